@@ -1,0 +1,99 @@
+"""jaxltl: policies known to do their task.
+
+State a task by a temporal-logic formula, demonstrations, a reward, or a mix; learn in the
+product of the world and the task's automaton; get every answer with its evidence.
+"""
+
+from jaxltl.core.automaton import Automaton
+from jaxltl.core.bellman import (
+    boltzmann_fixed_points,
+    boltzmann_value,
+    optimal_value,
+    policy_value,
+    soft_value,
+)
+from jaxltl.core.graph import (
+    almost_surely_reaching,
+    attractor,
+    avoidable,
+    end_components,
+)
+from jaxltl.core.ltl import Formula, holds_on_lasso, parse_ltl
+from jaxltl.core.mdp import MDP, DenseMDP, from_dense, make_mdp, to_dense
+from jaxltl.core.occupancy import feature_expectation, occupancy_measure
+from jaxltl.core.operators import (
+    exists_successor,
+    expectation,
+    forall_successor,
+    pushforward,
+    sample_successor,
+)
+from jaxltl.core.product import (
+    FiniteMemoryPolicy,
+    Product,
+    letters,
+    lift_policy,
+    lift_trajectories,
+    product,
+    project_policy,
+    restrict,
+)
+from jaxltl.core.reachability import (
+    optimal_satisfaction,
+    reachability_probability,
+    satisfaction_probability,
+)
+from jaxltl.core.rollout import Trajectories, make_trajectories, rollout
+from jaxltl.core.translate import to_automaton
+from jaxltl.core.types import NotConverged, Solution, Status, check
+from jaxltl.envs.gridworld import gridworld
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "MDP",
+    "Automaton",
+    "DenseMDP",
+    "FiniteMemoryPolicy",
+    "Formula",
+    "NotConverged",
+    "Product",
+    "Solution",
+    "Status",
+    "Trajectories",
+    "almost_surely_reaching",
+    "attractor",
+    "avoidable",
+    "boltzmann_fixed_points",
+    "boltzmann_value",
+    "check",
+    "end_components",
+    "exists_successor",
+    "expectation",
+    "feature_expectation",
+    "forall_successor",
+    "from_dense",
+    "gridworld",
+    "holds_on_lasso",
+    "letters",
+    "lift_policy",
+    "lift_trajectories",
+    "make_mdp",
+    "make_trajectories",
+    "occupancy_measure",
+    "optimal_satisfaction",
+    "optimal_value",
+    "parse_ltl",
+    "policy_value",
+    "product",
+    "project_policy",
+    "pushforward",
+    "reachability_probability",
+    "restrict",
+    "rollout",
+    "sample_successor",
+    "satisfaction_probability",
+    "soft_value",
+    "to_automaton",
+    "to_dense",
+]

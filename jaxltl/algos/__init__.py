@@ -1,0 +1,1 @@
+"""One module per learner, all of the same shape."""

@@ -1,0 +1,220 @@
+"""What all learners share: one loop, progress, and resuming bitwise.
+
+A learner is a module with ``init(key, problem, hparams) -> State`` and
+``step(state, problem, hparams) -> (State, Metrics)``, both pure. From these follow
+its ``run`` and ``train``::
+
+    run = partial(learner.run, step)
+    train = partial(learner.train, init, step)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+import zipfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+Init = Callable[..., Any]
+Step = Callable[..., tuple[Any, Any]]
+
+
+@partial(jax.jit, static_argnames=("step", "num_steps", "max_rows"))
+def run(
+    step: Step, state: Any, problem: Any, hparams: Any, *, num_steps: int, max_rows: int = 1000
+) -> tuple[Any, Any]:
+    """`num_steps` steps of a learner, compiled as one loop.
+
+    Args:
+      step: the learner's step.
+      state: where to go on from.
+      problem, hparams: arrays; new values do not recompile.
+      num_steps: static.
+      max_rows: metrics are kept of at most this many evenly spaced steps, always
+        including the last, so memory does not grow with `num_steps`.
+
+    Returns:
+      The state after the last step, and metrics with a leading axis of rows.
+
+    Raises:
+      ValueError: num_steps or max_rows is not positive.
+    """
+    if num_steps < 1 or max_rows < 1:
+        raise ValueError(f"num_steps={num_steps}, max_rows={max_rows}; both must be at least 1.")
+    stride = -(-num_steps // max_rows)
+    # The first block is the short one, so that every row ends a full stride.
+    first = num_steps - (num_steps - 1) // stride * stride
+
+    # One trace of the step serves all: two could be compiled to different roundings.
+    _, shape = jax.eval_shape(step, state, problem, hparams)
+    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
+
+    def block(state: Any, length: jax.Array) -> tuple[Any, Any]:
+        return lax.fori_loop(
+            0, length, lambda _, carry: step(carry[0], problem, hparams), (state, empty)
+        )
+
+    lengths = jnp.full(-(-num_steps // stride), stride).at[0].set(first)
+    return lax.scan(block, state, lengths)
+
+
+def train(
+    init: Init,
+    step: Step,
+    key: chex.PRNGKey,
+    problem: Any,
+    hparams: Any,
+    *,
+    num_steps: int,
+    max_rows: int = 1000,
+) -> tuple[Any, Any]:
+    """:func:`run` from a fresh state; ``vmap`` it over keys for a sweep of seeds."""
+    state = init(key, problem, hparams)
+    return run(step, state, problem, hparams, num_steps=num_steps, max_rows=max_rows)
+
+
+def run_in_chunks(
+    step: Step,
+    state: Any,
+    problem: Any,
+    hparams: Any,
+    *,
+    num_steps: int,
+    chunk: int = 50,
+    report: Callable[[int, Any], None] | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+) -> tuple[Any, Any]:
+    """The same steps in compiled chunks, with a report and a saved state after each.
+
+    Args:
+      step, state, problem, hparams: as for :func:`run`.
+      num_steps: the step counter to reach: a state that has already made some steps
+        (``state.step``) makes only the rest.
+      chunk: steps between reports.
+      report: called with the steps made and the newest metrics.
+      checkpoint: a file that holds the state after every chunk, written atomically. If
+        it exists, the run goes on from it.
+
+    Returns:
+      The state, and the metrics of the steps made in this call (None if there were none).
+
+    Raises:
+      ValueError: the checkpoint belongs to another learner or problem.
+    """
+    if checkpoint is not None and os.path.exists(checkpoint):
+        state = load(checkpoint, state)
+    rows = []
+    while (done := int(np.max(state.step))) < num_steps:
+        state, metrics = run(
+            step, state, problem, hparams, num_steps=min(chunk, num_steps - done)
+        )
+        rows.append(jax.device_get(metrics))
+        if checkpoint is not None:
+            save(checkpoint, state)
+        if report is not None:
+            report(int(np.max(state.step)), jax.tree.map(lambda x: x[-1], rows[-1]))
+    if not rows:
+        return state, None
+    return state, jax.tree.map(lambda *x: np.concatenate(x), *rows)
+
+
+# --- files ---------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def atomic_write(path: str | os.PathLike[str]):
+    """A binary file that appears under its name only when complete.
+
+    Raises:
+      ValueError: the place cannot be written to.
+    """
+    path = Path(path)
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    except OSError as error:
+        raise ValueError(
+            f"cannot write {str(path)!r}: {error.strerror}; choose a directory that exists and is "
+            "writable."
+        ) from error
+    try:
+        with os.fdopen(handle, "wb") as file:
+            yield file
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def save(path: str | os.PathLike[str], state: Any) -> None:
+    """Writes a learner's state as an ``.npz``, atomically.
+
+    Raises:
+      ValueError: the place cannot be written to.
+    """
+    arrays = {name: np.asarray(_data(leaf)) for name, leaf in _named(state)}
+    with atomic_write(path) as file:
+        np.savez(file, **arrays)
+
+
+def load(path: str | os.PathLike[str], like: Any) -> Any:
+    """Reads a state saved by :func:`save`, bit for bit.
+
+    Args:
+      path: the file.
+      like: a state of the same learner and problem (for example from ``init``).
+
+    Raises:
+      ValueError: the file is damaged, or its arrays do not fit `like`.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{str(path)!r} is not a saved state: {error}") from error
+    leaves = []
+    for name, leaf in _named(like):
+        expected = _data(leaf)
+        found = arrays.get(name)
+        if found is None or found.shape != expected.shape or found.dtype != expected.dtype:
+            is_ = "missing" if found is None else f"{found.dtype}{list(found.shape)}"
+            raise ValueError(
+                f"{str(path)!r} does not belong to this run: {name} is {is_}, expected "
+                f"{expected.dtype}{list(expected.shape)}. Delete the file to start afresh."
+            )
+        value = jnp.asarray(found)
+        if expected is not leaf:
+            value = jax.random.wrap_key_data(value, impl=jax.random.key_impl(leaf))
+        leaves.append(value)
+    return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def _named(tree: Any) -> list[tuple[str, Any]]:
+    """Leaves with distinct file-safe names, whose numbers keep nested paths apart."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return [
+        (f"{i}{jax.tree_util.keystr(path)}".replace("/", "_"), jnp.asarray(leaf))
+        for i, (path, leaf) in enumerate(leaves)
+    ]
+
+
+def _data(leaf: jax.Array) -> jax.Array:
+    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return jax.random.key_data(leaf) if is_key else leaf

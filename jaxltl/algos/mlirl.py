@@ -1,0 +1,410 @@
+"""Maximum-likelihood inverse RL with side information in temporal logic (chapter 2).
+
+From demonstrations, learn a reward whose softmax policy makes them likely (2.4), in the
+world or in its product with a task, and trade the likelihood against the probability
+that the policy does the task (2.6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+from jax.flatten_util import ravel_pytree
+
+from jaxltl.algos import learner
+from jaxltl.core.bellman import boltzmann_value, policy_logits, soft_value
+from jaxltl.core.mdp import MDP, DenseMDP
+from jaxltl.core.operators import expectation
+from jaxltl.core.product import Product, lift_trajectories
+from jaxltl.core.reachability import satisfaction_probability
+from jaxltl.core.rollout import Trajectories
+from jaxltl.core.types import Solution, Status
+
+Reward = Callable[[Any, jax.Array], jax.Array]
+
+
+def linear_reward(weights: jax.Array, features: jax.Array) -> jax.Array:
+    """``R = F theta``: ``float[S, A]`` from ``float[F]`` and ``float[S, A, F]``."""
+    return features @ weights
+
+
+@struct.dataclass
+class Problem:
+    """What is given: a model, features, demonstrations, and a class of rewards.
+
+    Attributes:
+      model: the world, or its product with the task.
+      features: ``float[S, A, F]`` (``[S, Q, A, F]``).
+      counts: ``float[S, A]``, how often each pair was demonstrated.
+      start: parameters around which learning starts, any pytree.
+      watched: ``float[S]``, weights of the states whose satisfaction counts in g.
+      reward: ``(parameters, features) -> float[S, A]``; static.
+    """
+
+    model: Any
+    features: jax.Array
+    counts: jax.Array
+    start: Any
+    watched: jax.Array
+    reward: Reward = struct.field(pytree_node=False, default=linear_reward)
+
+
+@struct.dataclass
+class Hparams:
+    """How to learn. Numbers are traced, so new values do not recompile.
+
+    Attributes:
+      discount: in [0, 1).
+      mu: weight of the satisfaction term (2.6); None leaves it out (cases 1 and 2).
+      l2: precision of the Gaussian prior on the parameters.
+      learning_rate: for ``adam`` and ``sgd``.
+      start_scale: standard deviation of the noise added to ``Problem.start``.
+      policy: ``"boltzmann"`` (2.3) or ``"soft"``; static.
+      adjoint: ``"exact"``, or ``"approximate"`` for (2.7); static.
+      optimizer: ``"lbfgs"``, ``"adam"`` or ``"sgd"``, all optax's; static.
+    """
+
+    discount: jax.Array | float
+    mu: jax.Array | float | None = None
+    l2: jax.Array | float = 1e-3
+    learning_rate: jax.Array | float = 0.1
+    start_scale: jax.Array | float = 1.0
+    policy: str = struct.field(pytree_node=False, default="boltzmann")
+    adjoint: str = struct.field(pytree_node=False, default="exact")
+    optimizer: str = struct.field(pytree_node=False, default="lbfgs")
+
+
+@struct.dataclass
+class State:
+    """Parameters on their way, with the value that the next solve starts from."""
+
+    key: jax.Array
+    step: jax.Array
+    parameters: Any
+    value: jax.Array
+    optimizer: Any
+
+
+@struct.dataclass
+class Metrics:
+    """Figures of the parameters before a step.
+
+    Attributes:
+      loss: the objective, with prior and satisfaction term.
+      neg_log_likelihood: (2.4), over all demonstrated pairs.
+      satisfaction: weighted mean of the satisfaction probability; NaN without the term.
+      gradient_norm: Euclidean.
+      status: of the value's solver; see :class:`~jaxltl.core.types.Status`.
+    """
+
+    loss: jax.Array
+    neg_log_likelihood: jax.Array
+    satisfaction: jax.Array
+    gradient_norm: jax.Array
+    status: jax.Array
+
+
+class Objective(NamedTuple):
+    """The loss at some parameters, and what it was made of."""
+
+    neg_log_likelihood: jax.Array
+    satisfaction: jax.Array
+    value: jax.Array
+    status: jax.Array
+
+
+def make_problem(
+    model: MDP | DenseMDP | Product,
+    features: jax.Array,
+    demonstrations: Trajectories,
+    *,
+    start: Any = None,
+    reward: Reward = linear_reward,
+    watched: str | jax.Array = "initial",
+) -> Problem:
+    """A checked :class:`Problem`.
+
+    Args:
+      model: the world (case 1) or a product (cases 2 and 3).
+      features: ``float[S, A, F]`` or ``float[S, Q, A, F]``.
+      demonstrations: in the world; lifted here if the model is a product.
+      start: initial parameters; default zero weights, one per feature.
+      reward: any differentiable reward of parameters and features, such as a flax
+        network's ``apply``.
+      watched: the states over which g sums (2.6): ``"initial"`` (where the model
+        starts; the dissertation's prose), ``"all"`` (its formula), or weights ``float[S]``.
+
+    Raises:
+      ValueError: features or weights of the wrong shape, features that are not finite,
+        an unknown `watched`, or a reward of the wrong shape.
+    """
+    actions = (*model.state_shape, model.num_actions)
+    features = jnp.asarray(features, model.dtype)
+    if features.shape[:-1] != actions:
+        raise ValueError(f"features have shape {features.shape}; expected {(*actions, 'F')}.")
+    if not bool(jnp.all(jnp.isfinite(features))):
+        place = np.argwhere(~np.isfinite(np.asarray(features)))[0]
+        raise ValueError(f"feature {place[-1]} at {tuple(place[:-1])} is not finite.")
+    if isinstance(model, Product):
+        demonstrations = lift_trajectories(model, demonstrations)
+    if isinstance(watched, str):
+        if watched not in ("initial", "all"):
+            raise ValueError(f'watched={watched!r}; choose "initial", "all" or weights.')
+        watched = jnp.ones(model.state_shape) if watched == "all" else model.initial > 0
+    watched = jnp.asarray(watched, model.dtype)
+    if watched.shape != model.state_shape:
+        raise ValueError(f"watched has shape {watched.shape}; expected {model.state_shape}.")
+    start = jnp.zeros(features.shape[-1], model.dtype) if start is None else start
+    start = jax.tree.map(lambda x: jnp.asarray(x, model.dtype), start)
+    shape = jax.eval_shape(reward, start, features).shape
+    if shape != actions:
+        raise ValueError(f"the reward has shape {shape}; expected {actions}.")
+    return Problem(
+        model=model, features=features, counts=pair_counts(model, demonstrations),
+        start=start, watched=watched, reward=reward,
+    )
+
+
+def pair_counts(model: Any, trajectories: Trajectories) -> jax.Array:
+    """How often each state-action pair occurs in trajectories of a model: ``float[S, A]``."""
+    actions = (*model.state_shape, model.num_actions)
+    pair = trajectories.state * model.num_actions + trajectories.action
+    flat = jnp.zeros(int(np.prod(actions)), model.dtype)
+    return flat.at[pair].add(trajectories.mask.astype(model.dtype)).reshape(actions)
+
+
+def solve(
+    parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
+) -> Solution:
+    """Value and policy of the reward at some parameters (2.3).
+
+    Args:
+      parameters: as ``Problem.start``.
+      problem, hparams: what and how.
+      initial: a value to start the Boltzmann iteration from.
+
+    Returns:
+      :class:`Solution`, differentiable in the parameters.
+
+    Raises:
+      ValueError: unknown kind of policy or adjoint.
+    """
+    reward = problem.reward(parameters, problem.features)
+    if hparams.policy == "soft":
+        if hparams.adjoint != "exact":
+            raise ValueError('adjoint="approximate" (2.7) belongs to the Boltzmann policy.')
+        return soft_value(problem.model, reward, hparams.discount)
+    if hparams.policy != "boltzmann":
+        raise ValueError(f"policy={hparams.policy!r}; choose boltzmann or soft.")
+    return boltzmann_value(
+        problem.model, reward, hparams.discount, initial=initial, adjoint=hparams.adjoint
+    )
+
+
+def objective(
+    parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
+) -> tuple[jax.Array, Objective]:
+    """``J = -sum log pi(s, a) - mu g(y) + l2 / 2 |theta|^2``: (2.4), (2.6) and the prior.
+
+    Args:
+      parameters, problem, hparams, initial: as in :func:`solve`.
+
+    Returns:
+      The loss, and :class:`Objective`. Differentiable in the parameters: exactly, or as in
+      (2.7) with the policy held constant in the Bellman equation.
+    """
+    solution = solve(parameters, problem, hparams, initial)
+    reward = problem.reward(parameters, problem.features)
+    logits = policy_logits(problem.model, reward, hparams.discount, solution.value)
+    log_policy = jax.nn.log_softmax(logits, axis=-1)
+    seen = problem.counts > 0
+    likelihood = jnp.sum(problem.counts * jnp.where(seen, log_policy, 0))
+    flat, _ = ravel_pytree(parameters)
+    loss = -likelihood + hparams.l2 / 2 * jnp.sum(flat * flat)
+    satisfaction = jnp.full((), jnp.nan, loss.dtype)
+    if hparams.mu is not None:
+        if not isinstance(problem.model, Product):
+            raise ValueError("mu weighs the satisfaction of a task: make the problem in a product.")
+        y = satisfaction_probability(problem.model, jax.nn.softmax(logits, axis=-1)).value
+        total = jnp.sum(problem.watched * y)
+        loss -= hparams.mu * total
+        satisfaction = total / jnp.sum(problem.watched)
+    return loss, Objective(-likelihood, satisfaction, solution.value, solution.status)
+
+
+def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """Parameters at ``problem.start`` plus noise of ``hparams.start_scale``; the key is kept."""
+    flat, unravel = ravel_pytree(problem.start)
+    noise = jax.random.normal(jax.random.fold_in(key, 0), flat.shape, flat.dtype)
+    parameters = unravel(flat + hparams.start_scale * noise)
+    return State(
+        key=key, step=jnp.int32(0), parameters=parameters,
+        value=jnp.zeros(problem.model.state_shape, problem.model.dtype),
+        optimizer=_optimizer(hparams).init(parameters),
+    )
+
+
+def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """One step of the optimiser on :func:`objective`; deterministic given the state."""
+
+    def loss_of(parameters: Any) -> jax.Array:
+        return objective(parameters, problem, hparams, state.value)[0]
+
+    (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
+        state.parameters, problem, hparams, state.value
+    )
+    updates, optimizer = _optimizer(hparams).update(
+        gradient, state.optimizer, state.parameters, value=loss, grad=gradient, value_fn=loss_of
+    )
+    metrics = Metrics(
+        loss=loss, neg_log_likelihood=parts.neg_log_likelihood, satisfaction=parts.satisfaction,
+        gradient_norm=optax.tree.norm(gradient), status=parts.status,
+    )
+    # A solve that failed would poison the next one's start.
+    usable = parts.status != Status.NONFINITE
+    return State(
+        key=state.key, step=state.step + 1,
+        parameters=optax.apply_updates(state.parameters, updates),
+        value=jnp.where(usable, parts.value, 0), optimizer=optimizer,
+    ), metrics
+
+
+def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
+    if hparams.optimizer == "lbfgs":
+        return optax.lbfgs()
+    rate = optax.scale_by_learning_rate(hparams.learning_rate)
+    if hparams.optimizer == "adam":
+        return optax.with_extra_args_support(optax.chain(optax.scale_by_adam(), rate))
+    if hparams.optimizer == "sgd":
+        return optax.with_extra_args_support(rate)
+    raise ValueError(f"optimizer={hparams.optimizer!r}; choose lbfgs, adam or sgd.")
+
+
+run = partial(learner.run, step)
+train = partial(learner.train, init, step)
+
+
+# --- the features of Table 1 -----------------------------------------------------------------
+
+
+class Features(NamedTuple):
+    """Named features: `values` is ``float[S, A, F]`` (``[S, Q, A, F]``)."""
+
+    values: jax.Array
+    names: tuple[str, ...]
+
+
+def task_features(
+    model: Product,
+    demonstrations: Trajectories,
+    *,
+    avoid: Collection[str] = (),
+    progress: Sequence[int] | None = None,
+) -> Features:
+    """The features of Table 1 in a product, zero where the task is done.
+
+    ``demonstrated``: whether the product pair occurs in the lifted demonstrations;
+    ``goal``: probability that the next automaton state is final; ``progress``:
+    probability of entering one of the automaton states `progress` from another;
+    ``avoid``: minus the probability that the next cell shows a proposition of `avoid`
+    (left out if there is none); ``time``: -1.
+
+    Args:
+      model: the product, whose acceptance is co-safe.
+      demonstrations: in the world.
+      avoid: propositions.
+      progress: automaton states; default :func:`progress_states`.
+
+    Raises:
+      ValueError: the task is not co-safe, or a state or proposition does not exist.
+    """
+    if model.automaton.acceptance != "cosafe":
+        raise ValueError("task_features needs a co-safe task, which has final states.")
+    lifted = lift_trajectories(model, demonstrations)
+    chosen = progress_states(model) if progress is None else tuple(progress)
+    num_memory = model.num_memory
+    for q in chosen:
+        if not 0 <= q < num_memory:
+            raise ValueError(f"progress: automaton state {q} does not exist; there are {num_memory}.")
+    target = np.isin(np.arange(num_memory), chosen)
+    entering = []
+    for q in range(num_memory):
+        region = jnp.asarray(target & (np.arange(num_memory) != q), model.dtype)
+        entering.append(expectation(model, jnp.broadcast_to(region, model.state_shape))[:, q])
+    columns = {
+        "demonstrated": (pair_counts(model, lifted) > 0).astype(model.dtype),
+        "goal": expectation(model, model.final.astype(model.dtype)),
+        "progress": jnp.stack(entering, axis=1),
+    }
+    red = _shows(model.mdp, avoid, "avoid")
+    return _table1(model, columns, red[:, None] & jnp.ones(num_memory, bool), avoid, model.final)
+
+
+def world_features(
+    world: MDP | DenseMDP,
+    demonstrations: Trajectories,
+    *,
+    goal: Collection[str],
+    progress: Collection[str] = (),
+    avoid: Collection[str] = (),
+) -> Features:
+    """The features of Table 1 without an automaton (case 1), zero in cells that show `goal`.
+
+    As in :func:`task_features`, with the probability that the next cell shows a
+    proposition of `goal`, `progress` and `avoid`.
+
+    Raises:
+      ValueError: a proposition does not exist.
+    """
+    columns = {
+        "demonstrated": (pair_counts(world, demonstrations) > 0).astype(world.dtype),
+        "goal": expectation(world, _shows(world, goal, "goal").astype(world.dtype)),
+        "progress": expectation(world, _shows(world, progress, "progress").astype(world.dtype)),
+    }
+    return _table1(
+        world, columns, _shows(world, avoid, "avoid"), avoid, _shows(world, goal, "goal")
+    )
+
+
+def _table1(model, columns, red, avoid, done) -> Features:
+    if avoid:
+        columns["avoid"] = -expectation(model, red.astype(model.dtype))
+    columns["time"] = -jnp.ones_like(columns["demonstrated"])
+    values = jnp.stack(list(columns.values()), axis=-1)
+    return Features(jnp.where(done[..., None, None], 0, values), tuple(columns))
+
+
+def _shows(world: MDP | DenseMDP, names: Collection[str], argument: str) -> jax.Array:
+    for name in names:
+        if name not in world.propositions:
+            raise ValueError(
+                f"{argument}: {name!r} is not a proposition of the world; "
+                f"it has {', '.join(world.propositions) or '(none)'}."
+            )
+    columns = [world.propositions.index(n) for n in names]
+    return jnp.any(world.label[:, columns], axis=1)
+
+
+def progress_states(model: Product) -> tuple[int, ...]:
+    """Automaton states that are not final but nearer to it than the farthest start.
+
+    Nearer in letters that occur in the world; the starts are the memories of initial
+    states.
+    """
+    delta = np.asarray(model.automaton.delta)[:, np.unique(np.asarray(model.letter))]
+    final = np.asarray(model.automaton.final)
+    distance = np.where(final, 0.0, np.inf)
+    for _ in range(len(delta)):
+        distance = np.minimum(distance, 1 + distance[delta].min(axis=1))
+    starts = np.asarray(model.initial_memory)[np.asarray(model.mdp.initial) > 0]
+    finite = distance[starts][np.isfinite(distance[starts])]
+    farthest = finite.max(initial=0)
+    return tuple(int(q) for q in np.flatnonzero((distance > 0) & (distance < farthest)))

@@ -1,0 +1,1 @@
+"""The mathematics: models, automata, products, and the solvers on them."""

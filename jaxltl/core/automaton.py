@@ -1,0 +1,529 @@
+"""Deterministic automata over infinite words, as integer tables.
+
+An automaton reads one letter per step; a letter is the set of the propositions true then.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxltl.core.ltl import Letter, as_letters, proposition_text
+
+ACCEPTANCES = ("cosafe", "safety")
+
+
+@dataclass(frozen=True, eq=False)
+class Automaton:
+    """A complete deterministic automaton; see `make_automaton` for checked construction.
+
+    A word is accepted iff its run is in `final` from some point on. With `"cosafe"` acceptance
+    the final states are absorbing: the run must reach one. With `"safety"` the non-final states
+    are absorbing: the run must avoid them.
+
+    Args:
+        delta: int32 `[Q, L]`, the state after reading letter l in state q.
+        initial: int32 scalar, the state before anything is read.
+        final: bool `[Q]`.
+        letters: bool `[L, P]`, whether proposition p holds in letter l.
+        propositions: `[P]` names.
+        acceptance: `"cosafe"` or `"safety"`.
+        state_names: `[Q]` readable names, one formula per state, or empty.
+    """
+
+    delta: NDArray[np.int32]
+    initial: int | NDArray[np.int32]
+    final: NDArray[np.bool_]
+    letters: NDArray[np.bool_]
+    propositions: tuple[str, ...]
+    acceptance: str
+    state_names: tuple[str, ...] = ()
+
+
+def make_automaton(
+    delta: ArrayLike,
+    initial: int,
+    final: ArrayLike,
+    letters: ArrayLike,
+    propositions: Iterable[str],
+    acceptance: str,
+    state_names: Iterable[str] = (),
+) -> Automaton:
+    """An `Automaton` from checked tables.
+
+    Args:
+        delta: `[Q, L]` integers in 0..Q-1.
+        initial: In 0..Q-1.
+        final: `[Q]` booleans, absorbing as `acceptance` asks.
+        letters: `[L, P]` booleans, no two rows equal.
+        propositions: `[P]` distinct names.
+        acceptance: `"cosafe"` or `"safety"`.
+        state_names: `[Q]` names, or none.
+
+    Raises:
+        ValueError: Naming the table, the entry and the fix.
+
+    >>> eventually_a = make_automaton(
+    ...     [[0, 1], [1, 1]], 0, [False, True], [[False], [True]], ["a"], "cosafe")
+    >>> int(eventually_a.delta[0, 1])
+    1
+    """
+    names, states = tuple(propositions), tuple(state_names)
+    table = np.asarray(delta)
+    if table.ndim != 2 or 0 in table.shape or table.dtype.kind not in "iu":
+        raise ValueError(
+            f"make_automaton: delta has shape {table.shape} and type {table.dtype}. "
+            "Pass integers [states, letters], with at least one of each."
+        )
+    count, width = table.shape
+    for q, letter in np.argwhere((table < 0) | (table >= count))[:1]:
+        raise ValueError(
+            f"make_automaton: delta[{q}, {letter}] = {table[q, letter]} is no state. "
+            f"The {count} rows of delta are the states 0..{count - 1}."
+        )
+    if initial not in range(count):
+        raise ValueError(
+            f"make_automaton: initial = {initial} is no state. Pass one of 0..{count - 1}."
+        )
+    is_final = _booleans(final, "final", (count,))
+    rows = _booleans(letters, "letters", (width, len(names)))
+    for name in names:
+        if names.count(name) > 1 or not isinstance(name, str):
+            raise ValueError(f"make_automaton: propositions has {name!r}. Pass distinct strings.")
+    first: dict[bytes, int] = {}
+    for letter, row in enumerate(rows):
+        twin = first.setdefault(row.tobytes(), letter)
+        if twin != letter:
+            held = _letter_text(names, row)
+            raise ValueError(
+                f"make_automaton: letters {twin} and {letter} are both {held}. Keep one of them."
+            )
+    if acceptance not in ACCEPTANCES:
+        raise ValueError(
+            f"make_automaton: acceptance = {acceptance!r}. Pass one of {', '.join(ACCEPTANCES)}."
+        )
+    absorbing = is_final if acceptance == "cosafe" else ~is_final
+    for q, letter in np.argwhere(absorbing[:, None] & ~absorbing[table])[:1]:
+        kind = "final" if acceptance == "cosafe" else "non-final"
+        raise ValueError(
+            f"make_automaton: delta[{q}, {letter}] = {table[q, letter]} leaves the {kind} states, "
+            f"which {acceptance!r} acceptance has absorbing. Redirect it, or change final."
+        )
+    if states and len(states) != count:
+        raise ValueError(
+            f"make_automaton: {len(states)} state_names for {count} states. Pass one each, or none."
+        )
+    return Automaton(
+        delta=table.astype(np.int32),
+        initial=np.asarray(initial, np.int32),
+        final=is_final,
+        letters=rows,
+        propositions=names,
+        acceptance=acceptance,
+        state_names=states,
+    )
+
+
+def _booleans(values: ArrayLike, place: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    array = np.asarray(values)
+    if array.size == 0:  # an empty list says nothing of its type
+        array = array.astype(bool)
+    if array.shape != shape or array.dtype.kind != "b":
+        raise ValueError(
+            f"make_automaton: {place} has shape {array.shape} and type {array.dtype}. "
+            f"Pass booleans of shape {shape}."
+        )
+    return array
+
+
+# ---------------------------------------------------------------------------------------------
+# Runs
+# ---------------------------------------------------------------------------------------------
+
+
+def letter_index(automaton: Automaton, letter: Letter) -> int:
+    """The index l of a letter, so that `delta[q, l]` reads it.
+
+    Args:
+        automaton: The automaton.
+        letter: The propositions that hold; names unknown to the automaton are ignored.
+
+    Raises:
+        ValueError: For a combination of propositions that is not among the letters.
+
+    >>> from jaxltl.core.translate import to_automaton
+    >>> letter_index(to_automaton("F a"), {"a", "unrelated"})
+    1
+    """
+    return _read(automaton, [letter], "letter_index: letter")[0]
+
+
+def _read(automaton: Automaton, word: Iterable[Letter], place: str) -> list[int]:
+    names = automaton.propositions
+    index = {
+        frozenset(name for name, holds in zip(names, row, strict=True) if holds): i
+        for i, row in enumerate(automaton.letters)
+    }
+    read = []
+    for position, letter in enumerate(as_letters(word, place)):
+        known = letter.intersection(names)
+        if known not in index:
+            raise ValueError(
+                f"{place} {position} is {set(known) or '{}'}, which is not among the "
+                f"{len(index)} letters of the automaton. Add it where the automaton is built "
+                "(the argument letters=)."
+            )
+        read.append(index[known])
+    return read
+
+
+def run(automaton: Automaton, word: Iterable[Letter]) -> NDArray[np.int32]:
+    """The states passed while reading a finite word, from `initial` on.
+
+    `q[0] = initial` and `q[t+1] = delta[q[t], w[t]]`.
+
+    Args:
+        automaton: The automaton.
+        word: `[T]` letters, each the collection of the propositions that hold.
+
+    Returns:
+        int32 `[T+1]`.
+
+    >>> from jaxltl.core.translate import to_automaton
+    >>> run(to_automaton("F a"), [set(), {"a"}, set()]).tolist()
+    [0, 0, 1, 1]
+    """
+    states = [int(automaton.initial)]
+    for letter in _read(automaton, word, "run: letter"):
+        states.append(int(automaton.delta[states[-1], letter]))
+    return np.array(states, np.int32)
+
+
+def accepts_lasso(automaton: Automaton, prefix: Iterable[Letter], cycle: Iterable[Letter]) -> bool:
+    """Whether the automaton accepts the infinite word prefix·cycle^ω.
+
+    Args:
+        automaton: The automaton.
+        prefix: `[n]` letters, may be empty.
+        cycle: `[m]` letters, at least one.
+
+    >>> from jaxltl.core.translate import to_automaton
+    >>> accepts_lasso(to_automaton("F a"), prefix=[set()], cycle=[set(), {"a"}])
+    True
+    """
+    laps = _read(automaton, cycle, "accepts_lasso: cycle letter")
+    if not laps:
+        raise ValueError("accepts_lasso: the cycle is empty. Pass at least one letter.")
+    state = int(automaton.initial)
+    for letter in _read(automaton, prefix, "accepts_lasso: prefix letter"):
+        state = int(automaton.delta[state, letter])
+    seen: set[int] = set()
+    # A state met again at the start of the cycle is on the loop, which is all in final or all out.
+    while state not in seen:
+        seen.add(state)
+        for letter in laps:
+            state = int(automaton.delta[state, letter])
+    return bool(automaton.final[state])
+
+
+# ---------------------------------------------------------------------------------------------
+# Minimal and complement automata
+# ---------------------------------------------------------------------------------------------
+
+
+def minimize(automaton: Automaton) -> Automaton:
+    """The smallest automaton with the same runs in and out of `final`.
+
+    Unreachable states are dropped and equivalent ones merged, by `equivalence_classes`. Automata
+    with the same language of finite words leading to `final`, over the same letters, give
+    identical tables. A merged state keeps the shortest of the names.
+
+    >>> from jaxltl.core.translate import to_automaton
+    >>> minimize(to_automaton("F a & F b")).delta.shape
+    (4, 4)
+    """
+    return quotient(automaton, equivalence_classes(automaton))
+
+
+def quotient(automaton: Automaton, classes: NDArray[np.int32]) -> Automaton:
+    """The automaton whose states are classes of equivalent states.
+
+    Args:
+        automaton: The automaton.
+        classes: int32 `[Q]`, the class of each state, -1 to drop it (see `equivalence_classes`).
+    """
+    kept = np.flatnonzero(classes >= 0)
+    _, first = np.unique(classes[kept], return_index=True)
+    members = kept[first]  # one state of each class, in the order of the classes
+    names: dict[int, str] = {}
+    for q in kept if automaton.state_names else ():
+        name = automaton.state_names[q]
+        names[classes[q]] = min(names.get(classes[q], name), name, key=len)
+    return replace(
+        automaton,
+        delta=classes[automaton.delta[members]],
+        initial=np.asarray(classes[int(automaton.initial)], np.int32),
+        final=automaton.final[members],
+        state_names=tuple(names[c] for c in sorted(names)),
+    )
+
+
+def equivalence_classes(automaton: Automaton) -> NDArray[np.int32]:
+    """The state of `minimize(automaton)` that each state becomes, -1 if it is unreachable.
+
+    Two states are equivalent when every finite word leads both into `final` or both out of it.
+    The coarsest such partition is found by refinement, always queueing the smaller half of a
+    split block (Hopcroft 1971, "An n log n algorithm for minimizing states in a finite
+    automaton"), and numbered breadth first from the initial state.
+
+    Returns:
+        int32 `[Q]`.
+    """
+    reached = _breadth_first(automaton.delta, int(automaton.initial))
+    position = np.full(len(automaton.delta), -1)
+    position[reached] = np.arange(len(reached))
+    # Letters with equal columns are one letter to Hopcroft's algorithm.
+    delta = np.unique(position[automaton.delta[reached]], axis=1)
+    blocks = _coarsest_partition(delta, automaton.final[reached])
+    order = np.full(blocks.max() + 1, -1)
+    found, first = np.unique(blocks, return_index=True)  # reached is in breadth-first order
+    order[found[np.argsort(first)]] = np.arange(len(found))
+    classes = np.full(len(automaton.delta), -1, np.int32)
+    classes[reached] = order[blocks]
+    return classes
+
+
+def _breadth_first(delta: NDArray[np.integer[Any]], start: int) -> list[int]:
+    order = {start: None}
+    queue = [start]
+    for state in queue:
+        for successor in dict.fromkeys(delta[state].tolist()):
+            if successor not in order:
+                order[successor] = None
+                queue.append(successor)
+    return queue
+
+
+def _coarsest_partition(
+    delta: NDArray[np.integer[Any]], final: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    count, width = delta.shape
+    before: list[list[list[int]]] = [[[] for _ in range(count)] for _ in range(width)]
+    for q, row in enumerate(delta.tolist()):
+        for letter, successor in enumerate(row):
+            before[letter][successor].append(q)
+    members = [set(np.flatnonzero(final).tolist()), set(np.flatnonzero(~final).tolist())]
+    block_of = [0 if holds else 1 for holds in final]
+    waiting = [min((0, 1), key=lambda block: len(members[block]))]
+    while waiting:
+        splitter = list(members[waiting.pop()])
+        for sources in before:
+            hit = defaultdict(set)
+            for q in splitter:
+                for source in sources[q]:
+                    hit[block_of[source]].add(source)
+            for block, inside in hit.items():
+                whole = members[block]
+                if len(inside) == len(whole):
+                    continue
+                # The smaller half gets the new number, so that a state is renumbered O(log Q)
+                # times; the larger half stays in `waiting` if the block was there.
+                smaller = inside if 2 * len(inside) <= len(whole) else whole - inside
+                whole -= smaller
+                members.append(smaller)
+                for q in smaller:
+                    block_of[q] = len(members) - 1
+                waiting.append(len(members) - 1)
+    return np.array(block_of)
+
+
+def complement(automaton: Automaton) -> Automaton:
+    """The automaton that accepts exactly the words that `automaton` rejects.
+
+    The run is the same and `final` is negated, which turns co-safe into safety acceptance.
+
+    >>> from jaxltl.core.translate import to_automaton
+    >>> complement(to_automaton("F a")).state_names
+    ('!(F a)', 'false')
+    """
+    constants = {"true": "false", "false": "true"}
+    return replace(
+        automaton,
+        final=~automaton.final,
+        acceptance="safety" if automaton.acceptance == "cosafe" else "cosafe",
+        state_names=tuple(constants.get(name, f"!({name})") for name in automaton.state_names),
+    )
+
+
+# ---------------------------------------------------------------------------------------------
+# Readable forms
+# ---------------------------------------------------------------------------------------------
+
+
+def guards(automaton: Automaton) -> dict[tuple[int, int], str]:
+    """A short condition on the propositions for each pair of states joined by a letter.
+
+    A guard is true of the letters that make the transition and false of the other letters; what
+    it says of combinations that are no letter is left to brevity. It is an irredundant
+    disjunction of prime cubes, chosen greedily, not always the shortest.
+
+    >>> from jaxltl.core.translate import to_automaton
+    >>> guards(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}]))
+    {(0, 0): '!g & !r', (0, 1): 'g', (0, 2): 'r', (1, 1): 'true', (2, 2): 'true'}
+    """
+    literals = [proposition_text(name) for name in automaton.propositions]
+    result = {}
+    for q, row in enumerate(automaton.delta):
+        for successor in np.unique(row):
+            cubes = _cover(automaton.letters, row == successor)
+            texts = [
+                " & ".join(literals[p] if value else f"!{literals[p]}" for p, value in cube)
+                for cube in cubes
+            ]
+            if len(texts) > 1:
+                texts = [f"({text})" if " & " in text else text for text in texts]
+            result[q, int(successor)] = " | ".join(texts) or "true"
+    return result
+
+
+_Cube = list[tuple[int, bool]]  # (proposition, its value)
+
+
+def _cover(letters: NDArray[np.bool_], chosen: NDArray[np.bool_]) -> list[_Cube]:
+    """Cubes that together hold in the chosen letters and in no other letter."""
+    cubes: list[_Cube] = []
+    left = chosen.copy()
+    while left.any():
+        cube = _prime_cube(letters, chosen, seed=int(np.argmax(left)))
+        left &= ~_inside(letters, cube)
+        cubes.append(cube)
+    for cube in list(cubes):
+        others = [_inside(letters, other) for other in cubes if other is not cube]
+        if others and not (chosen & ~np.any(others, axis=0)).any():
+            cubes.remove(cube)
+    return cubes
+
+
+def _prime_cube(letters: NDArray[np.bool_], chosen: NDArray[np.bool_], seed: int) -> _Cube:
+    """Literals of letter `seed`, none to spare, that hold together in chosen letters only."""
+    cube: _Cube = []
+    agrees = letters == letters[seed]
+    wrong = ~chosen
+    while wrong.any():
+        best = int(np.argmax((~agrees[wrong]).sum(axis=0)))
+        cube.append((best, bool(letters[seed, best])))
+        wrong &= agrees[:, best]
+    for literal in list(cube):
+        shorter = [other for other in cube if other != literal]
+        if not (_inside(letters, shorter) & ~chosen).any():
+            cube = shorter
+    return sorted(cube)
+
+
+def _inside(letters: NDArray[np.bool_], cube: _Cube) -> NDArray[np.bool_]:
+    inside = np.ones(len(letters), bool)
+    for proposition, value in cube:
+        inside &= letters[:, proposition] == value
+    return inside
+
+
+def _letter_text(names: Collection[str], row: NDArray[np.bool_]) -> str:
+    return "{" + ", ".join(name for name, holds in zip(names, row, strict=True) if holds) + "}"
+
+
+def _state_labels(automaton: Automaton) -> list[str]:
+    names = automaton.state_names or [""] * len(automaton.delta)
+    return [f"{q}: {name}" if name else f"{q}" for q, name in enumerate(names)]
+
+
+def to_text(automaton: Automaton) -> str:
+    """The automaton for reading: `>` marks the initial state and `*` the final ones.
+
+    >>> from jaxltl.core.translate import to_automaton
+    >>> print(to_text(to_automaton("F a")))
+    cosafe automaton: 2 states, 2 letters over a
+    >  0: F a
+         !a -> 0
+         a -> 1
+     * 1: true
+         true -> 1
+    """
+    count, width = automaton.delta.shape
+    over = ", ".join(automaton.propositions) or "no propositions"
+    lines = [f"{automaton.acceptance} automaton: {count} states, {width} letters over {over}"]
+    conditions = guards(automaton)
+    for q, label in enumerate(_state_labels(automaton)):
+        marks = (">" if q == automaton.initial else " ") + ("*" if automaton.final[q] else " ")
+        lines.append(f"{marks} {label}")
+        lines += [
+            f"     {text} -> {end}" for (start, end), text in conditions.items() if start == q
+        ]
+    return "\n".join(lines)
+
+
+def to_dot(automaton: Automaton) -> str:
+    """The automaton as a graph in the DOT language, final states double circled.
+
+    >>> from jaxltl.core.translate import to_automaton
+    >>> print(to_dot(to_automaton("true")))
+    digraph automaton {
+      rankdir=LR;
+      start [shape=point, label=""];
+      start -> 0;
+      0 [shape=doublecircle, label="0: true"];
+      0 -> 0 [label="true"];
+    }
+    """
+    lines = ["rankdir=LR;", 'start [shape=point, label=""];', f"start -> {automaton.initial};"]
+    for q, label in enumerate(_state_labels(automaton)):
+        shape = "doublecircle" if automaton.final[q] else "circle"
+        lines.append(f"{q} [shape={shape}, label={_dot_string(label)}];")
+    for (q, successor), text in guards(automaton).items():
+        lines.append(f"{q} -> {successor} [label={_dot_string(text)}];")
+    return "\n".join(["digraph automaton {", *(f"  {line}" for line in lines), "}"])
+
+
+def _dot_string(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n") + '"'
+
+
+def to_dict(automaton: Automaton) -> dict[str, Any]:
+    """The automaton as lists, numbers and strings, for JSON; `from_dict` is the inverse.
+
+    >>> from jaxltl.core.translate import to_automaton
+    >>> to_dict(to_automaton("F a"))["delta"]
+    [[0, 1], [1, 1]]
+    """
+    return {
+        "delta": automaton.delta.tolist(),
+        "initial": int(automaton.initial),
+        "final": automaton.final.tolist(),
+        "letters": automaton.letters.tolist(),
+        "propositions": list(automaton.propositions),
+        "acceptance": automaton.acceptance,
+        "state_names": list(automaton.state_names),
+    }
+
+
+def from_dict(tables: Mapping[str, Any]) -> Automaton:
+    """The automaton that `to_dict` wrote.
+
+    Raises:
+        ValueError: For a missing or unknown entry, or tables that are no automaton.
+
+    >>> from jaxltl.core.translate import to_automaton
+    >>> from_dict(to_dict(to_automaton("F a"))).acceptance
+    'cosafe'
+    """
+    fields = set(Automaton.__dataclass_fields__)
+    if set(tables) != fields:
+        wrong = ", ".join(sorted(map(str, set(tables) ^ fields)))
+        raise ValueError(
+            f"from_dict: missing or unknown entries: {wrong}. Pass what to_dict returned."
+        )
+    return make_automaton(**tables)

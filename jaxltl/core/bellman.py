@@ -1,0 +1,542 @@
+"""Discounted values: of a policy, optimal, soft, and Boltzmann.
+
+Every solver stops on a certified error, returns the enclosure that certifies it, and is
+differentiable by the implicit function theorem in the reward, the discount and the
+transition probabilities. A ``model`` is an MDP, a DenseMDP or a Product; shapes are
+written for an MDP, and a product's values have ``[S, Q]`` for ``[S]``.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.scipy.special import logsumexp
+
+from jaxltl.core.fixed_point import implicit, newton_step, solve_linear
+from jaxltl.core.operators import (
+    action_argmax,
+    action_max,
+    action_mean,
+    expectation,
+    induced_chain,
+    policy_distribution,
+)
+from jaxltl.core.types import Solution, Status, status_code
+
+
+def action_value(
+    model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
+) -> jax.Array:
+    """``Q(s, a) = R(s, a) + discount * sum_t P(t | s, a) V(t)``; zero at unavailable actions.
+
+    Args:
+      model: the model.
+      reward: ``float[S, A]``.
+      discount: scalar.
+      value: ``float[S]``.
+
+    Returns:
+      ``float[S, A]``.
+    """
+    q = reward + discount * expectation(model, value)
+    return jnp.where(model.available, q, 0)
+
+
+def expected_reward(model: Any, reward: jax.Array) -> jax.Array:
+    """A reward on transitions, ``[S, A, K]``, as its expectation ``[S, A]``; ``[S, A]`` as it is.
+
+    Raises:
+      ValueError: the reward has another shape.
+    """
+    actions = (*model.state_shape, model.num_actions)
+    transitions = (*actions, model.num_successors)
+    reward = jnp.asarray(reward, model.dtype)
+    if reward.shape == actions:
+        return reward
+    if reward.shape == transitions:
+        return jnp.sum(model.successor_probability * reward, axis=-1)
+    raise ValueError(f"reward has shape {reward.shape}; expected {actions} or {transitions}.")
+
+
+def _rounding(model: Any, reward: jax.Array, value: jax.Array, gap: jax.Array) -> jax.Array:
+    """What rounding in one backup can add to an error, amplified by ``1 / gap``.
+
+    A backup sums at most as many products as a state has successors, over which rows may
+    also miss one by a rounding each, and takes a maximum or a mean over the actions.
+    """
+    terms = model.num_successors + model.num_actions + 4
+    magnitude = jnp.max(jnp.abs(reward)) + jnp.max(jnp.abs(value))
+    return terms * jnp.finfo(value.dtype).eps * magnitude / gap
+
+
+def _macqueen(
+    model: Any, reward: jax.Array, discount: jax.Array, value: jax.Array, image: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Bounds on the fixed point of a monotone T with ``T(v + c) = T(v) + discount * c``.
+
+    ``T v + discount / (1 - discount) * [min, max](T v - v)`` (MacQueen 1966).
+
+    Returns:
+      The shifts (down, up) of `image` that enclose the fixed point, the rounding error
+      contained in them, and whether everything is finite.
+    """
+    change = image - value
+    gap = jnp.where(discount < 1, 1 - discount, jnp.nan)
+    rounding = _rounding(model, reward, image, gap)
+    down = discount / gap * jnp.min(change) - rounding
+    up = discount / gap * jnp.max(change) + rounding
+    finite = jnp.isfinite(down) & jnp.isfinite(up)
+    return down, up, rounding, finite
+
+
+def _certified(
+    model: Any,
+    reward: jax.Array,
+    discount: jax.Array,
+    tolerance: jax.Array | None,
+    value: jax.Array,
+    image: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Midpoint shift of the enclosure, its half width, and whether it meets the tolerance."""
+    down, up, rounding, finite = _macqueen(model, reward, discount, value, image)
+    half = (up - down) / 2
+    goal = 4 * rounding if tolerance is None else tolerance
+    half = jnp.where(finite, half, jnp.inf)
+    return (up + down) / 2, half, half <= goal
+
+
+def _solution(model, reward, discount, tolerance, value, image, policy, num_steps) -> Solution:
+    shift, half, converged = _certified(model, reward, discount, tolerance, value, image)
+    finite = jnp.all(jnp.isfinite(image)) & (discount < 1)
+    # Without a certificate the shift is meaningless and the iterate itself is the answer.
+    middle = image + jnp.where(jnp.isfinite(half), shift, 0)
+    return Solution(
+        value=middle,
+        policy=policy,
+        lower=middle - half,
+        upper=middle + half,
+        residual=jnp.max(jnp.abs(image - value)),
+        num_steps=num_steps,
+        status=status_code(converged, finite),
+    )
+
+
+@jax.jit
+def policy_value(
+    model: Any,
+    policy: jax.Array,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    *,
+    tolerance: jax.Array | float | None = None,
+    max_steps: jax.Array | int = 10_000,
+) -> Solution:
+    """Expected discounted reward of a policy.
+
+    ``V = r_pi + discount * P_pi V`` (dissertation, section 2.2.1). Solved by BiCGSTAB with
+    successive approximation where that stalls; the enclosure holds for any iterate.
+
+    Args:
+      model: the model.
+      policy: ``float[S, A]`` or ``int32[S]``.
+      reward: ``float[S, A]`` or ``float[S, A, K]``.
+      discount: scalar in [0, 1).
+      tolerance: certified absolute error asked for; default: what the dtype allows.
+      max_steps: rounds of 32 sweeps at most.
+
+    Returns:
+      :class:`Solution`; `value` is ``float[S]``.
+
+    Raises:
+      ValueError: policy or reward has the wrong shape.
+
+    Differentiable in the policy, the reward, the discount and the probabilities.
+
+    Example:
+      >>> from jaxltl.core.mdp import from_dense
+      >>> mdp = from_dense([[[1.0]]])
+      >>> round(policy_value(mdp, jnp.array([0]), jnp.ones((1, 1)), 0.5).value.item(), 4)
+      2.0
+    """
+    reward = expected_reward(model, reward)
+    discount = jnp.asarray(discount, model.dtype)
+    policy = policy_distribution(model, policy)
+    reward = jnp.where(model.available, reward, 0)
+
+    def backup(v: jax.Array) -> jax.Array:
+        return action_mean(policy, action_value(model, reward, discount, v))
+
+    constant = action_mean(policy, reward)
+    scale = jnp.finfo(model.dtype).eps
+    relative = scale if tolerance is None else jnp.maximum(
+        scale, tolerance * (1 - discount) / (4 * jnp.linalg.norm(constant.ravel()) + scale)
+    )
+    value = lax.stop_gradient(
+        solve_linear(
+            lambda v: v - (backup(v) - constant), constant,
+            tolerance=relative, max_rounds=max_steps,
+        )
+    )
+    solution = _solution(
+        model, reward, discount, tolerance, value, backup(value), policy, jnp.int32(1)
+    )
+    return _attach(solution, backup)
+
+
+def _attach(solution: Solution, backup) -> Solution:
+    """The solution with implicit derivatives on its value, and none on its evidence."""
+    solution = jax.tree.map(lax.stop_gradient, solution)
+    return solution.replace(value=implicit(backup, solution.value))
+
+
+@partial(jax.jit, static_argnames=("method",))
+def optimal_value(
+    model: Any,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    *,
+    method: str = "modified_policy_iteration",
+    tolerance: jax.Array | float | None = None,
+    max_steps: jax.Array | int = 100_000,
+    evaluation_sweeps: jax.Array | int = 8,
+) -> Solution:
+    """Largest expected discounted reward, ``V = max_a R + discount * P V``.
+
+    Modified policy iteration (Puterman and Shin 1978): after each sweep of the
+    optimality operator, `evaluation_sweeps` cheap sweeps under the greedy policy.
+    Stops on MacQueen's bounds, so a tolerance met is a certified error.
+
+    Args:
+      model: the model.
+      reward: ``float[S, A]`` or ``float[S, A, K]``.
+      discount: scalar in [0, 1).
+      method: ``"modified_policy_iteration"`` or ``"value_iteration"``.
+      tolerance: certified absolute error asked for; default: what the dtype allows.
+      max_steps: sweeps of the optimality operator at most.
+      evaluation_sweeps: sweeps between them under a fixed policy.
+
+    Returns:
+      :class:`Solution`; `value` is ``float[S]``, `policy` ``int32[S]`` is greedy and its
+      own value is at least `lower`.
+
+    Raises:
+      ValueError: the reward has the wrong shape, or an unknown method.
+
+    Differentiable in the reward, the discount and the probabilities, wherever the
+    greedy policy is unique.
+
+    Example:
+      >>> from jaxltl.core.mdp import from_dense
+      >>> mdp = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]])
+      >>> best = optimal_value(mdp, jnp.array([[0.0, 0.0], [1.0, 1.0]]), 0.5)
+      >>> [round(v, 4) for v in best.value.tolist()], best.policy.tolist()
+      ([1.0, 2.0], [1, 0])
+    """
+    if method not in ("modified_policy_iteration", "value_iteration"):
+        raise ValueError(f"method={method!r}; choose modified_policy_iteration or value_iteration.")
+    reward = expected_reward(model, reward)
+    discount = jnp.asarray(discount, model.dtype)
+
+    def backup(v: jax.Array) -> jax.Array:
+        q = reward + discount * expectation(model, v)
+        return action_max(q, model.available)
+
+    def greedy(v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        q = reward + discount * expectation(model, v)
+        return action_argmax(q, model.available)
+
+    def evaluate(v: jax.Array, policy: jax.Array) -> jax.Array:
+        chain = induced_chain(model, policy)
+        gain = action_mean(policy, reward)
+        return lax.fori_loop(
+            0, evaluation_sweeps,
+            lambda _, v: gain + discount * expectation(chain, v.ravel())[:, 0].reshape(v.shape), v,
+        )
+
+    def body(carry):
+        _, image, policy, n, _ = carry
+        value = image if method == "value_iteration" else evaluate(image, policy)
+        image, policy = greedy(value)
+        _, _, done = _certified(model, reward, discount, tolerance, value, image)
+        return value, image, policy, n + 1, done | ~jnp.isfinite(image.ravel()[0])
+
+    def unfinished(carry):
+        *_, n, done = carry
+        return ~done & (n < max_steps)
+
+    zero = jnp.zeros(model.state_shape, model.dtype)
+    start = (zero, *greedy(zero), jnp.int32(1), jnp.bool_(False))
+    value, image, policy, n, _ = lax.stop_gradient(lax.while_loop(unfinished, body, start))
+    solution = _solution(model, reward, discount, tolerance, value, image, policy, n)
+    return _attach(solution, backup)
+
+
+@partial(jax.jit, static_argnames=("method",))
+def soft_value(
+    model: Any,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    *,
+    method: str = "newton",
+    tolerance: jax.Array | float | None = None,
+    max_steps: jax.Array | int = 100_000,
+) -> Solution:
+    """Soft (maximum-entropy) value, ``V = log sum_a exp(R + discount * P V)`` (3.4).
+
+    Args:
+      model: the model.
+      reward: ``float[S, A]`` or ``float[S, A, K]``.
+      discount: scalar in [0, 1).
+      method: ``"newton"`` (soft policy iteration, few linear solves, for any discount)
+        or ``"value_iteration"`` (cheap sweeps).
+      tolerance: certified absolute error asked for; default: what the dtype allows.
+      max_steps: steps of the method at most.
+
+    Returns:
+      :class:`Solution`; `policy` is ``float[S, A]``, ``exp(Q - V)``.
+
+    Raises:
+      ValueError: the reward has the wrong shape, or an unknown method.
+
+    Value and policy are differentiable in the reward, the discount and the
+    probabilities. The bounds are certified: the soft operator is monotone and commutes
+    with constants up to the discount, as MacQueen's bounds need.
+
+    Example:
+      >>> from jaxltl.core.mdp import from_dense
+      >>> mdp = from_dense([[[1.0], [1.0]]])
+      >>> round(soft_value(mdp, jnp.zeros((1, 2)), 0.5).value.item(), 4)  # 2 log 2
+      1.3863
+    """
+    if method not in ("newton", "value_iteration"):
+        raise ValueError(f"method={method!r}; choose newton or value_iteration.")
+    reward = expected_reward(model, reward)
+    discount = jnp.asarray(discount, model.dtype)
+
+    def backup(v: jax.Array) -> jax.Array:
+        return logsumexp(policy_logits(model, reward, discount, v), axis=-1)
+
+    def body(carry):
+        value, image, n, _ = carry
+        if method == "newton":
+            # A Newton iterate lies below the fixed point; one sweep more is free.
+            value = newton_step(backup, value)
+        else:
+            value = image
+        image = backup(value)
+        _, _, done = _certified(model, reward, discount, tolerance, value, image)
+        return value, image, n + 1, done | ~jnp.isfinite(image.ravel()[0])
+
+    def unfinished(carry):
+        *_, n, done = carry
+        return ~done & (n < max_steps)
+
+    zero = jnp.zeros(model.state_shape, model.dtype)
+    start = (zero, backup(zero), jnp.int32(1), jnp.bool_(False))
+    value, image, n, _ = lax.stop_gradient(lax.while_loop(unfinished, body, start))
+    solution = _solution(model, reward, discount, tolerance, value, image, zero, n)
+    return _with_softmax(model, reward, discount, _attach(solution, backup))
+
+
+def policy_logits(
+    model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
+) -> jax.Array:
+    """Action values with minus infinity at unavailable actions, whose softmax is the policy."""
+    q = reward + discount * expectation(model, value)
+    return jnp.where(model.available, q, -jnp.inf)
+
+
+def _with_softmax(model, reward, discount, solution: Solution) -> Solution:
+    q = policy_logits(model, reward, discount, solution.value)
+    return solution.replace(policy=jax.nn.softmax(q, axis=-1))
+
+
+def boltzmann_expansion(num_actions: int) -> float:
+    """Largest row sum of the Jacobian of ``sum_a softmax(q)_a q_a`` over all q.
+
+    The Boltzmann operator contracts for discounts below its inverse. The supremum is
+    attained where one action stands above the rest, which are equal.
+
+    Example:
+      >>> [round(boltzmann_expansion(n), 3) for n in (1, 2, 3, 4)]
+      [1.0, 1.2, 1.327, 1.423]
+    """
+    if num_actions == 1:
+        return 1.0
+    gap = np.linspace(0.0, 40.0, 400_001)
+    top = 1 / (1 + (num_actions - 1) * np.exp(-gap))
+    mean = top * gap
+    row_sum = np.abs(top * (1 + gap - mean)) + np.abs((1 - top) * (1 - mean))
+    # The grid misses the maximum by less than its spacing squared.
+    return float(row_sum.max() + 1e-7)
+
+
+@partial(jax.jit, static_argnames=("adjoint", "method"))
+def boltzmann_value(
+    model: Any,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    *,
+    initial: jax.Array | None = None,
+    adjoint: str = "exact",
+    method: str = "damped",
+    tolerance: jax.Array | float | None = None,
+    max_steps: jax.Array | int = 5_000,
+) -> Solution:
+    """Value of the softmax policy of its own action values (2.1)-(2.3).
+
+    ``V = sum_a softmax(Q)_a Q_a`` with ``Q = R + discount * P V``. This operator
+    contracts only while ``discount * boltzmann_expansion(A) < 1``. Beyond, it can cycle or
+    have several fixed points: damped steps of one half are polished by Newton's method,
+    the enclosure is infinite, and the status tells when no fixed point was reached. See
+    :func:`boltzmann_fixed_points`.
+
+    Args:
+      model: the model.
+      reward: ``float[S, A]`` or ``float[S, A, K]``.
+      discount: scalar in [0, 1).
+      initial: ``float[S]``, where to start; default zero.
+      adjoint: ``"exact"``, or ``"approximate"`` for the sensitivity (2.7) that holds the
+        policy constant.
+      method: ``"damped"``, or ``"newton"`` for Newton steps from the start on, which may
+        also find fixed points that repel.
+      tolerance: on the certified error where the operator contracts, on the
+        residual elsewhere; default: what the dtype allows.
+      max_steps: damped steps at most.
+
+    Returns:
+      :class:`Solution`; `policy` is ``float[S, A]``, the softmax.
+
+    Raises:
+      ValueError: the reward has the wrong shape, or an unknown method or adjoint.
+
+    Value and policy are differentiable in the reward, the discount and the probabilities.
+
+    Example:
+      >>> from jaxltl.core.mdp import from_dense
+      >>> mdp = from_dense([[[1.0], [1.0]]])
+      >>> round(boltzmann_value(mdp, jnp.ones((1, 2)), 0.5).value.item(), 4)
+      2.0
+    """
+    if adjoint not in ("exact", "approximate"):
+        raise ValueError(f"adjoint={adjoint!r}; choose exact or approximate.")
+    if method not in ("damped", "newton"):
+        raise ValueError(f"method={method!r}; choose damped or newton.")
+    reward = expected_reward(model, reward)
+    discount = jnp.asarray(discount, model.dtype)
+    expansion = discount * boltzmann_expansion(model.num_actions)
+
+    def backup(v: jax.Array, constant_policy: bool = False) -> jax.Array:
+        policy = jax.nn.softmax(policy_logits(model, reward, discount, v), axis=-1)
+        if constant_policy:
+            policy = lax.stop_gradient(policy)
+        return action_mean(policy, action_value(model, reward, discount, v))
+
+    start = jnp.zeros(model.state_shape, model.dtype) if initial is None else initial
+    damping = jnp.where((expansion < 1) | (method == "newton"), 0.0, 0.5).astype(model.dtype)
+    gap = jnp.where(expansion < 1, 1 - expansion, 1)
+
+    def error(v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Certified (or, without contraction, residual) error, and the error asked for."""
+        residual = jnp.max(jnp.abs(backup(v) - v))
+        rounding = _rounding(model, reward, v, gap)
+        goal = 4 * rounding if tolerance is None else jnp.asarray(tolerance, v.dtype)
+        bound = residual / gap + rounding
+        return jnp.where(jnp.isfinite(bound), bound, jnp.inf), goal
+
+    num_damped = 0 if method == "newton" else 16
+
+    def round_(carry):
+        v, n, _ = carry
+        width = jnp.minimum(num_damped * (1 + n // 64), max_steps)
+        v = lax.fori_loop(0, width, lambda _, v: damping * v + (1 - damping) * backup(v), v)
+        polished, bound, goal = _polish(backup, error, v)
+        done = bound <= goal
+        return jnp.where(done, polished, v), n + jnp.maximum(width, 1), done
+
+    def unfinished(carry):
+        v, n, done = carry
+        return ~done & (n < max_steps) & jnp.all(jnp.isfinite(v))
+
+    value, n, done = lax.stop_gradient(
+        lax.while_loop(unfinished, round_, (start, jnp.int32(0), jnp.bool_(False)))
+    )
+    half = jnp.where(done & (expansion < 1), error(value)[0], jnp.inf)
+    finite = jnp.all(jnp.isfinite(value)) & (discount < 1)
+    residual = jnp.max(jnp.abs(backup(value) - value))
+    solution = Solution(
+        value=value, policy=value, lower=value - half, upper=value + half,
+        residual=residual, num_steps=n, status=status_code(done, finite),
+    )
+    solution = jax.tree.map(lax.stop_gradient, solution)
+    attached = implicit(partial(backup, constant_policy=adjoint == "approximate"), value)
+    return _with_softmax(model, reward, discount, solution.replace(value=attached))
+
+
+def _polish(backup, error, v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Newton steps for as long as they shrink the error and it is not yet small enough."""
+
+    def body(carry):
+        v, bound, _, n = carry
+        image = newton_step(backup, v)
+        new_bound, _ = error(image)
+        better = new_bound < bound
+        return (jnp.where(better, image, v), jnp.minimum(bound, new_bound), better, n + 1)
+
+    def unfinished(carry):
+        v, bound, better, n = carry
+        return (bound > error(v)[1]) & better & (n < 20)
+
+    bound, _ = error(v)
+    v, bound, _, _ = lax.while_loop(
+        unfinished, body, (v, bound, jnp.bool_(True), jnp.int32(0))
+    )
+    return v, bound, error(v)[1]
+
+
+def boltzmann_fixed_points(
+    model: Any,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    key: chex.PRNGKey,
+    *,
+    num_starts: int = 64,
+    tolerance: float = 1e-6,
+) -> list[Solution]:
+    """Distinct fixed points of the Boltzmann operator that were found from many starts.
+
+    Damped and Newton iterations from zero, from the optimal and the worst value, and from
+    random values between. A search, not a proof that there are no others.
+
+    Args:
+      model, reward, discount: as in :func:`boltzmann_value`.
+      key: a PRNG key, consumed.
+      num_starts: starts for each of the two methods.
+      tolerance: fixed points nearer than this (sup norm) are one; also the residual allowed.
+
+    Returns:
+      Converged solutions, ordered by the sum of their values. Works on the host.
+    """
+    best = optimal_value(model, reward, discount).value
+    worst = -optimal_value(model, -jnp.asarray(reward), discount).value
+    weight = jax.random.uniform(key, (num_starts, *(1 for _ in best.shape)), best.dtype)
+    weight = weight.at[0].set(0).at[-1].set(1)
+    starts = worst + weight * (best - worst)
+    found: list[Solution] = []
+    for method in ("damped", "newton"):
+        run = jax.vmap(
+            lambda v, method=method: boltzmann_value(
+                model, reward, discount, initial=v, method=method)
+        )
+        batch = run(starts)
+        for i in np.flatnonzero(np.asarray(batch.status) == Status.CONVERGED):
+            one = jax.tree.map(lambda x, i=i: x[i], batch)
+            if all(jnp.max(jnp.abs(one.value - f.value)) > tolerance for f in found):
+                found.append(one)
+    return sorted(found, key=lambda f: float(f.value.sum()))

@@ -1,0 +1,308 @@
+"""Exact questions about supports: attractors, almost-sure sets, end components.
+
+Regions are Boolean, and only whether a probability is positive matters. There is one
+answer and two ways to it. Sweeps of the primitives work inside ``jit`` and ``vmap`` and are
+fast where regions grow in few steps. On concrete arrays, a region that is still growing
+after a few dozen sweeps is finished by worklists on the host, in time linear in
+the transitions, so that depth costs nothing.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxltl.core.mdp import DenseMDP
+from jaxltl.core.operators import exists_successor, forall_successor
+
+_MAX_SWEEPS = 48  # beyond, a worklist on the host is faster
+
+
+class Attractor(NamedTuple):
+    """A region that a goal attracts, with an action that makes progress.
+
+    Attributes:
+      region: ``bool[S]``.
+      action: ``int32[S]``: in the region outside the goal, an allowed action with a
+        successor that is nearer to the goal; elsewhere the first available one.
+    """
+
+    region: jax.Array
+    action: jax.Array
+
+
+class EndComponents(NamedTuple):
+    """Maximal end components within a region.
+
+    Attributes:
+      component: ``int32[S]``: the smallest (flat) state number of the state's component;
+        outside of all components, the state's own number.
+      inside: ``bool[S, A]``: actions that surely stay in the state's component.
+    """
+
+    component: jax.Array
+    inside: jax.Array
+
+
+def attractor(
+    model: Any, goal: jax.Array, allowed: jax.Array | None = None, *, rule: str = "exists"
+) -> Attractor:
+    """States that a goal attracts: the least R with ``goal <= R`` closed under a rule.
+
+    Args:
+      model: the model.
+      goal: ``bool[S]``.
+      allowed: ``bool[S, A]``, the actions that count; default the available ones.
+      rule: ``"exists"``: some allowed action reaches R with positive probability;
+        ``"forall"``: every allowed action does (so a state without any is attracted).
+
+    Returns:
+      :class:`Attractor`. With ``"exists"`` the action is the one that makes progress.
+
+    Raises:
+      ValueError: unknown rule.
+
+    Example:
+      >>> from jaxltl.core.mdp import from_dense
+      >>> mdp = from_dense([[[0, 1.0]], [[0, 1.0]]])
+      >>> attractor(mdp, jnp.array([True, False])).region.tolist()
+      [True, False]
+    """
+    if rule not in ("exists", "forall"):
+        raise ValueError(f"rule={rule!r}; choose exists or forall.")
+    allowed = model.available if allowed is None else allowed
+    traced = is_traced((model, goal, allowed))
+    most = jnp.iinfo(jnp.int32).max if traced else _MAX_SWEEPS
+    found, growing = _attractor_sweeps(model, goal, allowed, most, rule=rule)
+    if traced or not growing:
+        return found
+    return _attractor_worklist(model, found, allowed, rule)
+
+
+@partial(jax.jit, static_argnames=("rule",))
+def _attractor_sweeps(model, goal, allowed, max_sweeps, *, rule):
+    def body(carry):
+        region, action, _, n = carry
+        hit = allowed & exists_successor(model, region)
+        joins = hit.any(-1) if rule == "exists" else (hit | ~allowed).all(-1)
+        new = joins & ~region
+        action = jnp.where(new, jnp.argmax(hit, axis=-1).astype(jnp.int32), action)
+        return region | new, action, new.any(), n + 1
+
+    def unfinished(carry):
+        *_, growing, n = carry
+        return growing & (n < max_sweeps)
+
+    first = jnp.argmax(model.available, axis=-1).astype(jnp.int32)
+    start = (goal, first, jnp.bool_(True), jnp.int32(0))
+    region, action, growing, _ = lax.while_loop(unfinished, body, start)
+    return Attractor(region, action), growing
+
+
+def avoidable(model: Any, goal: jax.Array, allowed: jax.Array | None = None) -> jax.Array:
+    """States from which some policy surely never reaches the goal: ``bool[S]``.
+
+    The complement of the ``"forall"`` attractor; the minimal reachability probability is
+    zero exactly there.
+    """
+    return ~attractor(model, goal, allowed, rule="forall").region
+
+
+def almost_surely_reaching(
+    model: Any, goal: jax.Array, allowed: jax.Array | None = None
+) -> Attractor:
+    """States from which some policy reaches the goal with probability one.
+
+    The greatest X such that within X, by actions that surely stay in X, the goal is
+    reachable (de Alfaro 1997).
+
+    Returns:
+      :class:`Attractor`: the region and, outside the goal, the actions of such a policy.
+    """
+    allowed = model.available if allowed is None else allowed
+
+    def inner(region: jax.Array) -> Attractor:
+        stay = allowed & forall_successor(model, region)
+        return attractor(model, goal, stay)
+
+    if is_traced((model, goal, allowed)):
+        def body(carry):
+            region, _, _ = carry
+            found = inner(region)
+            return found.region, found.action, jnp.any(found.region != region)
+
+        whole = jnp.ones(model.state_shape, bool)
+        start = (whole, jnp.zeros(model.state_shape, jnp.int32), jnp.bool_(True))
+        region, action, _ = lax.while_loop(lambda c: c[2], body, start)
+        return Attractor(region, action)
+    found = attractor(model, goal, allowed)
+    while True:
+        smaller = inner(found.region)
+        if bool(jnp.all(smaller.region == found.region)):
+            return smaller
+        found = smaller
+
+
+def end_components(model: Any, region: jax.Array) -> EndComponents:
+    """Maximal end components that lie within a region (de Alfaro 1997).
+
+    An end component is a set of states with actions that never leave it and
+    connect it. Computed on the host by strongly connected components, and only
+    among the states that can stay in the region for ever; under ``jit`` by a callback.
+
+    Args:
+      model: the model.
+      region: ``bool[S]``.
+    """
+    flat = int(np.prod(model.state_shape))
+    # Only states that can remain in the region matter; usually there are few.
+    core = region & avoidable(model, ~region)
+    allowed = model.available & forall_successor(model, core) & core[..., None]
+    shapes = (
+        jax.ShapeDtypeStruct(model.state_shape, jnp.int32),
+        jax.ShapeDtypeStruct((*model.state_shape, model.num_actions), jnp.bool_),
+    )
+
+    def trivial():
+        number = jnp.arange(flat, dtype=jnp.int32).reshape(model.state_shape)
+        return number, jnp.zeros(shapes[1].shape, bool)
+
+    arguments = (*_support(model), core, allowed)
+    if is_traced(arguments):
+        def callback():
+            return jax.pure_callback(
+                partial(_end_components, _label_on(model)), shapes, *arguments,
+                vmap_method="sequential",
+            )
+        return EndComponents(*lax.cond(core.any(), callback, trivial))
+    if not bool(core.any()):
+        return EndComponents(*trivial())
+    found = _end_components(_label_on(model), *(np.asarray(x) for x in arguments))
+    return EndComponents(*(jnp.asarray(x) for x in found))
+
+
+# --- the host side: an MDP is a product with one memory state -----------------------------
+
+
+def is_traced(tree: Any) -> bool:
+    """Whether any array in a tree is abstract, so that the host cannot read it."""
+    return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
+
+
+def _label_on(model: Any) -> str:
+    return getattr(model, "label_on", "entry")
+
+
+def _support(model: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """``successor[S, A, K]``, whether it is one, and ``next_memory[S, Q]``."""
+    world = getattr(model, "mdp", model)
+    used = world.successor_probability > 0
+    if isinstance(world, DenseMDP):
+        successor = jnp.broadcast_to(jnp.arange(world.num_states, dtype=jnp.int32), used.shape)
+    else:
+        successor = world.successor
+    if world is model:
+        return successor, used, jnp.zeros((world.num_states, 1), jnp.int32)
+    return successor, used, model.next_memory
+
+
+def _predecessors(successor: np.ndarray, used: np.ndarray) -> Any:
+    """World predecessors: column t holds the numbers ``s * A + a`` of the pairs that lead to t."""
+    from scipy import sparse  # a tenth of a second that only host graphs need
+
+    num_states, num_actions, width = successor.shape
+    rows = num_states * num_actions
+    if used.all():
+        indptr = np.arange(rows + 1, dtype=np.int32) * width
+        indices = successor.reshape(-1)
+    else:
+        indptr = np.concatenate([[0], used.reshape(rows, width).sum(-1).cumsum()])
+        indices = successor[used]
+    data = np.ones(indices.size, np.int8)
+    return sparse.csr_array((data, indices, indptr), shape=(rows, num_states)).tocsc()
+
+
+def _attractor_worklist(model, found: Attractor, allowed: jax.Array, rule: str) -> Attractor:
+    """Finishes an attractor frontier by frontier, touching each transition once."""
+    successor, used, next_memory = (np.asarray(x) for x in _support(model))
+    num_actions, num_memory = successor.shape[1], next_memory.shape[1]
+    into = _predecessors(successor, used)
+    on_entry = _label_on(model) == "entry"
+    region = np.array(found.region).ravel()
+    action = np.array(found.action).ravel()
+    open_ = np.array(allowed).ravel()  # pairs that count and have not been hit
+    remaining = open_.reshape(-1, num_actions).sum(-1)
+
+    def leading_to(frontier: np.ndarray) -> np.ndarray:
+        """Flat pairs ``(s * Q + q) * A + a`` with a successor in the frontier."""
+        target, memory = np.divmod(frontier, num_memory)
+        count = into.indptr[target + 1] - into.indptr[target]
+        offset = np.arange(count.sum()) - np.repeat(count.cumsum() - count, count)
+        pair = into.indices[np.repeat(into.indptr[target], count) + offset]
+        if num_memory == 1:
+            return pair
+        s, a = np.divmod(pair, num_actions)
+        read = np.repeat(target, count) if on_entry else s
+        row, q = np.nonzero(next_memory[read] == np.repeat(memory, count)[:, None])
+        return (s[row] * num_memory + q) * num_actions + a[row]
+
+    frontier = np.flatnonzero(region)
+    while frontier.size:
+        pair = leading_to(frontier)
+        pair = np.unique(pair[open_[pair]])
+        open_[pair] = False
+        s, a = np.divmod(pair, num_actions)
+        if rule == "forall":
+            np.subtract.at(remaining, s, 1)
+            joins = (remaining[s] == 0) & ~region[s]
+        else:
+            joins = ~region[s]
+        frontier, first = np.unique(s[joins], return_index=True)
+        action[frontier] = a[joins][first]
+        region[frontier] = True
+    shape = found.region.shape
+    return Attractor(jnp.asarray(region.reshape(shape)), jnp.asarray(action.reshape(shape)))
+
+
+def _end_components(label_on, successor, used, next_memory, core, allowed):
+    """Refines strongly connected components until no action leaves its own."""
+    from scipy import sparse
+    from scipy.sparse import csgraph
+
+    successor, used, next_memory = (np.asarray(x) for x in (successor, used, next_memory))
+    shape, num_memory = np.shape(core), next_memory.shape[1]
+    total = next_memory.size
+    states = np.flatnonzero(core)
+    s, q = np.divmod(states, num_memory)
+    read = successor[s] if label_on == "entry" else s[:, None, None]
+    flat = successor[s].astype(np.int64) * num_memory + next_memory[read, q[:, None, None]]
+    local = np.full(total, -1)
+    local[states] = np.arange(states.size)
+    target, real = local[flat], used[s]  # [N, A, K]
+    stay = np.asarray(allowed).reshape(total, -1)[states]
+    source = np.broadcast_to(np.arange(states.size)[:, None, None], target.shape)
+    while True:
+        edge = real & stay[:, :, None]
+        graph = sparse.csr_array(
+            (np.ones(edge.sum(), np.int8), (source[edge], target[edge])),
+            shape=(states.size, states.size),
+        )
+        _, label = csgraph.connected_components(graph, connection="strong")
+        leaves = edge & (label[target] != label[:, None, None])
+        kept = stay & ~leaves.any(-1)
+        if (kept == stay).all():
+            break
+        stay = kept
+    component = np.arange(total, dtype=np.int32)
+    alive = stay.any(-1)
+    smallest = np.full(label.max(initial=0) + 1, total)
+    np.minimum.at(smallest, label, states)
+    component[states[alive]] = smallest[label[alive]]
+    inside = np.zeros((total, stay.shape[1]), bool)
+    inside[states] = stay
+    return component.reshape(shape), inside.reshape(*shape, -1)

@@ -1,0 +1,288 @@
+"""Markov decision processes as arrays, and the host-side checks that let them in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+
+@struct.dataclass
+class MDP:
+    """A labelled Markov decision process with padded successor lists.
+
+    Taking action ``a`` in state ``s`` leads to ``successor[s, a, k]`` with
+    ``probability[s, a, k]``. Padding has successor 0 and probability 0, and so has
+    every unavailable action. Build one with :func:`make_mdp`, which checks it.
+
+    Attributes:
+      successor: ``int32[S, A, K]``.
+      probability: ``float[S, A, K]``; rows of available actions sum to one.
+      available: ``bool[S, A]``; every state has an available action.
+      initial: ``float[S]``, the initial distribution.
+      label: ``bool[S, P]``, which propositions hold in a state.
+      propositions: the P names, static.
+    """
+
+    successor: jax.Array
+    probability: jax.Array
+    available: jax.Array
+    initial: jax.Array
+    label: jax.Array
+    propositions: tuple[str, ...] = struct.field(pytree_node=False, default=())
+
+    @property
+    def num_states(self) -> int:
+        return self.available.shape[-2]
+
+    @property
+    def num_actions(self) -> int:
+        return self.available.shape[-1]
+
+    @property
+    def state_shape(self) -> tuple[int, ...]:
+        """The shape of a value: ``(S,)``."""
+        return (self.num_states,)
+
+    @property
+    def num_successors(self) -> int:
+        return self.probability.shape[-1]
+
+    @property
+    def successor_probability(self) -> jax.Array:
+        """Weights of the successors of each pair, ``float[S, A, K]``."""
+        return self.probability
+
+    @property
+    def dtype(self) -> jnp.dtype:
+        return self.probability.dtype
+
+
+@struct.dataclass
+class DenseMDP:
+    """The same process with a full matrix, ``transition[s, a, t]``, for small batched problems.
+
+    Attributes:
+      transition: ``float[S, A, S]``; rows of unavailable actions are zero.
+      available, initial, label, propositions: as in :class:`MDP`.
+    """
+
+    transition: jax.Array
+    available: jax.Array
+    initial: jax.Array
+    label: jax.Array
+    propositions: tuple[str, ...] = struct.field(pytree_node=False, default=())
+
+    num_states = MDP.num_states
+    num_actions = MDP.num_actions
+    state_shape = MDP.state_shape
+    num_successors = MDP.num_states
+
+    @property
+    def successor_probability(self) -> jax.Array:
+        """``float[S, A, S]``: every state counts as a successor."""
+        return self.transition
+
+    @property
+    def dtype(self) -> jnp.dtype:
+        return self.transition.dtype
+
+
+def make_mdp(
+    successor: chex.Array,
+    probability: chex.Array,
+    *,
+    available: chex.Array | None = None,
+    initial: chex.Array | None = None,
+    label: chex.Array | None = None,
+    propositions: Sequence[str] = (),
+) -> MDP:
+    """A checked :class:`MDP` from arrays, on the host.
+
+    Rows that sum to one within 1e-6 are scaled to do so as nearly as the dtype
+    allows; any other row is refused. The floating dtype is JAX's current default.
+
+    Args:
+      successor: ``int[S, A, K]``, entries in ``[0, S)`` wherever the probability is
+        positive.
+      probability: ``float[S, A, K]``.
+      available: ``bool[S, A]``; default: the actions with a positive probability.
+      initial: ``float[S]``, a distribution; default: uniform.
+      label: ``bool[S, P]``; default: no propositions.
+      propositions: P distinct names.
+
+    Raises:
+      ValueError: an array has the wrong shape, a probability is negative or not
+        finite, a row does not sum to one, a successor is out of range, or a state
+        has no action. The message names the state, the action and the value.
+
+    Example:
+      >>> mdp = make_mdp([[[0, 1]], [[1, 0]]], [[[0.5, 0.5]], [[1.0, 0.0]]])
+      >>> mdp.num_states, mdp.num_actions
+      (2, 1)
+    """
+    successor = np.asarray(successor)
+    probability = np.asarray(probability)
+    if probability.ndim != 3 or successor.shape != probability.shape:
+        raise ValueError(
+            f"successor has shape {successor.shape} and probability {probability.shape}; "
+            "both must be [states, actions, successors]."
+        )
+    num_states, num_actions, _ = probability.shape
+    if num_states == 0 or num_actions == 0:
+        raise ValueError(f"the model has {num_states} states and {num_actions} actions; "
+                         "it needs at least one of each.")
+    if not np.issubdtype(successor.dtype, np.integer):
+        raise ValueError(f"successor has dtype {successor.dtype}; it must hold integers.")
+    _check_probability(probability)
+    used = probability > 0
+    outside = used & ((successor < 0) | (successor >= num_states))
+    if outside.any():
+        s, a, k = np.argwhere(outside)[0]
+        raise ValueError(
+            f"state {s}, action {a}: successor {successor[s, a, k]} is out of range; "
+            f"states are 0 to {num_states - 1}."
+        )
+    if available is None:
+        available = used.any(axis=-1)
+    available = _checked_available(available, (num_states, num_actions))
+    scale = _row_scale(probability.sum(axis=-1, dtype=np.float64), available)
+    dtype = jnp.result_type(float)
+    used &= available[:, :, None]
+    probability = np.where(used, probability * scale[:, :, None], 0).astype(dtype)
+    label, names = _checked_label(label, propositions, num_states)
+    return MDP(
+        successor=jnp.asarray(np.where(used, successor, 0).astype(np.int32)),
+        probability=jnp.asarray(probability),
+        available=jnp.asarray(available),
+        initial=jnp.asarray(_checked_initial(initial, num_states).astype(dtype)),
+        label=jnp.asarray(label),
+        propositions=names,
+    )
+
+
+def from_dense(
+    transition: chex.Array,
+    *,
+    available: chex.Array | None = None,
+    initial: chex.Array | None = None,
+    label: chex.Array | None = None,
+    propositions: Sequence[str] = (),
+) -> MDP:
+    """The :class:`MDP` of a full matrix ``transition[s, a, t]``, checked as by :func:`make_mdp`.
+
+    K is the largest number of successors of any state and action.
+
+    Raises:
+      ValueError: as :func:`make_mdp`, and when the matrix is not ``[S, A, S]``.
+
+    Example:
+      >>> from_dense([[[0.5, 0.5]], [[0.0, 1.0]]]).successor.shape
+      (2, 1, 2)
+    """
+    transition = np.asarray(transition)
+    if transition.ndim != 3 or transition.shape[0] != transition.shape[2]:
+        raise ValueError(f"transition has shape {transition.shape}; it must be [S, A, S].")
+    _check_probability(transition)
+    width = max(1, int((transition > 0).sum(axis=-1).max(initial=1)))
+    # A stable sort puts the positive entries first and keeps them in state order.
+    successor = np.argsort(~(transition > 0), axis=-1, kind="stable")[:, :, :width]
+    probability = np.take_along_axis(transition, successor, axis=-1)
+    return make_mdp(
+        successor, probability, available=available, initial=initial,
+        label=label, propositions=propositions,
+    )
+
+
+def to_dense(mdp: MDP) -> DenseMDP:
+    """The same process as a :class:`DenseMDP`; memory grows with S squared.
+
+    Differentiable in the transition probabilities.
+
+    Example:
+      >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
+      >>> to_dense(mdp).transition.tolist()
+      [[[0.5, 0.5]], [[0.0, 1.0]]]
+    """
+    num_states, num_actions = mdp.num_states, mdp.num_actions
+    s = jnp.arange(num_states)[:, None, None]
+    a = jnp.arange(num_actions)[None, :, None]
+    empty = jnp.zeros((num_states, num_actions, num_states), mdp.dtype)
+    return DenseMDP(
+        transition=empty.at[s, a, mdp.successor].add(mdp.probability),
+        available=mdp.available,
+        initial=mdp.initial,
+        label=mdp.label,
+        propositions=mdp.propositions,
+    )
+
+
+def _check_probability(probability: np.ndarray) -> None:
+    bad = ~(probability >= 0) | np.isinf(probability)
+    if bad.any():
+        s, a, k = np.argwhere(bad)[0]
+        raise ValueError(
+            f"state {s}, action {a}: probability {probability[s, a, k]} (entry {k}); "
+            "probabilities must be finite and not negative."
+        )
+
+
+def _row_scale(total: np.ndarray, available: np.ndarray) -> np.ndarray:
+    wrong = available & (np.abs(total - 1) > 1e-6)
+    if wrong.any():
+        s, a = np.argwhere(wrong)[0]
+        raise ValueError(
+            f"state {s}, action {a}: the probabilities sum to {total[s, a]:.9g}, not 1; "
+            "correct the row, or mark the action unavailable."
+        )
+    return 1 / np.where(available, total, 1)
+
+
+def _checked_available(available: chex.Array, shape: tuple[int, int]) -> np.ndarray:
+    available = np.asarray(available, bool)
+    if available.shape != shape:
+        raise ValueError(f"available has shape {available.shape}; expected {shape}.")
+    stuck = ~available.any(axis=1)
+    if stuck.any():
+        raise ValueError(
+            f"state {np.flatnonzero(stuck)[0]} has no available action; give it one, "
+            "for example a loop to itself."
+        )
+    return available
+
+
+def _checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
+    if initial is None:
+        return np.full(num_states, 1 / num_states)
+    initial = np.asarray(initial, np.float64)
+    if initial.shape != (num_states,):
+        raise ValueError(f"initial has shape {initial.shape}; expected ({num_states},).")
+    bad = ~(initial >= 0)
+    if bad.any():
+        s = np.flatnonzero(bad)[0]
+        raise ValueError(f"initial probability of state {s} is {initial[s]}; "
+                         "it must not be negative or NaN.")
+    if abs(initial.sum() - 1) > 1e-6:
+        raise ValueError(f"the initial distribution sums to {initial.sum():.9g}, not 1.")
+    return initial / initial.sum()
+
+
+def _checked_label(
+    label: chex.Array | None, propositions: Sequence[str], num_states: int
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    names = tuple(propositions)
+    if len(set(names)) != len(names):
+        raise ValueError(f"propositions {names} are not distinct.")
+    if label is None:
+        label = np.zeros((num_states, len(names)), bool)
+    label = np.asarray(label, bool)
+    if label.shape != (num_states, len(names)):
+        raise ValueError(
+            f"label has shape {label.shape}; expected ({num_states}, {len(names)}): "
+            f"one row per state, one column per proposition {names}."
+        )
+    return label, names

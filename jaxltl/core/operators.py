@@ -1,0 +1,271 @@
+"""The five primitives through which every algorithm sees a model.
+
+A model is an :class:`~jaxltl.core.mdp.MDP`, a :class:`~jaxltl.core.mdp.DenseMDP` or a
+:class:`~jaxltl.core.product.Product`. Values have the shape of the model's states,
+``[S]`` or ``[S, Q]``, and quantities on actions have one more axis, A. The functions
+are open (``functools.singledispatch``): a representation of one's own needs
+``expectation``, ``exists_successor``, ``forall_successor`` and ``sample_successor``.
+"""
+
+from __future__ import annotations
+
+from functools import singledispatch
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxltl.core.mdp import MDP, DenseMDP
+
+# Up to this many successors a sum over them is written out term by term, which XLA
+# fuses into one pass; a reduction over a short last axis is two to three times slower.
+_UNROLL = 16
+
+
+@singledispatch
+def expectation(model: Any, value: jax.Array) -> jax.Array:
+    """Expected value of the next state, ``(P v)(s, a) = sum_t P(t | s, a) v(t)``.
+
+    Args:
+      model: the model.
+      value: ``float[S]``.
+
+    Returns:
+      ``float[S, A]``, zero at unavailable actions. Linear in `value` and in the
+      transition probabilities, and differentiable in both.
+
+    Example:
+      >>> from jaxltl.core.mdp import from_dense
+      >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
+      >>> expectation(mdp, jnp.array([0.0, 4.0])).tolist()
+      [[2.0], [4.0]]
+    """
+    raise TypeError(_unknown(model))
+
+
+@singledispatch
+def exists_successor(model: Any, region: jax.Array) -> jax.Array:
+    """Whether some successor lies in a region: ``bool[S, A]`` from ``bool[S]``.
+
+    Decided on the support of the transition function. False at unavailable actions.
+    """
+    raise TypeError(_unknown(model))
+
+
+@singledispatch
+def forall_successor(model: Any, region: jax.Array) -> jax.Array:
+    """Whether all successors lie in a region: ``bool[S, A]`` from ``bool[S]``.
+
+    Decided on the support; padding counts as true, so unavailable actions are True.
+    """
+    raise TypeError(_unknown(model))
+
+
+@singledispatch
+def sample_successor(
+    model: Any, key: chex.PRNGKey, state: jax.Array, action: jax.Array
+) -> jax.Array:
+    """One draw from ``P(. | state, action)``; the key is consumed.
+
+    A product's states are numbered ``s * Q + q``, the order of a flattened value.
+
+    Args:
+      model: the model.
+      key: a PRNG key.
+      state, action: ``int32[]``.
+
+    Returns:
+      ``int32[]``, the successor.
+    """
+    raise TypeError(_unknown(model))
+
+
+@singledispatch
+def induced_chain(model: Any, policy: jax.Array) -> MDP | DenseMDP:
+    """The Markov chain of a deterministic policy, as a model with one action.
+
+    Args:
+      model: the model.
+      policy: ``int32[S]``.
+
+    Returns:
+      A model without labels. Of a product it has ``S * Q`` states, numbered
+      ``s * Q + q``. Differentiable in the transition probabilities.
+    """
+    raise TypeError(_unknown(model))
+
+
+def pushforward(model: Any, mass: jax.Array) -> jax.Array:
+    """Mass that flows into each state, ``(P' x)(t) = sum_{s, a} P(t | s, a) x(s, a)``.
+
+    The transpose of :func:`expectation`, for every representation.
+
+    Args:
+      model: the model.
+      mass: ``float[S, A]``.
+
+    Returns:
+      ``float[S]``. Linear in `mass` and in the transition probabilities.
+
+    Example:
+      >>> from jaxltl.core.mdp import from_dense
+      >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
+      >>> pushforward(mdp, jnp.array([[1.0], [2.0]])).tolist()
+      [0.5, 2.5]
+    """
+    value = jax.ShapeDtypeStruct(model.state_shape, mass.dtype)
+    (result,) = jax.linear_transpose(lambda v: expectation(model, v), value)(mass)
+    return result
+
+
+def _unknown(model: Any) -> str:
+    return f"{type(model).__name__} is not a model: pass an MDP, a DenseMDP or a Product."
+
+
+def _gather(value: jax.Array, index: jax.Array) -> jax.Array:
+    return value.at[index].get(mode="promise_in_bounds")
+
+
+@expectation.register
+def _(model: MDP, value: jax.Array) -> jax.Array:
+    successor, probability = model.successor, model.probability
+    width = successor.shape[-1]
+    if width > _UNROLL:
+        return jnp.sum(probability * _gather(value, successor), axis=-1)
+    terms = [probability[..., k] * _gather(value, successor[..., k]) for k in range(width)]
+    return sum(terms[1:], start=terms[0])
+
+
+@exists_successor.register
+def _(model: MDP, region: jax.Array) -> jax.Array:
+    return jnp.any((model.probability > 0) & _gather(region, model.successor), axis=-1)
+
+
+@forall_successor.register
+def _(model: MDP, region: jax.Array) -> jax.Array:
+    return jnp.all((model.probability <= 0) | _gather(region, model.successor), axis=-1)
+
+
+@sample_successor.register
+def _(model: MDP, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
+    k = _sample(key, model.probability[state, action])
+    return model.successor[state, action, k]
+
+
+@induced_chain.register
+def _(model: MDP, policy: jax.Array) -> MDP:
+    pick = policy[:, None, None]
+    return make_chain(
+        jnp.take_along_axis(model.successor, pick, axis=1)[:, 0],
+        jnp.take_along_axis(model.probability, pick, axis=1)[:, 0],
+        model.initial,
+    )
+
+
+def make_chain(successor: jax.Array, probability: jax.Array, initial: jax.Array) -> MDP:
+    """An MDP with one action from ``int32[S, K]`` successors and their probabilities."""
+    num_states = successor.shape[0]
+    return MDP(
+        successor=successor[:, None, :], probability=probability[:, None, :],
+        available=jnp.ones((num_states, 1), bool), initial=initial,
+        label=jnp.zeros((num_states, 0), bool),
+    )
+
+
+@expectation.register
+def _(model: DenseMDP, value: jax.Array) -> jax.Array:
+    return jnp.einsum("sat,t->sa", model.transition, value)
+
+
+@induced_chain.register
+def _(model: DenseMDP, policy: jax.Array) -> DenseMDP:
+    rows = jnp.take_along_axis(model.transition, policy[:, None, None], axis=1)
+    return model.replace(
+        transition=rows, available=jnp.ones((model.num_states, 1), bool),
+        label=jnp.zeros((model.num_states, 0), bool), propositions=(),
+    )
+
+
+@exists_successor.register
+def _(model: DenseMDP, region: jax.Array) -> jax.Array:
+    return jnp.any((model.transition > 0) & region, axis=-1)
+
+
+@forall_successor.register
+def _(model: DenseMDP, region: jax.Array) -> jax.Array:
+    return jnp.all((model.transition <= 0) | region, axis=-1)
+
+
+@sample_successor.register
+def _(model: DenseMDP, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
+    return _sample(key, model.transition[state, action]).astype(jnp.int32)
+
+
+def _sample(key: chex.PRNGKey, probability: jax.Array) -> jax.Array:
+    return jax.random.categorical(key, jnp.log(probability))
+
+
+# --- what a policy does to quantities on actions -----------------------------------------
+
+
+def action_mean(policy: jax.Array, quantity: jax.Array) -> jax.Array:
+    """Mean over a policy's actions, ``sum_a pi(s, a) x(s, a)``.
+
+    Args:
+      policy: ``float[S, A]``, or ``int32[S]`` for a deterministic policy.
+      quantity: ``[S, A]``, finite.
+
+    Returns:
+      ``[S]``.
+    """
+    if is_deterministic(policy):
+        return jnp.take_along_axis(quantity, policy[..., None], axis=-1)[..., 0]
+    return jnp.sum(policy * quantity, axis=-1)
+
+
+def action_max(quantity: jax.Array, available: jax.Array) -> jax.Array:
+    """Maximum over available actions, ``[S]`` from ``[S, A]``; written out for few actions."""
+    quantity = jnp.where(available, quantity, -jnp.inf)
+    if quantity.shape[-1] > _UNROLL:
+        return quantity.max(axis=-1)
+    best = quantity[..., 0]
+    for a in range(1, quantity.shape[-1]):
+        best = jnp.maximum(best, quantity[..., a])
+    return best
+
+
+def action_argmax(quantity: jax.Array, available: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Maximum over available actions and the first action that attains it, ``[S]`` each."""
+    quantity = jnp.where(available, quantity, -jnp.inf)
+    if quantity.shape[-1] > _UNROLL:
+        return quantity.max(axis=-1), quantity.argmax(axis=-1).astype(jnp.int32)
+    best, action = quantity[..., 0], jnp.zeros(quantity.shape[:-1], jnp.int32)
+    for a in range(1, quantity.shape[-1]):
+        better = quantity[..., a] > best
+        best = jnp.where(better, quantity[..., a], best)
+        action = jnp.where(better, a, action)
+    return best, action
+
+
+def is_deterministic(policy: jax.Array) -> bool:
+    """Whether a policy is given as one action per state (integers) rather than a distribution."""
+    return jnp.issubdtype(jnp.result_type(policy), jnp.integer)
+
+
+def policy_distribution(model: Any, policy: jax.Array) -> jax.Array:
+    """Any policy as ``float[S, A]``, with its shape checked against the model.
+
+    Raises:
+      ValueError: the policy has neither the shape of states nor of state-action pairs.
+    """
+    states, actions = model.state_shape, model.num_actions
+    if is_deterministic(policy):
+        if jnp.shape(policy) != states:
+            raise ValueError(f"policy has shape {jnp.shape(policy)}; a deterministic policy "
+                             f"(integers) for this model has shape {states}.")
+        return jax.nn.one_hot(policy, actions, dtype=model.dtype)
+    if jnp.shape(policy) != (*states, actions):
+        raise ValueError(f"policy has shape {jnp.shape(policy)}; a stochastic policy for this "
+                         f"model has shape {(*states, actions)}.")
+    return policy

@@ -1,0 +1,395 @@
+"""A world run beside an automaton: the lazy product, and what crosses it.
+
+Nothing is copied. A value on the product has shape ``[S, Q]``, and the automaton only
+decides at which memory state the value of a successor is read.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.core import operators
+from jaxltl.core.automaton import Automaton, letter_index
+from jaxltl.core.ltl import Formula, parse_ltl
+from jaxltl.core.mdp import MDP, DenseMDP, make_mdp
+from jaxltl.core.rollout import Trajectories
+from jaxltl.core.translate import to_automaton
+
+jax.tree_util.register_dataclass(
+    Automaton,
+    data_fields=["delta", "initial", "final", "letters"],
+    meta_fields=["propositions", "acceptance", "state_names"],
+)
+
+
+@struct.dataclass
+class Product:
+    """A world beside an automaton that remembers the task's progress.
+
+    With ``label_on="entry"``, ``(s, q) -> (t, delta(q, L(t)))``, starting in
+    ``delta(q_I, L(s0))``: the label of the state that is entered is read. With
+    ``label_on="exit"``, ``(s, q) -> (t, delta(q, L(s)))``, starting in ``q_I``: the
+    label of the state that is left.
+
+    Attributes:
+      mdp: the world, an MDP or a DenseMDP.
+      automaton: the task.
+      letter: ``int32[S]``, the automaton's letter that each world state shows.
+      label_on: which label a step reads; static.
+    """
+
+    mdp: MDP | DenseMDP
+    automaton: Automaton
+    letter: jax.Array
+    label_on: str = struct.field(pytree_node=False, default="entry")
+
+    @property
+    def num_states(self) -> int:
+        """Product states: S times Q."""
+        return self.mdp.num_states * self.num_memory
+
+    @property
+    def num_memory(self) -> int:
+        return self.automaton.delta.shape[-2]
+
+    @property
+    def num_actions(self) -> int:
+        return self.mdp.num_actions
+
+    @property
+    def state_shape(self) -> tuple[int, ...]:
+        """The shape of a value: ``(S, Q)``."""
+        return (self.mdp.num_states, self.num_memory)
+
+    @property
+    def num_successors(self) -> int:
+        return self.mdp.num_successors
+
+    @property
+    def successor_probability(self) -> jax.Array:
+        """``float[S, 1, A, K]``: the same in every memory state."""
+        return self.mdp.successor_probability[:, None]
+
+    @property
+    def dtype(self) -> jnp.dtype:
+        return self.mdp.dtype
+
+    @property
+    def available(self) -> jax.Array:
+        """``bool[S, Q, A]``."""
+        shape = (*self.state_shape, self.num_actions)
+        return jnp.broadcast_to(self.mdp.available[:, None, :], shape)
+
+    @property
+    def next_memory(self) -> jax.Array:
+        """``int32[S, Q]``: the memory after reading the label of a world state in memory q."""
+        return jnp.asarray(self.automaton.delta)[:, self.letter].T
+
+    @property
+    def initial_memory(self) -> jax.Array:
+        """``int32[S]``: the memory in which a run starts at each world state."""
+        start = jnp.asarray(self.automaton.initial)
+        if self.label_on == "exit":
+            return jnp.full(self.letter.shape, start, jnp.int32)
+        return jnp.asarray(self.automaton.delta)[start, self.letter]
+
+    @property
+    def initial(self) -> jax.Array:
+        """``float[S, Q]``, the initial distribution."""
+        memory = jax.nn.one_hot(self.initial_memory, self.num_memory, dtype=self.dtype)
+        return self.mdp.initial[:, None] * memory
+
+    @property
+    def final(self) -> jax.Array:
+        """``bool[S, Q]``: the automaton is in a final state."""
+        return jnp.broadcast_to(jnp.asarray(self.automaton.final), self.state_shape)
+
+
+def letters(world: MDP | DenseMDP, propositions: Collection[str] | None = None) -> list[frozenset]:
+    """The sets of propositions that occur at some state of a world, for ``to_automaton``.
+
+    Args:
+      world: the model.
+      propositions: keep only these; default all.
+
+    Example:
+      >>> from jaxltl.core.mdp import from_dense
+      >>> world = from_dense([[[1.0, 0]], [[0, 1.0]]], label=[[0], [1]], propositions=["a"])
+      >>> [sorted(letter) for letter in letters(world)]
+      [[], ['a']]
+    """
+    keep = [i for i, p in enumerate(world.propositions)
+            if propositions is None or p in propositions]
+    names = [world.propositions[i] for i in keep]
+    rows = np.unique(np.asarray(world.label)[:, keep], axis=0)
+    return [frozenset(n for n, holds in zip(names, row, strict=True) if holds) for row in rows]
+
+
+def product(
+    world: MDP | DenseMDP, task: Automaton | Formula | str, *, label_on: str = "entry"
+) -> Product:
+    """The lazy product of a world and a task.
+
+    A formula is translated over the letters that occur in the world.
+
+    Args:
+      world: the model; its labels are read on the host.
+      task: an automaton, a formula, or a formula's text.
+      label_on: ``"entry"`` or ``"exit"``, see :class:`Product`.
+
+    Raises:
+      ValueError: the task mentions a proposition that the world lacks, or the world
+        shows a letter that the automaton was not built for.
+
+    Example:
+      >>> from jaxltl.core.mdp import from_dense
+      >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["goal"])
+      >>> product(world, "F goal").state_shape
+      (2, 2)
+    """
+    if label_on not in ("entry", "exit"):
+        raise ValueError(f'label_on={label_on!r}; it must be "entry" or "exit".')
+    if isinstance(task, str | Formula):
+        formula = parse_ltl(task) if isinstance(task, str) else task
+        _require_known(formula.propositions, world.propositions)
+        task = to_automaton(formula, letters=letters(world, formula.propositions))
+    _require_known(task.propositions, world.propositions)
+    column = [world.propositions.index(p) for p in task.propositions]
+    rows, letter = np.unique(np.asarray(world.label)[:, column], axis=0, return_inverse=True)
+    index = np.array(
+        [_letter(task, row, int(np.argmax(letter == i))) for i, row in enumerate(rows)], np.int32
+    )
+    automaton = jax.tree.map(jnp.asarray, task)
+    return Product(world, automaton, jnp.asarray(index[letter.ravel()]), label_on)
+
+
+def _require_known(needed: Collection[str], known: tuple[str, ...]) -> None:
+    for name in needed:
+        if name not in known:
+            guess = difflib.get_close_matches(name, known, n=1)
+            raise ValueError(
+                f"the task mentions the proposition {name!r}, which the world does not have; "
+                f"its propositions are {', '.join(known) or '(none)'}."
+                + (f" Did you mean {guess[0]!r}?" if guess else "")
+            )
+
+
+def _letter(automaton: Automaton, row: np.ndarray, state: int) -> int:
+    shown = {p for p, holds in zip(automaton.propositions, row, strict=True) if holds}
+    try:
+        return letter_index(automaton, shown)
+    except ValueError as error:
+        raise ValueError(
+            f"world state {state} shows the letter {{{', '.join(sorted(shown))}}}, which the "
+            "automaton was not built for; translate with letters=letters(world)."
+        ) from error
+
+
+_SELECT = 16  # memory states up to which reading at a memory is a selection
+
+
+# --- the primitives -----------------------------------------------------------------------
+
+
+def _through(model: Product, operator, value: jax.Array) -> jax.Array:
+    """Applies a primitive of the world at every memory state: ``[S, Q, A]`` from ``[S, Q]``.
+
+    On entry the value of t is read at delta(q, L(t)), before the world's operator; on
+    exit at delta(q, L(s)), after it.
+    """
+    each_memory = jax.vmap(lambda v: operator(model.mdp, v), in_axes=1, out_axes=1)
+    if model.label_on == "entry":
+        return each_memory(_read_at(value, model.next_memory))
+    return _read_at(each_memory(value), model.next_memory[:, :, None])
+
+
+def _read_at(value: jax.Array, memory: jax.Array) -> jax.Array:
+    """``value[s, memory[s, q]]``, as a selection for few memory states.
+
+    Its transpose is then a sum, where that of a gather is a scatter, which is slow.
+    """
+    num_memory = value.shape[1]
+    if num_memory > _SELECT:
+        return jnp.take_along_axis(value, memory, axis=1)
+    result = jnp.broadcast_to(value[:, :1], value.shape)
+    for q in range(1, num_memory):
+        result = jnp.where(memory == q, value[:, q : q + 1], result)
+    return result
+
+
+@operators.expectation.register
+def _(model: Product, value: jax.Array) -> jax.Array:
+    return _through(model, operators.expectation, value)
+
+
+@operators.exists_successor.register
+def _(model: Product, region: jax.Array) -> jax.Array:
+    return _through(model, operators.exists_successor, region)
+
+
+@operators.forall_successor.register
+def _(model: Product, region: jax.Array) -> jax.Array:
+    return _through(model, operators.forall_successor, region)
+
+
+@operators.sample_successor.register
+def _(model: Product, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
+    world, memory = state // model.num_memory, state % model.num_memory
+    successor = operators.sample_successor(model.mdp, key, world, action)
+    read = successor if model.label_on == "entry" else world
+    memory = jnp.asarray(model.automaton.delta)[memory, model.letter[read]]
+    return successor * model.num_memory + memory
+
+
+@operators.induced_chain.register
+def _(model: Product, policy: jax.Array) -> MDP:
+    world = model.mdp
+    s = jnp.arange(world.num_states)[:, None]
+    probability = world.successor_probability[s, policy]  # [S, Q, K]
+    if isinstance(world, MDP):
+        successor = world.successor[s, policy]
+    else:
+        successor = jnp.broadcast_to(jnp.arange(world.num_states), probability.shape)
+    q = jnp.arange(model.num_memory)[None, :, None]
+    flat = _flat_successor(successor, model.next_memory, s[..., None], q, model.label_on)
+    width = flat.shape[-1]
+    return operators.make_chain(
+        flat.reshape(-1, width).astype(jnp.int32), probability.reshape(-1, width),
+        model.initial.ravel(),
+    )
+
+
+# --- lifting and projecting -----------------------------------------------------------------
+
+
+def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectories:
+    """World trajectories with the memory that the automaton had along them.
+
+    Args:
+      model: the product.
+      trajectories: of the world.
+
+    Returns:
+      Trajectories of the product, states numbered ``s * Q + q``.
+    """
+    delta = jnp.asarray(model.automaton.delta)
+
+    def one(states: jax.Array) -> jax.Array:
+        letter = model.letter[states]
+        read = letter[1:] if model.label_on == "entry" else letter[:-1]
+        start = model.initial_memory[states[0]]
+        _, rest = jax.lax.scan(lambda q, x: (delta[q, x],) * 2, start, read)
+        return states * model.num_memory + jnp.concatenate([start[None], rest])
+
+    inside = jnp.arange(trajectories.state.shape[1]) < trajectories.length[:, None]
+    state = jax.vmap(one)(trajectories.state)
+    return trajectories.replace(state=jnp.where(inside, state, 0).astype(jnp.int32))
+
+
+def lift_policy(model: Product, policy: jax.Array) -> jax.Array:
+    """A memoryless policy of the world as a policy of the product: ``[S, Q, ...]``."""
+    return jnp.repeat(policy[:, None], model.num_memory, axis=1)
+
+
+@struct.dataclass
+class FiniteMemoryPolicy:
+    """A policy of the world whose memory is the automaton's state.
+
+    Attributes:
+      action: ``float[S, Q, A]`` or ``int32[S, Q]``, the product policy.
+      initial_memory: ``int32[S]``, the memory at the start of a run in s.
+      next_memory: ``int32[S, Q]``, the memory after reading the label of s.
+      label_on: static, as in :class:`Product`.
+    """
+
+    action: jax.Array
+    initial_memory: jax.Array
+    next_memory: jax.Array
+    label_on: str = struct.field(pytree_node=False, default="entry")
+
+    def update(self, memory: jax.Array, state: jax.Array, successor: jax.Array) -> jax.Array:
+        """The memory after the step from `state` to `successor`."""
+        return self.next_memory[successor if self.label_on == "entry" else state, memory]
+
+
+def project_policy(model: Product, policy: jax.Array) -> FiniteMemoryPolicy:
+    """A product policy as a finite-memory policy that runs on the world alone.
+
+    Raises:
+      ValueError: the policy does not have the product's shape.
+    """
+    operators.policy_distribution(model, policy)
+    return FiniteMemoryPolicy(policy, model.initial_memory, model.next_memory, model.label_on)
+
+
+class Restriction(NamedTuple):
+    """The reachable part of a product as an ordinary model.
+
+    State i of `mdp` is the product state ``(base_state[i], memory[i])``.
+    """
+
+    mdp: MDP
+    base_state: jax.Array
+    memory: jax.Array
+
+
+def restrict(model: Product, initial: chex.Array | None = None) -> Restriction:
+    """The states of a product that are reachable from its initial ones, on the host.
+
+    Args:
+      model: a product over a sparse MDP.
+      initial: ``float[S, Q]``, a distribution to start from; default the product's own.
+
+    Returns:
+      A :class:`Restriction`; labels and propositions are the world's.
+
+    Raises:
+      ValueError: the world is not an MDP with successor lists.
+    """
+    if not isinstance(model.mdp, MDP):
+        raise ValueError("restrict needs successor lists; convert the world by from_dense.")
+    initial = np.asarray(model.initial if initial is None else initial)
+    num_memory = model.num_memory
+    successor = np.asarray(model.mdp.successor)
+    used = np.asarray(model.mdp.probability) > 0
+    step = np.asarray(model.next_memory)
+    number = np.full(model.num_states, -1)
+    frontier = np.flatnonzero(initial.ravel() > 0)
+    found = []
+    while frontier.size:
+        number[frontier] = 0
+        found.append(frontier)
+        s, q = np.divmod(frontier, num_memory)
+        targets = _flat_successor(successor[s], step, *_columns(s, q), model.label_on)[used[s]]
+        frontier = np.unique(targets[number[targets] < 0])
+    states = np.sort(np.concatenate(found))
+    number[states] = np.arange(states.size)
+    s, q = np.divmod(states, num_memory)
+    flat = number[_flat_successor(successor[s], step, *_columns(s, q), model.label_on)]
+    mdp = make_mdp(
+        np.where(used[s], flat, 0),
+        np.asarray(model.mdp.probability)[s],
+        available=np.asarray(model.mdp.available)[s],
+        initial=initial.ravel()[states],
+        label=np.asarray(model.mdp.label)[s],
+        propositions=model.mdp.propositions,
+    )
+    return Restriction(mdp, jnp.asarray(s, jnp.int32), jnp.asarray(q, jnp.int32))
+
+
+def _columns(s: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return s[:, None, None], q[:, None, None]
+
+
+def _flat_successor(successor, next_memory, s, q, label_on):
+    """Numbers ``t * Q + q'`` of the product states that follow (s, q) when t follows s."""
+    read = successor if label_on == "entry" else s
+    return successor * next_memory.shape[1] + next_memory[read, q]

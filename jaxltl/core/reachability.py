@@ -1,0 +1,299 @@
+"""Probabilities of reaching a set and of satisfying a formula, with certified bounds.
+
+Where a probability is exactly 0 or exactly 1 is decided on the graph. In between, a fixed
+policy is a linear system, certified by its residual, and an optimum is enclosed by
+interval iteration with end components collapsed. No bound rests on a small change.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxltl.core import graph
+from jaxltl.core.fixed_point import implicit, solve_dense, solve_linear
+from jaxltl.core.operators import (
+    action_argmax,
+    action_mean,
+    expectation,
+    forall_successor,
+    policy_distribution,
+)
+from jaxltl.core.product import Product
+from jaxltl.core.types import Solution, require_shape, status_code
+
+_DENSE_LIMIT = 1024  # states up to which a linear system is solved by elimination
+
+
+class _Sets(NamedTuple):
+    """What the graph decides: probability one, probability zero, and witnessing actions."""
+
+    one: jax.Array
+    zero: jax.Array
+    action: jax.Array
+
+
+def reachability_probability(
+    model: Any,
+    target: jax.Array,
+    *,
+    policy: jax.Array | None = None,
+    objective: str = "max",
+    tolerance: jax.Array | float | None = None,
+    max_steps: jax.Array | int = 1_000_000,
+) -> Solution:
+    """Probability of ever reaching a set of states.
+
+    The least solution of ``y = 1`` on the target, ``y = sum_a pi(s, a) (P y)(s, a)``
+    elsewhere (2.5); for optima with a maximum or minimum over available actions
+    (Baier and Katoen 2008, section 10.6). Optima: interval iteration (Haddad and
+    Monmege 2018) with maximal end components collapsed and each bound rounded outwards.
+
+    Args:
+      model: the model.
+      target: ``bool[S]``.
+      policy: ``float[S, A]`` or ``int32[S]``: evaluate this policy. Default: optimise.
+      objective: ``"max"`` or ``"min"``; ignored when a policy is given.
+      tolerance: half the width of the enclosure asked for; default the square root of
+        the dtype's precision.
+      max_steps: sweeps at most.
+
+    Returns:
+      :class:`Solution`; `value` is ``float[S]``, exactly 0 or 1 where the graph says so. An
+      optimum's `policy` is ``int32[S]`` and attains its bound on the safe side
+      (`lower` for a maximum, `upper` for a minimum).
+
+    Raises:
+      ValueError: a shape is wrong, or the objective is unknown.
+
+    Differentiable in the policy and in the probabilities, with the support held fixed.
+
+    Example:
+      >>> from jaxltl.core.mdp import from_dense
+      >>> mdp = from_dense([[[0.5, 0.25, 0.25]], [[0, 1.0, 0]], [[0, 0, 1.0]]])
+      >>> round(reachability_probability(mdp, jnp.array([False, True, False])).value[0].item(), 3)
+      0.5
+    """
+    target = jnp.asarray(target, bool)
+    require_shape("target", target, model.state_shape)
+    if policy is not None:
+        policy = policy_distribution(model, policy)
+        sets = _policy_sets(model, target, policy)
+        return _evaluate(model, sets, policy, tolerance)
+    if objective not in ("max", "min"):
+        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    sets = _max_sets(model, target) if objective == "max" else _min_sets(model, target)
+    components = None
+    if objective == "max":
+        components = graph.end_components(model, ~(sets.one | sets.zero))
+        if not graph.is_traced(components) and not bool(components.inside.any()):
+            components = None
+    return _optimize(
+        model, sets, components, tolerance, max_steps, objective=objective
+    )
+
+
+def satisfaction_probability(
+    model: Product, policy: jax.Array, *, tolerance: jax.Array | float | None = None
+) -> Solution:
+    """Probability that a policy satisfies the product's task, from every product state.
+
+    For a co-safe task, of reaching a final state (2.5); for a safety task, of never
+    leaving the final states.
+
+    Args:
+      model: the product.
+      policy: ``float[S, Q, A]`` or ``int32[S, Q]``.
+      tolerance: half the width of the enclosure asked for.
+
+    Returns:
+      :class:`Solution`; `value` is ``float[S, Q]``. The probability from the start is
+      ``jnp.sum(model.initial * solution.value)``.
+
+    Differentiable in the policy and in the world's transition probabilities.
+    """
+    if _is_cosafe(model):
+        return reachability_probability(model, model.final, policy=policy, tolerance=tolerance)
+    return _complement(
+        reachability_probability(model, ~model.final, policy=policy, tolerance=tolerance)
+    )
+
+
+def optimal_satisfaction(
+    model: Product,
+    *,
+    tolerance: jax.Array | float | None = None,
+    max_steps: jax.Array | int = 1_000_000,
+) -> Solution:
+    """Largest probability of satisfying the product's task, with a policy that attains it.
+
+    Args:
+      model: the product.
+      tolerance: half the width of the enclosure asked for.
+      max_steps: sweeps at most.
+
+    Returns:
+      :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``.
+    """
+    if _is_cosafe(model):
+        return reachability_probability(
+            model, model.final, objective="max", tolerance=tolerance, max_steps=max_steps
+        )
+    return _complement(
+        reachability_probability(
+            model, ~model.final, objective="min", tolerance=tolerance, max_steps=max_steps
+        )
+    )
+
+
+def _is_cosafe(model: Product) -> bool:
+    return model.automaton.acceptance == "cosafe"
+
+
+def _complement(reach: Solution) -> Solution:
+    return reach.replace(value=1 - reach.value, lower=1 - reach.upper, upper=1 - reach.lower)
+
+
+# --- what the graph decides ----------------------------------------------------------------
+
+
+def _policy_sets(model: Any, target: jax.Array, policy: jax.Array) -> _Sets:
+    allowed = model.available & (policy > 0)
+    zero = ~graph.attractor(model, target, allowed).region
+    doomed = graph.attractor(model, zero, allowed & ~target[..., None]).region
+    return _Sets(~doomed, zero, jnp.zeros(target.shape, jnp.int32))
+
+
+def _max_sets(model: Any, target: jax.Array) -> _Sets:
+    some = graph.attractor(model, target)
+    sure = graph.almost_surely_reaching(model, target)
+    return _Sets(sure.region, ~some.region, jnp.where(sure.region, sure.action, some.action))
+
+
+def _min_sets(model: Any, target: jax.Array) -> _Sets:
+    zero = graph.avoidable(model, target)
+    doomed = graph.attractor(model, zero, model.available & ~target[..., None]).region
+    stay = model.available & forall_successor(model, zero)
+    return _Sets(~doomed, zero, jnp.argmax(stay, axis=-1).astype(jnp.int32))
+
+
+# --- a fixed policy: a linear system with a certificate -----------------------------------
+
+
+@jax.jit
+def _evaluate(model: Any, sets: _Sets, policy: jax.Array, tolerance) -> Solution:
+    """Solves ``y = 1_one + (P_pi y) on the undecided states`` and encloses the answer.
+
+    If e > 0 satisfies ``e - P e >= |r|`` there, where r is the residual of y, then
+    ``|y - y*| <= e``, because ``I - P`` is an M-matrix. So a second solve certifies the
+    first, and a check of that inequality is the proof.
+    """
+    undecided = ~(sets.one | sets.zero)
+    one = sets.one.astype(model.dtype)
+
+    def backup(y: jax.Array) -> jax.Array:
+        return jnp.where(undecided, action_mean(policy, expectation(model, y)), one)
+
+    def matvec(y: jax.Array) -> jax.Array:
+        return y - jnp.where(undecided, action_mean(policy, expectation(model, y)), 0)
+
+    solve = _linear_solver(model)
+    value = lax.stop_gradient(solve(matvec, one))
+    value = jnp.clip(jnp.where(undecided, value, one), 0, 1)
+    terms = model.num_successors + model.num_actions + 4
+    unit = terms * jnp.finfo(model.dtype).eps
+    residual = jnp.abs(backup(value) - value)
+    claim = jnp.where(undecided, 2 * residual + 4 * unit * (value + 1e-3), 0)
+    error = solve(matvec, claim)
+    proven = jnp.all(
+        jnp.where(undecided, matvec(error) >= residual + unit * (value + error), True)
+        & (error >= 0)
+    )
+    error = jnp.where(proven, error, 1)
+    goal = jnp.sqrt(jnp.finfo(model.dtype).eps) if tolerance is None else tolerance
+    solution = Solution(
+        value=value,
+        policy=policy,
+        lower=jnp.maximum(value - error, 0),
+        upper=jnp.minimum(value + error, 1),
+        residual=jnp.max(residual),
+        num_steps=jnp.int32(1),
+        status=status_code(jnp.max(error) <= goal, jnp.all(jnp.isfinite(policy))),
+    )
+    solution = jax.tree.map(lax.stop_gradient, solution)
+    return solution.replace(value=implicit(backup, solution.value, solve=solve), policy=policy)
+
+
+# --- optima: interval iteration -------------------------------------------------------------
+
+
+@partial(jax.jit, static_argnames=("objective",))
+def _optimize(model, sets: _Sets, components, tolerance, max_steps, *, objective) -> Solution:
+    sign = 1 if objective == "max" else -1
+    undecided = ~(sets.one | sets.zero)
+    one = sets.one.astype(model.dtype)
+    eps = jnp.finfo(model.dtype).eps
+    slack = (model.num_successors + model.num_actions + 4) * eps
+    goal = jnp.sqrt(eps) if tolerance is None else tolerance
+    leaving = model.available if components is None else model.available & ~components.inside
+
+    def best(y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        value, action = action_argmax(sign * expectation(model, y), leaving)
+        return _collapse(components, sign * value), action
+
+    def backup(y: jax.Array) -> jax.Array:
+        return jnp.where(undecided, best(y)[0], one)
+
+    def body(carry):
+        lower, upper, n, _ = carry
+        # Sums of nonnegative terms err by a relative amount, so these stay bounds.
+        new_lower = jnp.maximum(lower, backup(lower) * (1 - slack))
+        new_upper = jnp.minimum(upper, backup(upper) * (1 + slack))
+        moved = jnp.any((new_lower > lower) | (new_upper < upper))
+        return new_lower, new_upper, n + 1, moved
+
+    def unfinished(carry):
+        lower, upper, n, moved = carry
+        return (jnp.max(upper - lower) > 2 * goal) & (n < max_steps) & moved
+
+    start = (one, jnp.where(undecided, 1, one), jnp.int32(0), jnp.bool_(True))
+    lower, upper, n, _ = lax.stop_gradient(lax.while_loop(unfinished, body, start))
+    # Greedy for the bound that the policy is to attain.
+    action = best(lower if objective == "max" else upper)[1]
+    if components is not None:
+        own = action_argmax(expectation(model, lower), leaving)[0]
+        exits = undecided & (own >= _collapse(components, own))
+        towards = graph.attractor(model, exits, components.inside).action
+        action = jnp.where(exits, action, towards)
+    value = (lower + upper) / 2
+    residual = jnp.max(jnp.abs(backup(value) - value))
+    policy = jnp.where(undecided, action, sets.action)
+    solution = Solution(
+        value=value, policy=policy, lower=lower, upper=upper, residual=residual, num_steps=n,
+        status=status_code(jnp.max(upper - lower) <= 2 * goal, jnp.isfinite(residual)),
+    )
+    solution = jax.tree.map(lax.stop_gradient, solution)
+
+    def follow(y: jax.Array) -> jax.Array:
+        return jnp.where(undecided, action_mean(policy, expectation(model, y)), one)
+
+    # The optimum's derivative is that of the policy that attains it (Danskin).
+    return solution.replace(value=implicit(follow, solution.value, solve=_linear_solver(model)))
+
+
+def _collapse(components: graph.EndComponents | None, value: jax.Array) -> jax.Array:
+    """The largest value in each state's end component."""
+    if components is None:
+        return value
+    label = components.component.ravel()
+    best = jax.ops.segment_max(value.ravel(), label, num_segments=label.size)
+    return best[label].reshape(value.shape)
+
+
+def _linear_solver(model: Any):
+    return solve_dense if math.prod(model.state_shape) <= _DENSE_LIMIT else solve_linear

@@ -1,0 +1,163 @@
+"""Grid worlds read off a text map."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import chex
+import numpy as np
+
+from jaxltl.core.ltl import holds_on_lasso, parse_ltl
+from jaxltl.core.mdp import MDP, make_mdp
+
+ACTIONS = ("up", "down", "left", "right")
+_MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
+_SIDEWAYS = ((2, 3), (2, 3), (0, 1), (0, 1))
+
+
+def parse_map(text: str) -> np.ndarray:
+    """The cells of a text map, ``str[rows, columns]``.
+
+    One line per row. If any line has spaces inside, cells are words between spaces;
+    otherwise each character is a cell. Blank lines are ignored.
+
+    Raises:
+      ValueError: the map is empty or its rows differ in length.
+
+    Example:
+      >>> parse_map('''
+      ... ..y
+      ... b#.
+      ... ''').shape
+      (2, 3)
+    """
+    lines = [line.strip() for line in text.strip().splitlines() if line.strip()]
+    if not lines:
+        raise ValueError("the map is empty; give at least one row of cells.")
+    words = any(len(line.split()) > 1 for line in lines)
+    rows = [line.split() if words else list(line) for line in lines]
+    for i, row in enumerate(rows):
+        if len(row) != len(rows[0]):
+            raise ValueError(
+                f"map row {i + 1} has {len(row)} cells, row 1 has {len(rows[0])}: "
+                f"{lines[i]!r}. All rows must have the same length."
+            )
+    return np.array(rows)
+
+
+def gridworld(
+    text: str,
+    *,
+    slip: float = 0.0,
+    absorbing: Collection[str] = (),
+    legend: Mapping[str, Collection[str]] | None = None,
+    wall: str = "#",
+    initial: str | chex.Array | None = None,
+) -> MDP:
+    """A labelled grid world with the actions up, down, left, right.
+
+    State ``row * columns + column``, both from 0 at the top left. A move off the map or
+    into a wall stays. With probability `slip` a move goes to one of the two sides
+    instead, half each.
+
+    Args:
+      text: the map, see :func:`parse_map`.
+      slip: probability in [0, 1] of moving sideways.
+      absorbing: propositions; cells where one holds are never left.
+      legend: the propositions of each kind of cell. Without one, ``.`` has none and
+        any other cell has the proposition of its own name.
+      wall: the kind of cell that is not a place.
+      initial: where runs start, uniformly: a propositional formula over the labels
+        (``"!r & !y"``), or a distribution ``float[S]``; default every cell.
+
+    Raises:
+      ValueError: a malformed map, a cell that the legend lacks, a probability outside
+        [0, 1], an unknown proposition, or no initial cell.
+
+    Example:
+      >>> world = gridworld("b . y", absorbing=["y"])
+      >>> world.successor[:, 3, 0].tolist()  # right
+      [1, 2, 2]
+    """
+    cells = parse_map(text)
+    rows, columns = cells.shape
+    if not 0 <= slip <= 1:
+        raise ValueError(f"slip={slip}; it must be a probability in [0, 1].")
+    label, propositions = _labels(cells, legend, wall)
+    is_wall = (cells == wall).ravel()
+    stays = is_wall | _holds_one_of(absorbing, label, propositions, "absorbing")
+
+    state = np.arange(rows * columns)
+    row, column = np.divmod(state, columns)
+    moved = np.empty((state.size, len(ACTIONS)), np.int32)
+    for a, (down, right) in enumerate(_MOVES):
+        r, c = row + down, column + right
+        inside = (0 <= r) & (r < rows) & (0 <= c) & (c < columns)
+        target = np.where(inside, r * columns + c, state)
+        moved[:, a] = np.where(is_wall[target] | stays, state, target)
+    if slip == 0:
+        successor = moved[:, :, None]
+        probability = np.ones(successor.shape)
+    else:
+        successor = np.stack([moved, *(moved[:, list(x)] for x in zip(*_SIDEWAYS, strict=True))], 2)
+        probability = np.broadcast_to([1 - slip, slip / 2, slip / 2], successor.shape)
+    if initial is None or isinstance(initial, str):
+        initial = _initial(initial, label, propositions, ~is_wall)
+    return make_mdp(
+        successor, probability, initial=initial, label=label, propositions=propositions
+    )
+
+
+def _labels(
+    cells: np.ndarray, legend: Mapping[str, Collection[str]] | None, wall: str
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    kinds = np.unique(cells)
+    if legend is None:
+        legend = {kind: () if kind == "." else (str(kind),) for kind in kinds}
+    for kind in kinds:
+        if kind != wall and kind not in legend:
+            r, c = np.argwhere(cells == kind)[0]
+            raise ValueError(
+                f"cell {kind!r} (row {r + 1}, column {c + 1}) is not in the legend; the legend "
+                f"has {', '.join(map(repr, legend))}. Add it, with [] if nothing holds there."
+            )
+        if isinstance(legend.get(str(kind), ()), str):
+            raise ValueError(f"legend[{str(kind)!r}] is a string; give a list of propositions.")
+    here = [str(kind) for kind in kinds if kind != wall]
+    propositions = tuple(sorted({p for kind in legend for p in legend[kind] if kind != wall}))
+    label = np.zeros((cells.size, len(propositions)), bool)
+    for kind in here:
+        for p in legend[kind]:
+            label[(cells == kind).ravel(), propositions.index(p)] = True
+    return label, propositions
+
+
+def _holds_one_of(
+    names: Collection[str], label: np.ndarray, propositions: tuple[str, ...], argument: str
+) -> np.ndarray:
+    if isinstance(names, str):
+        names = (names,)
+    for name in names:
+        if name not in propositions:
+            raise ValueError(
+                f"{argument}: {name!r} is not a proposition of the map; "
+                f"it has {', '.join(propositions) or '(none)'}."
+            )
+    return label[:, [propositions.index(n) for n in names]].any(axis=1)
+
+
+def _initial(
+    formula: str | None, label: np.ndarray, propositions: tuple[str, ...], place: np.ndarray
+) -> np.ndarray:
+    holds = place
+    if formula is not None:
+        condition = parse_ltl(formula)
+        _holds_one_of(condition.propositions, label, propositions, "initial")
+        rows, inverse = np.unique(label, axis=0, return_inverse=True)
+        names = np.array(propositions, dtype=object)
+        # A stuttering word gives a propositional formula its truth in one letter.
+        truth = np.array([holds_on_lasso(condition, [], [set(names[row])]) for row in rows], bool)
+        holds = place & truth[inverse.ravel()]
+    if not holds.any():
+        raise ValueError(f"initial={formula!r} holds in no cell of the map.")
+    return holds / holds.sum()
