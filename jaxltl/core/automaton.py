@@ -92,17 +92,7 @@ def make_automaton(
         )
     is_final = _booleans(final, "final", (count,))
     rows = _booleans(letters, "letters", (width, len(names)))
-    for name in names:
-        if names.count(name) > 1 or not isinstance(name, str):
-            raise ValueError(f"make_automaton: propositions has {name!r}. Pass distinct strings.")
-    first: dict[bytes, int] = {}
-    for letter, row in enumerate(rows):
-        twin = first.setdefault(row.tobytes(), letter)
-        if twin != letter:
-            held = _letter_text(names, row)
-            raise ValueError(
-                f"make_automaton: letters {twin} and {letter} are both {held}. Keep one of them."
-            )
+    _check_distinct(names, rows)
     if acceptance not in ACCEPTANCES:
         raise ValueError(
             f"make_automaton: acceptance = {acceptance!r}. Pass one of {', '.join(ACCEPTANCES)}."
@@ -127,6 +117,20 @@ def make_automaton(
         acceptance=acceptance,
         state_names=states,
     )
+
+
+def _check_distinct(names: tuple[str, ...], rows: NDArray[np.bool_]) -> None:
+    for name in names:
+        if names.count(name) > 1 or not isinstance(name, str):
+            raise ValueError(f"make_automaton: propositions has {name!r}. Pass distinct strings.")
+    first: dict[bytes, int] = {}
+    for letter, row in enumerate(rows):
+        twin = first.setdefault(row.tobytes(), letter)
+        if twin != letter:
+            held = _letter_text(names, row)
+            raise ValueError(
+                f"make_automaton: letters {twin} and {letter} are both {held}. Keep one of them."
+            )
 
 
 def _booleans(values: ArrayLike, place: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:

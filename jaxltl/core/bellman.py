@@ -30,6 +30,9 @@ from jaxltl.core.operators import (
 from jaxltl.core.types import Solution, Status, status_code
 
 
+_GOOD_RATE = 0.7  # an iteration that contracts at least this fast is left to it
+
+
 def action_value(
     model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
 ) -> jax.Array:
@@ -325,8 +328,7 @@ def soft_value(
     def body(carry):
         value, image, n, _ = carry
         if method == "newton":
-            # A Newton iterate lies below the fixed point; one sweep more is free.
-            value = newton_step(backup, value)
+            value = newton_step(backup, value, image)
         else:
             value = image
         image = backup(value)
@@ -438,66 +440,64 @@ def boltzmann_value(
             policy = lax.stop_gradient(policy)
         return action_mean(policy, action_value(model, reward, discount, v))
 
-    start = jnp.zeros(model.state_shape, model.dtype) if initial is None else initial
-    damping = jnp.where((expansion < 1) | (method == "newton"), 0.0, 0.5).astype(model.dtype)
-    gap = jnp.where(expansion < 1, 1 - expansion, 1)
+    contracts = expansion < 1
+    damping = jnp.where(contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
+    gap = jnp.where(contracts, 1 - expansion, 1)
+    magnitude = jnp.max(jnp.abs(jnp.where(model.available, reward, 0))) / (1 - discount)
+    rounding = _rounding(model, reward, magnitude, gap)
+    goal = 4 * rounding if tolerance is None else jnp.asarray(tolerance, model.dtype)
 
-    def error(v: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Certified (or, without contraction, residual) error, and the error asked for."""
-        residual = jnp.max(jnp.abs(backup(v) - v))
-        rounding = _rounding(model, reward, v, gap)
-        goal = 4 * rounding if tolerance is None else jnp.asarray(tolerance, v.dtype)
-        bound = residual / gap + rounding
-        return jnp.where(jnp.isfinite(bound), bound, jnp.inf), goal
+    def error(value: jax.Array, image: jax.Array) -> jax.Array:
+        """Certified where the operator contracts; elsewhere the residual."""
+        return jnp.max(jnp.abs(image - value)) / gap + rounding
 
-    num_damped = 0 if method == "newton" else 16
+    def damped(carry):
+        value, image, before, _, n = carry
+        value = value + (1 - damping) * (image - value)
+        image = backup(value)
+        now = error(value, image)
+        return value, image, now, now <= _GOOD_RATE * before, n + 1
 
-    def round_(carry):
-        v, n, _ = carry
-        width = jnp.minimum(num_damped * (1 + n // 64), max_steps)
-        v = lax.fori_loop(0, width, lambda _, v: damping * v + (1 - damping) * backup(v), v)
-        polished, bound, goal = _polish(backup, error, v)
-        done = bound <= goal
-        return jnp.where(done, polished, v), n + jnp.maximum(width, 1), done
+    def newton(carry):
+        value, image, before, _, n = carry
+        trial = newton_step(backup, value, image)
+        trial_image = backup(trial)
+        now = error(trial, trial_image)
+        better = now <= before / 2
+        keep = partial(jnp.where, better)
+        return keep(trial, value), keep(trial_image, image), keep(now, before), better, n + 1
+
+    def polish(carry):
+        value, image, bound, n = carry
+        width = n + (0 if method == "newton" else 16 * (1 + n // 64))
+        again = (value, image, bound, jnp.bool_(method != "newton"), n)
+        value, image, bound, _, n = lax.while_loop(
+            lambda c: (c[2] > goal) & (c[3] | (c[4] < width)) & (c[4] < max_steps), damped, again
+        )
+        again = (value, image, bound, jnp.bool_(True), n)
+        value, image, bound, _, n = lax.while_loop(
+            lambda c: (c[2] > goal) & c[3] & (c[4] < max_steps), newton, again
+        )
+        return value, image, bound, n
 
     def unfinished(carry):
-        v, n, done = carry
-        return ~done & (n < max_steps) & jnp.all(jnp.isfinite(v))
+        _, _, bound, n = carry
+        return (bound > goal) & (n < max_steps) & jnp.isfinite(bound)
 
-    value, n, done = lax.stop_gradient(
-        lax.while_loop(unfinished, round_, (start, jnp.int32(0), jnp.bool_(False)))
-    )
-    half = jnp.where(done & (expansion < 1), error(value)[0], jnp.inf)
-    finite = jnp.all(jnp.isfinite(value)) & (discount < 1)
-    residual = jnp.max(jnp.abs(backup(value) - value))
+    start = jnp.zeros(model.state_shape, model.dtype) if initial is None else initial
+    image = backup(start)
+    first = (start, image, error(start, image), jnp.int32(1))
+    value, image, bound, n = lax.stop_gradient(lax.while_loop(unfinished, polish, first))
+    converged = bound <= goal
+    half = jnp.where(converged & contracts, bound, jnp.inf)
     solution = Solution(
         value=value, policy=value, lower=value - half, upper=value + half,
-        residual=residual, num_steps=n, status=status_code(done, finite),
+        residual=jnp.max(jnp.abs(image - value)), num_steps=n,
+        status=status_code(converged, jnp.isfinite(bound) & (discount < 1)),
     )
     solution = jax.tree.map(lax.stop_gradient, solution)
     attached = implicit(partial(backup, constant_policy=adjoint == "approximate"), value)
     return _with_softmax(model, reward, discount, solution.replace(value=attached))
-
-
-def _polish(backup, error, v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Newton steps for as long as they shrink the error and it is not yet small enough."""
-
-    def body(carry):
-        v, bound, _, n = carry
-        image = newton_step(backup, v)
-        new_bound, _ = error(image)
-        better = new_bound < bound
-        return (jnp.where(better, image, v), jnp.minimum(bound, new_bound), better, n + 1)
-
-    def unfinished(carry):
-        v, bound, better, n = carry
-        return (bound > error(v)[1]) & better & (n < 20)
-
-    bound, _ = error(v)
-    v, bound, _, _ = lax.while_loop(
-        unfinished, body, (v, bound, jnp.bool_(True), jnp.int32(0))
-    )
-    return v, bound, error(v)[1]
 
 
 def boltzmann_fixed_points(

@@ -96,6 +96,20 @@ def induced_chain(model: Any, policy: jax.Array) -> MDP | DenseMDP:
     raise TypeError(_unknown(model))
 
 
+@singledispatch
+def transition_matrix(model: Any, policy: jax.Array) -> jax.Array:
+    """``P_pi(s, t) = sum_a pi(s, a) P(t | s, a)`` as a full matrix, for small models.
+
+    Args:
+      model: the model.
+      policy: ``float[S, A]``.
+
+    Returns:
+      ``float[S, S]``; of a product, over states numbered ``s * Q + q``.
+    """
+    raise TypeError(_unknown(model))
+
+
 def pushforward(model: Any, mass: jax.Array) -> jax.Array:
     """Mass that flows into each state, ``(P' x)(t) = sum_{s, a} P(t | s, a) x(s, a)``.
 
@@ -163,6 +177,18 @@ def _(model: MDP, policy: jax.Array) -> MDP:
     )
 
 
+@transition_matrix.register
+def _(model: MDP, policy: jax.Array) -> jax.Array:
+    return scatter_matrix(model.successor, policy[:, :, None] * model.probability)
+
+
+def scatter_matrix(successor: jax.Array, weight: jax.Array) -> jax.Array:
+    """``float[S, S]`` that adds weights ``[S, A, K]`` at (s, successor)."""
+    num_states = successor.shape[0]
+    row = jnp.arange(num_states)[:, None, None]
+    return jnp.zeros((num_states, num_states), weight.dtype).at[row, successor].add(weight)
+
+
 def make_chain(successor: jax.Array, probability: jax.Array, initial: jax.Array) -> MDP:
     """An MDP with one action from ``int32[S, K]`` successors and their probabilities."""
     num_states = successor.shape[0]
@@ -185,6 +211,11 @@ def _(model: DenseMDP, policy: jax.Array) -> DenseMDP:
         transition=rows, available=jnp.ones((model.num_states, 1), bool),
         label=jnp.zeros((model.num_states, 0), bool), propositions=(),
     )
+
+
+@transition_matrix.register
+def _(model: DenseMDP, policy: jax.Array) -> jax.Array:
+    return jnp.einsum("sa,sat->st", policy, model.transition)
 
 
 @exists_successor.register

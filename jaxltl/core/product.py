@@ -251,20 +251,33 @@ def _(model: Product, key: chex.PRNGKey, state: jax.Array, action: jax.Array) ->
 
 @operators.induced_chain.register
 def _(model: Product, policy: jax.Array) -> MDP:
-    world = model.mdp
-    s = jnp.arange(world.num_states)[:, None]
-    probability = world.successor_probability[s, policy]  # [S, Q, K]
-    if isinstance(world, MDP):
-        successor = world.successor[s, policy]
-    else:
-        successor = jnp.broadcast_to(jnp.arange(world.num_states), probability.shape)
+    s = jnp.arange(model.mdp.num_states)[:, None]
     q = jnp.arange(model.num_memory)[None, :, None]
+    probability = model.mdp.successor_probability[s, policy]  # [S, Q, K]
+    successor = _successor(model.mdp)[s, policy]
     flat = _flat_successor(successor, model.next_memory, s[..., None], q, model.label_on)
     width = flat.shape[-1]
     return operators.make_chain(
         flat.reshape(-1, width).astype(jnp.int32), probability.reshape(-1, width),
         model.initial.ravel(),
     )
+
+
+@operators.transition_matrix.register
+def _(model: Product, policy: jax.Array) -> jax.Array:
+    s = jnp.arange(model.mdp.num_states)[:, None, None, None]
+    q = jnp.arange(model.num_memory)[None, :, None, None]
+    successor = _successor(model.mdp)[:, None]
+    flat = _flat_successor(successor, model.next_memory, s, q, model.label_on)
+    weight = policy[..., None] * model.successor_probability
+    shape = (model.num_states, *weight.shape[2:])
+    return operators.scatter_matrix(flat.reshape(shape), weight.reshape(shape))
+
+
+def _successor(world: MDP | DenseMDP) -> jax.Array:
+    if isinstance(world, MDP):
+        return world.successor
+    return jnp.broadcast_to(jnp.arange(world.num_states), world.transition.shape)
 
 
 # --- lifting and projecting -----------------------------------------------------------------

@@ -16,13 +16,14 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core import graph
-from jaxltl.core.fixed_point import implicit, solve_dense, solve_linear
+from jaxltl.core.fixed_point import DenseSolver, factorize, implicit, solve_linear
 from jaxltl.core.operators import (
     action_argmax,
     action_mean,
     expectation,
     forall_successor,
     policy_distribution,
+    transition_matrix,
 )
 from jaxltl.core.product import Product
 from jaxltl.core.types import Solution, require_shape, status_code
@@ -44,6 +45,7 @@ def reachability_probability(
     *,
     policy: jax.Array | None = None,
     objective: str = "max",
+    method: str = "auto",
     tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int = 1_000_000,
 ) -> Solution:
@@ -59,6 +61,8 @@ def reachability_probability(
       target: ``bool[S]``.
       policy: ``float[S, A]`` or ``int32[S]``: evaluate this policy. Default: optimise.
       objective: ``"max"`` or ``"min"``; ignored when a policy is given.
+      method: for a given policy: ``"direct"`` (elimination, however slowly the policy
+        makes progress), ``"iterative"`` (Krylov), or ``"auto"``, direct up to 1024 states.
       tolerance: half the width of the enclosure asked for; default the square root of
         the dtype's precision.
       max_steps: sweeps at most.
@@ -69,7 +73,7 @@ def reachability_probability(
       (`lower` for a maximum, `upper` for a minimum).
 
     Raises:
-      ValueError: a shape is wrong, or the objective is unknown.
+      ValueError: a shape is wrong, or the objective or method is unknown.
 
     Differentiable in the policy and in the probabilities, with the support held fixed.
 
@@ -79,12 +83,14 @@ def reachability_probability(
       >>> round(reachability_probability(mdp, jnp.array([False, True, False])).value[0].item(), 3)
       0.5
     """
+    if method not in ("auto", "direct", "iterative"):
+        raise ValueError(f"method={method!r}; choose auto, direct or iterative.")
     target = jnp.asarray(target, bool)
     require_shape("target", target, model.state_shape)
     if policy is not None:
         policy = policy_distribution(model, policy)
         sets = _policy_sets(model, target, policy)
-        return _evaluate(model, sets, policy, tolerance)
+        return _evaluate(model, sets, policy, tolerance, method=method)
     if objective not in ("max", "min"):
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
     sets = _max_sets(model, target) if objective == "max" else _min_sets(model, target)
@@ -99,7 +105,11 @@ def reachability_probability(
 
 
 def satisfaction_probability(
-    model: Product, policy: jax.Array, *, tolerance: jax.Array | float | None = None
+    model: Product,
+    policy: jax.Array,
+    *,
+    method: str = "auto",
+    tolerance: jax.Array | float | None = None,
 ) -> Solution:
     """Probability that a policy satisfies the product's task, from every product state.
 
@@ -109,6 +119,7 @@ def satisfaction_probability(
     Args:
       model: the product.
       policy: ``float[S, Q, A]`` or ``int32[S, Q]``.
+      method: as in :func:`reachability_probability`.
       tolerance: half the width of the enclosure asked for.
 
     Returns:
@@ -117,11 +128,12 @@ def satisfaction_probability(
 
     Differentiable in the policy and in the world's transition probabilities.
     """
-    if _is_cosafe(model):
-        return reachability_probability(model, model.final, policy=policy, tolerance=tolerance)
-    return _complement(
-        reachability_probability(model, ~model.final, policy=policy, tolerance=tolerance)
+    cosafe = _is_cosafe(model)
+    reach = reachability_probability(
+        model, model.final if cosafe else ~model.final,
+        policy=policy, method=method, tolerance=tolerance,
     )
+    return reach if cosafe else _complement(reach)
 
 
 def optimal_satisfaction(
@@ -185,8 +197,8 @@ def _min_sets(model: Any, target: jax.Array) -> _Sets:
 # --- a fixed policy: a linear system with a certificate -----------------------------------
 
 
-@jax.jit
-def _evaluate(model: Any, sets: _Sets, policy: jax.Array, tolerance) -> Solution:
+@partial(jax.jit, static_argnames=("method",))
+def _evaluate(model: Any, sets: _Sets, policy: jax.Array, tolerance, *, method) -> Solution:
     """Solves ``y = 1_one + (P_pi y) on the undecided states`` and encloses the answer.
 
     If e > 0 satisfies ``e - P e >= |r|`` there, where r is the residual of y, then
@@ -202,7 +214,8 @@ def _evaluate(model: Any, sets: _Sets, policy: jax.Array, tolerance) -> Solution
     def matvec(y: jax.Array) -> jax.Array:
         return y - jnp.where(undecided, action_mean(policy, expectation(model, y)), 0)
 
-    solve = _linear_solver(model)
+    solver = _linear_solver(model, policy, undecided, method)
+    solve = solver.solve
     value = lax.stop_gradient(solve(matvec, one))
     value = jnp.clip(jnp.where(undecided, value, one), 0, 1)
     terms = model.num_successors + model.num_actions + 4
@@ -226,7 +239,28 @@ def _evaluate(model: Any, sets: _Sets, policy: jax.Array, tolerance) -> Solution
         status=status_code(jnp.max(error) <= goal, jnp.all(jnp.isfinite(policy))),
     )
     solution = jax.tree.map(lax.stop_gradient, solution)
-    return solution.replace(value=implicit(backup, solution.value, solve=solve), policy=policy)
+    value = implicit(backup, solution.value, solve=solve, transpose_solve=solver.transpose_solve)
+    return solution.replace(value=value, policy=policy)
+
+
+class _Iterative(NamedTuple):
+    """The interface of a :class:`DenseSolver` without a matrix."""
+
+    @property
+    def solve(self):
+        return solve_linear
+
+    transpose_solve = solve
+
+
+def _linear_solver(
+    model: Any, policy: jax.Array, undecided: jax.Array, method: str
+) -> DenseSolver | _Iterative:
+    num_states = math.prod(model.state_shape)
+    if method == "iterative" or (method == "auto" and num_states > _DENSE_LIMIT):
+        return _Iterative()
+    rows = jnp.where(undecided.ravel()[:, None], transition_matrix(model, policy), 0)
+    return factorize(jnp.eye(num_states, dtype=rows.dtype) - rows)
 
 
 # --- optima: interval iteration -------------------------------------------------------------
@@ -283,7 +317,7 @@ def _optimize(model, sets: _Sets, components, tolerance, max_steps, *, objective
         return jnp.where(undecided, action_mean(policy, expectation(model, y)), one)
 
     # The optimum's derivative is that of the policy that attains it (Danskin).
-    return solution.replace(value=implicit(follow, solution.value, solve=_linear_solver(model)))
+    return solution.replace(value=implicit(follow, solution.value))
 
 
 def _collapse(components: graph.EndComponents | None, value: jax.Array) -> jax.Array:
@@ -293,7 +327,3 @@ def _collapse(components: graph.EndComponents | None, value: jax.Array) -> jax.A
     label = components.component.ravel()
     best = jax.ops.segment_max(value.ravel(), label, num_segments=label.size)
     return best[label].reshape(value.shape)
-
-
-def _linear_solver(model: Any):
-    return solve_dense if math.prod(model.state_shape) <= _DENSE_LIMIT else solve_linear
