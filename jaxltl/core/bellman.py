@@ -29,7 +29,6 @@ from jaxltl.core.operators import (
 )
 from jaxltl.core.types import Solution, Status, status_code
 
-
 _GOOD_RATE = 0.7  # an iteration that contracts at least this fast is left to it
 
 
@@ -207,7 +206,7 @@ def optimal_value(
     method: str = "modified_policy_iteration",
     tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int = 100_000,
-    evaluation_sweeps: jax.Array | int = 8,
+    evaluation_sweeps: jax.Array | int = 24,
 ) -> Solution:
     """Largest expected discounted reward, ``V = max_a R + discount * P V``.
 

@@ -3,7 +3,7 @@
 Regions are Boolean, and only whether a probability is positive matters. There is one
 answer and two ways to it. Sweeps of the primitives work inside ``jit`` and ``vmap`` and are
 fast where regions grow in few steps. On concrete arrays, a region that is still growing
-after a few dozen sweeps is finished by worklists on the host, in time linear in
+after a few hundred sweeps is finished by worklists on the host, in time linear in
 the transitions, so that depth costs nothing.
 """
 
@@ -20,7 +20,7 @@ from jax import lax
 from jaxltl.core.mdp import DenseMDP
 from jaxltl.core.operators import exists_successor, forall_successor
 
-_MAX_SWEEPS = 48  # beyond, a worklist on the host is faster
+_MAX_SWEEPS = 256  # beyond, a worklist on the host is faster
 
 
 class Attractor(NamedTuple):
@@ -114,12 +114,22 @@ def avoidable(model: Any, goal: jax.Array, allowed: jax.Array | None = None) -> 
 
 
 def almost_surely_reaching(
-    model: Any, goal: jax.Array, allowed: jax.Array | None = None
+    model: Any,
+    goal: jax.Array,
+    allowed: jax.Array | None = None,
+    *,
+    reaching: Attractor | None = None,
 ) -> Attractor:
     """States from which some policy reaches the goal with probability one.
 
     The greatest X such that within X, by actions that surely stay in X, the goal is
     reachable (de Alfaro 1997).
+
+    Args:
+      model: the model.
+      goal: ``bool[S]``.
+      allowed: ``bool[S, A]``, the actions that count; default the available ones.
+      reaching: ``attractor(model, goal, allowed)``, if it is known already.
 
     Returns:
       :class:`Attractor`: the region and, outside the goal, the actions of such a policy.
@@ -130,22 +140,20 @@ def almost_surely_reaching(
         stay = allowed & forall_successor(model, region)
         return attractor(model, goal, stay)
 
-    if is_traced((model, goal, allowed)):
-        def body(carry):
-            region, _, _ = carry
-            found = inner(region)
-            return found.region, found.action, jnp.any(found.region != region)
+    found = attractor(model, goal, allowed) if reaching is None else reaching
 
-        whole = jnp.ones(model.state_shape, bool)
-        start = (whole, jnp.zeros(model.state_shape, jnp.int32), jnp.bool_(True))
-        region, action, _ = lax.while_loop(lambda c: c[2], body, start)
-        return Attractor(region, action)
-    found = attractor(model, goal, allowed)
-    while True:
+    def body(carry):
+        found, _ = carry
         smaller = inner(found.region)
-        if bool(jnp.all(smaller.region == found.region)):
-            return smaller
-        found = smaller
+        return smaller, jnp.any(smaller.region != found.region)
+
+    # A state that cannot reach the goal at all is what removes others.
+    carry = (found, ~jnp.all(found.region))
+    if is_traced((model, goal, allowed, found)):
+        return lax.while_loop(lambda c: c[1], body, carry)[0]
+    while bool(carry[1]):
+        carry = body(carry)
+    return carry[0]
 
 
 def end_components(model: Any, region: jax.Array) -> EndComponents:

@@ -22,12 +22,15 @@ from jaxltl.core.operators import (
     action_mean,
     expectation,
     forall_successor,
+    induced_chain,
     policy_distribution,
     transition_matrix,
 )
 from jaxltl.core.product import Product
 from jaxltl.core.types import Solution, require_shape, status_code
 
+_POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
+_FAR_SWEEPS = 6  # sweeps of a guess, or of interval iteration after one that failed
 _DENSE_LIMIT = 1024  # states up to which a linear system is solved by elimination
 
 
@@ -183,7 +186,7 @@ def _policy_sets(model: Any, target: jax.Array, policy: jax.Array) -> _Sets:
 
 def _max_sets(model: Any, target: jax.Array) -> _Sets:
     some = graph.attractor(model, target)
-    sure = graph.almost_surely_reaching(model, target)
+    sure = graph.almost_surely_reaching(model, target, reaching=some)
     return _Sets(sure.region, ~some.region, jnp.where(sure.region, sure.action, some.action))
 
 
@@ -268,44 +271,89 @@ def _linear_solver(
 
 @partial(jax.jit, static_argnames=("objective",))
 def _optimize(model, sets: _Sets, components, tolerance, max_steps, *, objective) -> Solution:
+    """Encloses an optimum between a bound that a policy attains and one that is proven.
+
+    The attained bound ("near") is the lower one of a maximum and the upper one of a
+    minimum. Sweeps under its own greedy policy move it soundly and cheaply. The other
+    ("far") is found by guessing: a value that the operator does not carry away from
+    the optimum is a bound, because the fixed point is unique where end components
+    are collapsed. Where the guess fails, plain interval iteration goes on.
+    """
     sign = 1 if objective == "max" else -1
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
     eps = jnp.finfo(model.dtype).eps
     slack = (model.num_successors + model.num_actions + 4) * eps
-    goal = jnp.sqrt(eps) if tolerance is None else tolerance
+    goal = jnp.sqrt(eps) if tolerance is None else jnp.asarray(tolerance, model.dtype)
     leaving = model.available if components is None else model.available & ~components.inside
 
     def best(y: jax.Array) -> tuple[jax.Array, jax.Array]:
         value, action = action_argmax(sign * expectation(model, y), leaving)
-        return _collapse(components, sign * value), action
+        return jnp.where(undecided, _collapse(components, sign * value), one), action
 
-    def backup(y: jax.Array) -> jax.Array:
-        return jnp.where(undecided, best(y)[0], one)
+    # Sums of nonnegative terms err by a relative amount, so rounded outwards these stay bounds.
+    def near_step(near: jax.Array, image: jax.Array) -> jax.Array:
+        return sign * jnp.maximum(sign * near, sign * image * (1 - sign * slack))
+
+    def far_step(far: jax.Array, image: jax.Array) -> jax.Array:
+        return sign * jnp.minimum(sign * far, sign * image * (1 + sign * slack))
+
+    def follow_greedy(near: jax.Array, action: jax.Array) -> jax.Array:
+        chain = induced_chain(model, action)
+
+        def sweep(_, y: jax.Array) -> jax.Array:
+            image = expectation(chain, y.ravel())[:, 0].reshape(y.shape)
+            return near_step(y, jnp.where(undecided, image, one))
+
+        return lax.fori_loop(0, _POLICY_SWEEPS, sweep, near)
+
+    def guess(near: jax.Array, far: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Offers `near` moved by almost the tolerance; some sweeps give it its shape."""
+        guessed = jnp.where(undecided, jnp.clip(near + sign * 1.8 * goal, 0, 1), one)
+
+        def sweep(_, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            return carry[1], best(carry[1])[0] * (1 + sign * slack)
+
+        before, after = lax.fori_loop(0, _FAR_SWEEPS, sweep, (guessed, guessed))
+        proven = jnp.all(sign * after <= sign * before)
+        return jnp.where(proven, far_step(far, after), far), ~proven
+
+    def iterate(_: jax.Array, far: jax.Array) -> tuple[jax.Array, jax.Array]:
+        step = lax.fori_loop(0, _FAR_SWEEPS, lambda _, y: far_step(y, best(y)[0]), far)
+        return step, jnp.bool_(False)
 
     def body(carry):
-        lower, upper, n, _ = carry
-        # Sums of nonnegative terms err by a relative amount, so these stay bounds.
-        new_lower = jnp.maximum(lower, backup(lower) * (1 - slack))
-        new_upper = jnp.minimum(upper, backup(upper) * (1 + slack))
-        moved = jnp.any((new_lower > lower) | (new_upper < upper))
-        return new_lower, new_upper, n + 1, moved
+        near, far, failed, n, _ = carry
+        image, action = best(near)
+        settled = jnp.max(jnp.abs(image - near)) <= goal / 32
+        new_near = near_step(near, image)
+        if components is None:
+            new_near = follow_greedy(new_near, action)
+        new_far, failed = lax.cond(
+            settled,
+            lambda: lax.cond(failed, iterate, guess, new_near, far),
+            lambda: (far, failed),
+        )
+        moved = jnp.any((new_near != near) | (new_far != far)) | failed
+        return new_near, new_far, failed, n + 1, moved
 
     def unfinished(carry):
-        lower, upper, n, moved = carry
-        return (jnp.max(upper - lower) > 2 * goal) & (n < max_steps) & moved
+        near, far, _, n, moved = carry
+        return (jnp.max(jnp.abs(far - near)) > 2 * goal) & (n < max_steps) & moved
 
-    start = (one, jnp.where(undecided, 1, one), jnp.int32(0), jnp.bool_(True))
-    lower, upper, n, _ = lax.stop_gradient(lax.while_loop(unfinished, body, start))
-    # Greedy for the bound that the policy is to attain.
-    action = best(lower if objective == "max" else upper)[1]
+    top = jnp.where(undecided, 1, one)
+    near, far = (one, top) if objective == "max" else (top, one)
+    start = (near, far, jnp.bool_(False), jnp.int32(0), jnp.bool_(True))
+    near, far, _, n, _ = lax.stop_gradient(lax.while_loop(unfinished, body, start))
+    action = best(near)[1]
     if components is not None:
-        own = action_argmax(expectation(model, lower), leaving)[0]
+        own = action_argmax(expectation(model, near), leaving)[0]
         exits = undecided & (own >= _collapse(components, own))
         towards = graph.attractor(model, exits, components.inside).action
         action = jnp.where(exits, action, towards)
+    lower, upper = (near, far) if objective == "max" else (far, near)
     value = (lower + upper) / 2
-    residual = jnp.max(jnp.abs(backup(value) - value))
+    residual = jnp.max(jnp.abs(best(value)[0] - value))
     policy = jnp.where(undecided, action, sets.action)
     solution = Solution(
         value=value, policy=policy, lower=lower, upper=upper, residual=residual, num_steps=n,

@@ -92,7 +92,7 @@ def gridworld(
     moved = np.empty((state.size, len(ACTIONS)), np.int32)
     for a, (down, right) in enumerate(_MOVES):
         r, c = row + down, column + right
-        inside = (0 <= r) & (r < rows) & (0 <= c) & (c < columns)
+        inside = (r >= 0) & (r < rows) & (c >= 0) & (c < columns)
         target = np.where(inside, r * columns + c, state)
         moved[:, a] = np.where(is_wall[target] | stays, state, target)
     if slip == 0:

@@ -1,0 +1,59 @@
+"""``python -m benchmarks [a b c d] [--states N] [--json]``: a table, and JSON."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+from typing import Any
+
+import jax
+
+
+def _row_text(row: dict[str, Any]) -> str:
+    def seconds(key: str) -> str:
+        return f"{row[key]:10.4f}" if key in row else " " * 10
+
+    target = row.get("target")
+    verdict = "" if target is None else ("met" if row["ratio"] <= target else "MISSED")
+    aim = "" if target is None else f"<= {target:.3g}"
+    return (
+        f"{row['name']:<50} {row['peer']:<34} {seconds('compile_seconds')} "
+        f"{seconds('seconds')} {seconds('peer_seconds')} {row['ratio']:8.3f} {aim:>9} {verdict}"
+    )
+
+
+def main() -> None:
+    """Measures the chosen parts, prints a row each and at the end all as one JSON line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("parts", nargs="*", default=["a", "b", "c", "d"], help="a, b, c, d")
+    parser.add_argument("--states", type=int, default=1_000_000)
+    parser.add_argument("--json", action="store_true", help="only the JSON line")
+    chosen = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    header = (f"{'what':<50} {'peer':<34} {'compile s':>10} {'run s':>10} {'peer s':>10} "
+              f"{'ratio':>8} {'target':>9}")
+    if not chosen.json:
+        print(f"jax {jax.__version__} on {platform.machine()}, {os.cpu_count()} cores\n{header}")
+    for part in chosen.parts:
+        if part == "a":
+            from benchmarks.sweep import run as measure
+        elif part == "b":
+            from benchmarks.solvers import run as measure
+        elif part == "c":
+            from benchmarks.gradient import run as measure
+        elif part == "d":
+            from benchmarks.memory import run as measure
+        else:
+            parser.error(f"unknown part {part!r}; choose among a, b, c, d")
+        found = measure() if part == "c" else measure(chosen.states)
+        rows += found
+        if not chosen.json:
+            print(*map(_row_text, found), sep="\n", flush=True)
+    machine = {"cores": os.cpu_count(), "machine": platform.machine(), "jax": jax.__version__}
+    print(json.dumps({"machine": machine, "rows": rows}))
+
+
+if __name__ == "__main__":
+    main()

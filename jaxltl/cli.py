@@ -1,0 +1,317 @@
+"""The command line: learn from a task file, translate formulas, reproduce published figures.
+
+Heavy modules are imported inside the commands, so that help is quick.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+import jaxltl
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from jaxltl.core.automaton import Automaton
+    from jaxltl.learn import Outcome
+
+
+class _Failure(click.ClickException):
+    """A mistake in what was asked, told in one line."""
+
+    exit_code = 2
+
+    def show(self, file: Any = None) -> None:
+        click.echo(f"error: {self.message}", err=True)
+
+
+def _plain_errors(command: Callable[..., None]) -> Callable[..., None]:
+    """Errors meant for people come without a traceback; others are our mistakes and keep it."""
+
+    @functools.wraps(command)
+    def run(*args: Any, **options: Any) -> None:
+        try:
+            command(*args, **options)
+        except jaxltl.NotConverged as error:
+            raise _Failure(str(error)) from None
+        except ValueError as error:
+            raise _Failure(str(error)) from None
+        except OSError as error:
+            where = f"{error.filename!r}: " if error.filename else ""
+            raise _Failure(f"{where}{error.strerror or error}") from None
+
+    return run
+
+
+@contextlib.contextmanager
+def _float64() -> Iterator[None]:
+    """Double precision for this command; the library itself leaves JAX's settings alone."""
+    import jax
+
+    # Before JAX 0.8 the context lived in jax.experimental.
+    context = getattr(jax, "enable_x64", None)
+    if context is None:
+        from jax import experimental
+
+        context = experimental.enable_x64  # type: ignore[attr-defined]
+    with context(True):
+        yield
+
+
+def _print_json(result: Any) -> None:
+    click.echo(json.dumps(result, allow_nan=False))
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(jaxltl.__version__, prog_name="jaxltl")
+def main() -> None:
+    """Learn policies that are known to do their task."""
+
+
+# --- learn and check ------------------------------------------------------------------------
+
+
+@main.command()
+@click.argument("task_file", metavar="TASK.toml", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="Directory for the results.  "
+              "[default: out/NAME]")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0, 2**31 - 1))
+@click.option("--seeds", default=1, show_default=True, type=click.IntRange(1),
+              help="Learn with this many seeds side by side and keep the best.")
+@click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
+@_plain_errors
+def learn(task_file: Path, out: Path | None, seed: int, seeds: int, as_json: bool) -> None:
+    """Learn a policy for a task, and say how well it does it.
+
+    Writes policy.npz, result.json, report.html and pictures. An interrupted run goes on where
+    it stopped when it is started again with the same task and options.
+    """
+    from jaxltl.task import read_task
+
+    task = read_task(task_file)
+    out = out or Path("out") / task.name.replace("/", "-").replace(" ", "_")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(
+            f"cannot write into {str(out)!r}: {error.strerror}; choose another with --out."
+        ) from None
+    with _float64():
+        outcome = _learn(task, out, seed, seeds)
+        result = _write(outcome, out, task_file)
+    click.echo(_table(result))
+    click.echo(f"\nwrote {out}/report.html and the files beside it")
+    if as_json:
+        _print_json(result)
+
+
+def _learn(task: Any, out: Path, seed: int, seeds: int) -> Outcome:
+    from tqdm import tqdm
+
+    from jaxltl import learn as job
+    from jaxltl.algos.learner import atomic_write
+
+    begin = time.perf_counter()
+    setup = job.prepare(task, seed)
+    checkpoint = out / f"checkpoint-{job.fingerprint(task, seed, seeds)}.npz"
+    # A place that cannot be written to must be known before the work, not after.
+    with atomic_write(out / "task.toml") as file:
+        file.write(task.path.read_bytes())
+    if checkpoint.exists():
+        click.echo(f"going on from {checkpoint}", err=True)
+    with tqdm(total=task.learner.get("steps", job.STEPS), unit="step", leave=False) as bar:
+
+        def report(step: int, figures: Mapping[str, np.ndarray]) -> None:
+            bar.update(step - bar.n)
+            bar.set_postfix(loss=f"{figures['loss'].min():.4f}",
+                            gradient=f"{figures['gradient_norm'].max():.1e}")
+
+        try:
+            parts = job.learn(setup, seed, seeds, report=report, checkpoint=checkpoint)
+        except KeyboardInterrupt:
+            bar.close()
+            kept = "; the same command goes on from the last checkpoint"
+            click.echo(f"interrupted{kept if checkpoint.exists() else ''}", err=True)
+            raise SystemExit(130) from None
+    checkpoint.unlink(missing_ok=True)
+    return job.Outcome(setup, *parts, seed=seed, seconds=time.perf_counter() - begin)
+
+
+def _write(outcome: Outcome, out: Path, task_file: Path) -> dict[str, Any]:
+    from jaxltl import learn as job
+    from jaxltl import report
+    from jaxltl.algos.learner import atomic_write
+
+    result = job.summary(outcome)
+    job.save_policy(out / "policy.npz", outcome)
+    pictures = job.pictures(outcome)
+    for name, _, svg, _ in pictures:
+        with atomic_write(out / name) as file:
+            file.write(svg)
+    page = report.page(result, [p[1:] for p in pictures], task_file.read_text())
+    with atomic_write(out / "report.html") as file:
+        file.write(page.encode())
+    # Last, so that its presence says that all the rest is there.
+    with atomic_write(out / "result.json") as file:
+        file.write((json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
+    return result
+
+
+def _table(result: Mapping[str, Any]) -> str:
+    from jaxltl.report import certified, number, place, probability, spread, warnings
+
+    shown, training, seeds = result["demonstrations"], result["training"], result["seeds"]
+    dropped = f", {shown['dropped']} unfinished dropped" if shown["dropped"] else ""
+    lines = [
+        f"{result['task']}: {result['num_states']} states x {result['num_memory']} memory states, "
+        f"{shown['number']} {'synthetic ' * shown['synthetic']}demonstrations "
+        f"({shown['pairs']} pairs{dropped}), {result['method']} in the {result['in']}",
+        "",
+        "probability of doing the task, over "
+        f"{result['satisfaction']['num_starts']} initial states",
+    ]
+    for title, key in (("learned policy", "satisfaction"), ("best achievable", "best_achievable")):
+        for what in ("mean", "minimum"):
+            entry = result[key][what]
+            where = place(entry) if what == "minimum" else ""
+            lines.append(
+                f"  {title:16} {what:8} {probability(entry['value']):>9}   certified "
+                f"{certified(entry):15} {where}".rstrip()
+            )
+    weights = "  ".join(f"{k} {number(v)}" for k, v in result["weights"].items())
+    lines += [
+        "",
+        f"negative log-likelihood  {number(result['neg_log_likelihood'])}",
+        f"weights                  {weights}",
+    ]
+    if training["converged"]:
+        lines.append(
+            f"learning                 converged in {training['steps']} steps "
+            f"(gradient norm {training['gradient_norm']:.1e})"
+        )
+    if seeds["number"] > 1:
+        lines += [
+            "",
+            f"over {seeds['number']} seeds ({seeds['converged']} converged; the one of least loss "
+            "is above)",
+            f"  mean                    {spread(seeds['mean'])}",
+            f"  minimum                 {spread(seeds['minimum'])}",
+            f"  negative log-likelihood {spread(seeds['neg_log_likelihood'])}",
+        ]
+    lines += [f"\nwarning: {text}" for text in warnings(result)]
+    return "\n".join(lines)
+
+
+@main.command()
+@click.argument("task_file", metavar="TASK.toml", type=click.Path(path_type=Path))
+@_plain_errors
+def check(task_file: Path) -> None:
+    """Check a task file and all that it names, without learning."""
+    from jaxltl import learn as job
+    from jaxltl.task import read_task
+
+    with _float64():
+        setup = job.prepare(read_task(task_file), seed=0)
+    lengths = setup.demonstrations.length
+    click.echo(
+        f"ok: {setup.world.mdp.num_states} states, {setup.model.num_memory} memory states, "
+        f"{len(lengths)} demonstrations of {int(lengths.sum())} pairs"
+    )
+
+
+# --- automaton ------------------------------------------------------------------------------
+
+
+@main.command()
+@click.argument("formulas", metavar="FORMULA...", nargs=-1)
+@click.option("-F", "--file", "source", metavar="FILE",
+              help="Read one formula a line from a file; - is standard input.")
+@click.option("--to", "form", default="text", show_default=True,
+              type=click.Choice(["text", "dot", "svg", "json"]))
+@_plain_errors
+def automaton(formulas: tuple[str, ...], source: str | None, form: str) -> None:
+    """Translate formulas to minimal deterministic automata, in order.
+
+    A formula is co-safe or safety, in the syntax that Spot reads:
+    ! & | -> <-> xor X F G U R W M, true, false, and propositions.
+    """
+    from jaxltl.core.translate import to_automaton
+
+    numbered = [("", f) for f in formulas] + _formula_lines(source)
+    if not numbered:
+        raise click.UsageError("give at least one formula, or a file of them with -F.")
+    for i, (where, formula) in enumerate(numbered):
+        try:
+            result = to_automaton(formula)
+        except ValueError as error:
+            raise ValueError(f"{where}{error}") from None
+        if i and form == "text":
+            click.echo()
+        click.echo(_render(result, form))
+
+
+def _formula_lines(source: str | None) -> list[tuple[str, str]]:
+    """The non-empty lines of a file, each with the place to name in an error."""
+    if source is None:
+        return []
+    text = sys.stdin.read() if source == "-" else Path(source).read_text()
+    name = "standard input" if source == "-" else source
+    return [
+        (f"{name}, line {i}: ", line.strip())
+        for i, line in enumerate(text.splitlines(), start=1)
+        if line.strip()
+    ]
+
+
+def _render(result: Automaton, form: str) -> str:
+    from jaxltl.core.automaton import to_dict, to_dot, to_text
+
+    if form == "text":
+        return to_text(result)
+    if form == "dot":
+        return to_dot(result)
+    if form == "json":
+        return json.dumps(to_dict(result))
+    program = shutil.which("dot")
+    if program is not None:
+        with contextlib.suppress(OSError, subprocess.CalledProcessError):
+            drawn = subprocess.run(
+                [program, "-Tsvg"], input=to_dot(result).encode(), capture_output=True, check=True
+            )
+            return drawn.stdout.decode()
+    from jaxltl import plot
+
+    return plot.to_bytes(plot.automaton(result), "svg").decode()
+
+
+# --- reproduce ------------------------------------------------------------------------------
+
+
+@main.command()
+@click.argument("what", type=click.Choice(["mlirl"]))
+@click.option("--json", "as_json", is_flag=True, help="End with the figures as one JSON line.")
+@_plain_errors
+def reproduce(what: str, as_json: bool) -> None:
+    """Print published figures beside ours.
+
+    mlirl: section 2.5, inverse reinforcement learning with a temporal-logic task.
+    """
+    from jaxltl import reproduce as figures
+
+    del what  # the only choice so far
+    with _float64():
+        result = figures.mlirl(progress=lambda text: click.echo(text, err=True))
+    click.echo(figures.mlirl_table(result))
+    if as_json:
+        _print_json(result)

@@ -1,0 +1,412 @@
+"""Pictures, one call each: automata, grid maps with values and policies, learning curves.
+
+Each function returns a new matplotlib ``Figure`` and touches no global state, so it works
+without a display and in any thread. ``figure.savefig("name.svg")`` writes it.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, FancyArrowPatch, Polygon, Rectangle
+from matplotlib.path import Path
+from numpy.typing import ArrayLike, NDArray
+
+from jaxltl import drawing
+from jaxltl.core.automaton import Automaton, guards
+from jaxltl.envs.gridworld import parse_map
+
+INK, MUTED, FAINT = "#1f2a37", "#6b7785", "#d5dae0"
+ACCENT, GOOD, PAPER = "#1f6f8b", "#e4f1ea", "#ffffff"
+_SERIES = ("#1f6f8b", "#c2571a", "#5b7f2b", "#7a4f9a", "#a23b5b", "#4a5a6a")
+_KINDS = ("#dfd0ea", "#f5d6b3", "#d3e6e8", "#e3ddd0", "#f0d3df", "#dbe3b8")
+# Cells are often named for a colour, and then have it.
+_NAMED = {"r": "#f0b9b1", "y": "#f7e08e", "g": "#bfe3c4", "b": "#bcd3f2"}
+# What is well is light, so that the cells that are not stand out.
+_SCALE = LinearSegmentedColormap.from_list(
+    "probability", ["#2f2b57", "#4a5a92", "#7f9cc0", "#bfd3df", "#f6f8f4"]
+)
+_STEPS = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)}
+
+
+def to_bytes(figure: Figure, kind: str = "svg", dpi: int = 150) -> bytes:
+    """A figure as the bytes of a file.
+
+    Args:
+      figure: the figure.
+      kind: ``"svg"``, ``"png"`` or ``"pdf"``.
+      dpi: dots per inch of a PNG.
+    """
+    buffer = io.BytesIO()
+    # Without a date, the same figure gives the same bytes.
+    metadata = {"Date": None} if kind == "svg" else None
+    figure.savefig(buffer, format=kind, dpi=dpi, metadata=metadata, facecolor=PAPER)
+    return buffer.getvalue()
+
+
+# --- automata -------------------------------------------------------------------------------
+
+
+def automaton(automaton: Automaton, *, names: bool = True) -> Figure:
+    """An automaton as a graph from left to right.
+
+    Final states have a double circle. States in which the word is already rejected stand
+    below, in grey. Needs no graphviz.
+
+    Args:
+      automaton: the automaton.
+      names: list the formula that each state has left to satisfy under the graph.
+
+    Returns:
+      The figure, in inches that suit the graph.
+    """
+    table = replace(
+        automaton,
+        delta=np.asarray(automaton.delta),
+        final=np.asarray(automaton.final),
+        initial=int(automaton.initial),
+    )
+    texts = _guard_texts(table)
+    graph = drawing.arrange(table.delta, int(table.initial), drawing.rejecting(table), texts)
+    lines = _state_lines(table, graph.size[0]) if names else []
+    if names and "else" in texts.values():
+        lines.append("else: every letter that no other arrow of the state reads")
+    width, height = graph.size
+    below = 0.19 * len(lines) + (0.25 if lines else 0.0)
+    figure = Figure(figsize=(width, height + below), facecolor=PAPER)
+    axes = figure.add_axes((0, below / (height + below), 1, height / (height + below)))
+    axes.set(xlim=(0, width), ylim=(0, height), aspect="equal")
+    axes.axis("off")
+    doomed = drawing.rejecting(table)
+    for edge in graph.edges:
+        color = MUTED if doomed[edge.target] else INK
+        _edge(axes, edge.curve, FAINT if doomed[edge.source] else color)
+    for label in graph.labels:
+        axes.text(
+            label.center[0], label.center[1], label.text, ha="center", va="center",
+            fontsize=drawing.FONT_SIZE, color=MUTED if doomed[label.target] else INK,
+            linespacing=1.15, zorder=4, parse_math=False,
+            bbox={"facecolor": PAPER, "edgecolor": "none", "pad": 0.8},
+        )
+    start = graph.position[int(table.initial)]
+    tail = start - [drawing.RADIUS + 0.42, 0]
+    _edge(axes, np.array([tail, (tail + start) / 2, start - [drawing.RADIUS, 0]]), INK)
+    for q, center in enumerate(graph.position):
+        _state(axes, center, str(q), bool(table.final[q]), bool(doomed[q]))
+    for i, line in enumerate(lines):
+        figure.text(
+            0.25 / width, (below - 0.19 * (i + 0.5)) / (height + below), line, fontsize=8,
+            color=MUTED, va="center", family="monospace", parse_math=False,
+        )
+    return figure
+
+
+def pretty_guard(text: str) -> str:
+    """A guard in the signs of logic; quoted names stay as they are.
+
+    >>> pretty_guard('!a & b | "x & y"')
+    '¬a ∧ b ∨ "x & y"'
+    """
+    signs = {"!": "¬", "&": "∧", "|": "∨", "true": "⊤"}
+    return re.sub(
+        r'"(?:[^"\\]|\\.)*"|!|&|\||\btrue\b', lambda m: signs.get(m[0], m[0]), text
+    )
+
+
+def _guard_texts(table: Automaton) -> dict[tuple[int, int], str]:
+    """Guards for drawing: the longest of each state says "else", which is shorter and exact."""
+    texts = {pair: pretty_guard(text) for pair, text in guards(table).items()}
+    for q in range(len(table.delta)):
+        mine = [pair for pair in texts if pair[0] == q]
+        longest = max(mine, key=lambda pair: (len(texts[pair]), pair[0] == pair[1]))
+        if len(mine) > 1 and len(texts[longest]) > 8:
+            texts[longest] = "else"
+    return texts
+
+
+def _state_lines(table: Automaton, width: float) -> list[str]:
+    lines = []
+    for q, name in enumerate(table.state_names):
+        wrapped = textwrap.wrap(name, max(30, int(width * 13.5)), max_lines=3, placeholder=" …")
+        indent = " " * (len(str(q)) + 2)
+        lines += [f"{q}: {wrapped[0]}", *(indent + w for w in wrapped[1:])]
+    return lines
+
+
+def _edge(axes: Axes, curve: NDArray[np.float64], color: str) -> None:
+    codes = [Path.MOVETO] + [Path.CURVE3 if len(curve) == 3 else Path.CURVE4] * (len(curve) - 1)
+    axes.add_patch(
+        FancyArrowPatch(
+            path=Path(curve, codes), arrowstyle="-|>,head_length=5,head_width=2.4",
+            mutation_scale=1, color=color, linewidth=1.1, zorder=2, joinstyle="miter",
+        )
+    )
+
+
+def _state(axes: Axes, center: NDArray[np.float64], text: str, final: bool, doomed: bool) -> None:
+    line, fill = (MUTED, "#f2f3f5") if doomed else (INK, GOOD if final else PAPER)
+    axes.add_patch(
+        Circle(tuple(center), drawing.RADIUS, facecolor=fill, edgecolor=line, lw=1.3, zorder=5)
+    )
+    if final:
+        inner = drawing.RADIUS - 0.05
+        axes.add_patch(
+            Circle(tuple(center), inner, facecolor="none", edgecolor=line, lw=1, zorder=5)
+        )
+    axes.text(center[0], center[1], text, ha="center", va="center_baseline", fontsize=11,
+              color=line, zorder=6)
+
+
+# --- grids ----------------------------------------------------------------------------------
+
+
+def grid(
+    cells: str | NDArray[np.str_],
+    values: ArrayLike | None = None,
+    policy: ArrayLike | None = None,
+    *,
+    titles: Sequence[str] | str = "",
+    label: str = "",
+    limits: tuple[float, float] | None = (0.0, 1.0),
+    actions: Sequence[str] = ("up", "down", "left", "right"),
+    wall: str = "#",
+) -> Figure:
+    """A map, with a value in each cell as a colour, and a policy as arrows.
+
+    Args:
+      cells: a text map (see :func:`jaxltl.envs.gridworld.parse_map`) or its cells.
+      values: ``float[S]``, or ``float[M, S]`` for M panels; NaN leaves a cell blank.
+      policy: ``float[S, A]`` or ``int[S]``, or with M panels first; arrows are as long as
+        their action is likely, and a row of NaN has none.
+      titles: one per panel.
+      label: what the colours mean.
+      limits: values at the ends of the scale; None takes the data's.
+      actions: the name of each action, of up, down, left and right.
+      wall: the kind of cell that is not a place.
+
+    Returns:
+      The figure.
+
+    Raises:
+      ValueError: values or policy do not fit the map, or an action has no direction.
+    """
+    kinds = parse_map(cells) if isinstance(cells, str) else np.asarray(cells)
+    panels, arrows = _panels(kinds, values, policy, len(actions))
+    for name in actions:
+        if policy is not None and name not in _STEPS:
+            raise ValueError(f"action {name!r} has no direction; use {', '.join(_STEPS)}.")
+    count = next((len(x) for x in (panels, arrows) if x is not None), 1)
+    titles = [titles] * count if isinstance(titles, str) else list(titles)
+    rows, columns = kinds.shape
+    across = 2 if count == 4 else min(count, 3)
+    down = -(-count // across)
+    size = float(np.clip(5.2 / max(rows, columns), 0.16, 0.52))
+    figure = Figure(
+        figsize=(across * (columns * size + 0.35) + (0.75 if panels is not None else 0.1),
+                 down * (rows * size + 0.55)),
+        layout="constrained", facecolor=PAPER,
+    )
+    all_axes = np.atleast_1d(figure.subplots(down, across, squeeze=False)).ravel()
+    if limits is None and panels is not None:
+        limits = (float(np.nanmin(panels)), float(np.nanmax(panels)))
+    low, high = limits or (0.0, 1.0)
+    for axes in all_axes[count:]:
+        axes.axis("off")
+    for m, axes in enumerate(all_axes[:count]):
+        shown = None if panels is None else panels[m]
+        image = _cells(axes, kinds, shown, low, high, wall, arrows is None)
+        if arrows is not None:
+            _arrows(axes, kinds.shape, arrows[m], shown, low, high, actions)
+        axes.set_title(titles[m], fontsize=9.5, color=INK, pad=5, loc="left", parse_math=False)
+    if panels is not None:
+        bar = figure.colorbar(
+            image, ax=all_axes.tolist(), shrink=0.6, pad=0.015, aspect=24
+        )
+        bar.set_label(label, fontsize=9, color=INK)
+        bar.outline.set_visible(False)
+        bar.ax.tick_params(labelsize=8, color=MUTED, labelcolor=INK, length=2)
+    return figure
+
+
+def _panels(
+    kinds: NDArray[np.str_], values: ArrayLike | None, policy: ArrayLike | None, num_actions: int
+) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+    """Values as ``[M, S]`` and policies as ``[M, S, A]``."""
+    size = kinds.size
+    panels = arrows = None
+    if values is not None:
+        panels = np.atleast_2d(np.asarray(values, float))
+        if panels.ndim != 2 or panels.shape[1] != size:
+            raise ValueError(
+                f"values have shape {np.shape(values)}; the map has {size} cells, so pass "
+                f"[{size}] or [panels, {size}]."
+            )
+    if policy is not None:
+        given = np.asarray(policy)
+        if given.dtype.kind in "iu":
+            given = np.eye(num_actions)[given]
+        arrows = given[None] if given.ndim == 2 else given
+        if arrows.shape[1:] != (size, num_actions):
+            raise ValueError(
+                f"policy has shape {np.shape(policy)}; the map has {size} cells and there are "
+                f"{num_actions} actions, so pass [{size}, {num_actions}], or panels of that."
+            )
+    if panels is not None and arrows is not None and len(panels) != len(arrows):
+        raise ValueError(f"values have {len(panels)} panels and the policy {len(arrows)}.")
+    return panels, arrows
+
+
+def _cells(
+    axes: Axes, kinds: NDArray[np.str_], values: NDArray[np.float64] | None,
+    low: float, high: float, wall: str, numbers: bool,
+) -> Any:
+    rows, columns = kinds.shape
+    names, counts = np.unique(kinds, return_counts=True)
+    plain = "." if "." in names else str(names[np.argmax(counts)])
+    special = [str(k) for k in names if k not in (plain, wall)]
+    shown: NDArray[np.float64] = np.full(kinds.shape, np.nan)
+    if values is not None:
+        shown = values.reshape(kinds.shape)
+    image = axes.imshow(
+        np.ma.masked_invalid(shown), cmap=_SCALE, vmin=low, vmax=high,
+        extent=(0, columns, rows, 0), interpolation="nearest",
+    )
+    tiny = max(rows, columns) > 16
+    for (r, c), kind in np.ndenumerate(kinds):
+        blank = np.isnan(shown[r, c])
+        if kind == wall:
+            axes.add_patch(Rectangle((c, r), 1, 1, facecolor="#55606c", lw=0))
+        elif kind in special:
+            color = _NAMED.get(
+                re.sub(r"\d+$", "", str(kind)).lower()[:1] if len(str(kind)) < 3 else "",
+                _KINDS[special.index(str(kind)) % len(_KINDS)],
+            )
+            if blank:
+                axes.add_patch(Rectangle((c, r), 1, 1, facecolor=color, lw=0))
+            if not tiny and blank:
+                axes.text(c + 0.5, r + 0.5, kind, ha="center", va="center", fontsize=9, color=INK,
+                          parse_math=False)
+            elif not tiny:
+                axes.text(c + 0.06, r + 0.06, kind, ha="left", va="top", fontsize=6.5, color=INK,
+                          weight="bold", parse_math=False, zorder=5,
+                          bbox={"facecolor": color, "edgecolor": "none", "pad": 0.9})
+        if numbers and not blank and not tiny:
+            dark = shown[r, c] < low + 0.5 * (high - low)
+            axes.text(c + 0.5, r + 0.58, _short_number(float(shown[r, c])), ha="center", va="center",
+                      fontsize=7, color=PAPER if dark else INK)
+    lines = [((0, r), (columns, r)) for r in range(rows + 1)]
+    lines += [((c, 0), (c, rows)) for c in range(columns + 1)]
+    axes.add_collection(LineCollection(lines, colors=FAINT, linewidths=0.6))
+    axes.set(xlim=(0, columns), ylim=(rows, 0), aspect="equal")
+    _number_cells(axes, rows, columns)
+    return image
+
+
+def _short_number(value: float) -> str:
+    """Three places; a probability goes without its leading zero."""
+    return f"{value:.3f}".removeprefix("0") if 0 <= value < 1 else f"{value:.3g}"
+
+
+def _number_cells(axes: Axes, rows: int, columns: int) -> None:
+    for axis, count in ((axes.xaxis, columns), (axes.yaxis, rows)):
+        stride = max(1, count // 10)
+        axis.set_ticks(np.arange(0, count, stride) + 0.5, labels=[
+            str(i + 1) for i in range(0, count, stride)])
+    axes.xaxis.tick_top()
+    axes.tick_params(length=0, labelsize=6.5, labelcolor=MUTED, pad=2)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def _arrows(
+    axes: Axes, shape: tuple[int, int], policy: NDArray[np.float64],
+    values: NDArray[np.float64] | None, low: float, high: float, actions: Sequence[str],
+) -> None:
+    """Triangles from the centre of each cell, as long as the action is likely."""
+    for state, chances in enumerate(policy):
+        row, column = divmod(state, shape[1])
+        dark = values is not None and values[state] < low + 0.5 * (high - low)
+        for a, chance in enumerate(chances):
+            if not chance > 0.04:
+                continue
+            step = np.array(_STEPS[actions[a]], float)
+            side = step[::-1]
+            center = np.array([column + 0.5, row + 0.5])
+            tip = center + step * (0.1 + 0.34 * chance)
+            base = center + step * 0.03
+            width = 0.045 + 0.075 * chance
+            axes.add_patch(
+                Polygon([base + side * width, tip, base - side * width], closed=True, lw=0,
+                        facecolor=PAPER if dark else INK, alpha=0.92, zorder=4)
+            )
+
+
+# --- curves ---------------------------------------------------------------------------------
+
+
+def curves(
+    metrics: Mapping[str, ArrayLike] | Any,
+    *,
+    steps: ArrayLike | None = None,
+    show: Sequence[str] | None = None,
+) -> Figure:
+    """Learning curves, one panel per figure: the median over seeds, and their spread.
+
+    Args:
+      metrics: figures ``[T]`` or ``[N, T]`` by name, or a learner's ``Metrics``.
+      steps: ``[T]``, the step of each figure; default 1, 2, ...
+      show: names in order; default all that are not wholly NaN.
+
+    Returns:
+      The figure. The band holds all the seeds; it is left out for a single one.
+
+    Raises:
+      ValueError: there is nothing to show.
+    """
+    if not isinstance(metrics, Mapping):
+        metrics = {name: getattr(metrics, name) for name in metrics.__dataclass_fields__}
+    series = {k: np.atleast_2d(np.asarray(v, float)) for k, v in metrics.items()}
+    chosen = [
+        k for k in (show or series) if k in series and np.isfinite(series[k]).any()
+    ]
+    if not chosen:
+        raise ValueError(f"curves: nothing to show among {', '.join(series) or 'no figures'}.")
+    figure = Figure(figsize=(3.1 * len(chosen) + 0.2, 2.5), layout="constrained", facecolor=PAPER)
+    for i, (name, axes) in enumerate(
+        zip(chosen, figure.subplots(1, len(chosen), squeeze=False)[0], strict=True)
+    ):
+        _curve(axes, series[name], steps, name.replace("_", " "), _SERIES[i % len(_SERIES)])
+    return figure
+
+
+def _curve(
+    axes: Axes, rows: NDArray[np.float64], steps: ArrayLike | None, name: str, color: str
+) -> None:
+    x = np.arange(1, rows.shape[1] + 1) if steps is None else np.asarray(steps)
+    rows = np.where(np.isfinite(rows), rows, np.nan)
+    middle = np.nanmedian(rows, axis=0) if len(rows) > 1 else rows[0]
+    if len(rows) > 1:
+        axes.fill_between(x, np.nanmin(rows, axis=0), np.nanmax(rows, axis=0), color=color,
+                          alpha=0.18, lw=0)
+    axes.plot(x, middle, color=color, lw=1.6)
+    positive = rows[rows > 0]
+    if positive.size and np.nanmin(rows) > 0 and positive.max() > 100 * positive.min():
+        axes.set_yscale("log")
+    axes.set_title(name, fontsize=9.5, color=INK, loc="left")
+    axes.set_xlabel("step", fontsize=8.5, color=MUTED)
+    axes.tick_params(labelsize=8, color=FAINT, labelcolor=INK, length=3)
+    axes.grid(color=FAINT, lw=0.5)
+    axes.set_axisbelow(True)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(FAINT)

@@ -1,0 +1,236 @@
+"""The command line: what it prints and writes, and that mistakes come as one plain line."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from jaxltl.cli import main
+from tests.test_task import SHOWN, TASK, write  # noqa: F401
+
+QUICK = ("discount = 0.9", 'discount = 0.9\nmu = 0.01\nsteps = 40\ntolerance = 1e-6\n'
+         'optimizer = "adam"\nlearning_rate = 0.3\navoid = ["r"]')
+
+
+def run(*arguments, input=None):
+    return CliRunner().invoke(main, [str(a) for a in arguments], input=input)
+
+
+def failure(*arguments, input=None):
+    """The message of a command that must fail plainly."""
+    result = run(*arguments, input=input)
+    assert result.exit_code == 2, result.output
+    assert result.stderr.startswith("error: ") and "Traceback" not in result.output
+    return result.stderr
+
+
+# --- automaton ------------------------------------------------------------------------------
+
+
+def test_automata_in_order_and_from_standard_input():
+    result = run("automaton", "F a", "G b")
+    assert result.exit_code == 0
+    assert result.output.index("cosafe automaton") < result.output.index("safety automaton")
+    result = run("automaton", "-F", "-", "--to", "json", input="F a\n\nF b & F c\n")
+    sizes = [len(json.loads(line)["delta"]) for line in result.output.splitlines()]
+    assert sizes == [2, 4]
+
+
+@pytest.mark.parametrize(("form", "sign"), [("dot", "digraph"), ("svg", "<svg"), ("text", ">  0")])
+def test_forms_of_an_automaton(form, sign, monkeypatch):
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    result = run("automaton", "F a", "--to", form)
+    assert result.exit_code == 0 and sign in result.output
+
+
+def test_graphviz_draws_if_it_is_there(monkeypatch, tmp_path):
+    program = tmp_path / "dot"
+    program.write_text("#!/bin/sh\ncat > /dev/null\necho '<svg>by graphviz</svg>'\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("shutil.which", lambda name: str(program))
+    assert "by graphviz" in run("automaton", "F a", "--to", "svg").output
+    program.write_text("#!/bin/sh\nexit 1\n")
+    assert "matplotlib" in run("automaton", "F a", "--to", "svg").output
+
+
+def test_mistakes_in_formulas(tmp_path):
+    assert "column 5" in failure("automaton", "F (a")
+    assert "neither co-safe nor a safety formula" in failure("automaton", "G F a")
+    assert "standard input, line 2: " in failure("automaton", "-F", "-", input="F a\nF )\n")
+    assert "No such file" in failure("automaton", "-F", tmp_path / "none")
+    result = run("automaton")
+    assert result.exit_code == 2 and "give at least one formula" in result.stderr
+
+
+# --- learn ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    """A finished run with two seeds: its directory, and what it printed."""
+    place = tmp_path_factory.mktemp("learned")
+    (place / "task.toml").write_text(TASK.replace(*QUICK))
+    (place / "shown.json").write_text(json.dumps(SHOWN))
+    result = run("learn", place / "task.toml", "--out", place / "out", "--seeds", 2, "--json")
+    assert result.exit_code == 0, result.output
+    return place, result
+
+
+def test_learn_prints_evidence(learned):
+    _, result = learned
+    for words in ("probability of doing the task", "certified", "best achievable", "weights",
+                  "over 2 seeds"):
+        assert words in result.stdout
+    last = json.loads(result.stdout.splitlines()[-1])
+    learned_mean, best = last["satisfaction"]["mean"], last["best_achievable"]["mean"]
+    assert learned_mean["lower"] <= learned_mean["value"] <= learned_mean["upper"]
+    assert learned_mean["value"] <= best["upper"] + 1e-12 and best["value"] > 0.999
+    assert last["satisfaction"]["minimum"].keys() >= {"row", "column", "value", "lower", "upper"}
+    assert set(last["weights"]) == {"demonstrated", "goal", "progress", "avoid", "time"}
+    assert len(last["seeds"]["mean"]) == 2
+
+
+def test_learn_says_that_it_did_not_converge(learned):
+    _, result = learned
+    assert not json.loads(result.stdout.splitlines()[-1])["training"]["converged"]
+    assert "warning: Learning did not converge in 40 steps (gradient norm" in result.stdout
+
+
+def test_learn_writes_its_results(learned):
+    place, result = learned
+    names = {path.name for path in (place / "out").iterdir()}
+    assert names == {"policy.npz", "result.json", "report.html", "task.toml", "automaton.svg",
+                     "values.svg", "policy.svg", "learning.svg"}
+    written = json.loads((place / "out" / "result.json").read_text())
+    assert written == json.loads(result.stdout.splitlines()[-1])
+    page = (place / "out" / "report.html").read_text()
+    assert page.count("data:image/svg+xml;base64,") == 4
+    assert "http" not in page.replace("http-equiv", "") and "prefers-color-scheme: dark" in page
+
+
+def test_the_written_policy_runs_alone(learned):
+    place, result = learned
+    with np.load(place / "out" / "policy.npz") as file:
+        policy = dict(file)
+    rng = np.random.default_rng(0)
+    moves = {"up": -3, "down": 3, "left": -1, "right": 1}
+    done = 0
+    for _ in range(300):
+        state = 3
+        memory = policy["initial_memory"][state]
+        for _ in range(60):
+            chances = policy["policy"][state, memory]
+            action = policy["actions"][rng.choice(4, p=chances / chances.sum())]
+            row, column = divmod(state, 3)
+            off = (row == 0 and action == "up") or (row == 1 and action == "down") or (
+                column == 0 and action == "left") or (column == 2 and action == "right")
+            state = state if off or state == 5 else state + moves[str(action)]
+            memory = policy["next_memory"][state, memory]
+        done += state == 5
+    start = policy["satisfaction"][3, policy["initial_memory"][3]]
+    assert abs(done / 300 - start) < 4 * np.sqrt(start * (1 - start) / 300) + 0.02
+
+
+def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch):
+    place, _ = learned
+    task, out = place / "task.toml", place / "again"
+    reports = []
+
+    def interrupt(self, *_, **__):
+        reports.append(self)
+        if len(reports) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("tqdm.tqdm.set_postfix", interrupt)
+    result = run("learn", task, "--out", out, "--seeds", 2)
+    assert result.exit_code == 130 and "goes on from the last checkpoint" in result.stderr
+    assert len(list(out.glob("checkpoint-*.npz"))) == 1
+    assert not (out / "result.json").exists()
+    monkeypatch.undo()
+    result = run("learn", task, "--out", out, "--seeds", 2)
+    assert result.exit_code == 0 and "going on from" in result.stderr
+    assert not list(out.glob("checkpoint-*.npz"))
+    with np.load(out / "policy.npz") as a, np.load(place / "out" / "policy.npz") as b:
+        for name in ("policy", "weights", "all_weights", "satisfaction"):
+            assert a[name].tobytes() == b[name].tobytes()
+    first, second = ((p / "learning.svg").read_text() for p in (out, place / "out"))
+    assert len(first) == len(second)  # the history too is whole
+
+
+def test_another_task_does_not_go_on_from_a_checkpoint(learned, monkeypatch):
+    place, _ = learned
+    out = place / "other"
+    (place / "b.toml").write_text((place / "task.toml").read_text().replace("0.01", "0.02"))
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tqdm.tqdm.set_postfix", interrupt)
+    run("learn", place / "task.toml", "--out", out)
+    result = run("learn", place / "b.toml", "--out", out)
+    assert "going on from" not in result.stderr
+    assert len(list(out.glob("checkpoint-*.npz"))) == 2
+
+
+def test_a_task_that_cannot_be_done_from_some_start(write, tmp_path):  # noqa: F811
+    path = write(
+        (". . r\nb . y", "b # .\n. # y"), ('initial = "!r & !y"', 'initial = "!y"'),
+        ('"!r U y"', '"F y"'), ("discount = 0.9", 'discount = 0.5\nsteps = 3\noptimizer = "adam"'),
+        shown={"demonstrations": [{"cells": [[1, 3]], "actions": ["down"]}]},
+    )
+    result = run("learn", path, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert ("warning: No policy can do the task from 2 of 3 initial states: "
+            "row 1, column 1; row 2, column 1.") in result.stdout
+    written = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert written["impossible_starts"] == [
+        {"state": 0, "row": 1, "column": 1}, {"state": 3, "row": 2, "column": 1}]
+    assert written["best_achievable"]["minimum"]["value"] == 0
+
+
+@pytest.mark.parametrize(("replacement", "message"), [
+    (("discount = 0.9", "discount = "), "line 18"),
+    (("!r U y", "!r U U y"), "column 6"),
+    (("!r U y", "!red U y"), "the task mentions the proposition 'red'"),
+    (("!r U y", "G F y"), "neither co-safe nor a safety formula"),
+    (("!r U y", "G !r"), "co-safe"),
+    (("discount = 0.9", "discount = 0.9\nstart = [1, 2]"), "start has 2 numbers; there are 4"),
+    (("discount = 0.9", 'discount = 0.9\navoid = ["q"]'), "'q' is not a proposition"),
+    (("discount = 0.9", "discount = 0.9\nprogress = [9]"), "automaton state 9 does not exist"),
+])
+def test_mistakes_come_as_one_line(write, tmp_path, replacement, message):  # noqa: F811
+    assert message in failure("learn", write(replacement), "--out", tmp_path / "out")
+
+
+def test_places_that_cannot_be_used(write, tmp_path):  # noqa: F811
+    assert "cannot be read" in failure("learn", tmp_path / "none.toml")
+    path = write()
+    assert "cannot write into" in failure("learn", path, "--out", path / "below")
+    (tmp_path / "out" / "task.toml").mkdir(parents=True)
+    assert "task.toml" in failure("learn", path, "--out", tmp_path / "out")
+
+
+def test_check(write):  # noqa: F811
+    result = run("check", write())
+    assert result.output == "ok: 6 states, 3 memory states, 1 demonstrations of 2 pairs\n"
+    assert "demonstration 1, step 1" in failure(
+        "check", write(shown={"demonstrations": [{"cells": [[9, 9]], "actions": ["up"]}]}))
+
+
+def test_the_examples_are_sound():
+    for name in ("two_goals", "slippery_delivery"):
+        assert run("check", f"examples/{name}.toml").output.startswith("ok: ")
+
+
+def test_help_does_not_load_the_pictures():
+    code = (
+        "import sys; from click.testing import CliRunner; from jaxltl.cli import main; "
+        "r = CliRunner().invoke(main, ['--help']); assert r.exit_code == 0; "
+        "print([m for m in ('matplotlib', 'tqdm', 'jaxltl.learn', 'jaxltl.plot') "
+        "if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
