@@ -43,9 +43,7 @@ def _plain_errors(command: Callable[..., None]) -> Callable[..., None]:
     def run(*args: Any, **options: Any) -> None:
         try:
             command(*args, **options)
-        except jaxltl.NotConverged as error:
-            raise _Failure(str(error)) from None
-        except ValueError as error:
+        except (ValueError, jaxltl.NotConverged) as error:
             raise _Failure(str(error)) from None
         except OSError as error:
             where = f"{error.filename!r}: " if error.filename else ""
@@ -130,7 +128,8 @@ def _learn(task: Any, out: Path, seed: int, seeds: int) -> Outcome:
         file.write(task.path.read_bytes())
     if checkpoint.exists():
         click.echo(f"going on from {checkpoint}", err=True)
-    with tqdm(total=task.learner.get("steps", job.STEPS), unit="step", leave=False) as bar:
+    total = task.learner.get("steps", job.STEPS)
+    with tqdm(total=total, unit="step", leave=False, delay=0.5) as bar:
 
         def report(step: int, figures: Mapping[str, np.ndarray]) -> None:
             bar.update(step - bar.n)

@@ -343,7 +343,8 @@ def _wrap(text: str, width: int = 22) -> str:
 
 @cache
 def _line_width(line: str) -> float:
-    return float(TextPath((0, 0), line.replace("$", "\\$") or " ", size=FONT_SIZE).get_extents().width)
+    path = TextPath((0, 0), line.replace("$", "\\$") or " ", size=FONT_SIZE)
+    return float(path.get_extents().width)
 
 
 def _size(text: str) -> Points:

@@ -6,7 +6,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -51,12 +51,32 @@ def _step_until_flat(
 
 
 @functools.cache  # the loop is compiled once for each step function, so it must stay the same one
-def _lanes(step: learner.Step) -> learner.Step:
-    return jax.vmap(functools.partial(_step_until_flat, step), in_axes=(0, None, 0))
+def _lanes(step: learner.Step, num_lanes: int) -> learner.Step:
+    one = functools.partial(_step_until_flat, step)
+    if num_lanes > 1:
+        return jax.vmap(one, in_axes=(0, None, 0))
+
+    def alone(states: Any, problem: Any, settings: Any) -> tuple[Any, dict[str, jax.Array]]:
+        # Without vmap, whose loops and branches take several times as long to compile.
+        state, setting = jax.tree.map(lambda x: x[0], (states, settings))
+        return jax.tree.map(lambda x: x[None], one(state, problem, setting))
+
+    return alone
+
+
+def _strong(tree: Any) -> Any:
+    """Arrays whose type is not weak, so that the first chunk's program serves the others too."""
+
+    def one(x: jax.Array) -> jax.Array:
+        is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        return x if is_key else jax.lax.convert_element_type(x, x.dtype)
+
+    return jax.tree.map(one, tree)
 
 
 def optimize(
     step: learner.Step,
+    metrics: type[Any],
     states: Any,
     problem: Any,
     hparams: Any,
@@ -74,6 +94,7 @@ def optimize(
 
     Args:
       step: the learner's step.
+      metrics: the dataclass of its metrics, among them ``gradient_norm``.
       states: N states, leading axis.
       problem: shared by the runs.
       hparams: numbers, shared, or arrays ``[N]``, one for each run.
@@ -96,23 +117,23 @@ def optimize(
     shape, spread = (num_lanes,), functools.partial(jnp.broadcast_to, shape=(num_lanes,))
     dtype = states.value.dtype
     settings = jax.tree.map(lambda x: spread(jnp.asarray(x, dtype)), (hparams, tolerance))
-    batched = _lanes(step)
-    names = jax.eval_shape(batched, states, problem, settings)[1]
+    batched = _lanes(step, num_lanes)
+    names = ("step", *(field.name for field in fields(metrics)))
     empty = np.zeros((-(-num_steps // chunk) * _ROWS, *shape))
     saved = {"states": states, "rows": jnp.int32(0), "history": dict.fromkeys(names, empty)}
     if checkpoint is not None and checkpoint.exists():
         saved = learner.load(checkpoint, saved)
-    states, rows = saved["states"], int(saved["rows"])
+    states, rows = _strong(saved["states"]), int(saved["rows"])
     history = {name: np.array(column) for name, column in saved["history"].items()}
     while (done := int(np.max(states.step))) < num_steps:
         if rows and bool(np.all(history["gradient_norm"][rows - 1] <= tolerance)):
             break
-        states, metrics = learner.run(
+        states, figures = learner.run(
             batched, states, problem, settings,
             num_steps=min(chunk, num_steps - done), max_rows=_ROWS,
         )
-        added = len(metrics["step"])
-        for name, column in metrics.items():
+        added = len(figures["step"])
+        for name, column in figures.items():
             history[name][rows : rows + added] = column
         rows += added
         if checkpoint is not None:
@@ -186,14 +207,13 @@ def _mlirl(
     num_steps, tolerance = spec.get("steps", STEPS), spec.get("tolerance", _TOLERANCE)
     states = jax.jit(jax.vmap(mlirl.init, (0, None, None)))(keys, problem, hparams)
     states, history = optimize(
-        mlirl.step, states, problem, hparams, num_steps=num_steps, tolerance=tolerance,
-        report=report, checkpoint=checkpoint,
+        mlirl.step, mlirl.Metrics, states, problem, hparams, num_steps=num_steps,
+        tolerance=tolerance, report=report, checkpoint=checkpoint,
     )
-    solution, nll = jax.jit(jax.vmap(_policy_and_likelihood, (0, None, None)))(
-        states.parameters, problem, hparams
-    )
-    policy = solution.policy
-    gradient_norm, status = history["gradient_norm"][-1], np.asarray(solution.status)
+    evaluate = jax.jit(_policy_and_likelihood)
+    found = [evaluate(parameters, problem, hparams) for parameters in states.parameters]
+    policy, nll, codes = (jnp.stack(column) for column in zip(*found, strict=True))
+    gradient_norm, status = history["gradient_norm"][-1], np.asarray(codes)
     flat = history["gradient_norm"] <= tolerance
     first = np.where(flat.any(axis=0), np.argmax(flat, axis=0), len(flat) - 1)
     steps = np.take_along_axis(history["step"], first[None], axis=0)[0]
@@ -208,11 +228,11 @@ def _mlirl(
 
 def _policy_and_likelihood(
     parameters: Any, problem: mlirl.Problem, hparams: mlirl.Hparams
-) -> tuple[Solution, jax.Array]:
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     solution = mlirl.solve(parameters, problem, hparams)
     seen = problem.counts > 0
     log_policy = jnp.log(jnp.where(seen, solution.policy, 1))
-    return solution, -jnp.sum(problem.counts * log_policy)
+    return solution.policy, -jnp.sum(problem.counts * log_policy), solution.status
 
 
 METHODS = {"mlirl": _mlirl}
@@ -355,7 +375,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "seeds": {
             "first": outcome.seed,
             "number": len(learned.loss),
-            "kept": outcome.seed if len(learned.loss) == 1 else i,
+            "kept": i,
             "converged": int(learned.converged.sum()),
             "mean": mean,
             "minimum": least,

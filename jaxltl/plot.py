@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, FancyArrowPatch, Polygon, Rectangle
+from matplotlib.patches import Circle, FancyArrowPatch, Rectangle
 from matplotlib.path import Path
 from numpy.typing import ArrayLike, NDArray
 
@@ -74,6 +74,7 @@ def automaton(automaton: Automaton, *, names: bool = True) -> Figure:
         automaton,
         delta=np.asarray(automaton.delta),
         final=np.asarray(automaton.final),
+        letters=np.asarray(automaton.letters),
         initial=int(automaton.initial),
     )
     texts = _guard_texts(table)
@@ -302,8 +303,8 @@ def _cells(
                           bbox={"facecolor": color, "edgecolor": "none", "pad": 0.9})
         if numbers and not blank and not tiny:
             dark = shown[r, c] < low + 0.5 * (high - low)
-            axes.text(c + 0.5, r + 0.58, _short_number(float(shown[r, c])), ha="center", va="center",
-                      fontsize=7, color=PAPER if dark else INK)
+            axes.text(c + 0.5, r + 0.58, _short_number(float(shown[r, c])), ha="center",
+                      va="center", fontsize=7, color=PAPER if dark else INK)
     lines = [((0, r), (columns, r)) for r in range(rows + 1)]
     lines += [((c, 0), (c, rows)) for c in range(columns + 1)]
     axes.add_collection(LineCollection(lines, colors=FAINT, linewidths=0.6))
@@ -333,6 +334,8 @@ def _arrows(
     values: NDArray[np.float64] | None, low: float, high: float, actions: Sequence[str],
 ) -> None:
     """Triangles from the centre of each cell, as long as the action is likely."""
+    shapes: list[Any] = []
+    colors: list[str] = []
     for state, chances in enumerate(policy):
         row, column = divmod(state, shape[1])
         dark = values is not None and values[state] < low + 0.5 * (high - low)
@@ -345,10 +348,9 @@ def _arrows(
             tip = center + step * (0.1 + 0.34 * chance)
             base = center + step * 0.03
             width = 0.045 + 0.075 * chance
-            axes.add_patch(
-                Polygon([base + side * width, tip, base - side * width], closed=True, lw=0,
-                        facecolor=PAPER if dark else INK, alpha=0.92, zorder=4)
-            )
+            shapes.append([base + side * width, tip, base - side * width])
+            colors.append(PAPER if dark else INK)
+    axes.add_collection(PolyCollection(shapes, facecolors=colors, lw=0, alpha=0.92, zorder=4))
 
 
 # --- curves ---------------------------------------------------------------------------------

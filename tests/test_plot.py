@@ -69,8 +69,10 @@ def test_a_grid_with_values_and_policy():
     figure = plot.grid(MAP, values, policy, titles="memory 0", label="probability")
     assert plot.to_bytes(figure, "png").startswith(b"\x89PNG")
     greedy = plot.grid(MAP, policy=np.zeros(6, int))
-    assert len(greedy.axes[0].patches) > 0
-    panels = plot.grid(MAP, np.tile(values, (4, 1)), np.tile(policy, (4, 1, 1)), titles=list("abcd"))
+    assert len(greedy.axes[0].collections[-1].get_paths()) == 6
+    panels = plot.grid(
+        MAP, np.tile(values, (4, 1)), np.tile(policy, (4, 1, 1)), titles=list("abcd")
+    )
     assert [axes.get_title(loc="left") for axes in panels.axes[:4]] == list("abcd")
 
 

@@ -122,7 +122,7 @@ def test_a_missing_task_file(tmp_path):
 @pytest.mark.parametrize(("replacement", "message"), [
     ((". . r\n", ". . .\n"), r"\[world\] initial: 'r' is not a proposition of the map"),
     (("b . y", "b y"), r"\[world\] map row 2 has 2 cells, row 1 has 3"),
-    (('absorbing = ["y"]', "slip = 0.1\nlegend = { b = [] }"), r"'\.'\)? \(row 1, column 1\) is not in the legend"),
+    (('absorbing = ["y"]', "slip = 0.1\nlegend = { b = [] }"), r"\(row 1, column 1\) is not in"),
 ])
 def test_mistakes_in_the_world(write, replacement, message):
     with pytest.raises(ValueError, match=message):

@@ -18,7 +18,7 @@ import numpy as np
 from jax import lax
 
 from jaxltl.core.mdp import DenseMDP
-from jaxltl.core.operators import exists_successor, forall_successor
+from jaxltl.core.operators import exists_successor, first_action, forall_successor
 
 _MAX_SWEEPS = 256  # beyond, a worklist on the host is faster
 
@@ -50,7 +50,12 @@ class EndComponents(NamedTuple):
 
 
 def attractor(
-    model: Any, goal: jax.Array, allowed: jax.Array | None = None, *, rule: str = "exists"
+    model: Any,
+    goal: jax.Array,
+    allowed: jax.Array | None = None,
+    *,
+    rule: str = "exists",
+    among: jax.Array | None = None,
 ) -> Attractor:
     """States that a goal attracts: the least R with ``goal <= R`` closed under a rule.
 
@@ -60,6 +65,7 @@ def attractor(
       allowed: ``bool[S, A]``, the actions that count; default the available ones.
       rule: ``"exists"``: some allowed action reaches R with positive probability;
         ``"forall"``: every allowed action does (so a state without any is attracted).
+      among: ``bool[S]``, the states outside the goal that may join; default all.
 
     Returns:
       :class:`Attractor`. With ``"exists"`` the action is the one that makes progress.
@@ -76,29 +82,31 @@ def attractor(
     if rule not in ("exists", "forall"):
         raise ValueError(f"rule={rule!r}; choose exists or forall.")
     allowed = model.available if allowed is None else allowed
-    traced = is_traced((model, goal, allowed))
+    traced = is_traced((model, goal, allowed, among))
     most = jnp.iinfo(jnp.int32).max if traced else _MAX_SWEEPS
-    found, growing = _attractor_sweeps(model, goal, allowed, most, rule=rule)
+    among = jnp.ones(model.state_shape, bool) if among is None else among
+    found, growing = _attractor_sweeps(model, goal, allowed, among, most, rule=rule)
     if traced or not growing:
         return found
-    return _attractor_worklist(model, found, allowed, rule)
+    return _attractor_worklist(model, found, allowed, among, rule)
 
 
 @partial(jax.jit, static_argnames=("rule",))
-def _attractor_sweeps(model, goal, allowed, max_sweeps, *, rule):
+def _attractor_sweeps(model, goal, allowed, among, max_sweeps, *, rule):
     def body(carry):
         region, action, _, n = carry
         hit = allowed & exists_successor(model, region)
-        joins = hit.any(-1) if rule == "exists" else (hit | ~allowed).all(-1)
-        new = joins & ~region
-        action = jnp.where(new, jnp.argmax(hit, axis=-1).astype(jnp.int32), action)
+        some, first = first_action(hit)
+        joins = some if rule == "exists" else ~first_action(allowed & ~hit)[0]
+        new = joins & among & ~region
+        action = jnp.where(new, first, action)
         return region | new, action, new.any(), n + 1
 
     def unfinished(carry):
         *_, growing, n = carry
         return growing & (n < max_sweeps)
 
-    first = jnp.argmax(model.available, axis=-1).astype(jnp.int32)
+    _, first = first_action(model.available)
     start = (goal, first, jnp.bool_(True), jnp.int32(0))
     region, action, growing, _ = lax.while_loop(unfinished, body, start)
     return Attractor(region, action), growing
@@ -137,8 +145,9 @@ def almost_surely_reaching(
     allowed = model.available if allowed is None else allowed
 
     def inner(region: jax.Array) -> Attractor:
-        stay = allowed & forall_successor(model, region)
-        return attractor(model, goal, stay)
+        # First all states that are forced out, then those that cannot reach the goal inside.
+        outside = attractor(model, ~region, allowed, rule="forall", among=~goal).region
+        return attractor(model, goal, allowed & forall_successor(model, ~outside))
 
     found = attractor(model, goal, allowed) if reaching is None else reaching
 
@@ -235,7 +244,9 @@ def _predecessors(successor: np.ndarray, used: np.ndarray) -> Any:
     return sparse.csr_array((data, indices, indptr), shape=(rows, num_states)).tocsc()
 
 
-def _attractor_worklist(model, found: Attractor, allowed: jax.Array, rule: str) -> Attractor:
+def _attractor_worklist(
+    model, found: Attractor, allowed: jax.Array, among: jax.Array, rule: str
+) -> Attractor:
     """Finishes an attractor frontier by frontier, touching each transition once."""
     successor, used, next_memory = (np.asarray(x) for x in _support(model))
     num_actions, num_memory = successor.shape[1], next_memory.shape[1]
@@ -245,6 +256,7 @@ def _attractor_worklist(model, found: Attractor, allowed: jax.Array, rule: str) 
     action = np.array(found.action).ravel()
     open_ = np.array(allowed).ravel()  # pairs that count and have not been hit
     remaining = open_.reshape(-1, num_actions).sum(-1)
+    closed = ~np.array(among).ravel()
 
     def leading_to(frontier: np.ndarray) -> np.ndarray:
         """Flat pairs ``(s * Q + q) * A + a`` with a successor in the frontier."""
@@ -267,9 +279,9 @@ def _attractor_worklist(model, found: Attractor, allowed: jax.Array, rule: str) 
         s, a = np.divmod(pair, num_actions)
         if rule == "forall":
             np.subtract.at(remaining, s, 1)
-            joins = (remaining[s] == 0) & ~region[s]
+            joins = (remaining[s] == 0) & ~region[s] & ~closed[s]
         else:
-            joins = ~region[s]
+            joins = ~region[s] & ~closed[s]
         frontier, first = np.unique(s[joins], return_index=True)
         action[frontier] = a[joins][first]
         region[frontier] = True

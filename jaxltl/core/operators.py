@@ -153,12 +153,18 @@ def _(model: MDP, value: jax.Array) -> jax.Array:
 
 @exists_successor.register
 def _(model: MDP, region: jax.Array) -> jax.Array:
-    return jnp.any((model.probability > 0) & _gather(region, model.successor), axis=-1)
+    probability, successor = model.probability, model.successor
+    if successor.shape[-1] > _UNROLL:
+        return jnp.any((probability > 0) & _gather(region, successor), axis=-1)
+    found = jnp.zeros(model.available.shape, bool)
+    for k in range(successor.shape[-1]):
+        found |= (probability[..., k] > 0) & _gather(region, successor[..., k])
+    return found
 
 
 @forall_successor.register
 def _(model: MDP, region: jax.Array) -> jax.Array:
-    return jnp.all((model.probability <= 0) | _gather(region, model.successor), axis=-1)
+    return ~exists_successor(model, ~region)
 
 
 @sample_successor.register
@@ -277,6 +283,18 @@ def action_argmax(quantity: jax.Array, available: jax.Array) -> tuple[jax.Array,
         best = jnp.where(better, quantity[..., a], best)
         action = jnp.where(better, a, action)
     return best, action
+
+
+def first_action(condition: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Whether a condition ``bool[S, A]`` holds for some action, and the first one (or 0)."""
+    if condition.shape[-1] > _UNROLL:
+        return condition.any(axis=-1), condition.argmax(axis=-1).astype(jnp.int32)
+    some = jnp.zeros(condition.shape[:-1], bool)
+    action = jnp.zeros(condition.shape[:-1], jnp.int32)
+    for a in reversed(range(condition.shape[-1])):
+        some |= condition[..., a]
+        action = jnp.where(condition[..., a], a, action)
+    return some, action
 
 
 def is_deterministic(policy: jax.Array) -> bool:

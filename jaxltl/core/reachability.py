@@ -21,6 +21,7 @@ from jaxltl.core.operators import (
     action_argmax,
     action_mean,
     expectation,
+    first_action,
     forall_successor,
     induced_chain,
     policy_distribution,
@@ -180,7 +181,7 @@ def _complement(reach: Solution) -> Solution:
 def _policy_sets(model: Any, target: jax.Array, policy: jax.Array) -> _Sets:
     allowed = model.available & (policy > 0)
     zero = ~graph.attractor(model, target, allowed).region
-    doomed = graph.attractor(model, zero, allowed & ~target[..., None]).region
+    doomed = graph.attractor(model, zero, allowed, among=~target).region
     return _Sets(~doomed, zero, jnp.zeros(target.shape, jnp.int32))
 
 
@@ -192,9 +193,9 @@ def _max_sets(model: Any, target: jax.Array) -> _Sets:
 
 def _min_sets(model: Any, target: jax.Array) -> _Sets:
     zero = graph.avoidable(model, target)
-    doomed = graph.attractor(model, zero, model.available & ~target[..., None]).region
+    doomed = graph.attractor(model, zero, among=~target).region
     stay = model.available & forall_successor(model, zero)
-    return _Sets(~doomed, zero, jnp.argmax(stay, axis=-1).astype(jnp.int32))
+    return _Sets(~doomed, zero, first_action(stay)[1])
 
 
 # --- a fixed policy: a linear system with a certificate -----------------------------------
@@ -286,6 +287,8 @@ def _optimize(model, sets: _Sets, components, tolerance, max_steps, *, objective
     slack = (model.num_successors + model.num_actions + 4) * eps
     goal = jnp.sqrt(eps) if tolerance is None else jnp.asarray(tolerance, model.dtype)
     leaving = model.available if components is None else model.available & ~components.inside
+    # A product gathers whole rows, which its chain over single states cannot.
+    cheap_chain = components is None and not isinstance(model, Product)
 
     def best(y: jax.Array) -> tuple[jax.Array, jax.Array]:
         value, action = action_argmax(sign * expectation(model, y), leaving)
@@ -327,7 +330,7 @@ def _optimize(model, sets: _Sets, components, tolerance, max_steps, *, objective
         image, action = best(near)
         settled = jnp.max(jnp.abs(image - near)) <= goal / 32
         new_near = near_step(near, image)
-        if components is None:
+        if cheap_chain:
             new_near = follow_greedy(new_near, action)
         new_far, failed = lax.cond(
             settled,

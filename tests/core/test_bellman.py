@@ -7,7 +7,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl import Status
-from jaxltl.core.bellman import boltzmann_expansion
+from jaxltl.core.bellman import boltzmann_expansion, expected_reward
 from tests import reference
 from tests.support import as_mdp, assert_encloses, mass_preserving, stack
 
@@ -164,15 +164,10 @@ def test_rewards_on_transitions_count_by_their_expectation():
     model = reference.random_model(rng, *SHAPE)
     mdp, reward = as_mdp(model), rng.normal(size=SHAPE)
     expected = (model.probability * reward).sum(-1)
-    policy = jnp.asarray(reference.random_policy(rng, model))
-    for solve in (
-        lambda r: jl.policy_value(mdp, policy, r, 0.9),
-        lambda r: jl.optimal_value(mdp, r, 0.9),
-        lambda r: jl.soft_value(mdp, r, 0.9),
-        lambda r: jl.boltzmann_value(mdp, r, 0.9),
-    ):
-        one, other = solve(jnp.asarray(reward)), solve(jnp.asarray(expected))
-        np.testing.assert_allclose(one.value, other.value, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(expected_reward(mdp, reward), expected, atol=1e-14)
+    np.testing.assert_array_equal(expected_reward(mdp, expected), expected)
+    one, other = (jl.optimal_value(mdp, r, 0.9).value for r in (reward, expected))
+    np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
 
 
 def test_bad_arguments_are_named():
@@ -249,9 +244,9 @@ def test_a_fixed_point_that_plain_iteration_misses():
 
 def test_random_models_beyond_contraction():
     """Of 150 models with 6 states and 4 actions at discount .95, plain iteration fails on many."""
-    rng = np.random.default_rng(5)
-    transition = rng.dirichlet(np.full(6, 0.3), (150, 6, 4))
-    reward = rng.normal(size=(150, 6, 4)) * 5
+    rng = np.random.default_rng(0)
+    transition = rng.dirichlet(np.full(6, 0.01), (150, 6, 4))
+    reward = rng.normal(size=(150, 6, 4)) * 3
     available = np.ones((150, 6, 4), bool)
     dense = jl.DenseMDP(
         jnp.asarray(transition), jnp.asarray(available), jnp.full((150, 6), 1 / 6),
@@ -268,7 +263,8 @@ def test_random_models_beyond_contraction():
     for _ in range(1000):
         q = reward + 0.95 * np.einsum("nsat,nt->nsa", transition, plain)
         plain, last = reference.soft_maximum(q, available, "boltzmann"), plain
-    assert (np.abs(plain - last).max(axis=1) > 1e-3).any(), "some of the examples are hard"
+    failed = np.abs(plain - last).max(axis=1) > 1e-3
+    assert failed.sum() > 20, "many of the examples are hard"
 
 
 @pytest.mark.parametrize("num_actions", [2, 3, 4, 7])
@@ -298,7 +294,10 @@ def test_expansion_as_published():
 
 
 def explicit_sensitivity(model, policy, q, value, direction, discount, constant_policy):
-    """d value and d Q along a direction of the reward: (2.7), or with the policy's own change."""
+    """d value and d Q along a direction of Q's constant part.
+
+    ``d V = sum_a w_a d Q_a`` with w the policy (2.7), or with the policy's own change in it.
+    """
     weight = policy if constant_policy else policy * (1 + q - value[:, None])
     chain = np.einsum("sa,sat->st", weight, model.transition)
     slope = np.linalg.solve(np.eye(len(value)) - discount * chain, (weight * direction).sum(1))
@@ -307,65 +306,53 @@ def explicit_sensitivity(model, policy, q, value, direction, discount, constant_
 
 @pytest.mark.parametrize("adjoint", ["exact", "approximate"])
 def test_sensitivities_equal_the_explicit_equations(adjoint):
+    """In the reward and the probabilities; the two adjoints differ, except at zero reward."""
     rng = np.random.default_rng(7)
     model = reference.random_model(rng, 6, 3, 3, 0.2)
     mdp, discount = as_mdp(model), 0.8
-    reward, direction = rng.normal(size=(2, 6, 3)) * 2
+    toward_reward = rng.normal(size=(6, 3))
+    toward_probability = mass_preserving(rng, model.probability)
+    cotangent = rng.normal(size=6)
 
-    def answer(r):
-        solution = jl.boltzmann_value(mdp, r, discount, adjoint=adjoint)
+    def answer(reward, probability):
+        solution = jl.boltzmann_value(
+            mdp.replace(probability=probability), reward, discount, adjoint=adjoint
+        )
         return solution.value, solution.policy
 
-    answer = jax.jit(answer)
-    (value, policy), (dvalue, dpolicy) = jax.jvp(answer, (reward,), (direction,))
-    value, policy = np.asarray(value), np.asarray(policy)
-    q = reward + discount * (model.transition @ value)
-    q = np.where(model.available, q, 0)
-    approximate = adjoint == "approximate"
-    slope, dq = explicit_sensitivity(model, policy, q, value, direction, discount, approximate)
-    np.testing.assert_allclose(dvalue, slope, rtol=1e-9, atol=1e-10)
-    np.testing.assert_allclose(
-        dpolicy, policy * (dq - (policy * dq).sum(1, keepdims=True)), rtol=1e-8, atol=1e-10
-    )
-    wrong, _ = explicit_sensitivity(model, policy, q, value, direction, discount, not approximate)
-    assert np.abs(wrong - slope).max() > 1e-2, "the two sensitivities differ here"
-    _, pull = jax.vjp(answer, reward)
-    (gradient,) = pull((jnp.asarray(direction[:, 0]), jnp.zeros_like(policy)))
-    np.testing.assert_allclose(np.vdot(gradient, direction), direction[:, 0] @ slope, rtol=1e-8)
-
-
-def test_sensitivities_agree_at_zero_reward():
-    rng = np.random.default_rng(8)
-    mdp = as_mdp(reference.random_model(rng, 6, 3, 3))
-    features = jnp.asarray(rng.normal(size=(6, 3, 4)))
-    exact, approximate = (
-        jax.jacfwd(lambda w, a=a: jl.boltzmann_value(mdp, features @ w, 0.8, adjoint=a).value)
-        for a in ("exact", "approximate")
-    )
-    np.testing.assert_allclose(exact(jnp.zeros(4)), approximate(jnp.zeros(4)), atol=1e-10)
-    weights = jnp.asarray(rng.normal(size=4))
-    assert np.abs(exact(weights) - approximate(weights)).max() > 1e-2
-
-
-def test_sensitivity_in_the_probabilities_with_the_policy_held():
-    rng = np.random.default_rng(9)
-    model = reference.random_model(rng, 5, 2, 3, 0.0)
-    mdp, reward, discount = as_mdp(model), jnp.asarray(rng.normal(size=(5, 2))), 0.7
-    direction = mass_preserving(rng, model.probability)
-
-    def value(probability):
-        return jl.boltzmann_value(
-            mdp.replace(probability=probability), reward, discount, adjoint="approximate"
+    @jax.jit
+    def derivatives(reward):
+        found, forward = jax.linearize(answer, reward, mdp.probability)
+        zero = jnp.zeros_like(reward), jnp.zeros_like(mdp.probability)
+        backward = jax.linear_transpose(forward, reward, mdp.probability)
+        return (
+            found, forward(toward_reward, zero[1]), forward(zero[0], toward_probability),
+            backward((jnp.asarray(cotangent), zero[0])),
         )
 
-    solution = value(mdp.probability)
-    _, slope = jax.jvp(lambda p: value(p).value, (mdp.probability,), (jnp.asarray(direction),))
-    policy = np.asarray(solution.policy)
-    change = (direction * np.asarray(solution.value)[model.successor]).sum(-1)
-    chain = np.einsum("sa,sat->st", policy, model.transition)
-    expected = np.linalg.solve(
-        np.eye(5) - discount * chain, discount * (policy * change).sum(1)
-    )
-    np.testing.assert_allclose(slope, expected, rtol=1e-9, atol=1e-11)
-
-
+    for reward in (2 * rng.normal(size=(6, 3)), np.zeros((6, 3))):
+        found, *forward, backward = jax.tree.map(np.asarray, derivatives(reward))
+        value, policy = found
+        q = np.where(model.available, reward + discount * (model.transition @ value), 0)
+        change = discount * (toward_probability * value[model.successor]).sum(-1)
+        along = zip(
+            (toward_reward, change), forward, (toward_reward, toward_probability), backward,
+            strict=True,
+        )
+        for direction, (dvalue, dpolicy), input_direction, gradient in along:
+            slope, dq = explicit_sensitivity(
+                model, policy, q, value, direction, discount, adjoint == "approximate"
+            )
+            np.testing.assert_allclose(dvalue, slope, rtol=1e-9, atol=1e-10)
+            softmax_slope = policy * (dq - (policy * dq).sum(1, keepdims=True))
+            np.testing.assert_allclose(dpolicy, softmax_slope, rtol=1e-8, atol=1e-10)
+            np.testing.assert_allclose(
+                np.vdot(gradient, input_direction), cotangent @ slope, rtol=1e-8, atol=1e-10
+            )
+            other, _ = explicit_sensitivity(
+                model, policy, q, value, direction, discount, adjoint == "exact"
+            )
+            if reward.any():
+                assert np.abs(other - slope).max() > 1e-2
+            else:
+                np.testing.assert_allclose(other, slope, atol=1e-12)

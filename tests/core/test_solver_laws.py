@@ -239,10 +239,10 @@ def test_one_step_is_not_enough(name):
 
 
 def test_one_round_is_not_enough_for_a_long_ring():
-    size = 3000
+    size = 500
     ring = jl.make_mdp((np.arange(size)[:, None, None] + 1) % size, np.ones((size, 1, 1)))
     reward = jnp.asarray(np.random.default_rng(0).normal(size=(size, 1)))
-    arguments = ring, jnp.zeros(size, int), reward, 0.9999
+    arguments = ring, jnp.zeros(size, int), reward, 0.999
     assert jl.policy_value(*arguments, tolerance=1e-6, max_steps=1).status == Status.MAX_STEPS
     assert jl.policy_value(*arguments, tolerance=1e-6).status == Status.CONVERGED
 
@@ -286,16 +286,30 @@ def test_discounts_outside_the_promise_never_converge(name, discount):
 # --- derivatives -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "kind"), [p for p in PAIRS if "value_iteration" not in p[0]])
+# Compiling each pair takes seconds; by default every solver and every representation occurs.
+USUAL = {"policy_value", "boltzmann_value", "reachability-policy"}
+DERIVATIVES = [
+    pytest.param(
+        name, kind,
+        marks=[] if kind == "sparse" or name in USUAL or SOLVERS[name].kinds == ("product",)
+        else pytest.mark.exhaustive,
+    )
+    for name, kind in PAIRS if "value_iteration" not in name
+]
+
+
+@pytest.mark.parametrize(("name", "kind"), DERIVATIVES)
 def test_derivatives(name, kind):
     """Forward, reverse and central differences, in all inputs and the transition probabilities."""
     solver = SOLVERS[name]
-    model, explicit, inputs = example(kind)
+    model, _, inputs = example(kind)
     world = getattr(model, "mdp", model)
     field = "transition" if kind == "dense" else "probability"
-    probability = getattr(world, field)
-    point = {name: inputs[name] for name in solver.needs} | {"probability": probability}
     rng = np.random.default_rng(4)
+    # Optima have derivatives where no two actions tie, as they may in eighths.
+    probability = np.asarray(getattr(world, field))
+    probability = probability + 0.02 * mass_preserving(rng, probability)
+    point = {name: inputs[name] for name in solver.needs} | {"probability": probability}
     directions = {
         "reward": rng.normal(size=inputs["reward"].shape),
         "discount": np.ones(()),

@@ -1,0 +1,267 @@
+"""Inverse RL: features by hand, gradients of the objective, and the optimum of a small problem."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+from flax import linen as nn
+from jax.flatten_util import ravel_pytree
+
+import jaxltl as jl
+from jaxltl.algos import mlirl
+from tests.support import assert_gradients
+
+UP, DOWN, LEFT, RIGHT = range(4)
+TASK = "F (c & F g)"
+
+
+def grid(slip=0.0):
+    """Cells 0 to 5: b c r over . . g; the demonstrations pass c on the way to g."""
+    world = jl.gridworld("b c r\n. . g", slip=slip, absorbing=["g"])
+    runs = [[(0, RIGHT), (1, DOWN), (4, RIGHT)], [(0, DOWN), (3, RIGHT), (4, UP), (1, DOWN)]]
+    return world, jl.make_trajectories(world, runs)
+
+
+def test_pair_counts_by_hand():
+    world, demonstrations = grid()
+    expected = np.zeros((6, 4))
+    for s, a, count in ((0, RIGHT, 1), (1, DOWN, 2), (4, RIGHT, 1), (0, DOWN, 1), (3, RIGHT, 1),
+                        (4, UP, 1)):
+        expected[s, a] = count
+    np.testing.assert_array_equal(mlirl.pair_counts(world, demonstrations), expected)
+
+
+def test_pair_counts_in_a_product_follow_the_memory():
+    world, demonstrations = grid()
+    lazy = jl.product(world, TASK)
+    assert lazy.num_memory == 3
+    counts = mlirl.pair_counts(lazy, jl.lift_trajectories(lazy, demonstrations))
+    start = int(lazy.initial_memory[0])
+    middle = int(lazy.initial_memory[1])
+    expected = np.zeros((6, 3, 4))
+    for s, q, a, count in (
+        (0, start, RIGHT, 1), (1, middle, DOWN, 2), (4, middle, RIGHT, 1),
+        (0, start, DOWN, 1), (3, start, RIGHT, 1), (4, start, UP, 1),
+    ):
+        expected[s, q, a] = count
+    np.testing.assert_array_equal(counts, expected)
+
+
+def test_world_features_by_hand():
+    world, demonstrations = grid()
+    found = mlirl.world_features(
+        world, demonstrations, goal=["g"], progress=["c"], avoid=["r"]
+    )
+    assert found.names == ("demonstrated", "goal", "progress", "avoid", "time")
+    expected = np.zeros((6, 4, 5))
+    for s, a in ((0, RIGHT), (1, DOWN), (4, RIGHT), (0, DOWN), (3, RIGHT), (4, UP)):
+        expected[s, a, 0] = 1
+    expected[2, DOWN, 1] = expected[4, RIGHT, 1] = 1
+    # The cell c is entered from its neighbours, and again by pushing against the wall above.
+    expected[0, RIGHT, 2] = expected[2, LEFT, 2] = expected[4, UP, 2] = expected[1, UP, 2] = 1
+    expected[1, RIGHT, 3] = expected[2, UP, 3] = expected[2, RIGHT, 3] = -1
+    expected[:5, :, 4] = -1  # the goal's cell has no features
+    np.testing.assert_array_equal(found.values, expected)
+
+
+def test_task_features_by_hand():
+    world, demonstrations = grid()
+    lazy = jl.product(world, TASK)
+    found = mlirl.task_features(lazy, demonstrations, avoid=["r"])
+    assert found.names == ("demonstrated", "goal", "progress", "avoid", "time")
+    start, middle = (int(lazy.initial_memory[s]) for s in (0, 1))
+    (done,) = np.flatnonzero(lazy.automaton.final)
+    assert mlirl.progress_states(lazy) == (middle,)
+    expected = np.zeros((6, 3, 4, 5))
+    expected[..., 4] = -1
+    for s, q, a in ((0, start, RIGHT), (1, middle, DOWN), (4, middle, RIGHT), (0, start, DOWN),
+                    (3, start, RIGHT), (4, start, UP)):
+        expected[s, q, a, 0] = 1
+    # The goal counts after c only; in the goal's cell itself the memory is done at once.
+    for s, a in ((2, DOWN), (4, RIGHT), *((5, a) for a in range(4))):
+        expected[s, middle, a, 1] = 1
+    for s, a in ((0, RIGHT), (2, LEFT), (4, UP), (1, UP)):
+        expected[s, start, a, 2] = 1
+    for s, a in ((1, RIGHT), (2, UP), (2, RIGHT)):
+        expected[s, :, a, 3] = -1
+    expected[:, done] = 0
+    np.testing.assert_array_equal(found.values, expected)
+
+
+def test_features_weigh_by_probability():
+    world, demonstrations = grid(slip=0.2)
+    found = mlirl.world_features(world, demonstrations, goal=["g"]).values
+    assert found.shape[-1] == 4, "without a thing to avoid the feature is left out"
+    # From the cell above the goal: down succeeds with .8, and left slips there with .1.
+    np.testing.assert_allclose(found[2, :, 1], [0, 0.8, 0.1, 0.1], atol=1e-15)
+
+
+# --- gradients of the objective --------------------------------------------------------------------
+
+
+class Network(nn.Module):
+    @nn.compact
+    def __call__(self, features):
+        hidden = nn.tanh(nn.Dense(3, param_dtype=float)(features))
+        return nn.Dense(1, param_dtype=float)(hidden)[..., 0]
+
+
+def problem_in(place, reward="linear"):
+    world, demonstrations = grid(slip=0.2)
+    if place == "world":
+        model = world
+        features = mlirl.world_features(world, demonstrations, goal=["g"], avoid=["r"]).values
+    else:
+        model = jl.product(world, TASK)
+        features = mlirl.task_features(model, demonstrations, avoid=["r"]).values
+    if reward == "linear":
+        return mlirl.make_problem(model, features, demonstrations)
+    network = Network()
+    start = network.init(jax.random.key(0), features)
+    return mlirl.make_problem(model, features, demonstrations, start=start, reward=network.apply)
+
+
+@pytest.mark.parametrize(
+    ("place", "reward", "options"),
+    [
+        ("world", "linear", {}),
+        ("world", "linear", {"policy": "soft"}),
+        ("world", "network", {}),
+        ("product", "linear", {"mu": 2.0}),
+        pytest.param("product", "linear", {"mu": 2.0, "policy": "soft"},
+                     marks=pytest.mark.exhaustive),
+        pytest.param("product", "network", {"mu": 2.0}, marks=pytest.mark.exhaustive),
+        pytest.param("product", "network", {}, marks=pytest.mark.exhaustive),
+    ],
+)
+def test_gradients_of_the_objective(place, reward, options):
+    problem = problem_in(place, reward)
+    hparams = mlirl.Hparams(discount=0.7, **options)
+    flat, unravel = ravel_pytree(problem.start)
+    rng = np.random.default_rng(0)
+
+    def loss(x):
+        return mlirl.objective(unravel(x["parameters"]), problem, hparams)[0]
+
+    assert_gradients(
+        loss, {"parameters": flat + rng.normal(size=flat.size)},
+        {"parameters": rng.normal(size=flat.size)},
+    )
+
+
+def test_the_approximate_gradient_is_another_except_at_zero():
+    problem = problem_in("world")
+    gradient = {
+        adjoint: jax.jit(jax.grad(lambda p, a=adjoint: mlirl.objective(
+            p, problem, mlirl.Hparams(discount=0.7, adjoint=a))[0]))
+        for adjoint in ("exact", "approximate")
+    }
+    zero, one = jnp.zeros(4), jnp.array([1.0, 2.0, -1.0, 0.5])
+    np.testing.assert_allclose(gradient["exact"](zero), gradient["approximate"](zero), atol=1e-9)
+    relative = jnp.linalg.norm(gradient["exact"](one) - gradient["approximate"](one))
+    assert relative > 1e-3 * jnp.linalg.norm(gradient["exact"](one))
+
+
+def test_the_objective_by_hand():
+    """The terms (2.4), (2.6) and the prior, from the policy's own numbers."""
+    problem = problem_in("product")
+    hparams = mlirl.Hparams(discount=0.5, mu=3.0, l2=0.1)
+    weights = jnp.array([1.0, 2.0, 0.5, 1.0, 0.2])
+    loss, parts = mlirl.objective(weights, problem, hparams)
+    policy = np.asarray(mlirl.solve(weights, problem, hparams).policy)
+    counts = np.asarray(problem.counts)
+    likelihood = (counts[counts > 0] * np.log(policy[counts > 0])).sum()
+    y = np.asarray(jl.satisfaction_probability(problem.model, jnp.asarray(policy)).value)
+    watched = np.asarray(problem.model.initial) > 0
+    np.testing.assert_allclose(parts.neg_log_likelihood, -likelihood, rtol=1e-10)
+    np.testing.assert_allclose(parts.satisfaction, y[watched].mean(), rtol=1e-7)
+    expected = -likelihood - 3.0 * y[watched].sum() + 0.05 * float(weights @ weights)
+    np.testing.assert_allclose(loss, expected, rtol=1e-8)
+
+
+def test_learning_reaches_the_optimum():
+    problem = problem_in("world")
+    hparams = mlirl.Hparams(discount=0.5, l2=1e-2)
+    state, metrics = mlirl.train(jax.random.key(0), problem, hparams, num_steps=60)
+    likelihood = -np.asarray(metrics.neg_log_likelihood)
+    assert likelihood[-1] > likelihood[0] + 1
+    assert (metrics.status == jl.Status.CONVERGED).all()
+    assert np.isnan(metrics.satisfaction).all(), "there is no task"
+    evaluate = jax.jit(jax.value_and_grad(lambda p: mlirl.objective(p, problem, hparams)[0]))
+    best = min(
+        scipy.optimize.minimize(
+            lambda p: tuple(np.asarray(x) for x in evaluate(p)), np.full(4, start), jac=True,
+            method="BFGS", options={"gtol": 1e-9},
+        ).fun
+        for start in (0.0, 1.0, 3.0)
+    )
+    np.testing.assert_allclose(evaluate(state.parameters)[0], best, rtol=1e-8)
+    np.testing.assert_allclose(metrics.loss[-1], best, rtol=1e-8)
+    assert metrics.gradient_norm[-1] < 1e-4
+
+
+# --- settings and errors ------------------------------------------------------------------------------
+
+
+def test_watched_states():
+    world, demonstrations = grid()
+    lazy = jl.product(world, TASK)
+    features = jnp.zeros((*lazy.state_shape, 4, 1))
+    initial = mlirl.make_problem(lazy, features, demonstrations).watched
+    np.testing.assert_array_equal(initial, lazy.initial > 0)
+    every = mlirl.make_problem(lazy, features, demonstrations, watched="all").watched
+    assert every.shape == (6, 3)
+    assert every.all()
+    weights = np.arange(18.0).reshape(6, 3)
+    mine = mlirl.make_problem(lazy, features, demonstrations, watched=weights).watched
+    np.testing.assert_array_equal(mine, weights)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"features": np.zeros((6, 3, 2))}, r"features have shape \(6, 3, 2\); expected \(6, 4, 'F'\)"),
+        ({"features": np.full((6, 4, 1), np.nan)}, r"feature 0 at \(.*0, .*0\) is not finite"),
+        ({"watched": "some"}, "watched='some'; choose"),
+        ({"watched": np.zeros(5)}, r"watched has shape \(5,\); expected \(6,\)"),
+        ({"reward": lambda p, f: f}, r"the reward has shape \(6, 4, 2\); expected \(6, 4\)"),
+    ],
+)
+def test_bad_problems_are_refused(arguments, message):
+    world, demonstrations = grid()
+    arguments = {"features": np.zeros((6, 4, 2)), **arguments}
+    with pytest.raises(ValueError, match=message):
+        mlirl.make_problem(world, demonstrations=demonstrations, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"policy": "greedy"}, "policy='greedy'; choose boltzmann or soft"),
+        ({"policy": "soft", "adjoint": "approximate"}, "belongs to the Boltzmann policy"),
+        ({"adjoint": "none"}, "adjoint='none'; choose exact or approximate"),
+        ({"mu": 1.0}, "make the problem in a product"),
+        ({"optimizer": "newton"}, "optimizer='newton'; choose lbfgs, adam or sgd"),
+    ],
+)
+def test_bad_settings_are_refused(options, message):
+    problem = problem_in("world")
+    hparams = mlirl.Hparams(discount=0.5, **options)
+    with pytest.raises(ValueError, match=message):
+        mlirl.train(jax.random.key(0), problem, hparams, num_steps=1)
+
+
+def test_features_refuse_what_does_not_exist():
+    world, demonstrations = grid()
+    for argument in ("goal", "progress", "avoid"):
+        names = {"goal": ["g"], argument: ["z"]}
+        with pytest.raises(ValueError, match=f"{argument}: 'z' is not a proposition of the world"):
+            mlirl.world_features(world, demonstrations, **names)
+    lazy = jl.product(world, TASK)
+    with pytest.raises(ValueError, match="progress: automaton state 3 does not exist; there are 3"):
+        mlirl.task_features(lazy, demonstrations, progress=[3])
+    with pytest.raises(ValueError, match="avoid: 'z' is not a proposition"):
+        mlirl.task_features(lazy, demonstrations, avoid=["z"])
+    with pytest.raises(ValueError, match="needs a co-safe task"):
+        mlirl.task_features(jl.product(world, "G !r"), demonstrations)

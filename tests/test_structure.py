@@ -1,0 +1,136 @@
+"""The shape of the package: which way imports flow, what is public, and what importing does."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import jaxltl
+
+ROOT = Path(jaxltl.__file__).parent
+MODULES = {
+    ".".join(path.relative_to(ROOT.parent).with_suffix("").parts): path
+    for path in sorted(ROOT.rglob("*.py")) if path.name != "__init__.py"
+}
+NO_JAX = ("jaxltl.core.ltl", "jaxltl.core.translate", "jaxltl.core.automaton")
+
+# Lower rooms first: a module of the core imports only from rows above its own.
+LAYERS = [
+    {"types", "ltl"},
+    {"mdp", "translate", "automaton"},
+    {"operators"},
+    {"game", "rollout"},
+    {"product", "graph", "fixed_point"},
+    {"bellman", "occupancy", "reachability", "winning"},
+]
+
+PUBLIC = [
+    "MDP", "Automaton", "DenseMDP", "FiniteMemoryPolicy", "Formula", "NotConverged", "Product",
+    "Solution", "Status", "Trajectories", "almost_surely_reaching", "attractor", "avoidable",
+    "boltzmann_fixed_points", "boltzmann_value", "check", "end_components", "exists_successor",
+    "expectation", "feature_expectation", "forall_successor", "from_dense", "gridworld",
+    "holds_on_lasso", "letters", "lift_policy", "lift_trajectories", "make_mdp",
+    "make_trajectories", "occupancy_measure", "optimal_satisfaction", "optimal_value", "parse_ltl",
+    "policy_value", "product", "project_policy", "pushforward", "reachability_probability",
+    "restrict", "rollout", "sample_successor", "satisfaction_probability", "soft_value",
+    "to_automaton", "to_dense",
+]
+
+
+def imports(name: str) -> set[str]:
+    """Everything that a module imports anywhere in its text, as dotted names."""
+    found = set()
+    for node in ast.walk(ast.parse(MODULES[name].read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name}: relative import in line {node.lineno}"
+            found.add(node.module)
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def imports_any(name: str, roots: tuple[str, ...]) -> list[str]:
+    return sorted(
+        found for found in imports(name)
+        if any(found == root or found.startswith(f"{root}.") for root in roots)
+    )
+
+
+@pytest.mark.parametrize("name", [n for n in MODULES if n.startswith("jaxltl.core.")])
+def test_the_core_stands_alone(name):
+    forbidden = (
+        "optax", "flax.linen", "flax.nnx", "matplotlib", "click", "tqdm", "jaxltl.algos",
+        "jaxltl.envs", "jaxltl.io", "jaxltl.plot", "jaxltl.cli", "jaxltl.reproduce",
+    )
+    assert not imports_any(name, forbidden)
+
+
+@pytest.mark.parametrize("name", [n for n in NO_JAX if n in MODULES])
+def test_logic_never_imports_jax(name):
+    assert not imports_any(name, ("jax", "jaxlib", "flax", "chex"))
+
+
+def test_imports_of_the_core_flow_one_way():
+    level = {module: i for i, layer in enumerate(LAYERS) for module in layer}
+    for name in MODULES:
+        if not name.startswith("jaxltl.core."):
+            continue
+        own = name.removeprefix("jaxltl.core.")
+        assert own in level, f"{own} has no place in LAYERS; give it one"
+        for found in imports(name):
+            other = found.removeprefix("jaxltl.core.").split(".")[0]
+            if found.startswith("jaxltl.core.") and other in level:
+                same_room = {own, other} == {"translate", "automaton"}
+                assert level[other] < level[own] or same_room, f"{own} imports {other}"
+
+
+@pytest.mark.parametrize("name", [n for n in MODULES if n.startswith("jaxltl.algos.")])
+def test_learners_never_import_one_another(name):
+    allowed = ("jaxltl.algos", "jaxltl.algos.learner")
+    others = [
+        found for found in imports_any(name, ("jaxltl.algos",))
+        if found not in allowed and not found.startswith("jaxltl.algos.learner.")
+    ]
+    assert not others
+    assert not imports_any(name, ("jaxltl.cli", "jaxltl.plot", "jaxltl.reproduce", "matplotlib"))
+
+
+@pytest.mark.parametrize("name", [n for n in MODULES if n.startswith("jaxltl.envs.")])
+def test_worlds_import_the_core_alone(name):
+    outside = [n for n in imports_any(name, ("jaxltl",))
+               if not n.startswith(("jaxltl.core", "jaxltl.envs"))]
+    assert not outside
+
+
+def test_public_names_are_as_agreed():
+    assert jaxltl.__all__ == PUBLIC
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_public_names_are_documented(name):
+    assert (getattr(jaxltl, name).__doc__ or "").strip()
+    assert not getattr(jaxltl, name).__doc__.startswith(f"{name}("), "a generated docstring"
+
+
+def test_importing_changes_no_setting_and_stays_light():
+    program = """
+import sys, jax
+before = dict(jax.config.values)
+import jaxltl
+assert dict(jax.config.values) == before, "a setting of JAX was changed"
+print(*[name for name in ("matplotlib", "click", "optax", "scipy", "tqdm") if name in sys.modules])
+"""
+    base = "import sys, jax, flax.struct, chex; " \
+           "print(*[n for n in ('matplotlib', 'click', 'optax', 'scipy', 'tqdm') if n in sys.modules])"
+    loaded, without = (
+        set(subprocess.run(
+            [sys.executable, "-c", text], capture_output=True, text=True, check=True,
+            cwd=ROOT.parent,
+        ).stdout.split())
+        for text in (program, base)
+    )
+    # What JAX, flax and chex load themselves is not the package's doing.
+    assert loaded <= without
