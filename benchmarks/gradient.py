@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import flax.linen as nn
@@ -15,17 +14,17 @@ from jaxltl.algos import mlirl
 from jaxltl.core.bellman import action_value, policy_logits
 from jaxltl.core.operators import action_mean
 from jaxltl.core.product import product
-from jaxltl.task import read_task
+from jaxltl.reproduce import two_goals
 
-_EXAMPLE = Path(__file__).parent.parent / "examples" / "two_goals.toml"
+_TASK = "(!r & !y) -> ((!r U y) & (!y U g1) & (!y U g2) & F y)"
 
 
 def problem() -> mlirl.Problem:
-    """The example's product; over the words that occur after the start it has 100 x 6 states."""
-    task = read_task(_EXAMPLE)
-    model = product(task.world, task.formula)
-    features = mlirl.task_features(model, task.demonstrations, avoid=["r"])
-    return mlirl.make_problem(model, features.values, task.demonstrations)
+    """The grid world of section 2.5 beside its task: 100 cells, six states after the start."""
+    world, demonstrations = two_goals()
+    model = product(world, _TASK)
+    features = mlirl.task_features(model, demonstrations, avoid=["r"])
+    return mlirl.make_problem(model, features.values, demonstrations)
 
 
 @partial(jax.jit, static_argnames=("num_steps", "damping"))

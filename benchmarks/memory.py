@@ -30,7 +30,7 @@ def _bytes(tree: Any) -> int:
 
 
 def large_product(num_states: int) -> Product:
-    """A random world beside ten automaton states: wait two steps, then visit eight kinds in order."""
+    """A random world beside ten automaton states: visit eight kinds of states in order."""
     world, _ = risky_mdp(num_states)
     kinds = np.random.default_rng(2).integers(0, 64, num_states)
     names = tuple(f"g{i}" for i in range(8))
@@ -38,7 +38,7 @@ def large_product(num_states: int) -> Product:
     world = MDP(world.successor, world.probability, world.available, world.initial,
                 jnp.asarray(label), names)
     formula = "F (g0 & F (g1 & F (g2 & F (g3 & F (g4 & F (g5 & F (g6 & F g7)))))))"
-    task = to_automaton(f"X X {formula}", letters=letters(world))
+    task = to_automaton(f"X {formula}", letters=letters(world))
     return product(world, task)
 
 

@@ -9,7 +9,9 @@ from jaxltl.core.mdp import MDP
 from jaxltl.envs.gridworld import gridworld
 
 
-def random_mdp(num_states: int, num_actions: int = 4, num_successors: int = 4, seed: int = 0) -> MDP:
+def random_mdp(
+    num_states: int, num_actions: int = 4, num_successors: int = 4, seed: int = 0
+) -> MDP:
     """Uniform successors with uniform weights, in JAX's current float."""
     rng = np.random.default_rng(seed)
     shape = (num_states, num_actions, num_successors)

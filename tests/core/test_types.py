@@ -7,8 +7,8 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.types import require_shape, status_code
-from tests.support import as_mdp, lane, stack
 from tests import reference
+from tests.support import as_mdp, lane, stack
 
 
 def batch_with_one_failure():
