@@ -43,7 +43,7 @@ class Model:
         return dense
 
 
-# --- random models -------------------------------------------------------------------------
+# --- random models -----------------------------------------------------------------------------
 
 
 def random_model(
@@ -113,7 +113,7 @@ def random_acceptor(
     return delta, last if acceptance == "cosafe" else ~last
 
 
-# --- operators by loops ----------------------------------------------------------------------
+# --- operators by loops ------------------------------------------------------------------------
 
 
 def expectation(model: Model, value: np.ndarray) -> np.ndarray:
@@ -150,7 +150,7 @@ def forall_successor(model: Model, region: np.ndarray) -> np.ndarray:
     return result
 
 
-# --- exact solutions -------------------------------------------------------------------------
+# --- exact solutions ---------------------------------------------------------------------------
 
 
 def exact_solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -165,7 +165,8 @@ def exact_solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
         for j in range(size):
             factor = rows[j][i]
             if j != i and factor:
-                rows[j] = [x - factor * y if y else x for x, y in zip(rows[j], rows[i], strict=True)]
+                pairs = zip(rows[j], rows[i], strict=True)
+                rows[j] = [x - factor * y if y else x for x, y in pairs]
     return np.array([row[-1] for row in rows], object)
 
 
@@ -262,7 +263,7 @@ def exact_optimal_reachability(model: Model, target: np.ndarray, objective: str)
         policy = better
 
 
-# --- soft and Boltzmann values, in extended precision ----------------------------------------
+# --- soft and Boltzmann values, in extended precision ------------------------------------------
 
 
 def iterate_values(
@@ -288,7 +289,7 @@ def soft_maximum(q: np.ndarray, available: np.ndarray, operator: str) -> np.ndar
     return (weight * q).sum(axis=-1) / total
 
 
-# --- supports by brute force --------------------------------------------------------------------
+# --- supports by brute force -------------------------------------------------------------------
 
 
 def attractor(model: Model, goal: np.ndarray, allowed: np.ndarray, rule: str) -> np.ndarray:
@@ -369,7 +370,7 @@ def end_components(model: Model, region: np.ndarray) -> tuple[np.ndarray, np.nda
     return number, actions
 
 
-# --- the product, copied out ----------------------------------------------------------------
+# --- the product, copied out -------------------------------------------------------------------
 
 
 def explicit_product(

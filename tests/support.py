@@ -115,7 +115,7 @@ def counted_traces() -> Iterator[list[str]]:
         jax.monitoring.unregister_event_duration_listener(listener)
 
 
-# --- gradients ------------------------------------------------------------------------------
+# --- gradients ---------------------------------------------------------------------------------
 
 
 def assert_gradients(

@@ -251,7 +251,10 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     return State(
         key=key, step=jnp.int32(0), parameters=parameters,
         value=jnp.zeros(problem.model.state_shape, problem.model.dtype),
-        optimizer=_optimizer(hparams).init(parameters),
+        # optax starts from weakly typed zeros, which a second run would compile anew for.
+        optimizer=jax.tree.map(
+            lambda x: jnp.asarray(x, jnp.result_type(x)), _optimizer(hparams).init(parameters)
+        ),
     )
 
 
@@ -336,7 +339,9 @@ def task_features(
     num_memory = model.num_memory
     for q in chosen:
         if not 0 <= q < num_memory:
-            raise ValueError(f"progress: automaton state {q} does not exist; there are {num_memory}.")
+            raise ValueError(
+                f"progress: automaton state {q} does not exist; there are {num_memory}."
+            )
     target = np.isin(np.arange(num_memory), chosen)
     entering = []
     for q in range(num_memory):

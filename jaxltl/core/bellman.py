@@ -137,7 +137,7 @@ def policy_value(
     discount: jax.Array | float,
     *,
     tolerance: jax.Array | float | None = None,
-    max_steps: jax.Array | int = 10_000,
+    max_steps: jax.Array | int = 100_000,
 ) -> Solution:
     """Expected discounted reward of a policy.
 
@@ -150,7 +150,7 @@ def policy_value(
       reward: ``float[S, A]`` or ``float[S, A, K]``.
       discount: scalar in [0, 1).
       tolerance: certified absolute error asked for; default: what the dtype allows.
-      max_steps: rounds of 32 sweeps at most.
+      max_steps: sweeps at most.
 
     Returns:
       :class:`Solution`; `value` is ``float[S]``.
@@ -182,7 +182,7 @@ def policy_value(
     value = lax.stop_gradient(
         solve_linear(
             lambda v: v - (backup(v) - constant), constant,
-            tolerance=relative, max_rounds=max_steps,
+            tolerance=relative, max_steps=max_steps,
         )
     )
     solution = _solution(

@@ -59,40 +59,50 @@ def implicit(
     )
 
 
-class _Krylov(NamedTuple):
-    """The vectors and scalars of BiCGSTAB, in the names of van der Vorst (1992)."""
+class _Solve(NamedTuple):
+    """The state of :func:`solve_linear`; BiCGSTAB in the names of van der Vorst (1992)."""
 
+    phase: jax.Array
+    z: jax.Array  # what the operator is applied to next
     x: jax.Array
-    r: jax.Array
+    r: jax.Array  # the residual of x, by recurrence
+    error: jax.Array  # the norm of r
     shadow: jax.Array
     p: jax.Array
     v: jax.Array
     rho: jax.Array
     alpha: jax.Array
-    omega: jax.Array
+    steps: jax.Array  # in this phase
+    forced: jax.Array  # whether the last stretch was forced Richardson steps
+    returning: jax.Array  # whether this look only fetches the residual of the best x
+    best: jax.Array  # the best x whose true residual was looked at
+    best_error: jax.Array
+    num_steps: jax.Array
+
+
+_RICHARDSON, _FORCED, _KRYLOV, _KRYLOV_HALF, _LOOK, _DONE = range(6)
 
 
 def solve_linear(
     matvec: Operator,
     b: jax.Array,
     *,
-    start: jax.Array | None = None,
     tolerance: jax.Array | float | None = None,
-    max_rounds: jax.Array | int = 1000,
+    max_steps: jax.Array | int = 100_000,
 ) -> jax.Array:
     """Solves ``matvec(x) = b`` where matvec is the identity minus an operator.
 
-    Richardson steps ``x + (b - matvec(x))`` for as long as they contract well, then rounds
-    of BiCGSTAB (van der Vorst 1992), each judged by its true residual. A round that
-    did not halve it is followed by Richardson steps all the same, which converge
-    whenever the operator is a contraction in some norm.
+    Richardson steps ``x + (b - matvec(x))`` for as long as they contract well, then
+    BiCGSTAB (van der Vorst 1992), with regular looks at the true residual. Where
+    BiCGSTAB did not halve it, Richardson steps follow all the same, which converge
+    whenever the operator is a contraction in some norm. `matvec` occurs once in the
+    program, which keeps compilation short: what it is applied to depends on the phase.
 
     Args:
       matvec: a linear map on arrays of the shape of `b`.
       b: the right-hand side.
-      start: where to start; default `b`.
       tolerance: relative residual in the Euclidean norm; default ``eps ** 0.8``.
-      max_rounds: rounds at most.
+      max_steps: applications of `matvec` at most.
 
     Returns:
       x. Judge it by its residual: the best iterate is returned however it ended.
@@ -102,63 +112,67 @@ def solve_linear(
     target = tolerance * _norm(b)
     tiny = jnp.finfo(b.dtype).tiny
 
-    def richardson(x, r, error, forced):
-        def body(carry):
-            x, r, error, _, n = carry
-            x = x + r
-            r = b - matvec(x)
-            new = _norm(r)
-            return x, r, new, new <= _GOOD_RATE * error, n + 1
+    def richardson(k: _Solve, image: jax.Array) -> _Solve:
+        x, r = k.x + k.r, k.r - image
+        error = _norm(r)
+        forced = k.phase == _FORCED
+        go_on = jnp.where(forced, k.steps < _KRYLOV_STEPS, error <= _GOOD_RATE * k.error)
+        finished = (error <= target) | ~jnp.isfinite(error) | (forced & ~go_on)
+        after = jnp.where(finished, _LOOK, jnp.where(go_on, k.phase, _KRYLOV))
+        return k._replace(
+            phase=after.astype(jnp.int32), steps=jnp.where(go_on, k.steps + 1, 0),
+            x=x, r=r, error=error, p=r, shadow=r, rho=_dot(r, r),
+            z=jnp.where(finished, x, r),
+        )
 
-        def unfinished(carry):
-            _, _, error, fast, n = carry
-            return (error > target) & (fast | (n < forced)) & jnp.isfinite(error)
+    def krylov(k: _Solve, image: jax.Array) -> _Solve:
+        alpha = _ratio(k.rho, _dot(k.shadow, image), tiny)
+        s = k.r - alpha * image
+        k = k._replace(x=k.x + alpha * k.p, r=s, v=image, alpha=alpha)
+        return k._replace(phase=jnp.int32(_KRYLOV_HALF), z=s)
 
-        first = (x, r, error, jnp.bool_(True), jnp.int32(0))
-        return lax.while_loop(unfinished, body, first)[:3]
+    def krylov_half(k: _Solve, image: jax.Array) -> _Solve:
+        omega = _ratio(_dot(image, k.r), _dot(image, image), tiny)
+        x, r = k.x + omega * k.r, k.r - omega * image
+        error, rho = _norm(r), _dot(k.shadow, r)
+        p = r + _ratio(rho * k.alpha, k.rho * omega, tiny) * (k.p - omega * k.v)
+        finished = (error <= target / 2) | (k.steps >= _KRYLOV_STEPS) | ~jnp.isfinite(error)
+        k = k._replace(x=x, r=r, error=error, p=p, rho=rho, steps=k.steps + 1)
+        after = jnp.where(finished, _LOOK, _KRYLOV).astype(jnp.int32)
+        return k._replace(phase=after, z=jnp.where(finished, x, p))
 
-    def krylov_step(carry):
-        k, n = carry
-        rho = _dot(k.shadow, k.r)
-        beta = _ratio(rho * k.alpha, k.rho * k.omega, tiny)
-        p = k.r + beta * (k.p - k.omega * k.v)
-        v = matvec(p)
-        alpha = _ratio(rho, _dot(k.shadow, v), tiny)
-        s = k.r - alpha * v
-        t = matvec(s)
-        omega = _ratio(_dot(t, s), _dot(t, t), tiny)
-        x = k.x + alpha * p + omega * s
-        return _Krylov(x, s - omega * t, k.shadow, p, v, rho, alpha, omega), n + 1
+    def look(k: _Solve, image: jax.Array) -> _Solve:
+        """Judges x by its true residual; what failed is left for the best x so far."""
+        r = b - image
+        error = _norm(r)
+        better = error < k.best_error  # false for NaN
+        halved = error <= k.best_error / 2
+        best = jnp.where(better, k.x, k.best)
+        best_error = jnp.where(better, error, k.best_error)
+        stop = (best_error <= target) | (k.forced & ~better & ~k.returning)
+        returning = ~(better | k.returning | stop)
+        after = jnp.where(halved, _KRYLOV, jnp.where(returning, _LOOK, _FORCED))
+        return k._replace(
+            phase=jnp.where(stop, _DONE, after).astype(jnp.int32), steps=jnp.int32(0),
+            x=best, r=r, error=error, p=r, shadow=r, rho=_dot(r, r),
+            z=jnp.where(returning, best, r), best=best, best_error=best_error,
+            forced=jnp.where(returning, k.forced, ~halved), returning=returning,
+        )
 
-    def krylov_unfinished(carry):
-        k, n = carry
-        error = _norm(k.r)
-        return (error > target / 2) & (n < _KRYLOV_STEPS) & jnp.isfinite(error)
+    def step(k: _Solve) -> _Solve:
+        branches = (richardson, richardson, krylov, krylov_half, look)
+        k = lax.switch(k.phase, branches, k, matvec(k.z))
+        return k._replace(num_steps=k.num_steps + 1)
 
-    def round_(carry):
-        x, r, error, forced, n, _ = carry
-        x, r, middle = richardson(x, r, error, forced)
-        one, zero = jnp.ones((), b.dtype), jnp.zeros_like(b)
-        first = _Krylov(x, r, r, zero, zero, one, one, one)
-        steps = jnp.where(middle > target, 0, _KRYLOV_STEPS).astype(jnp.int32)
-        k, _ = lax.while_loop(krylov_unfinished, krylov_step, (first, steps))
-        r_krylov = b - matvec(k.x)
-        last = _norm(r_krylov)
-        better = last < middle  # false for NaN
-        x, r = jnp.where(better, k.x, x), jnp.where(better, r_krylov, r)
-        end = jnp.where(better, last, middle)
-        forced = jnp.where(end <= middle / 2, 0, _KRYLOV_STEPS).astype(jnp.int32)
-        # Give up only when forced Richardson steps brought nothing either.
-        return x, r, end, forced, n + 1, (carry[3] == 0) | (end < error)
-
-    def unfinished(carry):
-        _, _, error, _, n, progress = carry
-        return (error > target) & (n < max_rounds) & progress
-
-    x = b if start is None else start
-    r = b - matvec(x)
-    first = (x, r, _norm(r), jnp.int32(0), jnp.int32(0), jnp.bool_(True))
-    return lax.while_loop(unfinished, round_, first)[0]
+    zero, none, one, no = jnp.zeros_like(b), jnp.int32(0), jnp.ones((), b.dtype), jnp.bool_(False)
+    best = jnp.where(jnp.isfinite(target), zero, jnp.nan)
+    first = _Solve(
+        phase=none, z=b, x=zero, r=b, error=_norm(b), shadow=b, p=b, v=zero, rho=one,
+        alpha=one, steps=none, forced=no, returning=no, best=best, best_error=_norm(b),
+        num_steps=none,
+    )
+    last = lax.while_loop(lambda k: (k.phase != _DONE) & (k.num_steps < max_steps), step, first)
+    return last.best
 
 
 class DenseSolver(NamedTuple):
@@ -181,7 +195,7 @@ def factorize(matrix: jax.Array) -> DenseSolver:
 def newton_step(operator: Operator, v: jax.Array, image: jax.Array) -> jax.Array:
     """One inexact step of Newton's method on ``v - operator(v) = 0``; `image` is operator(v)."""
     _, tangent = jax.linearize(operator, v)
-    step = solve_linear(lambda x: x - tangent(x), image - v, tolerance=1e-4, max_rounds=2)
+    step = solve_linear(lambda x: x - tangent(x), image - v, tolerance=1e-4, max_steps=160)
     return v + step
 
 

@@ -118,7 +118,7 @@ def _labels(
         if kind != wall and kind not in legend:
             r, c = np.argwhere(cells == kind)[0]
             raise ValueError(
-                f"cell {kind!r} (row {r + 1}, column {c + 1}) is not in the legend; the legend "
+                f"cell {str(kind)!r} (row {r + 1}, column {c + 1}) is not in the legend; the legend "
                 f"has {', '.join(map(repr, legend))}. Add it, with [] if nothing holds there."
             )
         if isinstance(legend.get(str(kind), ()), str):

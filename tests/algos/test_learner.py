@@ -53,8 +53,8 @@ TOY = SimpleNamespace(
 
 def grid():
     world = jl.gridworld("b . r\n. . g", slip=0.1, absorbing=["g"])
-    demonstrations = jl.make_trajectories(world, [[(0, 1), (3, 3), (4, 3)], [(0, 3), (1, 1), (4, 3)]])
-    return world, demonstrations
+    runs = [[(0, 1), (3, 3), (4, 3)], [(0, 3), (1, 1), (4, 3)]]
+    return world, jl.make_trajectories(world, runs)
 
 
 def mlirl_world():
@@ -205,10 +205,12 @@ def test_an_interrupted_run_resumes_and_ends_bitwise_equal(name, tmp_path):
     assert_bitwise(state, six_steps(name)[0])
 
 
-# --- what the shared loop does, shown on the cheapest learner ---------------------------------------
+# --- what the shared loop does, shown on the cheapest learner ----------------------------------
 
 
-@pytest.mark.parametrize(("num_steps", "max_rows"), [(1, 1), (6, 6), (10, 4), (7, 3), (9, 1), (12, 5)])
+@pytest.mark.parametrize(
+    ("num_steps", "max_rows"), [(1, 1), (6, 6), (10, 4), (7, 3), (9, 1), (12, 5)]
+)
 def test_metrics_are_thinned_and_end_with_the_last_step(num_steps, max_rows):
     module, problem, hparams, _ = case("toy")
     state, metrics = module.run(
@@ -300,10 +302,10 @@ def test_a_changed_byte_is_noticed(tmp_path):
 def test_states_of_another_run_are_refused(tmp_path):
     path = tmp_path / "state.npz"
     learner.save(path, start("toy"))
-    with pytest.raises(ValueError, match=r"does not belong to this run: .*position is float64\[3\], "
-                                         r"expected float64\[4\]"):
+    message = r"does not belong to this run: .*position is float64\[3\], expected float64\[4\]"
+    with pytest.raises(ValueError, match=message):
         learner.load(path, toy_init(jax.random.key(0), jnp.zeros(4), 0.1))
-    with pytest.raises(ValueError, match="does not belong to this run: .* is missing"):
+    with pytest.raises(ValueError, match=r"does not belong to this run: .* is missing"):
         learner.load(path, start("mlirl-world"))
     module, problem, hparams, _ = case("mlirl-world")
     with pytest.raises(ValueError, match="Delete the file to start afresh"):

@@ -97,7 +97,7 @@ def test_features_weigh_by_probability():
     np.testing.assert_allclose(found[2, :, 1], [0, 0.8, 0.1, 0.1], atol=1e-15)
 
 
-# --- gradients of the objective --------------------------------------------------------------------
+# --- gradients of the objective ----------------------------------------------------------------
 
 
 class Network(nn.Module):
@@ -201,7 +201,7 @@ def test_learning_reaches_the_optimum():
     assert metrics.gradient_norm[-1] < 1e-4
 
 
-# --- settings and errors ------------------------------------------------------------------------------
+# --- settings and errors -----------------------------------------------------------------------
 
 
 def test_watched_states():
@@ -221,7 +221,7 @@ def test_watched_states():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"features": np.zeros((6, 3, 2))}, r"features have shape \(6, 3, 2\); expected \(6, 4, 'F'\)"),
+        ({"features": np.zeros((6, 3, 2))}, r"shape \(6, 3, 2\); expected \(6, 4, 'F'\)"),
         ({"features": np.full((6, 4, 1), np.nan)}, r"feature 0 at \(0, 0\) is not finite"),
         ({"watched": "some"}, "watched='some'; choose"),
         ({"watched": np.zeros(5)}, r"watched has shape \(5,\); expected \(6,\)"),

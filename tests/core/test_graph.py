@@ -126,7 +126,8 @@ def test_representations_hosts_and_traces_agree(kind, label_on, monkeypatch):
                 if rule == "exists":
                     flat = jax.tree.map(np.ravel, found)
                     check_progress(explicit, goal, allowed, flat)
-            np.testing.assert_array_equal(compiled[rule](model, goal_, allowed_).region, found.region)
+            traced = compiled[rule](model, goal_, allowed_)
+            np.testing.assert_array_equal(traced.region, found.region)
         small = kind != "product"  # brute force tries every policy and every set of states
         expected = reference.almost_surely_reaching(explicit, goal, allowed) if small else None
         for sweeps in (48, 1):

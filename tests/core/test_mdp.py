@@ -92,9 +92,9 @@ def test_bad_shapes(successor, probability, message):
 
 
 def test_bad_dense_matrices():
-    with pytest.raises(ValueError, match=r"transition has shape \(1, 1, 2\); it must be \[S, A, S\]"):
+    with pytest.raises(ValueError, match=r"shape \(1, 1, 2\); it must be \[S, A, S\]"):
         from_dense([[[0.5, 0.5]]])
-    with pytest.raises(ValueError, match="state 1, action 0: the probabilities sum to 0.5"):
+    with pytest.raises(ValueError, match=r"state 1, action 0: the probabilities sum to 0\.5"):
         from_dense([[[0.5, 0.5]], [[0.5, 0.0]]])
     with pytest.raises(ValueError, match=r"state 1, action 0: probability -1.0 \(entry 1\)"):
         from_dense([[[0.5, 0.5]], [[2.0, -1.0]]])

@@ -88,7 +88,7 @@ def test_restriction_needs_successor_lists():
         jl.restrict(lazy.replace(mdp=jl.to_dense(lazy.mdp)))
 
 
-# --- trajectories and policies that cross -------------------------------------------------------------
+# --- trajectories and policies that cross ------------------------------------------------------
 
 
 @pytest.mark.parametrize("label_on", READINGS)
@@ -191,7 +191,7 @@ def test_projected_policies_must_fit():
         jl.project_policy(lazy, jnp.zeros((3, 2)))
 
 
-# --- building one, and what is refused ---------------------------------------------------------------
+# --- building one, and what is refused ---------------------------------------------------------
 
 
 def labelled_world():
@@ -227,7 +227,7 @@ def test_unknown_propositions_name_themselves_and_the_closest():
 
 def test_letters_that_the_automaton_was_not_built_for():
     automaton = jl.to_automaton("F goal & F danger", letters=[{"goal"}, set()])
-    with pytest.raises(ValueError, match=r"world state 1 shows the letter \{danger\}, which the auto"):
+    with pytest.raises(ValueError, match=r"world state 1 shows the letter \{danger\}, which"):
         jl.product(labelled_world(), automaton)
 
 

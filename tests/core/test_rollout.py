@@ -69,7 +69,8 @@ def test_rollouts_are_runs_of_the_model(kind):
     assert runs.length.tolist() == [12] * 50
     assert (explicit.initial[runs.state[:, 0]] > 0).all()
     assert (policy[runs.state, runs.action] > 0).all()
-    assert (explicit.transition[runs.state[:, :-1], runs.action[:, :-1], runs.state[:, 1:]] > 0).all()
+    s, a, t = runs.state[:, :-1], runs.action[:, :-1], runs.state[:, 1:]
+    assert (explicit.transition[s, a, t] > 0).all()
 
 
 def test_rollouts_visit_as_the_occupancy_says():

@@ -165,7 +165,7 @@ def test_representations_agree(name, kind):
         )
 
 
-# --- vmap, jit and traces ------------------------------------------------------------------------
+# --- vmap, jit and traces ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", SOLVERS)
@@ -221,7 +221,7 @@ def test_new_numbers_do_not_retrace(name):
     assert traced, "the counter works"
 
 
-# --- how a solver ends -----------------------------------------------------------------------------
+# --- how a solver ends -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", [n for n, s in SOLVERS.items() if s.steps and n != "policy_value"])
@@ -234,7 +234,7 @@ def test_one_step_is_not_enough(name):
         model, {**inputs, "discount": 0.999}, tolerance=tolerance, max_steps=1
     )
     assert solution.status == Status.MAX_STEPS
-    with pytest.raises(jl.NotConverged, match="MAX_STEPS.*raise max_steps"):
+    with pytest.raises(jl.NotConverged, match=r"MAX_STEPS.*raise max_steps"):
         jl.check(solution)
 
 
@@ -256,7 +256,7 @@ def test_rewards_that_are_not_finite_are_reported(name, bad):
     reward[s, a] = bad
     solution = SOLVERS[name].solve(model, {**inputs, "reward": reward})
     assert solution.status == Status.NONFINITE
-    with pytest.raises(jl.NotConverged, match="NONFINITE.*look for NaN or infinity"):
+    with pytest.raises(jl.NotConverged, match=r"NONFINITE.*look for NaN or infinity"):
         jl.check(solution)
 
 
@@ -283,7 +283,7 @@ def test_discounts_outside_the_promise_never_converge(name, discount):
     assert not np.isfinite(solution.upper).any()
 
 
-# --- derivatives -------------------------------------------------------------------------------------
+# --- derivatives -------------------------------------------------------------------------------
 
 
 # Compiling each pair takes seconds; by default every solver and every representation occurs.

@@ -87,7 +87,7 @@ def test_maps_of_words_and_of_characters():
         ("ab", {"slip": 1.5}, "slip=1.5; it must be a probability"),
         ("ab", {"slip": -0.1}, "slip=-0.1"),
         ("ab", {"slip": float("nan")}, "slip=nan"),
-        ("ab\naz", {"legend": {"a": [], "b": []}}, r"cell 'z' \(row 2, column 2\) is not in the leg"),
+        ("ab\naz", {"legend": {"a": [], "b": []}}, r"cell 'z' \(row 2, column 2\) is not in"),
         ("ab", {"legend": {"a": "goal", "b": []}}, r"legend\['a'\] is a string; give a list"),
         ("ab", {"absorbing": ["z"]}, "absorbing: 'z' is not a proposition of the map; it has a, b"),
         ("..", {"absorbing": ["z"]}, r"absorbing: 'z' .* it has \(none\)"),
