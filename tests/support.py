@@ -150,8 +150,10 @@ def assert_gradients(
     weights = np.random.default_rng(0).normal(size=shape)
     forward, gradient = derivatives(point, tangents, weights)
     for (name, direction), found in zip(directions.items(), forward, strict=True):
-        ahead = flat({**point, name: point[name] + step * direction})
-        behind = flat({**point, name: point[name] - step * direction})
+        ahead, behind = (
+            flat(jax.tree.map(jnp.asarray, {**point, name: point[name] + shift * direction}))
+            for shift in (step, -step)
+        )
         expected = (np.asarray(ahead) - np.asarray(behind)) / (2 * step)
         scale = np.abs(expected).max()
         assert scale > 1e-3, f"{name}: the direction does not change anything"

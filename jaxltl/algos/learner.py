@@ -169,7 +169,7 @@ def save(path: str | os.PathLike[str], state: Any) -> None:
     Raises:
       ValueError: the place cannot be written to.
     """
-    arrays = {name: np.asarray(_data(leaf)) for name, leaf in _named(state)}
+    arrays: dict[str, Any] = {name: np.asarray(_data(leaf)) for name, leaf in _named(state)}
     with atomic_write(path) as file:
         np.savez(file, **arrays)
 

@@ -8,6 +8,7 @@ written for an MDP, and a product's values have ``[S, Q]`` for ``[S]``.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -101,7 +102,7 @@ def _certified(
     model: Any,
     reward: jax.Array,
     discount: jax.Array,
-    tolerance: jax.Array | None,
+    tolerance: jax.Array | float | None,
     value: jax.Array,
     image: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -175,7 +176,7 @@ def policy_value(
         return action_mean(policy, action_value(model, reward, discount, v))
 
     constant = action_mean(policy, reward)
-    scale = jnp.finfo(model.dtype).eps
+    scale = float(jnp.finfo(model.dtype).eps)
     relative = scale if tolerance is None else jnp.maximum(
         scale, tolerance * (1 - discount) / (4 * jnp.linalg.norm(constant.ravel()) + scale)
     )
@@ -194,7 +195,7 @@ def policy_value(
 def _attach(solution: Solution, backup) -> Solution:
     """The solution with implicit derivatives on its value, and none on its evidence."""
     solution = jax.tree.map(lax.stop_gradient, solution)
-    return solution.replace(value=implicit(backup, solution.value))
+    return replace(solution, value=implicit(backup, solution.value))
 
 
 @partial(jax.jit, static_argnames=("method",))
@@ -326,10 +327,7 @@ def soft_value(
 
     def body(carry):
         value, image, n, _ = carry
-        if method == "newton":
-            value = newton_step(backup, value, image)
-        else:
-            value = image
+        value = newton_step(backup, value, image) if method == "newton" else image
         image = backup(value)
         _, _, done = _certified(model, reward, discount, tolerance, value, image)
         return value, image, n + 1, done | ~jnp.isfinite(image.ravel()[0])
@@ -355,7 +353,7 @@ def policy_logits(
 
 def _with_softmax(model, reward, discount, solution: Solution) -> Solution:
     q = policy_logits(model, reward, discount, solution.value)
-    return solution.replace(policy=jax.nn.softmax(q, axis=-1))
+    return replace(solution, policy=jax.nn.softmax(q, axis=-1))
 
 
 def boltzmann_expansion(num_actions: int) -> float:
@@ -496,7 +494,7 @@ def boltzmann_value(
     )
     solution = jax.tree.map(lax.stop_gradient, solution)
     attached = implicit(partial(backup, constant_policy=adjoint == "approximate"), value)
-    return _with_softmax(model, reward, discount, solution.replace(value=attached))
+    return _with_softmax(model, reward, discount, replace(solution, value=attached))
 
 
 def boltzmann_fixed_points(

@@ -110,7 +110,7 @@ def solve_linear(
     if tolerance is None:
         tolerance = float(jnp.finfo(b.dtype).eps) ** 0.8
     target = tolerance * _norm(b)
-    tiny = jnp.finfo(b.dtype).tiny
+    tiny = float(jnp.finfo(b.dtype).tiny)
 
     def richardson(k: _Solve, image: jax.Array) -> _Solve:
         x, r = k.x + k.r, k.r - image
@@ -207,7 +207,7 @@ def _norm(x: jax.Array) -> jax.Array:
     return jnp.sqrt(_dot(x, x))
 
 
-def _ratio(x: jax.Array, y: jax.Array, tiny: jax.Array) -> jax.Array:
+def _ratio(x: jax.Array, y: jax.Array, tiny: float) -> jax.Array:
     """x / y, and zero where y has vanished, which restarts the recurrence."""
     safe = jnp.abs(y) > tiny
     return jnp.where(safe, x / jnp.where(safe, y, 1), 0)

@@ -77,10 +77,22 @@ class DenseMDP:
     label: jax.Array
     propositions: tuple[str, ...] = struct.field(pytree_node=False, default=())
 
-    num_states = MDP.num_states
-    num_actions = MDP.num_actions
-    state_shape = MDP.state_shape
-    num_successors = MDP.num_states
+    @property
+    def num_states(self) -> int:
+        return self.available.shape[-2]
+
+    @property
+    def num_actions(self) -> int:
+        return self.available.shape[-1]
+
+    @property
+    def num_successors(self) -> int:
+        return self.num_states
+
+    @property
+    def state_shape(self) -> tuple[int, ...]:
+        """The shape of a value: ``(S,)``."""
+        return (self.num_states,)
 
     @property
     def successor_probability(self) -> jax.Array:

@@ -9,6 +9,7 @@ are open (``functools.singledispatch``): a representation of one's own needs
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import singledispatch
 from typing import Any
 
@@ -213,7 +214,8 @@ def _(model: DenseMDP, value: jax.Array) -> jax.Array:
 @induced_chain.register
 def _(model: DenseMDP, policy: jax.Array) -> DenseMDP:
     rows = jnp.take_along_axis(model.transition, policy[:, None, None], axis=1)
-    return model.replace(
+    return replace(
+        model,
         transition=rows, available=jnp.ones((model.num_states, 1), bool),
         label=jnp.zeros((model.num_states, 0), bool), propositions=(),
     )

@@ -10,6 +10,7 @@ import difflib
 import functools
 import math
 from collections.abc import Collection
+from dataclasses import replace
 from typing import NamedTuple
 
 import chex
@@ -334,7 +335,7 @@ def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectorie
 
     inside = jnp.arange(trajectories.state.shape[1]) < trajectories.length[:, None]
     state = jax.vmap(one)(trajectories.state)
-    return trajectories.replace(state=jnp.where(inside, state, 0).astype(jnp.int32))
+    return replace(trajectories, state=jnp.where(inside, state, 0).astype(jnp.int32))
 
 
 def lift_policy(model: Product, policy: jax.Array) -> jax.Array:

@@ -8,6 +8,7 @@ interval iteration with end components collapsed. No bound rests on a small chan
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core import graph
-from jaxltl.core.fixed_point import DenseSolver, factorize, implicit, solve_linear
+from jaxltl.core.fixed_point import LinearSolver, factorize, implicit, solve_linear
 from jaxltl.core.operators import (
     action_argmax,
     action_mean,
@@ -172,7 +173,9 @@ def _is_cosafe(model: Product) -> bool:
 
 
 def _complement(reach: Solution) -> Solution:
-    return reach.replace(value=1 - reach.value, lower=1 - reach.upper, upper=1 - reach.lower)
+    return replace(
+        reach, value=1 - reach.value, lower=1 - reach.upper, upper=1 - reach.lower
+    )
 
 
 # --- what the graph decides ----------------------------------------------------------------
@@ -218,8 +221,7 @@ def _evaluate(model: Any, sets: _Sets, policy: jax.Array, tolerance, *, method) 
     def matvec(y: jax.Array) -> jax.Array:
         return y - jnp.where(undecided, action_mean(policy, expectation(model, y)), 0)
 
-    solver = _linear_solver(model, policy, undecided, method)
-    solve = solver.solve
+    solve, transpose_solve = _linear_solvers(model, policy, undecided, method)
     value = lax.stop_gradient(solve(matvec, one))
     value = jnp.clip(jnp.where(undecided, value, one), 0, 1)
     terms = model.num_successors + model.num_actions + 4
@@ -243,28 +245,20 @@ def _evaluate(model: Any, sets: _Sets, policy: jax.Array, tolerance, *, method) 
         status=status_code(jnp.max(error) <= goal, jnp.all(jnp.isfinite(policy))),
     )
     solution = jax.tree.map(lax.stop_gradient, solution)
-    value = implicit(backup, solution.value, solve=solve, transpose_solve=solver.transpose_solve)
-    return solution.replace(value=value, policy=policy)
+    value = implicit(backup, solution.value, solve=solve, transpose_solve=transpose_solve)
+    return replace(solution, value=value, policy=policy)
 
 
-class _Iterative(NamedTuple):
-    """The interface of a :class:`DenseSolver` without a matrix."""
-
-    @property
-    def solve(self):
-        return solve_linear
-
-    transpose_solve = solve
-
-
-def _linear_solver(
+def _linear_solvers(
     model: Any, policy: jax.Array, undecided: jax.Array, method: str
-) -> DenseSolver | _Iterative:
+) -> tuple[LinearSolver, LinearSolver]:
+    """Solvers of ``(I - P_pi) x = b`` on the undecided states, and of its transpose."""
     num_states = math.prod(model.state_shape)
     if method == "iterative" or (method == "auto" and num_states > _DENSE_LIMIT):
-        return _Iterative()
+        return solve_linear, solve_linear
     rows = jnp.where(undecided.ravel()[:, None], transition_matrix(model, policy), 0)
-    return factorize(jnp.eye(num_states, dtype=rows.dtype) - rows)
+    dense = factorize(jnp.eye(num_states, dtype=rows.dtype) - rows)
+    return dense.solve, dense.transpose_solve
 
 
 # --- optima: interval iteration -------------------------------------------------------------
@@ -368,7 +362,7 @@ def _optimize(model, sets: _Sets, components, tolerance, max_steps, *, objective
         return jnp.where(undecided, action_mean(policy, expectation(model, y)), one)
 
     # The optimum's derivative is that of the policy that attains it (Danskin).
-    return solution.replace(value=implicit(follow, solution.value))
+    return replace(solution, value=implicit(follow, solution.value))
 
 
 def _collapse(components: graph.EndComponents | None, value: jax.Array) -> jax.Array:

@@ -118,7 +118,7 @@ def _labels(
         if kind != wall and kind not in legend:
             r, c = np.argwhere(cells == kind)[0]
             raise ValueError(
-                f"cell {str(kind)!r} (row {r + 1}, column {c + 1}) is not in the legend; the legend "
+                f"cell {str(kind)!r} (row {r + 1}, column {c + 1}) is not in the legend; it "
                 f"has {', '.join(map(repr, legend))}. Add it, with [] if nothing holds there."
             )
         if isinstance(legend.get(str(kind), ()), str):
@@ -143,7 +143,8 @@ def _holds_one_of(
                 f"{argument}: {name!r} is not a proposition of the map; "
                 f"it has {', '.join(propositions) or '(none)'}."
             )
-    return label[:, [propositions.index(n) for n in names]].any(axis=1)
+    chosen = label[:, [propositions.index(n) for n in names]]
+    return np.asarray(chosen.any(axis=1))
 
 
 def _initial(

@@ -291,8 +291,7 @@ USUAL = {"policy_value", "boltzmann_value", "reachability-policy"}
 DERIVATIVES = [
     pytest.param(
         name, kind,
-        marks=[] if kind == "sparse" or name in USUAL or SOLVERS[name].kinds == ("product",)
-        else pytest.mark.exhaustive,
+        marks=[] if kind == SOLVERS[name].kinds[0] or name in USUAL else pytest.mark.exhaustive,
     )
     for name, kind in PAIRS if "value_iteration" not in name
 ]
