@@ -185,7 +185,8 @@ def load(path: str | os.PathLike[str], like: Any) -> Any:
       ValueError: the file is damaged, or its arrays do not fit `like`.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # An open file of our own is closed even where a damaged archive is given up.
+        with open(path, "rb") as handle, np.load(handle, allow_pickle=False) as file:
             arrays = dict(file)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{str(path)!r} is not a saved state: {error}") from error

@@ -102,7 +102,7 @@ class Metrics:
       neg_log_likelihood: (2.4), over all demonstrated pairs.
       satisfaction: weighted mean of the satisfaction probability; NaN without the term.
       gradient_norm: Euclidean.
-      status: of the value's solver; see :class:`~jaxltl.core.types.Status`.
+      status: of the solvers of value and satisfaction; see :class:`~jaxltl.core.types.Status`.
     """
 
     loss: jax.Array
@@ -152,7 +152,8 @@ def make_problem(
         raise ValueError(f"features have shape {features.shape}; expected {(*actions, 'F')}.")
     if not bool(jnp.all(jnp.isfinite(features))):
         place = np.argwhere(~np.isfinite(np.asarray(features)))[0]
-        raise ValueError(f"feature {place[-1]} at {tuple(place[:-1])} is not finite.")
+        *pair, feature = place.tolist()
+        raise ValueError(f"feature {feature} at {tuple(pair)} is not finite.")
     if isinstance(model, Product):
         demonstrations = lift_trajectories(model, demonstrations)
     if isinstance(watched, str):
@@ -229,7 +230,7 @@ def objective(
     likelihood = jnp.sum(problem.counts * jnp.where(seen, log_policy, 0))
     flat, _ = ravel_pytree(parameters)
     loss = -likelihood + hparams.l2 / 2 * jnp.sum(flat * flat)
-    satisfaction = jnp.full((), jnp.nan, loss.dtype)
+    satisfaction, status = jnp.full((), jnp.nan, loss.dtype), solution.status
     if hparams.mu is not None:
         if not isinstance(problem.model, Product):
             raise ValueError("mu weighs the satisfaction of a task: make the problem in a product.")
@@ -240,7 +241,9 @@ def objective(
         total = jnp.sum(problem.watched * done.value)
         loss -= hparams.mu * total
         satisfaction = total / jnp.sum(problem.watched)
-    return loss, Objective(-likelihood, satisfaction, solution.value, solution.status)
+        solved = done.residual <= jnp.sqrt(jnp.finfo(loss.dtype).eps)
+        status = jnp.where(solved, status, jnp.maximum(status, Status.MAX_STEPS))
+    return loss, Objective(-likelihood, satisfaction, solution.value, status)
 
 
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jax.scipy.special import logsumexp
 
-from jaxltl.core.fixed_point import implicit, newton_step, solve_linear
+from jaxltl.core.fixed_point import implicit, solve_linear
 from jaxltl.core.operators import (
     action_argmax,
     action_max,
@@ -27,11 +27,9 @@ from jaxltl.core.operators import (
     expectation,
     induced_chain,
     policy_distribution,
+    pushforward,
 )
 from jaxltl.core.types import Solution, Status, status_code
-
-_GOOD_RATE = 0.7  # an iteration that contracts at least this fast is left to it
-
 
 def action_value(
     model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
@@ -192,10 +190,44 @@ def policy_value(
     return _attach(solution, backup)
 
 
-def _attach(solution: Solution, backup) -> Solution:
+def _attach(solution: Solution, backup, jacobian: _Jacobian | None = None) -> Solution:
     """The solution with implicit derivatives on its value, and none on its evidence."""
     solution = jax.tree.map(lax.stop_gradient, solution)
-    return replace(solution, value=implicit(backup, solution.value))
+    if jacobian is None:
+        return replace(solution, value=implicit(backup, solution.value))
+    value = implicit(
+        backup, solution.value, solve=jacobian.solve, transpose_solve=jacobian.transpose_solve
+    )
+    return replace(solution, value=value)
+
+
+class _Jacobian(NamedTuple):
+    """A backup's derivative in the value, ``J x = discount * sum_a w(s, a) (P x)(s, a)``.
+
+    Written out with its weights w, a product with it is far cheaper than what
+    differentiating the backup gives. It only steers solvers: derivatives of any order
+    are those of the backup itself.
+    """
+
+    model: Any
+    discount: jax.Array
+    weight: jax.Array
+
+    def matvec(self, x: jax.Array) -> jax.Array:
+        return x - self.discount * action_mean(self.weight, expectation(self.model, x))
+
+    def solve(self, _, b: jax.Array) -> jax.Array:
+        return solve_linear(self.matvec, b)
+
+    def transpose_solve(self, _, b: jax.Array) -> jax.Array:
+        def vecmat(x: jax.Array) -> jax.Array:
+            return x - self.discount * pushforward(self.model, self.weight * x[..., None])
+
+        return solve_linear(vecmat, b)
+
+    def newton(self, value: jax.Array, image: jax.Array) -> jax.Array:
+        """One inexact step of Newton's method from `value`, whose backup is `image`."""
+        return value + solve_linear(self.matvec, image - value, tolerance=1e-2, max_steps=48)
 
 
 @partial(jax.jit, static_argnames=("method",))
@@ -325,9 +357,13 @@ def soft_value(
     def backup(v: jax.Array) -> jax.Array:
         return logsumexp(policy_logits(model, reward, discount, v), axis=-1)
 
+    def jacobian(v: jax.Array) -> _Jacobian:
+        policy = jax.nn.softmax(policy_logits(model, reward, discount, v), axis=-1)
+        return lax.stop_gradient(_Jacobian(model, discount, policy))
+
     def body(carry):
         value, image, n, _ = carry
-        value = newton_step(backup, value, image) if method == "newton" else image
+        value = jacobian(value).newton(value, image) if method == "newton" else image
         image = backup(value)
         _, _, done = _certified(model, reward, discount, tolerance, value, image)
         return value, image, n + 1, done | ~jnp.isfinite(image.ravel()[0])
@@ -340,7 +376,8 @@ def soft_value(
     start = (zero, backup(zero), jnp.int32(1), jnp.bool_(False))
     value, image, n, _ = lax.stop_gradient(lax.while_loop(unfinished, body, start))
     solution = _solution(model, reward, discount, tolerance, value, image, zero, n)
-    return _with_softmax(model, reward, discount, _attach(solution, backup))
+    solution = _attach(solution, backup, jacobian(solution.value))
+    return _with_softmax(model, reward, discount, solution)
 
 
 def policy_logits(
@@ -437,6 +474,13 @@ def boltzmann_value(
             policy = lax.stop_gradient(policy)
         return action_mean(policy, action_value(model, reward, discount, v))
 
+    def jacobian(v: jax.Array, constant_policy: bool = False) -> _Jacobian:
+        policy = jax.nn.softmax(policy_logits(model, reward, discount, v), axis=-1)
+        if not constant_policy:
+            q = action_value(model, reward, discount, v)
+            policy *= 1 + q - action_mean(policy, q)[..., None]
+        return lax.stop_gradient(_Jacobian(model, discount, policy))
+
     contracts = expansion < 1
     damping = jnp.where(contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
     gap = jnp.where(contracts, 1 - expansion, 1)
@@ -449,15 +493,14 @@ def boltzmann_value(
         return jnp.max(jnp.abs(image - value)) / gap + rounding
 
     def damped(carry):
-        value, image, before, _, n = carry
+        value, image, _, better, n = carry
         value = value + (1 - damping) * (image - value)
         image = backup(value)
-        now = error(value, image)
-        return value, image, now, now <= _GOOD_RATE * before, n + 1
+        return value, image, error(value, image), better, n + 1
 
     def newton(carry):
         value, image, before, _, n = carry
-        trial = newton_step(backup, value, image)
+        trial = jacobian(value).newton(value, image)
         trial_image = backup(trial)
         now = error(trial, trial_image)
         better = now <= before / 2
@@ -466,10 +509,11 @@ def boltzmann_value(
 
     def polish(carry):
         value, image, bound, n = carry
-        width = n + (0 if method == "newton" else 16 * (1 + n // 64))
-        again = (value, image, bound, jnp.bool_(method != "newton"), n)
+        # Newton's method early, but ever more damped steps where it does not take hold.
+        width = n + (0 if method == "newton" else 4 * (1 + n // 16))
+        again = (value, image, bound, jnp.bool_(True), n)
         value, image, bound, _, n = lax.while_loop(
-            lambda c: (c[2] > goal) & (c[3] | (c[4] < width)) & (c[4] < max_steps), damped, again
+            lambda c: (c[2] > goal) & (c[4] < jnp.minimum(width, max_steps)), damped, again
         )
         again = (value, image, bound, jnp.bool_(True), n)
         value, image, bound, _, n = lax.while_loop(
@@ -492,9 +536,11 @@ def boltzmann_value(
         residual=jnp.max(jnp.abs(image - value)), num_steps=n,
         status=status_code(converged, jnp.isfinite(bound) & (discount < 1)),
     )
-    solution = jax.tree.map(lax.stop_gradient, solution)
-    attached = implicit(partial(backup, constant_policy=adjoint == "approximate"), value)
-    return _with_softmax(model, reward, discount, replace(solution, value=attached))
+    constant = adjoint == "approximate"
+    solution = _attach(
+        solution, partial(backup, constant_policy=constant), jacobian(value, constant)
+    )
+    return _with_softmax(model, reward, discount, solution)
 
 
 def boltzmann_fixed_points(

@@ -80,7 +80,7 @@ class _Solve(NamedTuple):
     num_steps: jax.Array
 
 
-_RICHARDSON, _FORCED, _KRYLOV, _KRYLOV_HALF, _LOOK, _DONE = range(6)
+_RICHARDSON, _KRYLOV, _KRYLOV_HALF, _LOOK, _DONE = range(5)
 
 
 def solve_linear(
@@ -95,8 +95,9 @@ def solve_linear(
     Richardson steps ``x + (b - matvec(x))`` for as long as they contract well, then
     BiCGSTAB (van der Vorst 1992), with regular looks at the true residual. Where
     BiCGSTAB did not halve it, Richardson steps follow all the same, which converge
-    whenever the operator is a contraction in some norm. `matvec` occurs once in the
-    program, which keeps compilation short: what it is applied to depends on the phase.
+    whenever the operator is a contraction in some norm. After the first steps `matvec`
+    occurs only once in the program, which keeps compilation short: what it is applied
+    to depends on the phase.
 
     Args:
       matvec: a linear map on arrays of the shape of `b`.
@@ -115,14 +116,10 @@ def solve_linear(
     def richardson(k: _Solve, image: jax.Array) -> _Solve:
         x, r = k.x + k.r, k.r - image
         error = _norm(r)
-        forced = k.phase == _FORCED
-        go_on = jnp.where(forced, k.steps < _KRYLOV_STEPS, error <= _GOOD_RATE * k.error)
-        finished = (error <= target) | ~jnp.isfinite(error) | (forced & ~go_on)
-        after = jnp.where(finished, _LOOK, jnp.where(go_on, k.phase, _KRYLOV))
+        finished = (error <= target) | ~jnp.isfinite(error) | (k.steps >= _KRYLOV_STEPS)
         return k._replace(
-            phase=after.astype(jnp.int32), steps=jnp.where(go_on, k.steps + 1, 0),
-            x=x, r=r, error=error, p=r, shadow=r, rho=_dot(r, r),
-            z=jnp.where(finished, x, r),
+            phase=jnp.where(finished, _LOOK, _RICHARDSON).astype(jnp.int32), steps=k.steps + 1,
+            x=x, r=r, error=error, z=jnp.where(finished, x, r),
         )
 
     def krylov(k: _Solve, image: jax.Array) -> _Solve:
@@ -151,7 +148,7 @@ def solve_linear(
         best_error = jnp.where(better, error, k.best_error)
         stop = (best_error <= target) | (k.forced & ~better & ~k.returning)
         returning = ~(better | k.returning | stop)
-        after = jnp.where(halved, _KRYLOV, jnp.where(returning, _LOOK, _FORCED))
+        after = jnp.where(halved, _KRYLOV, jnp.where(returning, _LOOK, _RICHARDSON))
         return k._replace(
             phase=jnp.where(stop, _DONE, after).astype(jnp.int32), steps=jnp.int32(0),
             x=best, r=r, error=error, p=r, shadow=r, rho=_dot(r, r),
@@ -160,16 +157,30 @@ def solve_linear(
         )
 
     def step(k: _Solve) -> _Solve:
-        branches = (richardson, richardson, krylov, krylov_half, look)
+        branches = (richardson, krylov, krylov_half, look)
         k = lax.switch(k.phase, branches, k, matvec(k.z))
         return k._replace(num_steps=k.num_steps + 1)
 
-    zero, none, one, no = jnp.zeros_like(b), jnp.int32(0), jnp.ones((), b.dtype), jnp.bool_(False)
-    best = jnp.where(jnp.isfinite(target), zero, jnp.nan)
+    def contract(carry):
+        x, r, error, _, n = carry
+        x, r = x + r, r - matvec(r)
+        new = _norm(r)
+        return x, r, new, new <= _GOOD_RATE * error, n + 1
+
+    def contracts(carry):
+        _, _, error, fast, n = carry
+        return fast & (error > target) & (n < max_steps)
+
+    # Most systems are finished here, in a loop with nothing to decide.
+    zero, none, no = jnp.zeros_like(b), jnp.int32(0), jnp.bool_(False)
+    x, r, error, fast, n = lax.while_loop(
+        contracts, contract, (zero, b, _norm(b), jnp.bool_(True), none)
+    )
     first = _Solve(
-        phase=none, z=b, x=zero, r=b, error=_norm(b), shadow=b, p=b, v=zero, rho=one,
-        alpha=one, steps=none, forced=no, returning=no, best=best, best_error=_norm(b),
-        num_steps=none,
+        phase=jnp.where(fast, _LOOK, _KRYLOV).astype(jnp.int32), z=jnp.where(fast, x, r),
+        x=x, r=r, error=error, shadow=r, p=r, v=zero, rho=_dot(r, r), alpha=jnp.ones((), b.dtype),
+        steps=none, forced=no, returning=no, best=jnp.where(jnp.isfinite(target), zero, jnp.nan),
+        best_error=_norm(b), num_steps=n,
     )
     last = lax.while_loop(lambda k: (k.phase != _DONE) & (k.num_steps < max_steps), step, first)
     return last.best
@@ -190,13 +201,6 @@ class DenseSolver(NamedTuple):
 def factorize(matrix: jax.Array) -> DenseSolver:
     """Factors a small system once, for values of any shape with as many entries."""
     return DenseSolver(lu_factor(lax.stop_gradient(matrix)))
-
-
-def newton_step(operator: Operator, v: jax.Array, image: jax.Array) -> jax.Array:
-    """One inexact step of Newton's method on ``v - operator(v) = 0``; `image` is operator(v)."""
-    _, tangent = jax.linearize(operator, v)
-    step = solve_linear(lambda x: x - tangent(x), image - v, tolerance=1e-4, max_steps=160)
-    return v + step
 
 
 def _dot(x: jax.Array, y: jax.Array) -> jax.Array:

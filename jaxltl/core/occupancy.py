@@ -57,7 +57,10 @@ def occupancy_measure(
         return start + discount * pushforward(model, d[..., None] * policy)
 
     visits = lax.stop_gradient(
-        solve_linear(lambda d: d - (flow(d) - start), jnp.broadcast_to(start, model.state_shape))
+        solve_linear(
+            lambda d: d - (flow(d) - start), jnp.broadcast_to(start, model.state_shape),
+            tolerance=jnp.finfo(model.dtype).eps,
+        )
     )
     residual = jnp.sum(jnp.abs(flow(visits) - visits))
     gap = jnp.where(discount < 1, 1 - discount, jnp.nan)

@@ -139,7 +139,7 @@ def _unknown(model: Any) -> str:
 
 
 def _gather(value: jax.Array, index: jax.Array) -> jax.Array:
-    return value.at[index].get(mode="promise_in_bounds")
+    return jnp.asarray(value).at[index].get(mode="promise_in_bounds")
 
 
 @expectation.register
@@ -165,7 +165,7 @@ def _(model: MDP, region: jax.Array) -> jax.Array:
 
 @forall_successor.register
 def _(model: MDP, region: jax.Array) -> jax.Array:
-    return ~exists_successor(model, ~region)
+    return ~exists_successor(model, ~jnp.asarray(region))
 
 
 @sample_successor.register

@@ -198,7 +198,8 @@ def _min_sets(model: Any, target: jax.Array) -> _Sets:
     zero = graph.avoidable(model, target)
     doomed = graph.attractor(model, zero, among=~target).region
     stay = model.available & forall_successor(model, zero)
-    return _Sets(~doomed, zero, first_action(stay)[1])
+    stays, action = first_action(stay)
+    return _Sets(~doomed, zero, jnp.where(stays, action, first_action(model.available)[1]))
 
 
 # --- a fixed policy: a linear system with a certificate -----------------------------------

@@ -1,11 +1,11 @@
-"""Linear systems, Newton's method and the implicit function theorem."""
+"""Linear systems and the implicit function theorem."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.fixed_point import factorize, implicit, newton_step, solve_linear
+from jaxltl.core.fixed_point import factorize, implicit, solve_linear
 from tests.support import assert_gradients
 
 
@@ -97,15 +97,3 @@ def test_the_given_fixed_point_is_returned_and_its_own_derivative_dropped():
     assert jax.grad(root, 1)(0.5, jnp.array(2.0)) == 0.0
     # dv/da = v / (1 - a)
     np.testing.assert_allclose(jax.grad(root)(0.5, jnp.array(2.0)), 4.0)
-
-
-def test_newton_converges_fast():
-    def operator(v):
-        return jnp.cos(v) * jnp.array([0.5, 0.9])
-
-    v, errors = jnp.zeros(2), []
-    for _ in range(8):
-        v = newton_step(operator, v, operator(v))
-        errors.append(float(jnp.abs(v - operator(v)).max()))
-    assert errors[1] < 0.1 * errors[0]
-    assert errors[-1] < 1e-14
