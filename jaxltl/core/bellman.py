@@ -400,8 +400,8 @@ def boltzmann_expansion(num_actions: int) -> float:
     attained where one action stands above the rest, which are equal.
 
     Example:
-      >>> [round(boltzmann_expansion(n), 3) for n in (1, 2, 3, 4)]
-      [1.0, 1.2, 1.327, 1.423]
+      >>> [round(boltzmann_expansion(n), 2) for n in (1, 2, 3, 4)]
+      [1.0, 1.2, 1.33, 1.42]
     """
     if num_actions == 1:
         return 1.0

@@ -42,7 +42,8 @@ def implicit(
 
     Example:
       >>> a = jnp.array(0.5)
-      >>> jax.grad(lambda a: implicit(lambda v: 1 + a * v, jnp.array(2.0)))(a).item()
+      >>> slope = jax.grad(lambda a: implicit(lambda v: 1 + a * v, jnp.array(2.0)))(a)
+      >>> round(slope.item(), 3)
       4.0
     """
     solve = solve_linear if solve is None else solve
