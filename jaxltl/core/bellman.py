@@ -31,6 +31,7 @@ from jaxltl.core.operators import (
 )
 from jaxltl.core.types import Solution, Status, status_code
 
+
 def action_value(
     model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
 ) -> jax.Array:

@@ -59,7 +59,7 @@ def occupancy_measure(
     visits = lax.stop_gradient(
         solve_linear(
             lambda d: d - (flow(d) - start), jnp.broadcast_to(start, model.state_shape),
-            tolerance=jnp.finfo(model.dtype).eps,
+            tolerance=float(jnp.finfo(model.dtype).eps),
         )
     )
     residual = jnp.sum(jnp.abs(flow(visits) - visits))
