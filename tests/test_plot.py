@@ -77,9 +77,11 @@ def test_a_grid_with_values_and_policy():
 
 
 def test_a_blank_and_a_large_map():
-    plot.to_bytes(plot.grid(MAP))
-    plot.to_bytes(plot.grid("\n".join(["." * 30] * 25), np.full(750, np.nan)))
-    plot.to_bytes(plot.grid(MAP, np.arange(6.0), limits=None))
+    large = "\n".join(["." * 30] * 25)
+    figures = [plot.grid(MAP), plot.grid(large, np.full(750, np.nan)),
+               plot.grid(MAP, np.arange(6.0), limits=None)]
+    for figure in figures:
+        assert b"</svg>" in plot.to_bytes(figure)
 
 
 @pytest.mark.parametrize(("options", "message"), [
