@@ -73,7 +73,7 @@ def automaton(automaton: Automaton, *, names: bool = True) -> Figure:
     table = replace(
         automaton,
         delta=np.asarray(automaton.delta),
-        final=np.asarray(automaton.final),
+        priority=np.asarray(automaton.priority),
         letters=np.asarray(automaton.letters),
         initial=int(automaton.initial),
     )

@@ -59,7 +59,9 @@ def random_product(
     delta, final = reference.random_acceptor(rng, num_memory, 4, acceptance)
     start = int(rng.integers(num_memory))
     names = ("a", "b")
-    automaton = make_automaton(delta, start, final, bit_labels(np.arange(4), 2), names, acceptance)
+    automaton = make_automaton(
+        delta, start, bit_labels(np.arange(4), 2), names, final=final, acceptance=acceptance
+    )
     lazy = product(
         as_mdp(world, label=bit_labels(letter, 2), propositions=names), automaton,
         label_on=label_on,

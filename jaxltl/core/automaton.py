@@ -15,43 +15,70 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.ltl import Letter, as_letters, proposition_text
 
-ACCEPTANCES = ("cosafe", "safety")
+ACCEPTANCES = ("cosafe", "safety", "buchi", "parity")
 
 
 @dataclass(frozen=True, eq=False)
 class Automaton:
     """A complete deterministic automaton; see `make_automaton` for checked construction.
 
-    A word is accepted iff its run is in `final` from some point on. With `"cosafe"` acceptance
-    the final states are absorbing: the run must reach one. With `"safety"` the non-final states
-    are absorbing: the run must avoid them.
+    A word is accepted iff the least priority that its run reads infinitely often is even
+    (min-even parity, on transitions). The acceptance tells which priorities there are:
+
+    - `"cosafe"`: state q has priority 0 if it is final, else 1, and final states are absorbing:
+      the run must reach one.
+    - `"safety"`: the same, and non-final states are absorbing: the run must avoid them.
+    - `"buchi"`: 0 on accepting transitions, else 1.
+    - `"parity"`: any.
 
     Args:
         delta: int32 `[Q, L]`, the state after reading letter l in state q.
         initial: int32 scalar, the state before anything is read.
-        final: bool `[Q]`.
+        priority: int32 `[Q, L]`, of reading letter l in state q.
         letters: bool `[L, P]`, whether proposition p holds in letter l.
         propositions: `[P]` names.
-        acceptance: `"cosafe"` or `"safety"`.
+        acceptance: `"cosafe"`, `"safety"`, `"buchi"` or `"parity"`.
         state_names: `[Q]` readable names, one formula per state, or empty.
     """
 
     delta: NDArray[np.int32]
     initial: int | NDArray[np.int32]
-    final: NDArray[np.bool_]
+    priority: NDArray[np.int32]
     letters: NDArray[np.bool_]
     propositions: tuple[str, ...]
     acceptance: str
     state_names: tuple[str, ...] = ()
 
+    @property
+    def final(self) -> NDArray[np.bool_]:
+        """bool `[Q]`, the final states of a co-safe or safety automaton.
+
+        Raises:
+            ValueError: For Buchi and parity acceptance, which is on transitions.
+        """
+        if self.acceptance not in ("cosafe", "safety"):
+            raise ValueError(
+                f"final: an automaton with {self.acceptance} acceptance has no final states. "
+                "Read its priority[Q, L], or accepting[Q, L]."
+            )
+        return self.priority[..., 0] == 0
+
+    @property
+    def accepting(self) -> NDArray[np.bool_]:
+        """bool `[Q, L]`, the transitions of even priority."""
+        return self.priority % 2 == 0
+
 
 def make_automaton(
     delta: ArrayLike,
     initial: int,
-    final: ArrayLike,
     letters: ArrayLike,
     propositions: Iterable[str],
-    acceptance: str,
+    *,
+    final: ArrayLike | None = None,
+    accepting: ArrayLike | None = None,
+    priority: ArrayLike | None = None,
+    acceptance: str | None = None,
     state_names: Iterable[str] = (),
 ) -> Automaton:
     """An `Automaton` from checked tables.
@@ -59,17 +86,19 @@ def make_automaton(
     Args:
         delta: `[Q, L]` integers in 0..Q-1.
         initial: In 0..Q-1.
-        final: `[Q]` booleans, absorbing as `acceptance` asks.
         letters: `[L, P]` booleans, no two rows equal.
         propositions: `[P]` distinct names.
-        acceptance: `"cosafe"` or `"safety"`.
+        final: `[Q]` booleans, absorbing as `acceptance` asks.
+        accepting: `[Q]` or `[Q, L]` booleans, visited infinitely often (Buchi).
+        priority: `[Q]` or `[Q, L]` integers from 0 up; the least one met infinitely often is even.
+        acceptance: `"cosafe"` or `"safety"` with `final`; else follows from what is given.
         state_names: `[Q]` names, or none.
 
     Raises:
         ValueError: Naming the table, the entry and the fix.
 
-    >>> eventually_a = make_automaton(
-    ...     [[0, 1], [1, 1]], 0, [False, True], [[False], [True]], ["a"], "cosafe")
+    >>> eventually_a = make_automaton([[0, 1], [1, 1]], 0, [[False], [True]], ["a"],
+    ...                               final=[False, True], acceptance="cosafe")
     >>> int(eventually_a.delta[0, 1])
     1
     """
@@ -90,33 +119,69 @@ def make_automaton(
         raise ValueError(
             f"make_automaton: initial = {initial} is no state. Pass one of 0..{count - 1}."
         )
-    is_final = _booleans(final, "final", (count,))
-    rows = _booleans(letters, "letters", (width, len(names)))
-    _check_distinct(names, rows)
-    if acceptance not in ACCEPTANCES:
-        raise ValueError(
-            f"make_automaton: acceptance = {acceptance!r}. Pass one of {', '.join(ACCEPTANCES)}."
-        )
-    absorbing = is_final if acceptance == "cosafe" else ~is_final
-    for q, letter in np.argwhere(absorbing[:, None] & ~absorbing[table])[:1]:
-        kind = "final" if acceptance == "cosafe" else "non-final"
-        raise ValueError(
-            f"make_automaton: delta[{q}, {letter}] = {table[q, letter]} leaves the {kind} states, "
-            f"which {acceptance!r} acceptance has absorbing. Redirect it, or change final."
-        )
     if states and len(states) != count:
         raise ValueError(
             f"make_automaton: {len(states)} state_names for {count} states. Pass one each, or none."
         )
+    rows = _booleans(letters, "letters", (width, len(names)))
+    _check_distinct(names, rows)
+    kind, priorities = _priorities(table, final, accepting, priority, acceptance)
     return Automaton(
         delta=table.astype(np.int32),
         initial=np.asarray(initial, np.int32),
-        final=is_final,
+        priority=priorities.astype(np.int32),
         letters=rows,
         propositions=names,
-        acceptance=acceptance,
+        acceptance=kind,
         state_names=states,
     )
+
+
+def _priorities(
+    delta: NDArray[Any],
+    final: ArrayLike | None,
+    accepting: ArrayLike | None,
+    priority: ArrayLike | None,
+    acceptance: str | None,
+) -> tuple[str, NDArray[Any]]:
+    """The acceptance and its priorities `[Q, L]`, from the one table that is given."""
+    given = {"final": final, "accepting": accepting, "priority": priority}
+    (name, *more) = [key for key, table in given.items() if table is not None] or [""]
+    kinds = {"final": ("cosafe", "safety"), "accepting": ("buchi",), "priority": ("parity",)}
+    if not name or more:
+        raise ValueError("make_automaton: give exactly one of final, accepting and priority.")
+    kind = kinds[name][0] if acceptance is None and name != "final" else acceptance
+    if kind not in kinds[name]:
+        raise ValueError(
+            f"make_automaton: acceptance = {acceptance!r} with {name}. "
+            f"Pass one of {', '.join(kinds[name])}."
+        )
+    if name == "priority":
+        table = np.asarray(priority)
+        if table.dtype.kind not in "iu" or table.shape not in (delta.shape, delta.shape[:1]):
+            raise ValueError(
+                f"make_automaton: priority has shape {table.shape} and type {table.dtype}. "
+                f"Pass integers of shape {delta.shape} or {delta.shape[:1]}."
+            )
+        if (table < 0).any():
+            raise ValueError(f"make_automaton: priority {table.min()} is negative. Count from 0.")
+    elif name == "accepting":
+        shape = delta.shape[:1] if np.ndim(accepting) == 1 else delta.shape  # type: ignore[arg-type]
+        table = 1 - _booleans(accepting, "accepting", shape).astype(np.int32)
+    else:
+        is_final = _booleans(final, "final", delta.shape[:1])
+        absorbing = is_final if kind == "cosafe" else ~is_final
+        for q, letter in np.argwhere(absorbing[:, None] & ~absorbing[delta])[:1]:
+            inside = "final" if kind == "cosafe" else "non-final"
+            raise ValueError(
+                f"make_automaton: delta[{q}, {letter}] = {delta[q, letter]} leaves the {inside} "
+                f"states, which {kind!r} acceptance has absorbing. Redirect it, or change final."
+            )
+        table = 1 - is_final.astype(np.int32)
+    if table.ndim == 1:
+        table = np.repeat(table[:, None], delta.shape[1], axis=1)
+    assert kind is not None
+    return kind, table
 
 
 def _check_distinct(names: tuple[str, ...], rows: NDArray[np.bool_]) -> None:
@@ -133,7 +198,7 @@ def _check_distinct(names: tuple[str, ...], rows: NDArray[np.bool_]) -> None:
             )
 
 
-def _booleans(values: ArrayLike, place: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _booleans(values: ArrayLike | None, place: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     array = np.asarray(values)
     if array.size == 0:  # an empty list says nothing of its type
         array = array.astype(bool)
@@ -226,13 +291,20 @@ def accepts_lasso(automaton: Automaton, prefix: Iterable[Letter], cycle: Iterabl
     state = int(automaton.initial)
     for letter in _read(automaton, prefix, "accepts_lasso: prefix letter"):
         state = int(automaton.delta[state, letter])
-    seen: set[int] = set()
-    # A state met again at the start of the cycle is on the loop, which is all in final or all out.
-    while state not in seen:
-        seen.add(state)
+    # The least priority of each lap, by the state in which the lap starts.
+    least: dict[int, int] = {}
+    lap_end: dict[int, int] = {}
+    while state not in least:
+        start = state
+        read = []
         for letter in laps:
+            read.append(int(automaton.priority[state, letter]))
             state = int(automaton.delta[state, letter])
-    return bool(automaton.final[state])
+        least[start], lap_end[start] = min(read), state
+    on_cycle = {state}
+    while (state := lap_end[state]) not in on_cycle:
+        on_cycle.add(state)
+    return min(least[q] for q in on_cycle) % 2 == 0
 
 
 # ---------------------------------------------------------------------------------------------
@@ -241,11 +313,11 @@ def accepts_lasso(automaton: Automaton, prefix: Iterable[Letter], cycle: Iterabl
 
 
 def minimize(automaton: Automaton) -> Automaton:
-    """The smallest automaton with the same runs in and out of `final`.
+    """The smallest automaton whose runs read the same priorities.
 
-    Unreachable states are dropped and equivalent ones merged, by `equivalence_classes`. Automata
-    with the same language of finite words leading to `final`, over the same letters, give
-    identical tables. A merged state keeps the shortest of the names.
+    Unreachable states are dropped and equivalent ones merged, by `equivalence_classes`. Co-safe
+    and safety automata of one language, over the same letters, give identical tables. A merged
+    state keeps the shortest of the names.
 
     >>> from jaxltl.core.translate import to_automaton
     >>> minimize(to_automaton("F a & F b")).delta.shape
@@ -272,7 +344,7 @@ def quotient(automaton: Automaton, classes: NDArray[np.int32]) -> Automaton:
         automaton,
         delta=classes[automaton.delta[members]],
         initial=np.asarray(classes[int(automaton.initial)], np.int32),
-        final=automaton.final[members],
+        priority=automaton.priority[members],
         state_names=tuple(names[c] for c in sorted(names)),
     )
 
@@ -280,7 +352,7 @@ def quotient(automaton: Automaton, classes: NDArray[np.int32]) -> Automaton:
 def equivalence_classes(automaton: Automaton) -> NDArray[np.int32]:
     """The state of `minimize(automaton)` that each state becomes, -1 if it is unreachable.
 
-    Two states are equivalent when every finite word leads both into `final` or both out of it.
+    Two states are equivalent when every finite word reads the same priorities from both.
     The coarsest such partition is found by refinement, always queueing the smaller half of a
     split block (Hopcroft 1971, "An n log n algorithm for minimizing states in a finite
     automaton"), and numbered breadth first from the initial state.
@@ -293,7 +365,8 @@ def equivalence_classes(automaton: Automaton) -> NDArray[np.int32]:
     position[reached] = np.arange(len(reached))
     # Letters with equal columns are one letter to Hopcroft's algorithm.
     delta = np.unique(position[automaton.delta[reached]], axis=1)
-    blocks = _coarsest_partition(delta, automaton.final[reached])
+    _, output = np.unique(automaton.priority[reached], axis=0, return_inverse=True)
+    blocks = _coarsest_partition(delta, output.ravel())
     order = np.full(blocks.max() + 1, -1)
     found, first = np.unique(blocks, return_index=True)  # reached is in breadth-first order
     order[found[np.argsort(first)]] = np.arange(len(found))
@@ -314,16 +387,19 @@ def _breadth_first(delta: NDArray[np.integer[Any]], start: int) -> list[int]:
 
 
 def _coarsest_partition(
-    delta: NDArray[np.integer[Any]], final: NDArray[np.bool_]
+    delta: NDArray[np.integer[Any]], output: NDArray[np.integer[Any]]
 ) -> NDArray[np.int64]:
     count, width = delta.shape
     before: list[list[list[int]]] = [[[] for _ in range(count)] for _ in range(width)]
     for q, row in enumerate(delta.tolist()):
         for letter, successor in enumerate(row):
             before[letter][successor].append(q)
-    members = [set(np.flatnonzero(final).tolist()), set(np.flatnonzero(~final).tolist())]
-    block_of = [0 if holds else 1 for holds in final]
-    waiting = [min((0, 1), key=lambda block: len(members[block]))]
+    block_of = output.tolist()
+    members: list[set[int]] = [set() for _ in range(max(block_of) + 1)]
+    for q, block in enumerate(block_of):
+        members[block].add(q)
+    largest = max(range(len(members)), key=lambda block: len(members[block]))
+    waiting = [block for block in range(len(members)) if block != largest]
     while waiting:
         splitter = list(members[waiting.pop()])
         for sources in before:
@@ -349,17 +425,27 @@ def _coarsest_partition(
 def complement(automaton: Automaton) -> Automaton:
     """The automaton that accepts exactly the words that `automaton` rejects.
 
-    The run is the same and `final` is negated, which turns co-safe into safety acceptance.
+    The run is the same. Final states become the others, which turns co-safe into safety
+    acceptance; other priorities grow by one, which turns Buchi into parity.
 
     >>> from jaxltl.core.translate import to_automaton
     >>> complement(to_automaton("F a")).state_names
     ('!(F a)', 'false')
     """
     constants = {"true": "false", "false": "true"}
+    kind = automaton.acceptance
+    priority = automaton.priority + 1
+    if kind in ("cosafe", "safety"):
+        priority = 1 - automaton.priority
+    elif automaton.priority.min() > 0:
+        priority = automaton.priority - 1
+    only_two = priority.max() <= 1
     return replace(
         automaton,
-        final=~automaton.final,
-        acceptance="safety" if automaton.acceptance == "cosafe" else "cosafe",
+        priority=priority,
+        acceptance={"cosafe": "safety", "safety": "cosafe"}.get(
+            kind, "buchi" if only_two else "parity"
+        ),
         state_names=tuple(constants.get(name, f"!({name})") for name in automaton.state_names),
     )
 
@@ -503,10 +589,11 @@ def to_dict(automaton: Automaton) -> dict[str, Any]:
     >>> to_dict(to_automaton("F a"))["delta"]
     [[0, 1], [1, 1]]
     """
+    table = {"buchi": "accepting", "parity": "priority"}.get(automaton.acceptance, "final")
     return {
         "delta": automaton.delta.tolist(),
         "initial": int(automaton.initial),
-        "final": automaton.final.tolist(),
+        table: getattr(automaton, table).tolist(),
         "letters": automaton.letters.tolist(),
         "propositions": list(automaton.propositions),
         "acceptance": automaton.acceptance,
@@ -524,7 +611,8 @@ def from_dict(tables: Mapping[str, Any]) -> Automaton:
     >>> from_dict(to_dict(to_automaton("F a"))).acceptance
     'cosafe'
     """
-    fields = set(Automaton.__dataclass_fields__)
+    table = {"buchi": "accepting", "parity": "priority"}.get(tables.get("acceptance", ""), "final")
+    fields = set(Automaton.__dataclass_fields__) - {"priority"} | {table}
     if set(tables) != fields:
         wrong = ", ".join(sorted(map(str, set(tables) ^ fields)))
         raise ValueError(

@@ -28,7 +28,7 @@ from jaxltl.core.translate import to_automaton
 
 jax.tree_util.register_dataclass(
     Automaton,
-    data_fields=["delta", "initial", "final", "letters"],
+    data_fields=["delta", "initial", "priority", "letters"],
     meta_fields=["propositions", "acceptance", "state_names"],
 )
 

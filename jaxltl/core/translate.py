@@ -140,10 +140,11 @@ def _progression_automaton(
     reached = np.array(states) == (_TRUE if acceptance == "cosafe" else _FALSE)
     decided = _forced(delta, reached)
     propositions = formula.propositions
+    final = decided if acceptance == "cosafe" else ~decided
     automaton = Automaton(
         delta=delta,
         initial=0,
-        final=decided if acceptance == "cosafe" else ~decided,
+        priority=np.where(final, 0, 1)[:, None].repeat(len(alphabet), axis=1).astype(np.int32),
         letters=np.array([[name in letter for name in propositions] for letter in alphabet], bool),
         propositions=propositions,
         acceptance=acceptance,

@@ -48,7 +48,9 @@ def random_automaton(rng, states=8, letters=4):
     acceptance = rng.choice(["cosafe", "safety"])
     rows = [[bool(number >> p & 1) for p in range(2)] for number in range(letters)]
     is_final = kept if acceptance == "cosafe" else ~kept
-    return make_automaton(shuffled, order[0], is_final, rows, ["a", "b"], acceptance)
+    return make_automaton(
+        shuffled, order[0], rows, ["a", "b"], final=is_final, acceptance=acceptance
+    )
 
 
 @pytest.mark.parametrize(
@@ -71,7 +73,7 @@ def random_automaton(rng, states=8, letters=4):
         ({"propositions": ["a", "b"]}, r"Pass booleans of shape \(2, 2\)"),
         ({"propositions": [1]}, "Pass distinct strings"),
         ({"propositions": ["a", "a"], "letters": [[False] * 2, [True] * 2]}, "distinct strings"),
-        ({"acceptance": "buchi"}, "acceptance = 'buchi'. Pass one of cosafe, safety"),
+        ({"acceptance": "buchi"}, "acceptance = 'buchi' with final. Pass one of cosafe, safety"),
         ({"state_names": ["one"]}, "1 state_names for 2 states"),
     ],
 )
@@ -149,10 +151,10 @@ def test_minimal_tables_do_not_depend_on_the_numbering():
         renamed = make_automaton(
             delta,
             place[automaton.initial],
-            final,
             automaton.letters,
             automaton.propositions,
-            automaton.acceptance,
+            final=final,
+            acceptance=automaton.acceptance,
         )
         left, right = minimize(automaton), minimize(renamed)
         assert np.array_equal(left.delta, right.delta)
@@ -164,7 +166,9 @@ def test_minimize_is_quick_on_a_long_chain():
     n = 20_000
     delta = np.minimum(np.arange(n) + 1, n - 1)[:, None].repeat(2, axis=1)
     final = np.arange(n) == n - 1
-    automaton = make_automaton(delta, 0, final, [[False], [True]], ["a"], "cosafe")
+    automaton = make_automaton(
+        delta, 0, [[False], [True]], ["a"], final=final, acceptance="cosafe"
+    )
     assert len(minimize(automaton).delta) == n
 
 

@@ -42,7 +42,9 @@ def test_the_two_readings_by_hand():
         [[[1]], [[2]], [[2]]], np.ones((3, 1, 1)), initial=[1, 0, 0],
         label=[[False], [True], [False]], propositions=("g",),
     )
-    wait = make_automaton([[0, 1], [1, 1]], 0, [False, True], [[False], [True]], ["g"], "cosafe")
+    wait = make_automaton(
+        [[0, 1], [1, 1]], 0, [[False], [True]], ["g"], final=[False, True], acceptance="cosafe"
+    )
     value = jnp.array([[0.0, 1.0]] * 3)
     entry, leave = jl.product(world, wait), jl.product(world, wait, label_on="exit")
     # On entry g counts on the way from 0 to 1; on exit, on the way from 1 to 2.
