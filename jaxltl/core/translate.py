@@ -1,26 +1,26 @@
 """From linear temporal logic to deterministic automata.
 
-A state of the automaton is what is left to satisfy: the formula after the letters read so far
-(Esparza, Kretinsky & Sickert 2016, "From LTL to deterministic automata", the function `af`), up
-to propositional equivalence, which a binary decision diagram over propositions and temporal
-subformulas makes canonical.
+A syntactically co-safe or safety formula becomes the automaton of its progression. Any other is
+a combination of Sigma-2 and Pi-2 formulas and limits (`normal_form`), each followed by one
+tracker; the trackers side by side are an automaton with an Emerson-Lei condition, which turns
+into parity (`emerson_lei`) and is then made small (`parity`).
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
-from functools import reduce
 from itertools import chain, combinations
-from typing import TypeAlias
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.automaton import Automaton, equivalence_classes, quotient
+from jaxltl.core.diagram import FALSE, TRUE
+from jaxltl.core.emerson_lei import to_parity
+from jaxltl.core.language import find_not_included, live_states, universal_states
 from jaxltl.core.ltl import (
-    TRUE,
     Formula,
     Letter,
     as_formula,
@@ -28,34 +28,45 @@ from jaxltl.core.ltl import (
     is_syntactically_cosafe,
     is_syntactically_safe,
     negation_normal_form,
-    offending_subformula,
-    render,
-    subformulas,
 )
+from jaxltl.core.normal_form import Combination, combination, extent, simplify
+from jaxltl.core.parity import Table, is_weak, reduce_table
+from jaxltl.core.progression import Namer, Progression
+from jaxltl.core.trackers import track
+
+Acceptance = Literal["auto", "dfa", "buchi", "parity"]
 
 MAX_FREE_PROPOSITIONS = 12  # 2^12 letters
-MAX_NAME = 400  # characters of a state name before it is abbreviated
-MAX_CUBES = 60
+GOOD_ENOUGH = 3  # states up to which no other combination is tried
+WORTHWHILE = 3  # how many times as much the other combinations may track
+MAX_STEPS = 1_000_000  # of rewriting
+MAX_NODES = 2_000_000  # of diagrams
+NAMED_STATES = 300
 
 
 def to_automaton(
     formula: Formula | str,
     letters: Iterable[Letter] | None = None,
     max_states: int = 100_000,
+    *,
+    acceptance: Acceptance = "auto",
 ) -> Automaton:
-    """The minimal complete deterministic automaton of a co-safe or safety formula.
+    """A small complete deterministic automaton of a formula of linear temporal logic.
 
-    It accepts exactly the infinite words over `letters` that satisfy the formula. Co-safe and
-    safety are read off the syntax (`is_syntactically_cosafe`, `is_syntactically_safe`;
-    Kupferman & Vardi 2001); a formula that is both, with no operator but X, becomes co-safe.
-    A state is final as early as the given letters allow: for co-safe as soon as every
-    continuation satisfies the formula, for safety until no continuation does.
+    It accepts exactly the infinite words over `letters` that satisfy the formula. For co-safe
+    and safety languages it is minimal, and a state is final as early as the letters allow: for
+    co-safe as soon as every continuation satisfies the formula, for safety until no continuation
+    does. Where the verdict of a word depends on more, acceptance is on transitions.
 
     Args:
         formula: A formula or its text (see `parse_ltl`).
         letters: The letters that occur, each a collection of proposition names; names that are
             not in the formula are ignored. None stands for all 2^P subsets of its propositions.
-        max_states: The number of states, before minimisation, at which to give up.
+        max_states: The number of states, at any stage, at which to give up.
+        acceptance: `"auto"`, the simplest that the language has: `"cosafe"` or `"safety"`, where
+            a finite prefix proves or refutes; else `"buchi"`, where a deterministic Buchi
+            automaton exists; else `"parity"`. `"dfa"`, `"buchi"` and `"parity"` ask for that
+            form, by `"dfa"` either of the first two.
 
     Returns:
         An automaton over the sorted propositions of the formula. Letters are in the order of the
@@ -63,35 +74,40 @@ def to_automaton(
         is named by the formula that is left to satisfy there.
 
     Raises:
-        ValueError: For a formula in neither fragment, more than 12 propositions without
-            `letters`, a letter that is no collection, or too many states.
+        ValueError: For a language without the acceptance asked for, more than 12 propositions
+            without `letters`, a letter that is no collection, or too many states.
 
     >>> automaton = to_automaton("!r U g", letters=[{}, {"r"}, {"g"}])
     >>> automaton.delta.tolist(), automaton.state_names
     ([[0, 1, 2], [1, 1, 1], [2, 2, 2]], ('!r U g', 'true', 'false'))
+    >>> often = to_automaton("G F a & G F b")
+    >>> often.acceptance, often.accepting.astype(int).tolist()
+    ('buchi', [[0, 0, 0, 1], [0, 1, 0, 1]])
     """
+    if acceptance not in ("auto", "dfa", "buchi", "parity"):
+        raise ValueError(
+            f"to_automaton: acceptance = {acceptance!r}. Pass one of auto, dfa, buchi, parity."
+        )
     formula = as_formula(formula)
     alphabet = _alphabet(formula.propositions, letters)
     normal = negation_normal_form(formula)
-    if is_syntactically_cosafe(normal):
-        acceptance = "cosafe"
-    elif is_syntactically_safe(normal):
-        acceptance = "safety"
-    else:
-        raise ValueError(_outside_fragments(formula, normal))
     try:
-        return _progression_automaton(normal, alphabet, acceptance, max_states)
+        if is_syntactically_cosafe(normal):
+            automaton = _progression_automaton(normal, alphabet, "cosafe", max_states)
+        elif is_syntactically_safe(normal):
+            automaton = _progression_automaton(normal, alphabet, "safety", max_states)
+        else:
+            automaton = _general(formula, alphabet, max_states)
     except RecursionError:  # a diagram is as deep as the subformulas that a state combines
         raise ValueError(
             "to_automaton: too many subformulas are combined in one state (several hundred). "
             "Split the formula into parts that are tracked side by side."
         ) from None
+    return _with_acceptance(formula, automaton, acceptance)
 
 
-def _alphabet(
-    propositions: tuple[str, ...], letters: Iterable[Letter] | None
-) -> list[frozenset[str]]:
-    """The letters over the propositions, distinct, by binary number."""
+def _alphabet(propositions: tuple[str, ...], letters: Iterable[Letter] | None) -> NDArray[np.bool_]:
+    """The letters over the propositions, distinct, by binary number: bool `[L, P]`."""
     if letters is None:
         if len(propositions) > MAX_FREE_PROPOSITIONS:
             raise ValueError(
@@ -109,73 +125,65 @@ def _alphabet(
             "to_automaton: letters is empty. Pass at least one letter, such as set(), or None "
             "for all of them."
         )
-    return sorted(distinct, key=lambda letter: sum(bit[name] for name in letter))
+    rows = sorted(distinct, key=lambda letter: sum(bit[name] for name in letter))
+    table = [[name in letter for name in propositions] for letter in rows]
+    return np.array(table, bool).reshape(len(rows), len(propositions))
 
 
-def _outside_fragments(formula: Formula, normal: Formula) -> str:
-    unsafe = offending_subformula(formula, "safety")
-    uncosafe = offending_subformula(formula, "cosafe")
-    assert unsafe is not None and uncosafe is not None
-    inwards = "" if normal == formula else f"  With its negations pushed inwards: {normal}\n"
-    return (
-        f"to_automaton: {formula} is neither co-safe nor a safety formula.\n{inwards}"
-        f"  Not co-safe, because of {uncosafe}: {uncosafe.operator} asks something of infinitely "
-        "many steps, which no finite prefix proves (co-safe has X F U M).\n"
-        f"  Not safety, because of {unsafe}: {unsafe.operator} may be fulfilled arbitrarily "
-        "late, so no finite prefix refutes it (safety has X G R W).\n"
-        f"  For co-safe, ask {uncosafe.operator} only up to an event, as in 'p U done' for "
-        f"'G p'; for safety, replace {unsafe.operator} by a deadline of X, or U by W; or "
-        "translate the co-safe and the safety parts of a conjunction one by one."
-    )
+# ---------------------------------------------------------------------------------------------
+# The fragments
+# ---------------------------------------------------------------------------------------------
 
 
 def _progression_automaton(
-    formula: Formula, alphabet: list[frozenset[str]], acceptance: str, max_states: int
+    formula: Formula, alphabet: NDArray[np.bool_], acceptance: str, max_states: int
 ) -> Automaton:
-    """The minimal automaton of a formula in negation normal form."""
-    diagrams = _Diagrams()
-    variables, diagram_of = _encode(formula, diagrams)
-    steps = [_step(letter, variables, diagram_of, diagrams) for letter in alphabet]
-    states, delta = _explore(diagram_of[formula], steps, max_states)
-    reached = np.array(states) == (_TRUE if acceptance == "cosafe" else _FALSE)
-    decided = _forced(delta, reached)
+    """The minimal automaton of a co-safe or safety formula in negation normal form."""
     propositions = formula.propositions
+    progression = Progression([formula], alphabet, propositions)
+    states, delta = _explore(progression, progression.diagram_of[formula], max_states)
+    reached = np.array(states) == (TRUE if acceptance == "cosafe" else FALSE)
+    decided = _forced(delta, reached)
     final = decided if acceptance == "cosafe" else ~decided
+    delta = delta[:, progression.class_of]
     automaton = Automaton(
         delta=delta,
         initial=0,
-        priority=np.where(final, 0, 1)[:, None].repeat(len(alphabet), axis=1).astype(np.int32),
-        letters=np.array([[name in letter for name in propositions] for letter in alphabet], bool),
+        priority=np.where(final, 0, 1)[:, None].repeat(delta.shape[1], axis=1).astype(np.int32),
+        letters=alphabet,
         propositions=propositions,
         acceptance=acceptance,
     )
     classes = equivalence_classes(automaton)
     minimal = quotient(automaton, classes)
     _, first = np.unique(classes, return_index=True)  # every state is reachable
-    names = _state_names([states[q] for q in first], minimal, variables, diagrams)
-    return replace(minimal, state_names=names)
+    return replace(minimal, state_names=_names(minimal, progression, [states[q] for q in first]))
 
 
 def _explore(
-    start: int, steps: list[Callable[[int], int]], max_states: int
+    progression: Progression, start: int, max_states: int
 ) -> tuple[list[int], NDArray[np.int32]]:
-    """The states reached from `start`, breadth first, and their transition table `[Q, L]`."""
+    """The diagrams reached from `start`, breadth first, and their transitions `[Q, K]`."""
     states = [start]
     index = {start: 0}
     rows = []
     for state in states:
-        row = [step(state) for step in steps]
+        row = [after(state) for after in progression.after]
         for successor in row:
             if successor not in index:
                 index[successor] = len(states)
                 states.append(successor)
-        rows.append(np.array([index[successor] for successor in row], np.int32))
+        rows.append([index[successor] for successor in row])
         if len(states) > max_states:
-            raise ValueError(
-                f"to_automaton: more than {max_states} states. Pass fewer letters=, split the "
-                "formula into parts that are tracked side by side, or raise max_states."
-            )
-    return states, np.array(rows)
+            raise _too_many(max_states)
+    return states, np.array(rows, np.int32)
+
+
+def _too_many(max_states: int) -> ValueError:
+    return ValueError(
+        f"to_automaton: more than {max_states} states. Pass fewer letters=, split the "
+        "formula into parts that are tracked side by side, or raise max_states."
+    )
 
 
 def _forced(delta: NDArray[np.int32], target: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -187,210 +195,161 @@ def _forced(delta: NDArray[np.int32], target: NDArray[np.bool_]) -> NDArray[np.b
         target = wider
 
 
-# ---------------------------------------------------------------------------------------------
-# Progression
-# ---------------------------------------------------------------------------------------------
-
-_FALSE, _TRUE = 0, 1
-_TEMPORAL = frozenset("XFGURWM")
-
-
-class _Diagrams:
-    """Reduced ordered binary decision diagrams (Bryant 1986), equal iff equivalent.
-
-    A diagram is an index into `nodes`, which holds (variable, diagram if it is false, diagram if
-    it is true); 0 is false and 1 is true.
-    """
-
-    def __init__(self) -> None:
-        bottom = sys.maxsize  # the constants come after every variable
-        self.nodes = [(bottom, _FALSE, _FALSE), (bottom, _TRUE, _TRUE)]
-        self._index: dict[tuple[int, int, int], int] = {}
-        self._choices: dict[tuple[int, int, int], int] = {}
-
-    def node(self, variable: int, low: int, high: int) -> int:
-        if low == high:
-            return low
-        found = self._index.setdefault((variable, low, high), len(self.nodes))
-        if found == len(self.nodes):
-            self.nodes.append((variable, low, high))
-        return found
-
-    def cofactors(self, diagram: int, variable: int) -> tuple[int, int]:
-        top, low, high = self.nodes[diagram]
-        return (low, high) if top == variable else (diagram, diagram)
-
-    def choice(self, test: int, then: int, other: int) -> int:
-        """The diagram of `(test & then) | (!test & other)`."""
-        if test == _TRUE or then == other:
-            return then
-        if test == _FALSE:
-            return other
-        if then == _TRUE and other == _FALSE:
-            return test
-        key = (test, then, other)
-        if key not in self._choices:
-            variable = min(self.nodes[diagram][0] for diagram in key)
-            low, high = zip(*[self.cofactors(diagram, variable) for diagram in key], strict=True)
-            self._choices[key] = self.node(variable, self.choice(*low), self.choice(*high))
-        return self._choices[key]
-
-    def both(self, left: int, right: int) -> int:
-        return self.choice(left, right, _FALSE)
-
-    def either(self, left: int, right: int) -> int:
-        return self.choice(left, _TRUE, right)
-
-    def negation(self, diagram: int) -> int:
-        return self.choice(diagram, _FALSE, _TRUE)
-
-
-def _encode(formula: Formula, diagrams: _Diagrams) -> tuple[list[Formula], dict[Formula, int]]:
-    """The variables, propositions before temporal subformulas, and each subformula's diagram."""
-    nodes = subformulas(formula)
-    variables = [node for node in nodes if node.operator == "ap"]
-    variables += [node for node in nodes if node.operator in _TEMPORAL]
-    diagram_of = {v: diagrams.node(i, _FALSE, _TRUE) for i, v in enumerate(variables)}
-    for node in nodes:
-        # From the last operand to the first, so that the top variables are added last.
-        operands = [diagram_of[operand] for operand in reversed(node.operands)]
-        match node.operator:
-            case "true" | "false":
-                diagram_of[node] = _TRUE if node.operator == "true" else _FALSE
-            case "!":
-                diagram_of[node] = diagrams.negation(operands[0])
-            case "&":
-                diagram_of[node] = reduce(lambda rest, f: diagrams.both(f, rest), operands)
-            case "|":
-                diagram_of[node] = reduce(lambda rest, f: diagrams.either(f, rest), operands)
-    return variables, diagram_of
-
-
-def _step(
-    letter: frozenset[str],
-    variables: list[Formula],
-    diagram_of: dict[Formula, int],
-    diagrams: _Diagrams,
-) -> Callable[[int], int]:
-    """The function from the diagram of a formula to that of what is left of it after `letter`.
-
-    It replaces each variable by its own successor: `af(f U g) = af(g) | (af(f) & f U g)`.
-    """
-    both, either = diagrams.both, diagrams.either
-    successors: list[int] = []
-    done = {_FALSE: _FALSE, _TRUE: _TRUE}
-
-    def after(diagram: int) -> int:
-        if diagram not in done:
-            variable, low, high = diagrams.nodes[diagram]
-            done[diagram] = diagrams.choice(successors[variable], after(high), after(low))
-        return done[diagram]
-
-    for variable in variables:
-        if variable.operator == "ap":
-            successors.append(_TRUE if variable.proposition in letter else _FALSE)
-            continue
-        itself = diagram_of[variable]
-        left, right = diagram_of[variable.operands[0]], diagram_of[variable.operands[-1]]
-        match variable.operator:
-            case "X":
-                successors.append(left)
-            case "F":
-                successors.append(either(after(right), itself))
-            case "G":
-                successors.append(both(after(right), itself))
-            case "U" | "W":
-                successors.append(either(after(right), both(after(left), itself)))
-            case "R" | "M":
-                successors.append(both(after(right), either(after(left), itself)))
-    return after
-
-
-# ---------------------------------------------------------------------------------------------
-# State names
-# ---------------------------------------------------------------------------------------------
-
-_Text: TypeAlias = tuple[str, bool]  # and whether it needs parentheses inside a longer one
-
-
-def _state_names(
-    states: list[int], minimal: Automaton, variables: list[Formula], diagrams: _Diagrams
+def _names(
+    automaton: Automaton, progression: Progression, diagrams: list[int] | None
 ) -> tuple[str, ...]:
-    """What is left to satisfy in each state: the shorter of its disjunctive and conjunctive form.
-
-    Args:
-        states: `[Q]` diagrams, one for each state of `minimal`.
-        minimal: The minimal automaton.
-        variables: The formula of each variable of the diagrams.
-        diagrams: The diagrams.
-    """
-    texts: dict[Formula, str] = {}
-    for node in subformulas(Formula("&", (TRUE, TRUE, *variables))):
-        text = render(node, [texts[operand] for operand in node.operands])
-        texts[node] = text if len(text) <= MAX_NAME else "..."
-    literals = [(texts[variable], len(variable.operands) > 1) for variable in variables]
-    paths = {True: [0, 1], False: [1, 0]}  # how many lead from each diagram to true, to false
-    for count in paths.values():
-        for _, low, high in diagrams.nodes[2:]:
-            count.append(count[low] + count[high])
+    namer = Namer(progression)
     names = []
-    for q, state in enumerate(states):
-        if (minimal.delta[q] == q).all():
-            names.append("true" if minimal.final[q] else "false")
-            continue
-        forms = [
-            _normal_form(state, disjunctive, literals, diagrams)
-            for disjunctive, count in paths.items()
-            if count[state] <= MAX_CUBES
-        ]
-        name = min(forms, key=len, default="...")
-        names.append(name if len(name) <= MAX_NAME else "...")
+    still = (automaton.delta == np.arange(len(automaton.delta))[:, None]).all(axis=1)
+    for q, priorities in enumerate(automaton.priority):
+        if still[q] and (priorities % 2 == priorities[0] % 2).all():
+            names.append("false" if priorities[0] % 2 else "true")
+        else:
+            names.append("..." if diagrams is None else namer.name(diagrams[q]))
     return tuple(names)
 
 
-def _normal_form(
-    diagram: int, disjunctive: bool, literals: list[_Text], diagrams: _Diagrams
-) -> str:
-    # The conjunctive form of f is the negation, literal by literal, of the disjunctive one of !f.
-    goal = diagram if disjunctive else diagrams.negation(diagram)
-    outer, inner = ("|", "&") if disjunctive else ("&", "|")
-    clauses = []
-    for cube in _cubes(goal, goal, diagrams)[0]:
-        texts = []
-        for variable, value in cube:
-            text, grouped = literals[variable]
-            negated = f"!({text})" if grouped else f"!{text}"
-            texts.append(literals[variable] if value == disjunctive else (negated, False))
-        clauses.append(_joined(inner, texts))
-    return _joined(outer, clauses)[0]
+# ---------------------------------------------------------------------------------------------
+# All of the logic
+# ---------------------------------------------------------------------------------------------
 
 
-def _joined(operator: str, texts: list[_Text]) -> _Text:
-    if len(texts) == 1:
-        return texts[0]
-    return f" {operator} ".join(f"({text})" if group else text for text, group in texts), True
+def _general(formula: Formula, alphabet: NDArray[np.bool_], max_states: int) -> Automaton:
+    """The smallest automaton that the ways to combine trackers give."""
+    plain = simplify(formula)
+    ways = _combinations(plain)
+    best: tuple[Table, NDArray[np.intp]] | None = None
+    # The way that tracks least may explode where another does not, so all start with little.
+    for work in (MAX_NODES // 100, MAX_NODES // 10, MAX_NODES):
+        for parts, cost in ways:
+            if best is not None and cost > WORTHWHILE * ways[0][1]:
+                break
+            limit = min(max_states, work // 10)
+            if best is not None:
+                limit = min(limit, 20 * len(best[0].delta) + 100)
+            try:
+                found = _tracked(parts, alphabet, formula.propositions, limit, work)
+            except ValueError:
+                if best is None and work == MAX_NODES and parts is ways[-1][0]:
+                    raise
+                continue
+            if best is None or _size(found[0]) < _size(best[0]):
+                best = found
+            if is_weak(found[0]) or _size(best[0])[0] <= GOOD_ENOUGH:  # weak: it is minimal
+                break
+        if best is not None:
+            break
+    assert best is not None
+    class_of = best[1]
+    table, kind, _ = reduce_table(best[0])
+    automaton = Automaton(
+        delta=table.delta[:, class_of].astype(np.int32),
+        initial=np.asarray(table.initial, np.int32),
+        priority=table.priority[:, class_of].astype(np.int32),
+        letters=alphabet,
+        propositions=formula.propositions,
+        acceptance=kind,
+    )
+    return replace(automaton, state_names=_residual_names(plain, automaton))
 
 
-def _cubes(
-    lower: int, upper: int, diagrams: _Diagrams
-) -> tuple[list[tuple[tuple[int, bool], ...]], int]:
-    """An irredundant disjunction of prime cubes between two diagrams, and its own diagram.
+def _combinations(formula: Formula) -> list[tuple[Combination, int]]:
+    """The different combinations of a formula, with how much they track, least first."""
+    found: list[tuple[Combination, int]] = []
+    for steps in (MAX_STEPS // 100, MAX_STEPS):
+        for grouped, dual in ((True, False), (True, True), (False, False), (False, True)):
+            try:
+                parts = combination(formula, grouped, dual, steps)
+            except ValueError:
+                if steps == MAX_STEPS and not found and grouped < dual:
+                    raise
+                continue
+            if all(parts != other for other, _ in found):
+                found.append((parts, extent(parts)))
+        if found:
+            break
+    return sorted(found, key=lambda entry: entry[1])
 
-    Minato 1993, "Fast generation of prime-irredundant covers from binary decision diagrams".
-    """
-    if lower == _FALSE:
-        return [], _FALSE
-    if upper == _TRUE:
-        return [()], _TRUE
-    both, either, negation = diagrams.both, diagrams.either, diagrams.negation
-    variable = min(diagrams.nodes[lower][0], diagrams.nodes[upper][0])
-    lower0, lower1 = diagrams.cofactors(lower, variable)
-    upper0, upper1 = diagrams.cofactors(upper, variable)
-    cubes0, cover0 = _cubes(both(lower0, negation(upper1)), upper0, diagrams)
-    cubes1, cover1 = _cubes(both(lower1, negation(upper0)), upper1, diagrams)
-    missing = either(both(lower0, negation(cover0)), both(lower1, negation(cover1)))
-    cubes, cover = _cubes(missing, both(upper0, upper1), diagrams)
-    with_variable = [((variable, False), *cube) for cube in cubes0]
-    with_variable += [((variable, True), *cube) for cube in cubes1]
-    whole = diagrams.node(variable, either(cover0, cover), either(cover1, cover))
-    return with_variable + cubes, whole
+
+def _size(table: Table) -> tuple[int, int]:
+    """States, a rejecting sink apart, then priorities."""
+    still = (table.delta == np.arange(len(table.delta))[:, None]).all(axis=1)
+    sink = still & (table.priority % 2 == 1).all(axis=1)
+    return len(table.delta) - int(sink.any()), len(np.unique(table.priority))
+
+
+def _tracked(
+    parts: Combination,
+    alphabet: NDArray[np.bool_],
+    propositions: tuple[str, ...],
+    max_states: int,
+    max_nodes: int,
+) -> tuple[Table, NDArray[np.intp]]:
+    """The reduced parity automaton of trackers, over classes of letters `[L]`."""
+    delta, colors, condition, class_of = track(
+        parts, alphabet, propositions, max_states, max_nodes
+    )
+    table = to_parity(delta, colors, 0, condition, max_states)[:3]
+    return reduce_table(Table(*table), thorough=False)[0], class_of
+
+
+def _residual_names(formula: Formula, automaton: Automaton) -> tuple[str, ...]:
+    """The formula left after a shortest word to each state, which has the state's language."""
+    progression = Progression([formula], automaton.letters, automaton.propositions)
+    if len(automaton.delta) > NAMED_STATES:
+        return _names(automaton, progression, None)
+    diagrams = {int(automaton.initial): progression.diagram_of[formula]}
+    delta = automaton.delta[:, progression.representative].tolist()
+    for state in (queue := list(diagrams)):
+        for after, successor in zip(progression.after, delta[state], strict=True):
+            if successor not in diagrams:
+                diagrams[successor] = after(diagrams[state])
+                queue.append(successor)
+    return _names(automaton, progression, [diagrams[q] for q in range(len(delta))])
+
+
+def _undecided(automaton: Automaton) -> str:
+    """Words that show why no finite prefix decides."""
+
+    def states(final: NDArray[np.bool_]) -> Automaton:
+        priority = np.repeat(np.where(final, 0, 1)[:, None], automaton.delta.shape[1], axis=1)
+        return replace(automaton, priority=priority.astype(np.int32), acceptance="buchi")
+
+    hopeful, sure = states(live_states(automaton)), states(universal_states(automaton))
+    fails = find_not_included(hopeful, automaton)
+    holds = find_not_included(automaton, sure)
+    assert fails is not None and holds is not None
+    return (
+        f"  It fails on {_lasso_text(fails)}, though each prefix can still be continued well.\n"
+        f"  It holds on {_lasso_text(holds)}, though each prefix can still be continued badly.\n"
+    )
+
+
+def _lasso_text(lasso: tuple[list[frozenset[str]], list[frozenset[str]]]) -> str:
+    prefix, cycle = (" ".join("{" + ", ".join(sorted(x)) + "}" for x in part) for part in lasso)
+    return f"{prefix} ({cycle})^w".strip()
+
+
+def _with_acceptance(formula: Formula, automaton: Automaton, acceptance: Acceptance) -> Automaton:
+    """The automaton with the acceptance that was asked for, if it can have it."""
+    kind = automaton.acceptance
+    if acceptance == "auto":
+        return automaton
+    if acceptance == "dfa":
+        if kind in ("cosafe", "safety"):
+            return automaton
+        raise ValueError(
+            f"to_automaton: {formula} has no finite acceptance, because neither a finite prefix "
+            "proves it wherever it holds (co-safe) nor one refutes it wherever it fails "
+            f"(safety).\n{_undecided(automaton)}"
+            '  Ask for acceptance="auto", or bound the formula by an event.'
+        )
+    if acceptance == "buchi":
+        if kind == "parity":
+            raise ValueError(
+                f"to_automaton: {formula} has no deterministic Buchi automaton: some word is "
+                "accepted because certain letters stop occurring, which a deterministic run "
+                'cannot foresee. Ask for acceptance="parity".'
+            )
+        return replace(automaton, acceptance="buchi")
+    return replace(automaton, acceptance="parity")

@@ -1,0 +1,327 @@
+"""From Emerson-Lei conditions, any Boolean combination of "infinitely often", to parity.
+
+The alternating cycle decomposition (Casares, Colcombet & Fijalkow 2021, "Optimal transformations
+of games and automata using Muller conditions") of a strongly connected part is a tree of its
+cycles: the root holds all transitions, and the children of a node are its maximal strongly
+connected parts with the opposite verdict. No parity automaton on top of the same states has
+fewer states or priorities than the one that it gives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Integers: TypeAlias = NDArray[np.integer[Any]]
+Condition: TypeAlias = tuple[Any, ...]  # see `holds`
+
+MAX_SUBSETS = 200_000  # parts examined in one decomposition before it is given up
+
+
+def holds(condition: Condition, colors: int) -> bool:
+    """Whether a condition holds of the set of colors that occur infinitely often.
+
+    Args:
+        condition: `("true",)`, `("false",)`, `("inf", i)`: color i occurs infinitely often,
+            `("fin", i)`: it does not, `("and", ...)` or `("or", ...)` of conditions.
+        colors: The set, as a number with color i as bit i.
+
+    >>> holds(("and", ("inf", 0), ("fin", 1)), 0b01)
+    True
+    """
+    match condition[0]:
+        case "true" | "false":
+            return condition[0] == "true"
+        case "inf" | "fin":
+            return bool(colors >> condition[1] & 1) == (condition[0] == "inf")
+        case "and":
+            return all(holds(part, colors) for part in condition[1:])
+        case "or":
+            return any(holds(part, colors) for part in condition[1:])
+    raise ValueError(f"holds: unknown condition {condition[0]!r}. Use true false inf fin and or.")
+
+
+def parity_condition(num_priorities: int) -> Condition:
+    """The condition that the least color seen infinitely often is even."""
+    condition: Condition = ("false",)
+    for color in reversed(range(num_priorities)):
+        if color % 2 == 0:
+            condition = ("or", ("inf", color), condition)
+        else:
+            condition = ("and", ("fin", color), condition)
+    return condition
+
+
+def strong_components(source: Integers, target: Integers, count: int) -> Integers:
+    """The number of the strongly connected component of each of `count` nodes."""
+    from scipy import sparse
+    from scipy.sparse import csgraph
+
+    edges = sparse.csr_array(
+        (np.ones(len(source), np.int8), (source, target)), shape=(count, count)
+    )
+    return np.asarray(csgraph.connected_components(edges, connection="strong")[1])
+
+
+def to_parity(
+    delta: Integers,
+    colors: Integers,
+    initial: int,
+    condition: Condition,
+    max_states: int = 1_000_000,
+) -> tuple[Integers, Integers, int, Integers]:
+    """A deterministic min-even parity automaton with the language of an Emerson-Lei one.
+
+    Args:
+        delta: `[Q, L]` successors.
+        colors: int64 `[Q, L]`, the set of colors of each transition, color i as bit i.
+        initial: The initial state.
+        condition: See `holds`.
+        max_states: The number of states at which to give up.
+
+    Returns:
+        `delta [Q', L]`, `priority [Q', L]`, the initial state, and `[Q']` the old state of each
+        new one. Only reachable states are kept, the initial one first. Transitions on no cycle
+        have priority 1.
+
+    Raises:
+        ValueError: For more than `max_states` states, or too many parts to examine.
+    """
+    columns, inverse = _distinct_columns(delta, colors)
+    few_delta, few_colors = delta[:, columns], colors[:, columns]
+    component = strong_components(
+        np.repeat(np.arange(len(delta)), len(columns)), few_delta.ravel(), len(delta)
+    )
+    memo: dict[int, bool] = {}
+
+    def verdict(mask: int) -> bool:
+        if mask not in memo:
+            memo[mask] = holds(condition, mask)
+        return memo[mask]
+
+    trees: dict[int, _Tree] = {}
+    for c in _reached(few_delta, initial, component):
+        trees[c] = _tree(few_delta, few_colors, component, c, verdict)
+    new_delta, priority, base = _unfold(few_delta, component, trees, initial, max_states)
+    return new_delta[:, inverse], priority[:, inverse], 0, base
+
+
+def _distinct_columns(delta: Integers, colors: Integers) -> tuple[Integers, Integers]:
+    both = np.concatenate([delta, colors]).T
+    _, first, inverse = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    return first, inverse.ravel()
+
+
+def _reached(delta: Integers, initial: int, component: Integers) -> list[int]:
+    seen = np.zeros(len(delta), bool)
+    frontier = np.array([initial])
+    while frontier.size:
+        seen[frontier] = True
+        following = np.unique(delta[frontier])
+        frontier = following[~seen[following]]
+    return [int(c) for c in np.unique(component[seen])]
+
+
+# ---------------------------------------------------------------------------------------------
+# The decomposition of one component
+# ---------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Tree:
+    """The nodes of a decomposition; node 0 is the root and parents come before children.
+
+    `edges[n]` holds numbers q * K + k of transitions, `states[n]` their sources.
+    """
+
+    accepting: bool = False
+    edges: list[frozenset[int]] = field(default_factory=list)
+    states: list[frozenset[int]] = field(default_factory=list)
+    parent: list[int] = field(default_factory=list)
+    depth: list[int] = field(default_factory=list)
+    children: list[list[int]] = field(default_factory=list)
+
+    def add(self, edges: frozenset[int], states: frozenset[int], parent: int) -> None:
+        if self.edges:
+            self.children[parent].append(len(self.edges))
+        self.edges.append(edges)
+        self.states.append(states)
+        self.parent.append(parent)
+        self.depth.append(self.depth[parent] + 1 if len(self.edges) > 1 else 0)
+        self.children.append([])
+
+
+def _tree(
+    delta: Integers,
+    colors: Integers,
+    component: Integers,
+    chosen: int,
+    verdict: Callable[[int], bool],
+) -> _Tree:
+    width = delta.shape[1]
+    members = np.flatnonzero(component == chosen)
+    inside = component[delta[members]] == chosen
+    row, column = np.nonzero(inside)
+    source = members[row]
+    target, mask = delta[source, column], colors[source, column]
+    tree = _Tree()
+    number = source * width + column
+
+    def sets(part: Integers) -> tuple[frozenset[int], frozenset[int]]:
+        return frozenset(number[part].tolist()), frozenset(source[part].tolist())
+
+    # Transitions with the same ends and colors stand together.
+    ends = np.stack([source, target, mask], axis=1)
+    _, first, twin = np.unique(ends, axis=0, return_index=True, return_inverse=True)
+    twin = twin.ravel()
+    parts = _Parts(source[first], target[first], mask[first], verdict)
+    whole = np.arange(len(first))
+    tree.accepting = bool(len(source)) and verdict(_union(mask))
+    tree.add(*sets(np.arange(len(source))), 0)
+    waiting = [(whole, tree.accepting, 0)] if len(source) else []
+    while waiting:
+        part, accepting, node = waiting.pop()
+        for smaller in parts.maximal(part, accepting):
+            chosen_twins = np.isin(twin, smaller)
+            waiting.append((smaller, not accepting, len(tree.edges)))
+            tree.add(*sets(np.flatnonzero(chosen_twins)), node)
+    return tree
+
+
+def _union(masks: Integers) -> int:
+    return int(np.bitwise_or.reduce(masks)) if len(masks) else 0
+
+
+@dataclass
+class _Parts:
+    """Searches strongly connected sets of transitions."""
+
+    source: Integers
+    target: Integers
+    mask: Integers
+    verdict: Callable[[int], bool]
+    examined: int = 0
+
+    def maximal(self, part: Integers, accepting: bool) -> list[Integers]:
+        """The maximal strongly connected subsets with the other verdict.
+
+        Such a subset lacks a color of the whole, so it lies in a component of what is left
+        without the transitions of that color.
+        """
+        found: dict[bytes, Integers] = {}
+        seen: set[bytes] = set()
+        waiting = [part]
+        while waiting:
+            whole = waiting.pop()
+            colors = _union(self.mask[whole])
+            for color in range(colors.bit_length()):
+                if not colors >> color & 1:
+                    continue
+                for smaller in self._components(whole[self.mask[whole] >> color & 1 == 0]):
+                    key = smaller.tobytes()
+                    if key in seen:
+                        continue
+                    seen.add(key)
+                    self.examined += 1
+                    if self.examined > MAX_SUBSETS:
+                        raise ValueError(
+                            f"to_parity: more than {MAX_SUBSETS} sets of transitions to "
+                            "examine. The acceptance condition has too many independent parts."
+                        )
+                    if self.verdict(_union(self.mask[smaller])) != accepting:
+                        found[key] = smaller
+                    else:
+                        waiting.append(smaller)
+        return _largest(list(found.values()))
+
+    def _components(self, part: Integers) -> list[Integers]:
+        source, target = self.source[part], self.target[part]
+        if not len(part):
+            return []
+        if (source == source[0]).all() and (target == source[0]).all():
+            return [part]
+        states, ends = np.unique(np.concatenate([source, target]), return_inverse=True)
+        ends = ends.ravel()
+        label = strong_components(ends[: len(part)], ends[len(part) :], len(states))
+        start, stop = label[ends[: len(part)]], label[ends[len(part) :]]
+        part, start = part[start == stop], start[start == stop]
+        return [part[start == c] for c in np.unique(start)]
+
+
+def _largest(parts: list[Integers]) -> list[Integers]:
+    """The parts that are in no other."""
+    kept: list[tuple[Integers, frozenset[int]]] = []
+    for part in sorted(parts, key=len, reverse=True):
+        members = frozenset(part.tolist())
+        if not any(members <= other for _, other in kept):
+            kept.append((part, members))
+    return [part for part, _ in kept]
+
+
+# ---------------------------------------------------------------------------------------------
+# The parity automaton
+# ---------------------------------------------------------------------------------------------
+
+
+def _unfold(
+    delta: Integers,
+    component: Integers,
+    trees: dict[int, _Tree],
+    initial: int,
+    max_states: int,
+) -> tuple[Integers, Integers, Integers]:
+    """The automaton on pairs of a state and a lowest node of the tree that holds it."""
+    width = delta.shape[1]
+    component_of = component.tolist()
+    table = delta.tolist()
+
+    def lowest(tree: _Tree, node: int, state: int) -> int:
+        while True:
+            below = next((n for n in tree.children[node] if state in tree.states[n]), None)
+            if below is None:
+                return node
+            node = below
+
+    def step(state: int, leaf: int, k: int) -> tuple[int, int, int]:
+        target = table[state][k]
+        tree = trees[component_of[state]]
+        if component_of[target] != component_of[state]:
+            return target, lowest(trees[component_of[target]], 0, target), 1
+        edge = state * width + k
+        node, came_from = leaf, -1
+        while edge not in tree.edges[node]:
+            node, came_from = tree.parent[node], node
+        priority = tree.depth[node] + (not tree.accepting)
+        siblings = tree.children[node]
+        turn = siblings.index(came_from) + 1 if came_from >= 0 else 0
+        for child in siblings[turn:] + siblings[:turn]:
+            if target in tree.states[child]:
+                return target, lowest(tree, child, target), priority
+        return target, node, priority
+
+    start = (initial, lowest(trees[component_of[initial]], 0, initial))
+    index = {start: 0}
+    order = [start]
+    rows, priorities = [], []
+    for state, leaf in order:
+        row, marks = [], []
+        for k in range(width):
+            target, node, priority = step(state, leaf, k)
+            pair = (target, node)
+            if pair not in index:
+                index[pair] = len(order)
+                order.append(pair)
+            row.append(index[pair])
+            marks.append(priority)
+        rows.append(row)
+        priorities.append(marks)
+        if len(order) > max_states:
+            raise ValueError(
+                f"to_parity: more than {max_states} states. Use fewer letters, or raise the limit."
+            )
+    base = np.array([state for state, _ in order])
+    return np.array(rows, np.int32), np.array(priorities, np.int32), base

@@ -1,0 +1,1 @@
+"""Files of other tools: automata in the Hanoi format."""
