@@ -165,7 +165,9 @@ def almost_surely_reaching(
     return carry[0]
 
 
-def end_components(model: Any, region: jax.Array) -> EndComponents:
+def end_components(
+    model: Any, region: jax.Array, allowed: jax.Array | None = None
+) -> EndComponents:
     """Maximal end components that lie within a region (de Alfaro 1997).
 
     An end component is a set of states with actions that never leave it and
@@ -175,11 +177,27 @@ def end_components(model: Any, region: jax.Array) -> EndComponents:
     Args:
       model: the model.
       region: ``bool[S]``.
+      allowed: ``bool[S, A]``, the actions that count; default the available ones.
     """
-    flat = int(np.prod(model.state_shape))
     # Only states that can remain in the region matter; usually there are few.
-    core = region & avoidable(model, ~region)
-    allowed = model.available & forall_successor(model, core) & core[..., None]
+    core = region & avoidable(model, ~region, allowed)
+    allowed = model.available if allowed is None else allowed
+    allowed = allowed & forall_successor(model, core) & core[..., None]
+    return _components(model, core, allowed, closed=False)
+
+
+def bottom_components(model: Any, allowed: jax.Array) -> EndComponents:
+    """Strongly connected components that no allowed action leaves.
+
+    Args:
+      model: the model.
+      allowed: ``bool[S, A]``, the actions that are all taken, such as a policy's support.
+    """
+    return _components(model, jnp.ones(model.state_shape, bool), allowed, closed=True)
+
+
+def _components(model: Any, core: jax.Array, allowed: jax.Array, closed: bool) -> EndComponents:
+    flat = int(np.prod(model.state_shape))
     shapes = (
         jax.ShapeDtypeStruct(model.state_shape, jnp.int32),
         jax.ShapeDtypeStruct((*model.state_shape, model.num_actions), jnp.bool_),
@@ -190,16 +208,14 @@ def end_components(model: Any, region: jax.Array) -> EndComponents:
         return number, jnp.zeros(shapes[1].shape, bool)
 
     arguments = (*_support(model), core, allowed)
+    host = partial(_end_components, _label_on(model), closed)
     if is_traced(arguments):
         def callback():
-            return jax.pure_callback(
-                partial(_end_components, _label_on(model)), shapes, *arguments,
-                vmap_method="sequential",
-            )
+            return jax.pure_callback(host, shapes, *arguments, vmap_method="sequential")
         return EndComponents(*lax.cond(core.any(), callback, trivial))
     if not bool(core.any()):
         return EndComponents(*trivial())
-    found = _end_components(_label_on(model), *(np.asarray(x) for x in arguments))
+    found = host(*(np.asarray(x) for x in arguments))
     return EndComponents(*(jnp.asarray(x) for x in found))
 
 
@@ -289,8 +305,11 @@ def _attractor_worklist(
     return Attractor(jnp.asarray(region.reshape(shape)), jnp.asarray(action.reshape(shape)))
 
 
-def _end_components(label_on, successor, used, next_memory, core, allowed):
-    """Refines strongly connected components until no action leaves its own."""
+def _end_components(label_on, closed, successor, used, next_memory, core, allowed):
+    """Refines strongly connected components until no action leaves its own.
+
+    Or, if only closed components are asked for, keeps those that no action leaves.
+    """
     from scipy import sparse
     from scipy.sparse import csgraph
 
@@ -315,6 +334,10 @@ def _end_components(label_on, successor, used, next_memory, core, allowed):
         _, label = csgraph.connected_components(graph, connection="strong")
         leaves = edge & (label[target] != label[:, None, None])
         kept = stay & ~leaves.any(-1)
+        if closed:
+            open_ = np.unique(label[(leaves.any(-1) & stay).any(-1)])
+            stay = stay & ~np.isin(label, open_)[:, None]
+            break
         if (kept == stay).all():
             break
         stay = kept

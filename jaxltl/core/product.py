@@ -239,6 +239,23 @@ def _each_memory(world: MDP | DenseMDP, operator, value, term, combine) -> jax.A
     return jnp.stack(columns, axis=-1)
 
 
+def reads(model: Product, marked: jax.Array) -> jax.Array:
+    """Whether an action can make the automaton read a marked transition: ``bool[S, Q, A]``.
+
+    Args:
+      model: the product.
+      marked: ``bool[Q, L]``, transitions of the automaton.
+    """
+    here = jnp.asarray(marked)[:, model.letter].T
+    if model.label_on == "exit":
+        return here[:, :, None] & model.available
+    return _each_memory(model.mdp, operators.exists_successor, here, _hits, jnp.logical_or)
+
+
+def _hits(weight: jax.Array, inside: jax.Array) -> jax.Array:
+    return (weight > 0) & inside
+
+
 def _read_at(value: jax.Array, memory: jax.Array) -> jax.Array:
     """``value[s, memory[s, q]]``, as a selection for few memory states.
 
@@ -260,10 +277,7 @@ def _(model: Product, value: jax.Array) -> jax.Array:
 
 @operators.exists_successor.register
 def _(model: Product, region: jax.Array) -> jax.Array:
-    def hits(weight: jax.Array, inside: jax.Array) -> jax.Array:
-        return (weight > 0) & inside
-
-    return _through(model, operators.exists_successor, region, hits, jnp.logical_or)
+    return _through(model, operators.exists_successor, region, _hits, jnp.logical_or)
 
 
 @operators.forall_successor.register

@@ -17,6 +17,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core import graph
+from jaxltl.core.acceptance import accepting_bottom_components, accepting_end_components
+from jaxltl.core.automaton import Automaton
 from jaxltl.core.fixed_point import LinearSolver, factorize, implicit, solve_linear
 from jaxltl.core.operators import (
     action_argmax,
@@ -119,7 +121,8 @@ def satisfaction_probability(
     """Probability that a policy satisfies the product's task, from every product state.
 
     For a co-safe task, of reaching a final state (2.5); for a safety task, of never
-    leaving the final states.
+    leaving the final states; for Buchi and parity, of reaching a closed component of the
+    policy's chain whose least priority is even.
 
     Args:
       model: the product.
@@ -131,45 +134,70 @@ def satisfaction_probability(
       :class:`Solution`; `value` is ``float[S, Q]``. The probability from the start is
       ``jnp.sum(model.initial * solution.value)``.
 
-    Differentiable in the policy and in the world's transition probabilities.
+    Differentiable in the policy and in the world's transition probabilities, with the
+    support held fixed.
     """
-    cosafe = _is_cosafe(model)
+    kind = model.automaton.acceptance
+    if kind in ("cosafe", "safety"):
+        target = model.final if kind == "cosafe" else ~model.final
+    else:
+        policy = policy_distribution(model, policy)
+        target = accepting_bottom_components(model, lax.stop_gradient(policy))
     reach = reachability_probability(
-        model, model.final if cosafe else ~model.final,
-        policy=policy, method=method, tolerance=tolerance,
+        model, target, policy=policy, method=method, tolerance=tolerance
     )
-    return reach if cosafe else _complement(reach)
+    return _complement(reach) if kind == "safety" else reach
 
 
 def optimal_satisfaction(
     model: Product,
     *,
+    objective: str = "max",
     tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int = 1_000_000,
 ) -> Solution:
-    """Largest probability of satisfying the product's task, with a policy that attains it.
+    """Largest or smallest probability of satisfying the product's task, with its policy.
+
+    For a co-safe task, of reaching a final state; for a safety task, of never leaving
+    them; for Buchi and parity, of reaching an accepting end component, where the policy
+    goes on so that acceptance is almost sure (Baier and Katoen 2008, section 10.6.4).
+    The least probability of a task is one minus the largest of its negation.
 
     Args:
       model: the product.
+      objective: ``"max"`` or ``"min"``.
       tolerance: half the width of the enclosure asked for.
       max_steps: sweeps at most.
 
     Returns:
-      :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``.
+      :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``, memoryless in
+      the product: its memory is the automaton's state.
+
+    Raises:
+      ValueError: the objective is unknown.
     """
-    if _is_cosafe(model):
-        return reachability_probability(
-            model, model.final, objective="max", tolerance=tolerance, max_steps=max_steps
+    if objective not in ("max", "min"):
+        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    limits = {"tolerance": tolerance, "max_steps": max_steps}
+    kind = model.automaton.acceptance
+    if kind == "cosafe":
+        return reachability_probability(model, model.final, objective=objective, **limits)
+    if kind == "safety":
+        opposite = "min" if objective == "max" else "max"
+        return _complement(
+            reachability_probability(model, ~model.final, objective=opposite, **limits)
         )
-    return _complement(
-        reachability_probability(
-            model, ~model.final, objective="min", tolerance=tolerance, max_steps=max_steps
-        )
-    )
+    if objective == "min":
+        negated = model.replace(automaton=_shifted(model.automaton))
+        return _complement(optimal_satisfaction(negated, **limits))
+    accepting = accepting_end_components(model)
+    reach = reachability_probability(model, accepting.region, objective="max", **limits)
+    return replace(reach, policy=jnp.where(accepting.region, accepting.action, reach.policy))
 
 
-def _is_cosafe(model: Product) -> bool:
-    return model.automaton.acceptance == "cosafe"
+def _shifted(automaton: Automaton) -> Automaton:
+    """The automaton of the negation; unlike `complement`, for traced tables too."""
+    return replace(automaton, priority=automaton.priority + 1, acceptance="parity", state_names=())
 
 
 def _complement(reach: Solution) -> Solution:
