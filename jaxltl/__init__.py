@@ -4,7 +4,7 @@ State a task by a temporal-logic formula, demonstrations, a reward, or a mix; le
 product of the world and the task's automaton; get every answer with its evidence.
 """
 
-from jaxltl.core.automaton import Automaton
+from jaxltl.core.automaton import Automaton, complement, make_automaton
 from jaxltl.core.bellman import (
     boltzmann_fixed_points,
     boltzmann_value,
@@ -18,8 +18,10 @@ from jaxltl.core.graph import (
     avoidable,
     end_components,
 )
+from jaxltl.core.language import find_difference, is_equivalent
 from jaxltl.core.ltl import Formula, holds_on_lasso, parse_ltl
 from jaxltl.core.mdp import MDP, DenseMDP, from_dense, make_mdp, to_dense
+from jaxltl.core.monitor import Monitor, Verdict, make_monitor, monitor_step, verdict
 from jaxltl.core.occupancy import feature_expectation, occupancy_measure
 from jaxltl.core.operators import (
     exists_successor,
@@ -47,6 +49,7 @@ from jaxltl.core.rollout import Trajectories, make_trajectories, rollout
 from jaxltl.core.translate import to_automaton
 from jaxltl.core.types import NotConverged, Solution, Status, check
 from jaxltl.envs.gridworld import gridworld
+from jaxltl.io.hoa import read_hoa, write_hoa
 
 __version__ = "0.1.0"
 
@@ -56,30 +59,38 @@ __all__ = [
     "DenseMDP",
     "FiniteMemoryPolicy",
     "Formula",
+    "Monitor",
     "NotConverged",
     "Product",
     "Solution",
     "Status",
     "Trajectories",
+    "Verdict",
     "almost_surely_reaching",
     "attractor",
     "avoidable",
     "boltzmann_fixed_points",
     "boltzmann_value",
     "check",
+    "complement",
     "end_components",
     "exists_successor",
     "expectation",
     "feature_expectation",
+    "find_difference",
     "forall_successor",
     "from_dense",
     "gridworld",
     "holds_on_lasso",
+    "is_equivalent",
     "letters",
     "lift_policy",
     "lift_trajectories",
+    "make_automaton",
     "make_mdp",
+    "make_monitor",
     "make_trajectories",
+    "monitor_step",
     "occupancy_measure",
     "optimal_satisfaction",
     "optimal_value",
@@ -89,6 +100,7 @@ __all__ = [
     "project_policy",
     "pushforward",
     "reachability_probability",
+    "read_hoa",
     "restrict",
     "rollout",
     "sample_successor",
@@ -96,4 +108,6 @@ __all__ = [
     "soft_value",
     "to_automaton",
     "to_dense",
+    "verdict",
+    "write_hoa",
 ]

@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -237,13 +237,22 @@ def check(task_file: Path) -> None:
 @click.option("-F", "--file", "source", metavar="FILE",
               help="Read one formula a line from a file; - is standard input.")
 @click.option("--to", "form", default="text", show_default=True,
-              type=click.Choice(["text", "dot", "svg", "json"]))
+              type=click.Choice(["text", "dot", "svg", "json", "hoa"]))
+@click.option("--acceptance", default="auto", show_default=True,
+              type=click.Choice(["auto", "dfa", "buchi", "parity"]),
+              help="What an automaton accepts by: auto takes the simplest that the language has.")
 @_plain_errors
-def automaton(formulas: tuple[str, ...], source: str | None, form: str) -> None:
-    """Translate formulas to minimal deterministic automata, in order.
+def automaton(
+    formulas: tuple[str, ...], source: str | None, form: str,
+    acceptance: Literal["auto", "dfa", "buchi", "parity"],
+) -> None:
+    """Translate formulas to small deterministic automata, in order.
 
-    A formula is co-safe or safety, in the syntax that Spot reads:
+    Any formula of linear temporal logic, in the syntax that Spot reads:
     ! & | -> <-> xor X F G U R W M, true, false, and propositions.
+
+    Acceptance is by final states where a finite prefix decides (dfa), else by accepting
+    transitions met for ever (buchi) where that is possible, else by min-even parity.
     """
     from jaxltl.core.translate import to_automaton
 
@@ -252,12 +261,12 @@ def automaton(formulas: tuple[str, ...], source: str | None, form: str) -> None:
         raise click.UsageError("give at least one formula, or a file of them with -F.")
     for i, (where, formula) in enumerate(numbered):
         try:
-            result = to_automaton(formula)
+            result = to_automaton(formula, acceptance=acceptance)
         except ValueError as error:
             raise ValueError(f"{where}{error}") from None
         if i and form == "text":
             click.echo()
-        click.echo(_render(result, form))
+        click.echo(_render(result, form, formula))
 
 
 def _formula_lines(source: str | None) -> list[tuple[str, str]]:
@@ -273,7 +282,7 @@ def _formula_lines(source: str | None) -> list[tuple[str, str]]:
     ]
 
 
-def _render(result: Automaton, form: str) -> str:
+def _render(result: Automaton, form: str, formula: str) -> str:
     from jaxltl.core.automaton import to_dict, to_dot, to_text
 
     if form == "text":
@@ -282,6 +291,10 @@ def _render(result: Automaton, form: str) -> str:
         return to_dot(result)
     if form == "json":
         return json.dumps(to_dict(result))
+    if form == "hoa":
+        from jaxltl.io.hoa import write_hoa
+
+        return write_hoa(result, name=formula).removesuffix("\n")
     program = shutil.which("dot")
     if program is not None:
         with contextlib.suppress(OSError, subprocess.CalledProcessError):

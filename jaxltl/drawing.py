@@ -6,6 +6,8 @@ what is already there.
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 import textwrap
 from collections.abc import Mapping
 from functools import cache
@@ -18,29 +20,33 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from jaxltl.core.automaton import Automaton
+from jaxltl.core.language import live_states
 
 RADIUS = 0.24
 FONT_SIZE = 9.5
+MARKED_HEIGHT = FONT_SIZE * 1.5 / 72  # of a line with a mark
+MARK_WIDTH = 0.22  # of the column of marks before the lines of a label
 _MARGIN = 0.35
 _ROW = 1.4
 _SAMPLES = np.linspace(0, 1, 61)[:, None]
 
 Points = NDArray[np.float64]
+Key = tuple[int, int, int]  # source, target, and which of the curves between the two
+Rows = tuple[tuple[str, str], ...]  # a mark and a guard
 
 
 class Edge(NamedTuple):
     """A transition as a Bezier curve ``float[3 or 4, 2]`` between the rims of its states."""
 
-    source: int
-    target: int
+    key: Key
     curve: Points
 
 
 class Label(NamedTuple):
-    """A guard and where it stands."""
+    """Guards, each with its mark before the first of its lines, and where they stand."""
 
-    target: int
-    text: str
+    key: Key
+    rows: Rows
     center: Points
 
 
@@ -61,7 +67,12 @@ class _Box(NamedTuple):
         return int(np.sum(np.all(np.abs(points - self.center) < self.half, axis=1)))
 
     def overlaps(self, other: _Box) -> bool:
-        return bool(np.all(np.abs(self.center - other.center) < self.half + other.half))
+        return bool(self.overlapped(np.array([other]))[0])
+
+    def overlapped(self, others: Points) -> NDArray[np.bool_]:
+        """``bool[B]`` for boxes ``float[B, 2, 2]``."""
+        apart = np.abs(others[:, 0] - self.center) - others[:, 1]
+        return np.all(apart < self.half, axis=1)
 
     def near(self, centers: Points, distance: float) -> int:
         gap = np.maximum(np.abs(centers - self.center) - self.half, 0)
@@ -70,20 +81,15 @@ class _Box(NamedTuple):
 
 def rejecting(automaton: Automaton) -> NDArray[np.bool_]:
     """``bool[Q]``: states from which no word is accepted any more."""
-    final = np.asarray(automaton.final)
-    if automaton.acceptance == "safety":
-        return ~final
-    hopeful = final.copy()
-    for _ in range(len(final)):
-        hopeful |= hopeful[np.asarray(automaton.delta)].any(axis=1)
-    return ~hopeful
+    return ~live_states(automaton)
 
 
 def arrange(
     delta: NDArray[np.integer],
     initial: int,
     doomed: NDArray[np.bool_],
-    texts: Mapping[tuple[int, int], str],
+    texts: Mapping[Key, Rows],
+    position: Points | None = None,
 ) -> Graph:
     """A drawing of a transition graph.
 
@@ -91,42 +97,69 @@ def arrange(
       delta: ``int[Q, L]``.
       initial: the state on the left.
       doomed: ``bool[Q]``, states that stand below the others.
-      texts: the label of each pair of joined states; long ones are broken into lines.
+      texts: the label of each curve; long guards are broken into lines.
+      position: ``float[Q, 2]``, where the states stand; default our own choice.
     """
-    texts = {pair: _wrap(text) for pair, text in texts.items()}
-    position = _positions(delta, initial, doomed, texts)
-    pairs = sorted(
-        (p for p in texts if p[0] != p[1]),
-        key=lambda p: float(np.sum((position[p[0]] - position[p[1]]) ** 2)),
+    texts = {key: _wrapped(rows) for key, rows in texts.items()}
+    if position is None:
+        position = _positions(delta, initial, doomed, texts)
+    keys = sorted(
+        (k for k in texts if k[0] != k[1]),
+        key=lambda k: float(np.sum((position[k[0]] - position[k[1]]) ** 2)),
     )
     # Loops go first, clear of the straight lines that the other edges would like to take.
-    wishes = {p: _along(_curve(position[p[0]], position[p[1]], 0)) for p in pairs}
+    wishes = {k: _along(_curve(position[k[0]], position[k[1]], 0)) for k in keys}
     placed: list[Points] = [position[initial] - [[RADIUS + 0.2, 0]]]
     edges: list[Edge] = []
     boxes: list[_Box] = []
     labels: list[Label] = []
-    for q in sorted(p[0] for p in texts if p[0] == p[1]):
+    for key in sorted(k for k in texts if k[0] == k[1]):
         # A loop on a state that is never left says nothing, and its label would only crowd.
-        if texts[q, q] == "⊤":
+        if texts[key] == (("", "⊤"),):
             continue
-        near = [line for pair, line in wishes.items() if q in pair]
-        curve, box = _best_loop(position, q, texts[q, q], placed + near, boxes)
+        near = [line for k, line in wishes.items() if key[0] in k[:2]]
+        curve, box = _best_loop(position, key[0], texts[key], placed + near, boxes)
         placed.append(_along(curve))
         boxes.append(box)
-        edges.append(Edge(q, q, curve))
-        labels.append(Label(q, texts[q, q], box.center))
-    for source, target in pairs:
-        paired = (target, source) in texts
-        curve = _best_curve(position, source, target, paired, placed, boxes)
+        edges.append(Edge(key, curve))
+        labels.append(Label(key, texts[key], box.center))
+    for key in keys:
+        crowded = sum({*k[:2]} == {*key[:2]} for k in keys) > 1
+        curve = _best_curve(position, key[0], key[1], crowded, placed, boxes)
         placed.append(_along(curve))
-        edges.append(Edge(source, target, curve))
-    straight = [e for e in edges if e.source != e.target]
-    for edge in sorted(straight, key=lambda e: -len(texts[e.source, e.target])):
-        text = texts[edge.source, edge.target]
-        box = _best_label(position, edge, text, placed, boxes)
+        edges.append(Edge(key, curve))
+    straight = [e for e in edges if e.key[0] != e.key[1]]
+    for edge in sorted(straight, key=lambda e: -sum(len(text) for _, text in texts[e.key])):
+        box = _best_label(position, edge, texts[edge.key], placed, boxes)
         boxes.append(box)
-        labels.append(Label(edge.target, text, box.center))
+        labels.append(Label(edge.key, texts[edge.key], box.center))
     return _framed(position, edges, labels, boxes, initial)
+
+
+def graphviz_positions(count: int, initial: int, texts: Mapping[Key, Rows]) -> Points | None:
+    """``float[count, 2]``: where graphviz puts the states, or None where it does not run."""
+    program = shutil.which("dot")
+    if program is None:
+        return None
+    lines = [
+        "digraph {", "rankdir=LR; nodesep=0.8; ranksep=0.7;",
+        f"node [shape=circle, fixedsize=true, width={2 * RADIUS}];",
+        f"edge [fontsize={FONT_SIZE}];",
+        f"{initial};", *map(str, range(count)),  # the first that is named stands on the left
+    ]
+    for (source, target, _), rows in texts.items():
+        # The room that the label takes is all that counts, not what it says.
+        text = "\\n".join("m" * (len(line) + 2) for _, line in _wrapped(rows))
+        lines.append(f'{source} -> {target} [label="{text}"];')
+    try:
+        done = subprocess.run([program, "-Tplain"], input="\n".join([*lines, "}"]), text=True,
+                              capture_output=True, check=True, timeout=60)
+        found = [line.split()[1:4] for line in done.stdout.splitlines()
+                 if line.startswith("node ")]
+        places = {int(name): (float(x), float(y)) for name, x, y in found}
+        return np.array([places[q] for q in range(count)])
+    except (OSError, subprocess.SubprocessError, ValueError, KeyError):
+        return None
 
 
 def _framed(
@@ -150,7 +183,7 @@ def _framed(
 
 def _positions(
     delta: NDArray[np.integer], initial: int, doomed: NDArray[np.bool_],
-    texts: Mapping[tuple[int, int], str],
+    texts: Mapping[Key, Rows],
 ) -> Points:
     layer = _layers(delta, initial)
     upper = [np.flatnonzero((layer == i) & ~doomed) for i in range(layer.max() + 1)]
@@ -162,15 +195,16 @@ def _positions(
     for i, states in enumerate(order):
         if i:
             # Room for the widest label between this layer and the one before.
-            between = [_size(t)[0] for (a, b), t in texts.items()
+            between = [_size(t)[0] for (a, b, _), t in texts.items()
                        if a != b and {place.get(a), place.get(b)} == {i - 1, i}]
             x += max(1.6, 2 * RADIUS + 0.75 + max(between, default=0.0))
         column[states] = x
         last = i
     position = np.zeros((len(delta), 2))
     position[:, 0] = column
+    row = _ROW * max(1.0, (len(texts) / len(delta) / 2) ** 0.5)  # more room for more labels
     for states in order:
-        height = _ROW * (len(states) - 1) / 2
+        height = row * (len(states) - 1) / 2
         position[states, 1] = np.linspace(height, -height, len(states)) if len(states) > 1 else 0
     sinks = np.flatnonzero(doomed)
     if sinks.size:
@@ -233,19 +267,20 @@ def _along(curve: Points) -> Points:
 
 
 def _best_curve(
-    position: Points, source: int, target: int, paired: bool, placed: list[Points],
+    position: Points, source: int, target: int, crowded: bool, placed: list[Points],
     boxes: list[_Box],
 ) -> Points:
-    bends = (0.22, -0.22, 0.4, -0.4) if paired else (
+    bends = (0.22, -0.22, 0.4, -0.4) if crowded else (
         0, 0.12, -0.12, 0.25, -0.25, 0.4, -0.4, 0.6, -0.6)
     others = np.delete(position, [source, target], axis=0)
     drawn = np.concatenate(placed)
 
     def cost(bend: float) -> float:
         inside = _along(_curve(position[source], position[target], bend))[6:-6]
+        near, close = _reachable(inside, 0.1, drawn, boxes)
         gap = np.min(_distances(inside, others), initial=np.inf)
-        hits = np.sum(_distances(inside, drawn).min(axis=1) < 0.07)
-        hits += 4 * sum(box.holds(inside) for box in boxes)
+        hits = np.sum(_distances(inside, near).min(axis=1, initial=np.inf) < 0.07)
+        hits += 4 * sum(_Box(*box).holds(inside) for box in close)
         return 60 * max(0, RADIUS + 0.14 - gap) + 0.25 * hits + 3 * abs(bend) + 0.01 * (bend < 0)
 
     return _curve(position[source], position[target], min(bends, key=cost))
@@ -264,10 +299,12 @@ def _curve(start: Points, end: Points, bend: float) -> Points:
 
 
 def _best_loop(
-    position: Points, q: int, text: str, placed: list[Points], boxes: list[_Box]
+    position: Points, q: int, rows: Rows, placed: list[Points], boxes: list[_Box]
 ) -> tuple[Points, _Box]:
-    half = _size(text) / 2
+    half = _size(rows) / 2
     drawn, others = np.concatenate(placed), np.delete(position, q, axis=0)
+    reach = 4 * RADIUS + 2 * float(half.sum())
+    drawn, near = _reachable(position[[q]], reach, drawn, boxes)
 
     def candidate(angle: float) -> tuple[Points, _Box]:
         def rim(turn: float, reach: float) -> Points:
@@ -287,9 +324,9 @@ def _best_loop(
         beside = np.abs((taken - angle + np.pi) % (2 * np.pi) - np.pi) < 0.62
         points = _along(curve)[6:-6]
         return (
-            2 * np.sum(_distances(points, drawn).min(axis=1) < 0.08)
+            2 * np.sum(_distances(points, drawn).min(axis=1, initial=np.inf) < 0.08)
             + 60 * np.sum(_distances(points, others) < RADIUS + 0.08)
-            + _label_cost(box, others, drawn, boxes)
+            + _label_cost(box, others, drawn, near)
             + 3 * np.sum(beside)
             + (0.0 if np.isclose(angle, np.pi / 2) else 1.0)
         )
@@ -298,11 +335,12 @@ def _best_loop(
 
 
 def _best_label(
-    position: Points, edge: Edge, text: str, placed: list[Points], boxes: list[_Box]
+    position: Points, edge: Edge, rows: Rows, placed: list[Points], boxes: list[_Box]
 ) -> _Box:
-    half = _size(text) / 2
+    half = _size(rows) / 2
     own = _along(edge.curve)
     drawn = np.concatenate([p for p in placed if not np.array_equal(p, own)])
+    drawn, near = _reachable(own, 2 * float(half.sum()) + 0.3, drawn, boxes)
     best, least = None, np.inf
     for i in range(9, 52, 2):
         along = own[i + 1] - own[i - 1]
@@ -310,7 +348,7 @@ def _best_label(
         clear = np.abs(normal) @ half + 0.05
         for shift in (0.0, clear, -clear, clear + 0.1, -clear - 0.1):
             box = _Box(own[i] + shift * normal, half)
-            cost = _label_cost(box, position, drawn, boxes) + abs(i - 30) * 0.05
+            cost = _label_cost(box, position, drawn, near) + abs(i - 30) * 0.05
             # On its own line a label hides it, so beside the line is better, if it fits.
             cost += 6.0 if shift == 0 else 2.0 * box.holds(own) + 2.0 * (abs(shift) > clear)
             if cost < least:
@@ -319,9 +357,24 @@ def _best_label(
     return best
 
 
-def _label_cost(box: _Box, nodes: Points, drawn: Points, boxes: list[_Box]) -> float:
+def _reachable(
+    around: Points, reach: float, drawn: Points, boxes: list[_Box]
+) -> tuple[Points, Points]:
+    """Of points and boxes, all that come so near to some points, for speed, and perhaps more.
+
+    Returns:
+      ``float[N, 2]`` and, centres and halves, ``float[B, 2, 2]``.
+    """
+    low, high = around.min(axis=0) - reach, around.max(axis=0) + reach
+    region = _Box((low + high) / 2, (high - low) / 2)
+    near = np.all(np.abs(drawn - region.center) < region.half, axis=1)
+    stacked = np.array(boxes).reshape(-1, 2, 2)
+    return drawn[near], stacked[region.overlapped(stacked)]
+
+
+def _label_cost(box: _Box, nodes: Points, drawn: Points, boxes: Points) -> float:
     grown = _Box(box.center, box.half + 0.03)
-    clashes = sum(box.overlaps(other) for other in boxes)
+    clashes = int(box.overlapped(boxes).sum())
     return 60 * box.near(nodes, RADIUS + 0.04) + 40 * clashes + 2.0 * grown.holds(drawn)
 
 
@@ -330,7 +383,15 @@ def _distances(points: Points, others: Points) -> NDArray[np.float64]:
     return np.hypot(difference[..., 0], difference[..., 1])
 
 
-def _wrap(text: str, width: int = 22) -> str:
+def _wrapped(rows: Rows) -> Rows:
+    """Rows of one line each; the mark of a guard stands before its first line."""
+    return tuple(
+        (mark if i == 0 else "", line)
+        for mark, text in rows for i, line in enumerate(_wrap(text))
+    )
+
+
+def _wrap(text: str, width: int = 22) -> list[str]:
     lines = textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
     if len(lines) > 4:
         lines = [*lines[:3], lines[3] + " …"]
@@ -338,7 +399,7 @@ def _wrap(text: str, width: int = 22) -> str:
     for i in range(len(lines) - 1):
         if lines[i][-2:] in (" ∧", " ∨"):
             lines[i], lines[i + 1] = lines[i][:-2], lines[i][-1] + " " + lines[i + 1]
-    return "\n".join(lines)
+    return lines
 
 
 @cache
@@ -347,10 +408,18 @@ def _line_width(line: str) -> float:
     return float(path.get_extents().width)
 
 
-def _size(text: str) -> Points:
-    """Width and height of a drawn text."""
-    lines = text.split("\n")
-    return np.array([
-        max(_line_width(line) for line in lines) / 72 + 0.06,
-        len(lines) * FONT_SIZE * 1.2 / 72 + 0.04,
-    ])
+def text_width(rows: Rows) -> float:
+    """Width of the widest line, without marks."""
+    return max(_line_width(line) for _, line in rows) / 72
+
+
+def is_marked(rows: Rows) -> bool:
+    """Whether some line has a mark before it."""
+    return any(mark for mark, _ in rows)
+
+
+def _size(rows: Rows) -> Points:
+    """Width and height of a drawn label."""
+    if is_marked(rows):
+        return np.array([text_width(rows) + MARK_WIDTH + 0.06, len(rows) * MARKED_HEIGHT + 0.02])
+    return np.array([text_width(rows) + 0.06, len(rows) * FONT_SIZE * 1.2 / 72 + 0.04])

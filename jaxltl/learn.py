@@ -16,6 +16,7 @@ import numpy as np
 
 import jaxltl
 from jaxltl.algos import learner, mlirl
+from jaxltl.core.monitor import Verdict, make_monitor
 from jaxltl.core.product import Product, lift_policy, product, project_policy, restrict
 from jaxltl.core.reachability import optimal_satisfaction, satisfaction_probability
 from jaxltl.core.rollout import Trajectories
@@ -494,7 +495,8 @@ def _maps(outcome: Outcome, cells: np.ndarray) -> list[tuple[str, str, bytes, st
     at_start = np.where(starts, from_starts(model, value), np.nan)
     values = plot.grid(cells, at_start, label="probability of doing the task")
     # Memory states where the policy still matters: not done, not failed, and reachable.
-    undecided = ~np.asarray(model.automaton.final) & (value > 0).any(axis=0)
+    open_ = np.asarray(make_monitor(model.automaton).verdict) == Verdict.UNDECIDED
+    undecided = open_ & (value > 0).any(axis=0)
     met = _reached(model)
     shown = np.flatnonzero(undecided & met.any(axis=0))
     names = model.automaton.state_names or ("",) * model.num_memory

@@ -1,14 +1,21 @@
 """The command line: what it prints and writes, and that mistakes come as one plain line."""
 
+import doctest
 import json
+import re
+import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from jaxltl.cli import main
+from jaxltl.core.language import is_equivalent
+from jaxltl.core.translate import to_automaton
+from jaxltl.io.hoa import read_hoa_stream
 from tests.test_task import SHOWN, TASK, write  # noqa: F401
 
 QUICK = ("discount = 0.9", 'discount = 0.9\nsteps = 40\ntolerance = 1e-6\n'
@@ -39,11 +46,38 @@ def test_automata_in_order_and_from_standard_input():
     assert sizes == [2, 4]
 
 
-@pytest.mark.parametrize(("form", "sign"), [("dot", "digraph"), ("svg", "<svg"), ("text", ">  0")])
+@pytest.mark.parametrize(
+    ("form", "sign"), [("dot", "digraph"), ("svg", "<svg"), ("text", ">  0"), ("hoa", "HOA: v1")]
+)
 def test_forms_of_an_automaton(form, sign, monkeypatch):
     monkeypatch.setattr("shutil.which", lambda name: None)
-    result = run("automaton", "F a", "--to", form)
-    assert result.exit_code == 0 and sign in result.output
+    for formula in ("F a", "G F a", "F G a"):
+        result = run("automaton", formula, "--to", form)
+        assert result.exit_code == 0 and sign in result.output
+
+
+def test_a_stream_of_automata():
+    formulas = ["F a", "G F a & G F b", "F G \"odd \\\" name\""]
+    result = run("automaton", *formulas, "--to", "hoa")
+    assert result.output.endswith("--END--\n")
+    names = [line for line in result.output.splitlines() if line.startswith("name:")]
+    assert names == ['name: "F a"', 'name: "G F a & G F b"',
+                     r'name: "F G \"odd \\\" name\""']
+    read = read_hoa_stream(result.output)
+    assert [x.acceptance for x in read] == ["cosafe", "buchi", "parity"]
+    assert all(is_equivalent(x, to_automaton(f)) for x, f in zip(read, formulas, strict=True))
+
+
+def test_the_acceptance_that_is_asked_for():
+    for acceptance, found in (("auto", "cosafe"), ("dfa", "cosafe"), ("buchi", "buchi"),
+                              ("parity", "parity")):
+        result = run("automaton", "F a", "--acceptance", acceptance)
+        assert result.output.startswith(f"{found} automaton: 2 states")
+    assert "has no deterministic Buchi automaton" in failure(
+        "automaton", "F G a", "--acceptance", "buchi")
+    message = failure("automaton", "-F", "-", "--acceptance", "dfa", input="F a\nG F a\n")
+    assert message.startswith("error: standard input, line 2: ")
+    assert "G F a has no finite acceptance" in message
 
 
 def test_graphviz_draws_if_it_is_there(monkeypatch, tmp_path):
@@ -56,9 +90,25 @@ def test_graphviz_draws_if_it_is_there(monkeypatch, tmp_path):
     assert "matplotlib" in run("automaton", "F a", "--to", "svg").output
 
 
+def test_what_the_page_on_logic_shows_is_real(monkeypatch):
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    page = (Path(__file__).parent.parent / "docs" / "logic.md").read_text()
+    shown = "\n".join(re.findall(r"```console\n(.*?)```", page, re.DOTALL))
+    first, *commands = re.split(r"^\$ ", shown, flags=re.MULTILINE)
+    assert not first and len(commands) >= 5
+    for command in commands:
+        line, output = command.split("\n", 1)
+        assert run(*shlex.split(line)[1:]).output.strip() == output.strip(), line
+    blocks = "\n".join(re.findall(r"```pycon\n(.*?)```", page, re.DOTALL))
+    test = doctest.DocTestParser().get_doctest(blocks, {}, "logic.md", None, None)
+    assert len(test.examples) > 20
+    assert doctest.DocTestRunner().run(test).failed == 0
+    for picture in re.findall(r"\((pictures/.*?)\)", page):
+        assert (Path(__file__).parent.parent / "docs" / picture).exists()
+
+
 def test_mistakes_in_formulas(tmp_path):
     assert "column 5" in failure("automaton", "F (a")
-    assert "neither co-safe nor a safety formula" in failure("automaton", "G F a")
     assert "standard input, line 2: " in failure("automaton", "-F", "-", input="F a\nF )\n")
     assert "No such file" in failure("automaton", "-F", tmp_path / "none")
     result = run("automaton")
@@ -194,7 +244,7 @@ def test_a_task_that_cannot_be_done_from_some_start(write, tmp_path):  # noqa: F
     (("discount = 0.9", "discount = "), "line 18"),
     (("!r U y", "!r U U y"), "column 6"),
     (("!r U y", "!red U y"), "the task mentions the proposition 'red'"),
-    (("!r U y", "G F y"), "neither co-safe nor a safety formula"),
+    (("!r U y", "G F y"), "co-safe task"),
     (("!r U y", "G !r"), "co-safe task"),
     (("discount = 0.9", "discount = 0.9\nstart = [1, 2]"), "start has 2 numbers; there are 4"),
     (("discount = 0.9", 'discount = 0.9\navoid = ["q"]'), "'q' is not a proposition"),

@@ -1,11 +1,16 @@
 """Pictures: they are drawn whole, labels stand free, and misfits are named."""
 
+import stat
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
+from matplotlib.patches import Circle, FancyArrowPatch
 
 from jaxltl import drawing, plot
+from jaxltl.core.automaton import Automaton, complement, make_automaton
 from jaxltl.core.translate import to_automaton
 
 MAP = "b . r\n. # y"
@@ -17,13 +22,40 @@ GOOD = [
     "F a & F b",
     'F "a $x$ & b" & !c U d',
     "(!r & !y) -> ((!r U y) & (!y U g1) & (!y U g2) & F y)",
+    "G F a & G F b",
+    "F G a",
+    "G (r -> F g)",
+    "G F a -> G F b",
+    "F a & G F b",
+    "a U (b U G c)",
+    "G (a -> F b) & G (c -> F d)",
 ]
+
+
+def arranged(table):
+    """The drawing that `plot.automaton` makes without graphviz."""
+    doomed = drawing.rejecting(table)
+    texts = plot._edge_texts(table, doomed)
+    return drawing.arrange(table.delta, int(table.initial), doomed, texts)
+
+
+def colors(figure):
+    """How many curves there are of each colour."""
+    drawn = [x for x in figure.axes[0].patches if isinstance(x, FancyArrowPatch)]
+    return Counter(to_hex(x.get_edgecolor()) for x in drawn)
+
+
+def marks(figure):
+    """The fill of each circle that is no state, from top to bottom and left to right."""
+    found = [x for x in figure.axes[0].patches if isinstance(x, Circle) and x.get_radius() < 0.1]
+    return [to_hex(x.get_facecolor())
+            for x in sorted(found, key=lambda x: (-x.center[1], x.center[0]))]
 
 
 @pytest.mark.parametrize("formula", GOOD)
 def test_an_automaton_is_drawn(formula):
     table = to_automaton(formula)
-    figure = plot.automaton(table)
+    figure = plot.automaton(table, layout="matplotlib")
     axes = figure.axes[0]
     shown = {text.get_text() for text in axes.texts}
     assert {str(q) for q in range(len(table.delta))} <= shown
@@ -33,9 +65,8 @@ def test_an_automaton_is_drawn(formula):
 @pytest.mark.parametrize("formula", GOOD)
 def test_labels_stand_clear_of_states_and_each_other(formula):
     table = to_automaton(formula)
-    texts = plot._guard_texts(table)
-    graph = drawing.arrange(table.delta, int(table.initial), drawing.rejecting(table), texts)
-    boxes = [drawing._Box(x.center, drawing._size(x.text) / 2) for x in graph.labels]
+    graph = arranged(table)
+    boxes = [drawing._Box(x.center, drawing._size(x.rows) / 2) for x in graph.labels]
     if len(table.delta) <= 5:  # in a dense graph a label may touch its neighbour
         assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
     assert sum(box.near(graph.position, drawing.RADIUS) for box in boxes) == 0
@@ -46,15 +77,108 @@ def test_labels_stand_clear_of_states_and_each_other(formula):
 
 def test_states_do_not_overlap():
     table = to_automaton("F a & F b & F c")
-    texts = plot._guard_texts(table)
-    graph = drawing.arrange(table.delta, 0, drawing.rejecting(table), texts)
+    graph = arranged(table)
     gaps = np.hypot(*(graph.position[:, None] - graph.position[None]).transpose(2, 0, 1))
     assert gaps[~np.eye(len(gaps), dtype=bool)].min() > 2 * drawing.RADIUS
 
 
 def test_the_longest_guard_says_else():
-    texts = plot._guard_texts(to_automaton("!red U (goal & !red)"))
-    assert "else" in texts.values() and texts[0, 1] != texts[0, 0]
+    table = to_automaton("!red U (goal & !red)")
+    texts = plot._edge_texts(table, drawing.rejecting(table))
+    assert (("", "else"),) in texts.values() and texts[0, 1, 0] != texts[0, 0, 0]
+
+
+def test_accepting_arrows_are_coloured_and_have_a_dot():
+    figure = plot.automaton(to_automaton("F a & G F b"), layout="matplotlib")
+    # One arrow comes from nowhere; 0 -> 0, 0 -> 1 and 1 -> 1 do not accept, the other 1 -> 1 does.
+    assert colors(figure) == {plot.INK: 4, plot.ACCENT: 1}
+    assert marks(figure) == [plot.ACCENT]
+    notes = " ".join(text.get_text() for text in figure.texts)
+    assert "●: accepting" in notes
+    finite = plot.automaton(to_automaton("F a"), layout="matplotlib")
+    assert marks(finite) == [] and colors(finite) == {plot.INK: 3}
+
+
+def test_priorities_stand_before_their_guards():
+    table = to_automaton("G F a -> G F b")
+    texts = plot._edge_texts(table, drawing.rejecting(table))
+    assert texts == {(0, 0, 0): (("0", "b"), ("1", "a ∧ ¬b"), ("2", "¬a ∧ ¬b"))}
+    figure = plot.automaton(table, layout="matplotlib")
+    shown = {text.get_text(): text.get_position()[1] for text in figure.axes[0].texts}
+    assert shown["2"] == shown["¬a ∧ ¬b"] < shown["1"] == shown["a ∧ ¬b"]
+    assert marks(figure) == [plot.ACCENT, plot.PAPER, plot.ACCENT]
+
+
+def test_no_mark_counts_on_the_way_to_a_rejecting_state():
+    # Reading b, or a in the last state, has an even number and leads nowhere good.
+    table = make_automaton(
+        [[0, 1, 1], [1, 1, 1]], 0, [[True, False], [False, True], [False, False]], ["a", "b"],
+        priority=[[2, 0, 1], [1, 3, 3]],
+    )
+    texts = plot._edge_texts(table, drawing.rejecting(table))
+    assert texts == {(0, 0, 0): (("2", "a"),), (0, 1, 0): (("", "¬a"),), (1, 1, 0): (("", "⊤"),)}
+    assert len(arranged(table).edges) == 2
+    assert colors(plot.automaton(table, layout="matplotlib")) == {plot.INK: 2, plot.MUTED: 1}
+
+
+def test_rejecting_states_of_every_acceptance():
+    for formula, acceptance in (("!r U g", "dfa"), ("!r U g", "buchi"), ("!r U g", "parity")):
+        table = to_automaton(formula, acceptance=acceptance)
+        assert drawing.rejecting(table).tolist() == [False, False, True]
+        assert drawing.rejecting(complement(table)).tolist() == [False, True, False]
+
+
+def test_the_notes_are_not_cut_off():
+    for formula in ("G F a", "F G a", "!red U (goal & !red)", 'F "a place with a long name"'):
+        figure = plot.automaton(to_automaton(formula), layout="matplotlib")
+        figure.draw_without_rendering()
+        for text in figure.texts:
+            assert text.get_window_extent().x1 <= figure.bbox.x1, text.get_text()
+
+
+FAKE_DOT = """#!/bin/sh
+cat > "$0.read"
+echo 'graph 1 9 9'
+echo 'node 1 5.5 2.5 0.48 0.48 1 solid circle black lightgrey'
+echo 'node 0 1.5 1.5 0.48 0.48 0 solid circle black lightgrey'
+echo 'edge 0 1 4 1 1 2 2 3 3 4 4 m 2 2 solid black'
+echo stop
+"""
+
+
+def test_graphviz_may_place_the_states(monkeypatch, tmp_path):
+    program = tmp_path / "dot"
+    program.write_text(FAKE_DOT)
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setattr("shutil.which", lambda name: str(program))
+    table = to_automaton('G F "say \\"a\\"" & G F b')
+
+    def centers(layout):
+        circles = [x for x in plot.automaton(table, layout=layout).axes[0].patches
+                   if isinstance(x, Circle) and x.get_radius() == drawing.RADIUS]
+        return np.array([x.center for x in circles])
+
+    np.testing.assert_allclose(np.diff(centers("auto"), axis=0), [[4, 1]])
+    np.testing.assert_allclose(np.diff(centers("matplotlib"), axis=0)[0, 1], 0, atol=1e-12)
+    assert (tmp_path / "dot.read").read_text().count(" -> ") == 4
+    program.write_text("#!/bin/sh\nexit 1\n")
+    np.testing.assert_array_equal(centers("auto"), centers("matplotlib"))
+    with pytest.raises(ValueError, match="Install graphviz, or pass layout='matplotlib'"):
+        plot.automaton(table, layout="graphviz")
+    with pytest.raises(ValueError, match="Pass one of auto, graphviz, matplotlib"):
+        plot.automaton(table, layout="neato")
+
+
+def test_notebooks_show_a_picture_unless_it_would_crowd(monkeypatch):
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    picture = to_automaton("G F a")._repr_svg_()
+    assert picture is not None
+    assert ElementTree.fromstring(picture).tag == "{http://www.w3.org/2000/svg}svg"
+    for states, letters in ((41, 1), (16, 16)):
+        count = np.arange(states)[:, None] + np.arange(1, letters + 1)
+        rows = [[bool(n >> p & 1) for p in range(4)] for n in range(letters)]
+        crowd = make_automaton(count % states, 0, rows, "abcd", accepting=np.arange(states) == 0)
+        assert isinstance(crowd, Automaton) and crowd._repr_svg_() is None
 
 
 def test_the_same_picture_has_the_same_bytes():

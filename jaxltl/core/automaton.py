@@ -5,6 +5,7 @@ An automaton reads one letter per step; a letter is the set of the propositions 
 
 from __future__ import annotations
 
+import importlib
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxltl.core.ltl import Letter, as_letters, proposition_text
 
 ACCEPTANCES = ("cosafe", "safety", "buchi", "parity")
+DRAWN_STATES, DRAWN_ARROWS = 40, 120  # up to which a notebook shows a picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +69,20 @@ class Automaton:
     def accepting(self) -> NDArray[np.bool_]:
         """bool `[Q, L]`, the transitions of even priority."""
         return self.priority % 2 == 0
+
+    def __repr__(self) -> str:
+        count, width = self.delta.shape
+        over = ", ".join(self.propositions) or "no propositions"
+        return f"Automaton({self.acceptance}, {count} states, {width} letters over {over})"
+
+    def _repr_svg_(self) -> str | None:
+        """The picture that notebooks show; None, so that they show text, where it would crowd."""
+        arrows = sum(len(set(row)) for row in np.asarray(self.delta).tolist())
+        if len(self.delta) > DRAWN_STATES or arrows > DRAWN_ARROWS:
+            return None
+        # By name, since the core does not depend on drawing and only a notebook gets here.
+        plot = importlib.import_module("jaxltl.plot")
+        return plot.to_bytes(plot.automaton(self), "svg").decode()
 
 
 def make_automaton(
@@ -460,66 +476,122 @@ def guards(automaton: Automaton) -> dict[tuple[int, int], str]:
 
     A guard is true of the letters that make the transition and false of the other letters; what
     it says of combinations that are no letter is left to brevity. It is an irredundant
-    disjunction of prime cubes, chosen greedily, not always the shortest.
+    disjunction of prime cubes, not always the shortest.
 
     >>> from jaxltl.core.translate import to_automaton
     >>> guards(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}]))
     {(0, 0): '!g & !r', (0, 1): 'g', (0, 2): 'r', (1, 1): 'true', (2, 2): 'true'}
     """
+    same = np.zeros_like(np.asarray(automaton.priority))
+    return {(q, end): text for (q, end, _), text in _guards(automaton, same).items()}
+
+
+def edge_guards(automaton: Automaton) -> dict[tuple[int, int, int], str]:
+    """The condition of each (state, successor, priority) that some letter has, see `guards`.
+
+    >>> from jaxltl.core.translate import to_automaton
+    >>> edge_guards(to_automaton("G F a"))
+    {(0, 0, 0): 'a', (0, 0, 1): '!a'}
+    """
+    return _guards(automaton, np.asarray(automaton.priority))
+
+
+def _guards(automaton: Automaton, marks: NDArray[Any]) -> dict[tuple[int, int, int], str]:
+    """A guard for each (state, successor, mark), with the marks `[Q, L]` of transitions."""
     literals = [proposition_text(name) for name in automaton.propositions]
+    # As numbers of any size, for automata over many propositions and few letters.
+    numbers = [
+        sum(1 << p for p in np.flatnonzero(row).tolist()) for row in np.asarray(automaton.letters)
+    ]
     result = {}
-    for q, row in enumerate(automaton.delta):
-        for successor in np.unique(row):
-            cubes = _cover(automaton.letters, row == successor)
+    for q, row in enumerate(np.asarray(automaton.delta).tolist()):
+        groups = defaultdict(set)
+        for number, successor, mark in zip(numbers, row, marks[q].tolist(), strict=True):
+            groups[successor, mark].add(number)
+        for successor, mark in sorted(groups):
+            chosen = groups[successor, mark]
+            cubes = prime_cover(chosen, set(numbers) - chosen, len(literals))
             texts = [
                 " & ".join(literals[p] if value else f"!{literals[p]}" for p, value in cube)
                 for cube in cubes
             ]
             if len(texts) > 1:
                 texts = [f"({text})" if " & " in text else text for text in texts]
-            result[q, int(successor)] = " | ".join(texts) or "true"
+            result[q, successor, mark] = " | ".join(texts) or "true"
     return result
 
 
-_Cube = list[tuple[int, bool]]  # (proposition, its value)
+Cube = tuple[tuple[int, bool], ...]  # (proposition, its value), by proposition
 
 
-def _cover(letters: NDArray[np.bool_], chosen: NDArray[np.bool_]) -> list[_Cube]:
-    """Cubes that together hold in the chosen letters and in no other letter."""
-    cubes: list[_Cube] = []
-    left = chosen.copy()
-    while left.any():
-        cube = _prime_cube(letters, chosen, seed=int(np.argmax(left)))
-        left &= ~_inside(letters, cube)
-        cubes.append(cube)
-    for cube in list(cubes):
-        others = [_inside(letters, other) for other in cubes if other is not cube]
-        if others and not (chosen & ~np.any(others, axis=0)).any():
-            cubes.remove(cube)
-    return cubes
+def prime_cover(chosen: set[int], others: set[int], width: int) -> list[Cube]:
+    """Prime cubes, none to spare, that together hold in the chosen letters and in no other.
+
+    Minato 1993, "Fast generation of prime-irredundant covers from binary decision diagrams", on
+    sets of letters; letters that are in neither set may fall on either side.
+
+    Args:
+        chosen: Letters as numbers, with proposition p as bit p.
+        others: More letters.
+        width: The number of propositions.
+
+    >>> prime_cover({0b01, 0b11}, {0b00}, 2)
+    [((0, True),)]
+    """
+    if len(chosen) + len(others) < 1 << width:
+        # Where few letters occur, a few propositions tell, and guards of others would be long.
+        kept = _telling(chosen, others, width)
+        chosen, others = ({n & kept for n in part} for part in (chosen, others))
+    return sorted(_prime_cover(chosen, others, width))
 
 
-def _prime_cube(letters: NDArray[np.bool_], chosen: NDArray[np.bool_], seed: int) -> _Cube:
-    """Literals of letter `seed`, none to spare, that hold together in chosen letters only."""
-    cube: _Cube = []
-    agrees = letters == letters[seed]
-    wrong = ~chosen
-    while wrong.any():
-        best = int(np.argmax((~agrees[wrong]).sum(axis=0)))
-        cube.append((best, bool(letters[seed, best])))
-        wrong &= agrees[:, best]
-    for literal in list(cube):
-        shorter = [other for other in cube if other != literal]
-        if not (_inside(letters, shorter) & ~chosen).any():
-            cube = shorter
-    return sorted(cube)
+def _telling(chosen: set[int], others: set[int], width: int) -> int:
+    """Propositions, as bits, that tell all chosen letters from the others, found greedily."""
+    kept = 0
+    while True:
+        alike: dict[int, tuple[list[int], list[int]]] = defaultdict(lambda: ([], []))
+        for side, part in enumerate((chosen, others)):
+            for n in part:
+                alike[n & kept][side].append(n)
+        mixed = [(left, right) for left, right in alike.values() if left and right]
+        if not mixed:
+            return kept
+
+        def told(p: int, mixed: list[tuple[list[int], list[int]]] = mixed) -> int:
+            pairs = 0
+            for left, right in mixed:
+                held, others_held = (sum(n >> p & 1 for n in part) for part in (left, right))
+                pairs += held * (len(right) - others_held) + (len(left) - held) * others_held
+            return pairs
+
+        kept |= 1 << max(range(width), key=told)
 
 
-def _inside(letters: NDArray[np.bool_], cube: _Cube) -> NDArray[np.bool_]:
-    inside = np.ones(len(letters), bool)
-    for proposition, value in cube:
-        inside &= letters[:, proposition] == value
-    return inside
+def _prime_cover(chosen: set[int], others: set[int], width: int) -> list[Cube]:
+    cubes: list[Cube] = []
+    for p in reversed(range(width)):
+        if not chosen or not others:
+            break
+        bit = 1 << p
+        chosen1, others1 = ({n - bit for n in part if n & bit} for part in (chosen, others))
+        chosen0, others0 = ({n for n in part if not n & bit} for part in (chosen, others))
+        # A literal of proposition p is needed just where it tells the two sides apart.
+        cubes0 = _prime_cover(chosen0 & others1, others0, p)
+        cubes1 = _prime_cover(chosen1 & others0, others1, p)
+        cubes += [(*cube, (p, False)) for cube in cubes0]
+        cubes += [(*cube, (p, True)) for cube in cubes1]
+        chosen = _outside(chosen0, cubes0) | _outside(chosen1, cubes1)
+        others = others0 | others1
+    return [*cubes, ()] if chosen else cubes
+
+
+def _outside(letters: set[int], cubes: list[Cube]) -> set[int]:
+    """The letters that no cube holds in."""
+    for cube in cubes:
+        mask = sum(1 << p for p, _ in cube)
+        held = sum(1 << p for p, value in cube if value)
+        letters = {n for n in letters if n & mask != held}
+    return letters
 
 
 def _letter_text(names: Collection[str], row: NDArray[np.bool_]) -> str:
@@ -534,6 +606,9 @@ def _state_labels(automaton: Automaton) -> list[str]:
 def to_text(automaton: Automaton) -> str:
     """The automaton for reading: `>` marks the initial state and `*` the final ones.
 
+    In a Buchi automaton `*` marks the accepting transitions instead, and in a parity automaton
+    each transition is followed by its priority in braces.
+
     >>> from jaxltl.core.translate import to_automaton
     >>> print(to_text(to_automaton("F a")))
     cosafe automaton: 2 states, 2 letters over a
@@ -542,22 +617,45 @@ def to_text(automaton: Automaton) -> str:
          a -> 1
      * 1: true
          true -> 1
+    >>> print(to_text(to_automaton("G F a")))
+    buchi automaton: 1 states, 2 letters over a
+    >  0: G F a
+         a -> 0 *
+         !a -> 0
     """
     count, width = automaton.delta.shape
     over = ", ".join(automaton.propositions) or "no propositions"
     lines = [f"{automaton.acceptance} automaton: {count} states, {width} letters over {over}"]
-    conditions = guards(automaton)
+    final = _final_states(automaton)
+    edges = defaultdict(list)
+    for (q, successor, priority), text in edge_guards(automaton).items():
+        mark = _mark(automaton, priority, " *")
+        edges[q].append(f"     {text} -> {successor}{mark}")
     for q, label in enumerate(_state_labels(automaton)):
-        marks = (">" if q == automaton.initial else " ") + ("*" if automaton.final[q] else " ")
-        lines.append(f"{marks} {label}")
-        lines += [
-            f"     {text} -> {end}" for (start, end), text in conditions.items() if start == q
-        ]
+        marks = (">" if q == automaton.initial else " ") + ("*" if final[q] else " ")
+        lines += [f"{marks} {label}", *edges[q]]
     return "\n".join(lines)
+
+
+def _final_states(automaton: Automaton) -> NDArray[np.bool_]:
+    """bool `[Q]`, none where acceptance is on transitions."""
+    if automaton.acceptance in ("cosafe", "safety"):
+        return np.asarray(automaton.final)
+    return np.zeros(len(automaton.delta), bool)
+
+
+def _mark(automaton: Automaton, priority: int, accepting: str) -> str:
+    """What follows a transition, where acceptance is on transitions."""
+    if automaton.acceptance == "parity":
+        return f" {{{priority}}}"
+    return accepting if automaton.acceptance == "buchi" and priority == 0 else ""
 
 
 def to_dot(automaton: Automaton) -> str:
     """The automaton as a graph in the DOT language, final states double circled.
+
+    The accepting transitions of a Buchi automaton are bold and have a dot after their condition,
+    and those of a parity automaton have their priority in braces there.
 
     >>> from jaxltl.core.translate import to_automaton
     >>> print(to_dot(to_automaton("true")))
@@ -570,11 +668,15 @@ def to_dot(automaton: Automaton) -> str:
     }
     """
     lines = ["rankdir=LR;", 'start [shape=point, label=""];', f"start -> {automaton.initial};"]
+    final = _final_states(automaton)
     for q, label in enumerate(_state_labels(automaton)):
-        shape = "doublecircle" if automaton.final[q] else "circle"
+        shape = "doublecircle" if final[q] else "circle"
         lines.append(f"{q} [shape={shape}, label={_dot_string(label)}];")
-    for (q, successor), text in guards(automaton).items():
-        lines.append(f"{q} -> {successor} [label={_dot_string(text)}];")
+    for (q, successor, priority), text in edge_guards(automaton).items():
+        label = _dot_string(text + _mark(automaton, priority, " ●"))
+        bold = automaton.acceptance == "buchi" and priority == 0
+        style = ', style=bold, color="#1f6f8b"' if bold else ""
+        lines.append(f"{q} -> {successor} [label={label}{style}];")
     return "\n".join(["digraph automaton {", *(f"  {line}" for line in lines), "}"])
 
 

@@ -182,7 +182,9 @@ def _tree(
     whole = np.arange(len(first))
     tree.accepting = bool(len(source)) and verdict(_union(mask))
     tree.add(*sets(np.arange(len(source))), 0)
-    waiting = [(whole, tree.accepting, 0)] if len(source) else []
+    waiting: list[tuple[Integers, bool, int]] = []
+    if len(source):
+        waiting.append((whole, tree.accepting, 0))
     while waiting:
         part, accepting, node = waiting.pop()
         for smaller in parts.maximal(part, accepting):

@@ -160,7 +160,7 @@ def _binary(operator: str, left: Formula, right: Formula) -> Formula:
     if operator in ("R", "M"):
         dual = {"R": "U", "M": "W"}[operator]
         return negated(_binary(dual, negated(left), negated(right)))
-    if right == TRUE or left == FALSE or left == right:
+    if right == TRUE or left in (FALSE, right):
         return right
     if left == TRUE:
         return eventually(right) if operator == "U" else TRUE
@@ -285,7 +285,10 @@ class Rewriter:
             kept, strong = greatest.operands[1], _binary("M", *greatest.operands)
         return disjunction([
             self.limit_often(replace_all(operand, greatest, strong)),
-            conjunction([self.limit_ever(kept), self.limit_often(replace_all(operand, greatest, TRUE))]),
+            conjunction([
+                self.limit_ever(kept),
+                self.limit_often(replace_all(operand, greatest, TRUE)),
+            ]),
         ])
 
     def limit_ever(self, operand: Formula) -> Formula:
@@ -359,8 +362,9 @@ class Rewriter:
             goal, weak = conjunction(least.operands), _binary("R", *least.operands)
         often = self.limit_often(goal)
         without = always(replace_all(left, least, FALSE))
+        weaker = _binary("W", replace_all(left, least, weak), right)
         return disjunction([
-            conjunction([often, self.to_sigma2(_binary("W", replace_all(left, least, weak), right))]),
+            conjunction([often, self.to_sigma2(weaker)]),
             self.to_sigma2(_binary("U", left, disjunction([right, without]))),
         ])
 
@@ -434,7 +438,9 @@ def extent(parts: Combination) -> int:
 def _combine(formula: Formula, grouped: bool, dual: bool, rewriter: Rewriter) -> Combination:
     if is_limit(formula):
         normal = rewriter.map_limits(formula)
-        return Part("limit", normal) if is_limit(normal) else _combine(normal, grouped, dual, rewriter)
+        if is_limit(normal):
+            return Part("limit", normal)
+        return _combine(normal, grouped, dual, rewriter)
     if formula.operator in ("&", "|"):
         return _join(formula, grouped, dual, rewriter)
     kind = _kind(formula)
@@ -472,7 +478,8 @@ def _join(formula: Formula, grouped: bool, dual: bool, rewriter: Rewriter) -> Co
     for kind, formulas in together.items():
         if formulas:
             whole = _rebuild(formula.operator, formulas)
-            parts.append(Part(kind, whole) if _kind(whole) else _combine(whole, grouped, dual, rewriter))
+            one = Part(kind, whole) if _kind(whole) else None
+            parts.append(one or _combine(whole, grouped, dual, rewriter))
     flat = [p for part in parts for p in _same(formula.operator, part)]
     parts = _joined_limits(formula.operator, flat, grouped)
     return parts[0] if len(parts) == 1 else (formula.operator, *parts)

@@ -64,7 +64,7 @@ def reduce_table(table: Table, thorough: bool = True) -> tuple[Table, str, Integ
     `thorough` also tries to merge states one by one, which takes most of the time.
     """
     columns, inverse = _distinct_columns(table)
-    base = np.arange(len(table.delta))
+    base: Integers = np.arange(len(table.delta))
     few = Table(table.delta[:, columns], table.priority[:, columns], table.initial)
     while True:
         few, base = _composed(quotient_table(few), base)

@@ -178,7 +178,7 @@ def optimal_satisfaction(
     """
     if objective not in ("max", "min"):
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
-    limits = {"tolerance": tolerance, "max_steps": max_steps}
+    limits: dict[str, Any] = {"tolerance": tolerance, "max_steps": max_steps}
     kind = model.automaton.acceptance
     if kind == "cosafe":
         return reachability_probability(model, model.final, objective=objective, **limits)
@@ -188,7 +188,7 @@ def optimal_satisfaction(
             reachability_probability(model, ~model.final, objective=opposite, **limits)
         )
     if objective == "min":
-        negated = model.replace(automaton=_shifted(model.automaton))
+        negated = replace(model, automaton=_shifted(model.automaton))
         return _complement(optimal_satisfaction(negated, **limits))
     accepting = accepting_end_components(model)
     reach = reachability_probability(model, accepting.region, objective="max", **limits)

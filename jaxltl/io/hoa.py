@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.automaton import Automaton, _letter_text, make_automaton
+from jaxltl.core.automaton import Automaton, Cube, _letter_text, make_automaton, prime_cover
 from jaxltl.core.ltl import Letter, as_letters
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ MAX_COLORS = 62  # acceptance sets as bits of one int64
 
 # A label or an acceptance formula: an operator and its operands.
 _Tree: TypeAlias = tuple[Any, ...]
-_Cube: TypeAlias = tuple[tuple[int, bool], ...]  # (proposition, its value)
 _TRUE: _Tree = ("true",)
 _FALSE: _Tree = ("false",)
 
@@ -206,7 +205,7 @@ def _written_state(automaton: Automaton, q: int) -> Iterator[str]:
         yield f"[{label or 't'}] {successor}" + (f" {{{priority}}}" if marked else "")
 
 
-def _edges(automaton: Automaton, q: int) -> Iterator[tuple[int, int, list[_Cube]]]:
+def _edges(automaton: Automaton, q: int) -> Iterator[tuple[int, int, list[Cube]]]:
     """Successor, priority and cubes of each edge of state q, with disjoint labels."""
     pairs = list(zip(automaton.delta[q].tolist(), automaton.priority[q].tolist(), strict=True))
     if not _is_full(automaton):
@@ -214,36 +213,12 @@ def _edges(automaton: Automaton, q: int) -> Iterator[tuple[int, int, list[_Cube]
             yield successor, priority, [tuple(enumerate(row))]
         return
     width = len(automaton.propositions)
-    numbers = automaton.letters @ (1 << np.arange(width))
-    letters_of: dict[tuple[int, int], int] = {}  # as bits
-    for number, pair in zip(numbers.tolist(), pairs, strict=True):
-        letters_of[pair] = letters_of.get(pair, 0) | 1 << number
+    numbers = (automaton.letters @ (1 << np.arange(width))).tolist()
+    letters_of: dict[tuple[int, int], set[int]] = {}
+    for number, pair in zip(numbers, pairs, strict=True):
+        letters_of.setdefault(pair, set()).add(number)
     for pair, chosen in letters_of.items():
-        yield *pair, sorted(_cubes(chosen, chosen, width)[0])
-
-
-def _cubes(lower: int, upper: int, width: int) -> tuple[list[_Cube], int]:
-    """An irredundant disjunction of prime cubes between two sets of letters, and its own set.
-
-    A set of letters over the first `width` propositions is a number whose bit n stands for
-    letter n. Minato 1993, "Fast generation of prime-irredundant covers from binary decision
-    diagrams", on truth tables.
-    """
-    if lower == 0:
-        return [], 0
-    if upper == (1 << (1 << width)) - 1:
-        return [()], upper
-    last = width - 1
-    half = 1 << last  # letters without the last proposition come first
-    lower0, lower1 = lower & ((1 << half) - 1), lower >> half
-    upper0, upper1 = upper & ((1 << half) - 1), upper >> half
-    cubes0, cover0 = _cubes(lower0 & ~upper1, upper0, last)
-    cubes1, cover1 = _cubes(lower1 & ~upper0, upper1, last)
-    missing = lower0 & ~cover0 | lower1 & ~cover1
-    cubes, cover = _cubes(missing, upper0 & upper1, last)
-    cubes += [(*cube, (last, False)) for cube in cubes0]
-    cubes += [(*cube, (last, True)) for cube in cubes1]
-    return cubes, cover0 | cover | (cover1 | cover) << half
+        yield *pair, prime_cover(chosen, set(numbers) - chosen, width)
 
 
 def _quoted(text: str) -> str:
