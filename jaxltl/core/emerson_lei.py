@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import reduce
+from operator import or_
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -19,7 +21,8 @@ from numpy.typing import NDArray
 Integers: TypeAlias = NDArray[np.integer[Any]]
 Condition: TypeAlias = tuple[Any, ...]  # see `holds`
 
-MAX_SUBSETS = 200_000  # parts examined in one decomposition before it is given up
+MAX_COLORS = 62  # the bits of a set of colors
+MAX_SUBSETS = 20_000  # parts examined in one decomposition before it is given up
 
 
 def holds(condition: Condition, colors: int) -> bool:
@@ -43,6 +46,22 @@ def holds(condition: Condition, colors: int) -> bool:
         case "or":
             return any(holds(part, colors) for part in condition[1:])
     raise ValueError(f"holds: unknown condition {condition[0]!r}. Use true false inf fin and or.")
+
+
+def polarities(condition: Condition) -> tuple[int, int]:
+    """The colors that occur under `inf` and under `fin`, as sets."""
+    match condition[0]:
+        case "inf":
+            return 1 << condition[1], 0
+        case "fin":
+            return 0, 1 << condition[1]
+        case "and" | "or":
+            parts = [polarities(part) for part in condition[1:]]
+            return (
+                reduce(or_, (part[0] for part in parts), 0),
+                reduce(or_, (part[1] for part in parts), 0),
+            )
+    return 0, 0
 
 
 def parity_condition(num_priorities: int) -> Condition:
@@ -89,8 +108,15 @@ def to_parity(
         have priority 1.
 
     Raises:
-        ValueError: For more than `max_states` states, or too many parts to examine.
+        ValueError: For more than `max_states` states, too many parts to examine, or a color
+            above 61.
     """
+    inf, fin = polarities(condition)
+    if (inf | fin) >> MAX_COLORS:
+        raise ValueError(
+            f"to_parity: color {(inf | fin).bit_length() - 1} is in the condition. "
+            f"Number at most {MAX_COLORS} colors from 0."
+        )
     columns, inverse = _distinct_columns(delta, colors)
     few_delta, few_colors = delta[:, columns], colors[:, columns]
     component = strong_components(
@@ -105,7 +131,7 @@ def to_parity(
 
     trees: dict[int, _Tree] = {}
     for c in _reached(few_delta, initial, component):
-        trees[c] = _tree(few_delta, few_colors, component, c, verdict)
+        trees[c] = _tree(few_delta, few_colors, component, c, (verdict, inf, fin), max_states)
     new_delta, priority, base = _unfold(few_delta, component, trees, initial, max_states)
     return new_delta[:, inverse], priority[:, inverse], 0, base
 
@@ -160,7 +186,8 @@ def _tree(
     colors: Integers,
     component: Integers,
     chosen: int,
-    verdict: Callable[[int], bool],
+    judge: tuple[Callable[[int], bool], int, int],
+    max_nodes: int,
 ) -> _Tree:
     width = delta.shape[1]
     members = np.flatnonzero(component == chosen)
@@ -178,9 +205,10 @@ def _tree(
     ends = np.stack([source, target, mask], axis=1)
     _, first, twin = np.unique(ends, axis=0, return_index=True, return_inverse=True)
     twin = twin.ravel()
-    parts = _Parts(source[first], target[first], mask[first], verdict)
+    known: dict[bytes, tuple[frozenset[int], frozenset[int]]] = {}
+    parts = _Parts(source[first], target[first], mask[first], *judge)
     whole = np.arange(len(first))
-    tree.accepting = bool(len(source)) and verdict(_union(mask))
+    tree.accepting = bool(len(source)) and judge[0](_union(mask))
     tree.add(*sets(np.arange(len(source))), 0)
     waiting: list[tuple[Integers, bool, int]] = []
     if len(source):
@@ -188,9 +216,15 @@ def _tree(
     while waiting:
         part, accepting, node = waiting.pop()
         for smaller in parts.maximal(part, accepting):
-            chosen_twins = np.isin(twin, smaller)
+            key = smaller.tobytes()
+            if key not in known:  # the same part may stand below several others
+                known[key] = sets(np.flatnonzero(np.isin(twin, smaller)))
             waiting.append((smaller, not accepting, len(tree.edges)))
-            tree.add(*sets(np.flatnonzero(chosen_twins)), node)
+            tree.add(*known[key], node)
+        if len(tree.edges) > 2 * max_nodes:
+            raise ValueError(
+                f"to_parity: more than {max_nodes} states. Use fewer letters, or raise the limit."
+            )
     return tree
 
 
@@ -206,20 +240,31 @@ class _Parts:
     target: Integers
     mask: Integers
     verdict: Callable[[int], bool]
+    inf: int
+    fin: int
     examined: int = 0
+    known: dict[bytes, list[Integers]] = field(default_factory=dict)
 
     def maximal(self, part: Integers, accepting: bool) -> list[Integers]:
         """The maximal strongly connected subsets with the other verdict.
 
-        Such a subset lacks a color of the whole, so it lies in a component of what is left
-        without the transitions of that color.
+        A rejecting subset of an accepting part lacks a color that the condition asks for
+        (`inf`), an accepting subset of a rejecting part one that it forbids (`fin`). So it lies
+        in a component of what is left without the transitions of that color.
         """
+        key = part.tobytes()
+        if key not in self.known:
+            self.known[key] = self._maximal(part, accepting)
+        return self.known[key]
+
+    def _maximal(self, part: Integers, accepting: bool) -> list[Integers]:
+        removable = self.inf if accepting else self.fin
         found: dict[bytes, Integers] = {}
         seen: set[bytes] = set()
         waiting = [part]
         while waiting:
             whole = waiting.pop()
-            colors = _union(self.mask[whole])
+            colors = _union(self.mask[whole]) & removable
             for color in range(colors.bit_length()):
                 if not colors >> color & 1:
                     continue

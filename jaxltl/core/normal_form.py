@@ -99,6 +99,8 @@ def _rebuild(operator: str, operands: list[Formula]) -> Formula:
 
 
 def _next(operand: Formula) -> Formula:
+    if is_invariant(operand):
+        return operand
     if operand.operator in ("&", "|"):  # limits need no X
         fixed = [f for f in operand.operands if is_invariant(f)]
         if fixed:

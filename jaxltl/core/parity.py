@@ -72,6 +72,7 @@ def reduce_table(table: Table, thorough: bool = True) -> tuple[Table, str, Integ
         few, base = _composed(quotient_table(few), base)
         if is_weak(few):
             few, base = _composed(_weak_minimal(few), base)
+            few = _early(few)
             break
         size = len(few.delta)
         few, base = _composed(_move_down(few), base)
@@ -114,7 +115,7 @@ def _acceptance(table: Table) -> str:
 
 def quotient_table(table: Table) -> tuple[Table, Integers]:
     """Reachable states, merged where every word reads the same priorities (Moore 1956)."""
-    (delta, priority, _), old = _reachable(table)
+    (delta, priority, _), old = reachable(table)
     _, block = np.unique(priority, axis=0, return_inverse=True)
     block = block.ravel()
     count = block.max() + 1
@@ -127,7 +128,7 @@ def quotient_table(table: Table) -> tuple[Table, Integers]:
         count = block.max() + 1
     _, first = np.unique(block, return_index=True)
     small = Table(block[delta[first]], priority[first], int(block[0]))
-    ordered, order = _reachable(small)
+    ordered, order = reachable(small)
     return ordered, old[first[order]]
 
 
@@ -143,7 +144,7 @@ def _order(table: Table) -> Integers:
     return np.array(queue)
 
 
-def _reachable(table: Table) -> tuple[Table, Integers]:
+def reachable(table: Table) -> tuple[Table, Integers]:
     """The reachable part, renumbered breadth first, and the old numbers."""
     order = _order(table)
     position = np.full(len(table.delta), -1)
@@ -210,6 +211,30 @@ def _weak_minimal(table: Table) -> tuple[Table, Integers]:
         level = higher
     priority = np.repeat((level % 2)[component][:, None], table.delta.shape[1], axis=1)
     return quotient_table(Table(table.delta, priority, table.initial))
+
+
+def _early(table: Table) -> Table:
+    """A weak automaton with verdicts told as early as they are certain, where that suffices.
+
+    Where every accepting cycle is among states that accept all words, only those are final: the
+    language is co-safe. Where every rejecting cycle is among states that accept none, all
+    others are: it is safe.
+    """
+    component = components(table)
+    inside = component[table.delta] == component[:, None]
+    good, bad = (
+        (inside & (table.priority % 2 == parity)).any(axis=1) for parity in (0, 1)
+    )
+    reach = _reach(table.delta)
+    universal, live = ~(reach & bad).any(axis=1), (reach & good).any(axis=1)
+    if (good <= universal).all():
+        final = universal
+    elif (bad <= ~live).all():
+        final = live
+    else:
+        return table
+    priority = np.repeat(np.where(final, 0, 1)[:, None], table.delta.shape[1], axis=1)
+    return table._replace(priority=priority)
 
 
 def language_classes(table: Table) -> Integers | None:

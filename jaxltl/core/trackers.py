@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.diagram import FALSE, TRUE
-from jaxltl.core.emerson_lei import Condition
+from jaxltl.core.emerson_lei import MAX_COLORS, Condition
 from jaxltl.core.normal_form import (
     GREATEST,
     LEAST,
@@ -120,6 +120,11 @@ def track(
     trackers: dict[Part, Tracker] = {}
     for part in _leaves(parts):
         trackers.setdefault(part, Tracker(part))
+    if len(trackers) > MAX_COLORS:
+        raise ValueError(
+            f"to_automaton: the formula falls into {len(trackers)} parts, and at most {MAX_COLORS} "
+            "can be tracked together. Split it into formulas that are tracked side by side."
+        )
     number = {part: i for i, part in enumerate(trackers)}
     progression = Progression(
         [f for t in trackers.values() for f in t.followed], letters, propositions, max_nodes

@@ -30,7 +30,7 @@ from jaxltl.core.ltl import (
     negation_normal_form,
 )
 from jaxltl.core.normal_form import Combination, combination, extent, simplify
-from jaxltl.core.parity import Table, is_weak, reduce_table
+from jaxltl.core.parity import Table, is_weak, reachable, reduce_table
 from jaxltl.core.progression import Namer, Progression
 from jaxltl.core.trackers import track
 
@@ -241,11 +241,12 @@ def _general(formula: Formula, alphabet: NDArray[np.bool_], max_states: int) -> 
             break
     assert best is not None
     class_of = best[1]
-    table, kind, _ = reduce_table(best[0])
+    small, kind, _ = reduce_table(best[0])
+    table, _ = reachable(Table(small.delta[:, class_of], small.priority[:, class_of], 0))
     automaton = Automaton(
-        delta=table.delta[:, class_of].astype(np.int32),
+        delta=table.delta.astype(np.int32),
         initial=np.asarray(table.initial, np.int32),
-        priority=table.priority[:, class_of].astype(np.int32),
+        priority=table.priority.astype(np.int32),
         letters=alphabet,
         propositions=formula.propositions,
         acceptance=kind,
@@ -289,7 +290,10 @@ def _tracked(
     delta, colors, condition, class_of = track(
         parts, alphabet, propositions, max_states, max_nodes
     )
-    table = to_parity(delta, colors, 0, condition, max_states)[:3]
+    try:
+        table = to_parity(delta, colors, 0, condition, max_states)[:3]
+    except ValueError:
+        raise _too_many(max_states) from None
     return reduce_table(Table(*table), thorough=False)[0], class_of
 
 
