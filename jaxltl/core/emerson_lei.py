@@ -264,7 +264,7 @@ class _Parts:
         waiting = [part]
         while waiting:
             whole = waiting.pop()
-            colors = _union(self.mask[whole]) & removable
+            colors = self._to_remove(_union(self.mask[whole]), removable, accepting)
             for color in range(colors.bit_length()):
                 if not colors >> color & 1:
                     continue
@@ -284,6 +284,17 @@ class _Parts:
                     else:
                         waiting.append(smaller)
         return _largest(list(found.values()))
+
+    def _to_remove(self, colors: int, removable: int, accepting: bool) -> int:
+        """The colors one of which has to go; one alone if no smaller part can keep it."""
+        choices = colors & removable
+        if self.inf & self.fin:
+            return choices
+        other = colors & (self.fin if accepting else self.inf)
+        for color in range(choices.bit_length()):
+            if choices >> color & 1 and self.verdict(1 << color | other) == accepting:
+                return 1 << color
+        return choices
 
     def _components(self, part: Integers) -> list[Integers]:
         source, target = self.source[part], self.target[part]
@@ -326,12 +337,14 @@ def _unfold(
     component_of = component.tolist()
     table = delta.tolist()
 
+    found: dict[tuple[int, int], int] = {}
+
     def lowest(tree: _Tree, node: int, state: int) -> int:
-        while True:
+        key = (node, state)  # a state is in one tree only
+        if key not in found:
             below = next((n for n in tree.children[node] if state in tree.states[n]), None)
-            if below is None:
-                return node
-            node = below
+            found[key] = node if below is None else lowest(tree, below, state)
+        return found[key]
 
     def step(state: int, leaf: int, k: int) -> tuple[int, int, int]:
         target = table[state][k]

@@ -36,9 +36,92 @@ def _flat(operator: str, parts: Iterable[Formula], unit: Formula, zero: Formula)
                 return zero
             if piece != unit:
                 kept[piece] = None
-    if not kept:
+    pieces = _without_implied(operator, list(kept))
+    if pieces is None:
+        return zero
+    if not pieces:
         return unit
-    return next(iter(kept)) if len(kept) == 1 else Formula(operator, tuple(kept))
+    return pieces[0] if len(pieces) == 1 else Formula(operator, tuple(pieces))
+
+
+def _without_implied(operator: str, pieces: list[Formula]) -> list[Formula] | None:
+    """The operands that no other makes superfluous; None if two of them decide the whole."""
+    if not any(piece.operator in _TEMPORAL for piece in pieces):
+        return pieces
+    needed: list[Formula] = []
+    for i, piece in enumerate(pieces):
+        others = needed + pieces[i + 1 :]
+        pairs = [(piece, f) if operator == "|" else (f, piece) for f in others]
+        if any(implies(*pair) for pair in pairs):
+            continue
+        if any(
+            implies(negated(f), piece) if operator == "|" else implies(f, negated(piece))
+            for f in needed
+        ):
+            return None
+        needed.append(piece)
+    return needed
+
+
+@lru_cache(maxsize=1 << 16)
+def implies(one: Formula, two: Formula) -> bool:
+    """Whether simple rules on normal forms show that every word of `one` satisfies `two`.
+
+    The rules are those of Somenzi & Bloem 2000, "Efficient Buchi automata from LTL formulae".
+    """
+    if one == two or one == FALSE or two == TRUE:
+        return True
+    if one.operator == "|" or two.operator == "&":
+        if one.operator == "|":
+            return all(implies(f, two) for f in one.operands)
+        return all(implies(one, f) for f in two.operands)
+    if two.operator == "|" and any(implies(one, f) for f in two.operands):
+        return True
+    return _implies_by_left(one, two) or _implies_by_right(one, two)
+
+
+def _implies_by_left(one: Formula, two: Formula) -> bool:
+    match one.operator:
+        case "&":
+            return any(implies(f, two) for f in one.operands)
+        case "X":
+            return two.operator == "X" and implies(one.operands[0], two.operands[0])
+        case "G":
+            return implies(one.operands[0], two) or (
+                two.operator == "G" and implies(one, two.operands[0])
+            )
+        case "F":
+            return two.operator == "F" and implies(one.operands[0], two)
+        case "U" | "W":
+            if all(implies(f, two) for f in one.operands):
+                return True
+            if one.operator == "U" and two.operator == "F":
+                return implies(one.operands[1], two)
+            return two.operator in (one.operator, "W") and all(
+                implies(f, g) for f, g in zip(one.operands, two.operands, strict=True)
+            )
+        case "R" | "M":
+            if implies(one.operands[1], two):
+                return True
+            if one.operator == "M" and two.operator == "F":
+                return implies(one.operands[0], two)
+            return two.operator in (one.operator, "R") and all(
+                implies(f, g) for f, g in zip(one.operands, two.operands, strict=True)
+            )
+    return False
+
+
+def _implies_by_right(one: Formula, two: Formula) -> bool:
+    match two.operator:
+        case "F" | "U" | "W":
+            if implies(one, two.operands[-1]):
+                return True
+            return two.operator == "W" and implies(one, Formula("G", two.operands[:1]))
+        case "R" | "M":
+            if all(implies(one, f) for f in two.operands):
+                return True
+            return two.operator == "R" and implies(one, Formula("G", two.operands[1:]))
+    return False
 
 
 def _opposite(formula: Formula) -> Formula | None:
@@ -162,7 +245,7 @@ def _binary(operator: str, left: Formula, right: Formula) -> Formula:
     if operator in ("R", "M"):
         dual = {"R": "U", "M": "W"}[operator]
         return negated(_binary(dual, negated(left), negated(right)))
-    if right == TRUE or left in (FALSE, right):
+    if right == TRUE or implies(left, right):
         return right
     if left == TRUE:
         return eventually(right) if operator == "U" else TRUE
@@ -266,6 +349,7 @@ class Rewriter:
         if whole.operator == "F":
             return self.limit_ever(whole.operands[0].operands[0])
         operand = whole.operands[0].operands[0]
+        self._spend(operand)
         fixed = _outermost(operand, is_limit)
         if fixed is not None:
             return self._split(fixed, operand, self.limit_often)
@@ -312,6 +396,7 @@ class Rewriter:
         self, fixed: Formula, operand: Formula, rebuild: Callable[[Formula], Formula]
     ) -> Formula:
         """`f[L] = (L & f[true]) | f[false]` for a limit L below an operator."""
+        self._spend(operand)
         return disjunction([
             conjunction([self.map_limits(fixed), rebuild(replace_all(operand, fixed, TRUE))]),
             rebuild(replace_all(operand, fixed, FALSE)),
@@ -325,14 +410,17 @@ class Rewriter:
         if is_invariant(formula):
             return self.map_limits(formula)
         if formula not in self.known:
-            self.steps -= len(subformulas(formula))
-            if self.steps < 0:
-                raise ValueError(
-                    "to_automaton: the normal form of the formula is too large. Split it into "
-                    "formulas that are tracked side by side."
-                )
+            self._spend(formula)
             self.known[formula] = self._to_sigma2(formula)
         return self.known[formula]
+
+    def _spend(self, formula: Formula) -> None:
+        self.steps -= len(subformulas(formula))
+        if self.steps < 0:
+            raise ValueError(
+                "to_automaton: the normal form of the formula is too large. Split it into "
+                "formulas that are tracked side by side."
+            )
 
     def _to_sigma2(self, formula: Formula) -> Formula:
         if formula.operator in ("&", "|"):

@@ -39,8 +39,9 @@ Acceptance = Literal["auto", "dfa", "buchi", "parity"]
 MAX_FREE_PROPOSITIONS = 12  # 2^12 letters
 GOOD_ENOUGH = 3  # states up to which no other combination is tried
 WORTHWHILE = 3  # how many times as much the other combinations may track
-MAX_STEPS = 1_000_000  # of rewriting
-MAX_NODES = 2_000_000  # of diagrams
+MAX_STEPS = 200_000  # of rewriting
+MAX_NODES = 600_000  # of diagrams
+LARGE = 200_000  # transitions of an automaton that is taken as it is
 NAMED_STATES = 300
 
 
@@ -220,11 +221,11 @@ def _general(formula: Formula, alphabet: NDArray[np.bool_], max_states: int) -> 
     ways = _combinations(plain)
     best: tuple[Table, NDArray[np.intp]] | None = None
     # The way that tracks least may explode where another does not, so all start with little.
-    for work in (MAX_NODES // 100, MAX_NODES // 10, MAX_NODES):
+    for work in (MAX_NODES // 30, MAX_NODES // 5, MAX_NODES):
         for parts, cost in ways:
             if best is not None and cost > WORTHWHILE * ways[0][1]:
                 break
-            limit = min(max_states, work // 10)
+            limit = max_states if work == MAX_NODES else min(max_states, work // 10)
             if best is not None:
                 limit = min(limit, 20 * len(best[0].delta) + 100)
             try:
@@ -235,7 +236,10 @@ def _general(formula: Formula, alphabet: NDArray[np.bool_], max_states: int) -> 
                 continue
             if best is None or _size(found[0]) < _size(best[0]):
                 best = found
-            if is_weak(found[0]) or _size(best[0])[0] <= GOOD_ENOUGH:  # weak: it is minimal
+            # A weak automaton is minimal, and a large one takes too long to do again.
+            if is_weak(found[0]) or _size(best[0])[0] <= GOOD_ENOUGH:
+                break
+            if best[0].delta.size > LARGE:
                 break
         if best is not None:
             break
@@ -257,7 +261,7 @@ def _general(formula: Formula, alphabet: NDArray[np.bool_], max_states: int) -> 
 def _combinations(formula: Formula) -> list[tuple[Combination, int]]:
     """The different combinations of a formula, with how much they track, least first."""
     found: list[tuple[Combination, int]] = []
-    for steps in (MAX_STEPS // 100, MAX_STEPS):
+    for steps in (MAX_STEPS // 20, MAX_STEPS):
         for grouped, dual in ((True, False), (True, True), (False, False), (False, True)):
             try:
                 parts = combination(formula, grouped, dual, steps)
