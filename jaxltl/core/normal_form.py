@@ -69,7 +69,7 @@ def implies(one: Formula, two: Formula) -> bool:
 
     The rules are those of Somenzi & Bloem 2000, "Efficient Buchi automata from LTL formulae".
     """
-    if one == two or one == FALSE or two == TRUE:
+    if one in (two, FALSE) or two == TRUE:
         return True
     if one.operator == "|" or two.operator == "&":
         if one.operator == "|":

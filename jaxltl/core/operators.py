@@ -139,7 +139,7 @@ def _unknown(model: Any) -> str:
 
 
 def _gather(value: jax.Array, index: jax.Array) -> jax.Array:
-    return jnp.asarray(value).at[index].get(mode="promise_in_bounds")
+    return jnp.asarray(value).at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 @expectation.register

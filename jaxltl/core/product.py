@@ -231,7 +231,9 @@ def _each_memory(world: MDP | DenseMDP, operator, value, term, combine) -> jax.A
         terms = [
             term(
                 world.probability[:, a, k, None],
-                value.at[world.successor[:, a, k]].get(mode="promise_in_bounds"),
+                value.at[world.successor[:, a, k]].get(
+                    mode="promise_in_bounds", wrap_negative_indices=False
+                ),
             )
             for k in range(world.num_successors)
         ]
