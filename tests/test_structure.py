@@ -34,15 +34,16 @@ LAYERS = [
 ]
 
 PUBLIC = [
-    "MDP", "Automaton", "DenseMDP", "FiniteMemoryPolicy", "Formula", "NotConverged", "Product",
-    "Solution", "Status", "Trajectories", "almost_surely_reaching", "attractor", "avoidable",
-    "boltzmann_fixed_points", "boltzmann_value", "check", "end_components", "exists_successor",
-    "expectation", "feature_expectation", "forall_successor", "from_dense", "gridworld",
-    "holds_on_lasso", "letters", "lift_policy", "lift_trajectories", "make_mdp",
-    "make_trajectories", "occupancy_measure", "optimal_satisfaction", "optimal_value", "parse_ltl",
-    "policy_value", "product", "project_policy", "pushforward", "reachability_probability",
-    "restrict", "rollout", "sample_successor", "satisfaction_probability", "soft_value",
-    "to_automaton", "to_dense",
+    "MDP", "Automaton", "DenseMDP", "FiniteMemoryPolicy", "Formula", "Monitor", "NotConverged",
+    "Product", "Solution", "Status", "Trajectories", "Verdict", "almost_surely_reaching",
+    "attractor", "avoidable", "boltzmann_fixed_points", "boltzmann_value", "check", "complement",
+    "end_components", "exists_successor", "expectation", "feature_expectation", "find_difference",
+    "forall_successor", "from_dense", "gridworld", "holds_on_lasso", "is_equivalent", "letters",
+    "lift_policy", "lift_trajectories", "make_automaton", "make_mdp", "make_monitor",
+    "make_trajectories", "monitor_step", "occupancy_measure", "optimal_satisfaction",
+    "optimal_value", "parse_ltl", "policy_value", "product", "project_policy", "pushforward",
+    "reachability_probability", "read_hoa", "restrict", "rollout", "sample_successor",
+    "satisfaction_probability", "soft_value", "to_automaton", "to_dense", "verdict", "write_hoa",
 ]
 
 

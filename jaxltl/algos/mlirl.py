@@ -198,7 +198,12 @@ def solve(
     Raises:
       ValueError: unknown kind of policy or adjoint.
     """
-    reward = problem.reward(parameters, problem.features)
+    return _solve(problem.reward(parameters, problem.features), problem, hparams, initial)
+
+
+def _solve(
+    reward: jax.Array, problem: Problem, hparams: Hparams, initial: jax.Array | None
+) -> Solution:
     if hparams.policy == "soft":
         if hparams.adjoint != "exact":
             raise ValueError('adjoint="approximate" (2.7) belongs to the Boltzmann policy.')
@@ -222,8 +227,9 @@ def objective(
       The loss, and :class:`Objective`. Differentiable in the parameters: exactly, or as in
       (2.7) with the policy held constant in the Bellman equation.
     """
-    solution = solve(parameters, problem, hparams, initial)
+    # Once, so that the derivative goes back through it once.
     reward = problem.reward(parameters, problem.features)
+    solution = _solve(reward, problem, hparams, initial)
     logits = policy_logits(problem.model, reward, hparams.discount, solution.value)
     log_policy = jax.nn.log_softmax(logits, axis=-1)
     seen = problem.counts > 0

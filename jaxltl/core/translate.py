@@ -83,7 +83,7 @@ def to_automaton(
     ([[0, 1, 2], [1, 1, 1], [2, 2, 2]], ('!r U g', 'true', 'false'))
     >>> often = to_automaton("G F a & G F b")
     >>> often.acceptance, often.accepting.astype(int).tolist()
-    ('buchi', [[0, 0, 0, 1], [0, 1, 0, 1]])
+    ('buchi', [[0, 1, 0, 1], [0, 0, 1, 1]])
     """
     if acceptance not in ("auto", "dfa", "buchi", "parity"):
         raise ValueError(
