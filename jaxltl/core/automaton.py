@@ -71,9 +71,7 @@ class Automaton:
         return self.priority % 2 == 0
 
     def __repr__(self) -> str:
-        count, width = self.delta.shape
-        over = ", ".join(self.propositions) or "no propositions"
-        return f"Automaton({self.acceptance}, {count} states, {width} letters over {over})"
+        return f"Automaton({self.acceptance}, {_extent(self)})"
 
     def _repr_svg_(self) -> str | None:
         """The picture that notebooks show; None, so that they show text, where it would crowd."""
@@ -594,6 +592,12 @@ def _outside(letters: set[int], cubes: list[Cube]) -> set[int]:
     return letters
 
 
+def _extent(automaton: Automaton) -> str:
+    counts = zip(automaton.delta.shape, ("state", "letter"), strict=True)
+    sizes = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for n, name in counts)
+    return f"{sizes} over {', '.join(automaton.propositions) or 'no propositions'}"
+
+
 def _letter_text(names: Collection[str], row: NDArray[np.bool_]) -> str:
     return "{" + ", ".join(name for name, holds in zip(names, row, strict=True) if holds) + "}"
 
@@ -618,14 +622,12 @@ def to_text(automaton: Automaton) -> str:
      * 1: true
          true -> 1
     >>> print(to_text(to_automaton("G F a")))
-    buchi automaton: 1 states, 2 letters over a
+    buchi automaton: 1 state, 2 letters over a
     >  0: G F a
          a -> 0 *
          !a -> 0
     """
-    count, width = automaton.delta.shape
-    over = ", ".join(automaton.propositions) or "no propositions"
-    lines = [f"{automaton.acceptance} automaton: {count} states, {width} letters over {over}"]
+    lines = [f"{automaton.acceptance} automaton: {_extent(automaton)}"]
     final = _final_states(automaton)
     edges = defaultdict(list)
     for (q, successor, priority), text in edge_guards(automaton).items():

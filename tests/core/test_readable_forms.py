@@ -95,7 +95,7 @@ def test_text_marks_transitions():
         "     !b -> 1",
     ]
     assert to_text(to_automaton("G F a -> G F b")).splitlines() == [
-        "parity automaton: 1 states, 4 letters over a, b",
+        "parity automaton: 1 state, 4 letters over a, b",
         ">  0: F G !a | G F b",
         "     b -> 0 {0}",
         "     a & !b -> 0 {1}",
