@@ -1,18 +1,25 @@
 """Automata of formulas, against truth on lassos and brute force."""
 
 import random
+import re
 
 import numpy as np
 import pytest
 
 from jaxltl.core.automaton import accepts_lasso, complement, make_automaton, minimize, to_dict
-from jaxltl.core.language import is_equivalent, live_states, universal_states
+from jaxltl.core.language import (
+    find_difference,
+    is_equivalent,
+    live_states,
+    universal_states,
+)
 from jaxltl.core.ltl import (
     holds_on_lasso,
     is_syntactically_cosafe,
     is_syntactically_safe,
     parse_ltl,
 )
+from jaxltl.core.normal_form import simplify
 from jaxltl.core.translate import to_automaton
 from tests.reference_logic import (
     holds_by_definition,
@@ -606,3 +613,37 @@ def test_hostile_formulas_end(text):
         assert "to_automaton" in str(error) or "to_parity" in str(error)
     else:
         agree(automaton, parse_ltl(text), random.Random(0), subsets(automaton.propositions), 60)
+
+
+def test_formulas_are_compared_by_their_words():
+    rng = random.Random(77)
+    different = 0
+    for _ in range(60):
+        formula, other = (random_formula(rng, rng.randint(2, 8), "ab") for _ in range(2))
+        assert formula.equivalent(simplify(formula)) and formula.equivalent(str(formula))
+        word = find_difference(to_automaton(formula), to_automaton(other))
+        assert formula.equivalent(other) == (word is None)
+        if word is not None:
+            different += 1
+            assert holds_on_lasso(formula, *word) != holds_on_lasso(other, *word)
+    assert different > 40
+
+
+def test_a_refused_dfa_shows_words_that_no_prefix_decides():
+    rng = random.Random(78)
+    refused = 0
+    for _ in range(150):
+        formula = random_formula(rng, rng.randint(3, 10), "ab")
+        if to_automaton(formula).acceptance in ("buchi", "parity"):
+            refused += 1
+            with pytest.raises(ValueError, match="has no finite acceptance") as error:
+                to_automaton(formula, acceptance="dfa")
+            lines = str(error.value).splitlines()
+            for line, holds in ((lines[1], False), (lines[2], True)):
+                prefix, cycle = re.search(r" on (.*?)\((.*)\)\^w", line).groups()
+                word = [
+                    [set(filter(None, letter.split(", "))) for letter in re.findall(r"{(.*?)}", x)]
+                    for x in (prefix, cycle)
+                ]
+                assert holds_on_lasso(formula, *word) == holds
+    assert refused > 20
