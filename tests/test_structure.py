@@ -29,7 +29,7 @@ LAYERS = [
     {"game", "rollout", "language"},
     {"translate", "graph", "fixed_point"},
     {"product", "monitor"},
-    {"acceptance", "bellman", "occupancy", "winning"},
+    {"acceptance", "stiff", "bellman", "occupancy", "winning"},
     {"reachability"},
 ]
 

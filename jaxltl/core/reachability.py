@@ -31,11 +31,13 @@ from jaxltl.core.operators import (
     transition_matrix,
 )
 from jaxltl.core.product import Product
-from jaxltl.core.types import Solution, require_shape, status_code
+from jaxltl.core.stiff import reachability_bounds
+from jaxltl.core.types import Solution, Status, require_shape, status_code
 
 _POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
 _FAR_SWEEPS = 6  # sweeps of a guess, or of interval iteration after one that failed
 _DENSE_LIMIT = 1024  # states up to which a linear system is solved by elimination
+_PATIENCE = 20_000  # sweeps after which the optimum of a small model is, too
 
 
 class _Sets(NamedTuple):
@@ -61,7 +63,8 @@ def reachability_probability(
     The least solution of ``y = 1`` on the target, ``y = sum_a pi(s, a) (P y)(s, a)``
     elsewhere (2.5); for optima with a maximum or minimum over available actions
     (Baier and Katoen 2008, section 10.6). Optima: interval iteration (Haddad and
-    Monmege 2018) with maximal end components collapsed and each bound rounded outwards.
+    Monmege 2018) with maximal end components collapsed and each bound rounded outwards;
+    where that makes hardly any progress on a small model, policy iteration, proven.
 
     Args:
       model: the model.
@@ -106,9 +109,16 @@ def reachability_probability(
         components = graph.end_components(model, ~(sets.one | sets.zero))
         if not graph.is_traced(components) and not bool(components.inside.any()):
             components = None
-    return _optimize(
-        model, sets, components, tolerance, max_steps, objective=objective
-    )
+    solve = partial(_optimize, model, sets, components, tolerance, objective=objective)
+    small = math.prod(model.state_shape) <= _DENSE_LIMIT
+    if graph.is_traced((model, sets, tolerance, max_steps)) or not small:
+        return solve(max_steps)
+    solution = solve(jnp.minimum(max_steps, _PATIENCE))
+    if int(solution.status) != Status.CONVERGED and int(max_steps) > _PATIENCE:
+        undecided = ~(sets.one | sets.zero)
+        bounds = reachability_bounds(model, sets.one, undecided, components, objective)
+        solution = solve(max_steps, bounds or (solution.lower, solution.upper))
+    return solution
 
 
 def satisfaction_probability(
@@ -294,7 +304,9 @@ def _linear_solvers(
 
 
 @partial(jax.jit, static_argnames=("objective",))
-def _optimize(model, sets: _Sets, components, tolerance, max_steps, *, objective) -> Solution:
+def _optimize(
+    model, sets: _Sets, components, tolerance, max_steps, bounds=None, *, objective
+) -> Solution:
     """Encloses an optimum between a bound that a policy attains and one that is proven.
 
     The attained bound ("near") is the lower one of a maximum and the upper one of a
@@ -368,7 +380,8 @@ def _optimize(model, sets: _Sets, components, tolerance, max_steps, *, objective
         return (jnp.max(jnp.abs(far - near)) > 2 * goal) & (n < max_steps) & moved
 
     top = jnp.where(undecided, 1, one)
-    near, far = (one, top) if objective == "max" else (top, one)
+    lower, upper = (one, top) if bounds is None else bounds
+    near, far = (lower, upper) if objective == "max" else (upper, lower)
     start = (near, far, jnp.bool_(False), jnp.int32(0), jnp.bool_(True))
     near, far, _, n, _ = lax.stop_gradient(lax.while_loop(unfinished, body, start))
     action = best(near)[1]
