@@ -16,17 +16,17 @@ MODULES = {
 }
 NO_JAX = tuple(
     f"jaxltl.core.{name}" for name in (
-        "ltl", "diagram", "emerson_lei", "automaton", "normal_form", "progression", "parity",
-        "trackers", "language", "translate",
+        "ltl", "diagram", "emerson_lei", "automaton", "simplify", "normal_form", "progression",
+        "parity", "trackers", "language", "translate",
     )
 )
 
 # Lower rooms first: a module of the core imports only from rows above its own.
 LAYERS = [
     {"types", "ltl", "diagram", "emerson_lei"},
-    {"mdp", "automaton", "normal_form", "progression"},
-    {"operators", "parity", "trackers"},
-    {"game", "rollout", "language"},
+    {"mdp", "automaton", "simplify", "progression"},
+    {"operators", "parity", "normal_form"},
+    {"game", "rollout", "language", "trackers"},
     {"translate", "graph", "fixed_point"},
     {"product", "monitor"},
     {"acceptance", "stiff", "bellman", "occupancy", "winning"},

@@ -130,7 +130,7 @@ def to_parity(
         return memo[mask]
 
     trees: dict[int, _Tree] = {}
-    for c in _reached(few_delta, initial, component):
+    for c in np.unique(component[reached_from(few_delta, initial)]).tolist():
         trees[c] = _tree(few_delta, few_colors, component, c, (verdict, inf, fin), max_states)
     new_delta, priority, base = _unfold(few_delta, component, trees, initial, max_states)
     return new_delta[:, inverse], priority[:, inverse], 0, base
@@ -142,14 +142,15 @@ def _distinct_columns(delta: Integers, colors: Integers) -> tuple[Integers, Inte
     return first, inverse.ravel()
 
 
-def _reached(delta: Integers, initial: int, component: Integers) -> list[int]:
-    seen = np.zeros(len(delta), bool)
+def reached_from(delta: Integers, initial: int) -> NDArray[np.bool_]:
+    """The states that some word leads to, bool `[Q]`."""
+    reached = np.zeros(len(delta), bool)
     frontier = np.array([initial])
     while frontier.size:
-        seen[frontier] = True
+        reached[frontier] = True
         following = np.unique(delta[frontier])
-        frontier = following[~seen[following]]
-    return [int(c) for c in np.unique(component[seen])]
+        frontier = following[~reached[following]]
+    return reached
 
 
 # ---------------------------------------------------------------------------------------------

@@ -9,259 +9,29 @@ the normalization of linear temporal logic".
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
-from jaxltl.core.ltl import FALSE, TRUE, Formula, negation_normal_form, subformulas
+from jaxltl.core.ltl import FALSE, TRUE, Formula, subformulas
+from jaxltl.core.simplify import (
+    GREATEST,
+    LEAST,
+    TEMPORAL,
+    always,
+    binary,
+    conjunction,
+    disjunction,
+    eventually,
+    is_invariant,
+    is_limit,
+    negated,
+    next_step,
+    rebuild,
+    replace_all,
+)
 
-LEAST, GREATEST = frozenset("FUM"), frozenset("GRW")
-_TEMPORAL = LEAST | GREATEST | {"X"}
 MAX_PARTS = 400  # leaves of a combination beyond which the rewriting is given up
-
-
-def conjunction(parts: Iterable[Formula]) -> Formula:
-    return _flat("&", parts, TRUE, FALSE)
-
-
-def disjunction(parts: Iterable[Formula]) -> Formula:
-    return _flat("|", parts, FALSE, TRUE)
-
-
-def _flat(operator: str, parts: Iterable[Formula], unit: Formula, zero: Formula) -> Formula:
-    kept: dict[Formula, None] = {}
-    for part in parts:
-        for piece in part.operands if part.operator == operator else (part,):
-            if piece == zero or _opposite(piece) in kept:
-                return zero
-            if piece != unit:
-                kept[piece] = None
-    pieces = _without_implied(operator, list(kept))
-    if pieces is None:
-        return zero
-    if not pieces:
-        return unit
-    return pieces[0] if len(pieces) == 1 else Formula(operator, tuple(pieces))
-
-
-def _without_implied(operator: str, pieces: list[Formula]) -> list[Formula] | None:
-    """The operands that no other makes superfluous; None if two of them decide the whole."""
-    if not any(piece.operator in _TEMPORAL for piece in pieces):
-        return pieces
-    needed: list[Formula] = []
-    for i, piece in enumerate(pieces):
-        others = needed + pieces[i + 1 :]
-        pairs = [(piece, f) if operator == "|" else (f, piece) for f in others]
-        if any(implies(*pair) for pair in pairs):
-            continue
-        if any(
-            implies(negated(f), piece) if operator == "|" else implies(f, negated(piece))
-            for f in needed
-        ):
-            return None
-        needed.append(piece)
-    return needed
-
-
-@lru_cache(maxsize=1 << 16)
-def implies(one: Formula, two: Formula) -> bool:
-    """Whether simple rules on normal forms show that every word of `one` satisfies `two`.
-
-    The rules are those of Somenzi & Bloem 2000, "Efficient Buchi automata from LTL formulae".
-    """
-    if one in (two, FALSE) or two == TRUE:
-        return True
-    if one.operator == "|" or two.operator == "&":
-        if one.operator == "|":
-            return all(implies(f, two) for f in one.operands)
-        return all(implies(one, f) for f in two.operands)
-    if two.operator == "|" and any(implies(one, f) for f in two.operands):
-        return True
-    return _implies_by_left(one, two) or _implies_by_right(one, two)
-
-
-def _implies_by_left(one: Formula, two: Formula) -> bool:
-    match one.operator:
-        case "&":
-            return any(implies(f, two) for f in one.operands)
-        case "X":
-            return two.operator == "X" and implies(one.operands[0], two.operands[0])
-        case "G":
-            return implies(one.operands[0], two) or (
-                two.operator == "G" and implies(one, two.operands[0])
-            )
-        case "F":
-            return two.operator == "F" and implies(one.operands[0], two)
-        case "U" | "W":
-            if all(implies(f, two) for f in one.operands):
-                return True
-            if one.operator == "U" and two.operator == "F":
-                return implies(one.operands[1], two)
-            return two.operator in (one.operator, "W") and all(
-                implies(f, g) for f, g in zip(one.operands, two.operands, strict=True)
-            )
-        case "R" | "M":
-            if implies(one.operands[1], two):
-                return True
-            if one.operator == "M" and two.operator == "F":
-                return implies(one.operands[0], two)
-            return two.operator in (one.operator, "R") and all(
-                implies(f, g) for f, g in zip(one.operands, two.operands, strict=True)
-            )
-    return False
-
-
-def _implies_by_right(one: Formula, two: Formula) -> bool:
-    match two.operator:
-        case "F" | "U" | "W":
-            if implies(one, two.operands[-1]):
-                return True
-            return two.operator == "W" and implies(one, Formula("G", two.operands[:1]))
-        case "R" | "M":
-            if all(implies(one, f) for f in two.operands):
-                return True
-            return two.operator == "R" and implies(one, Formula("G", two.operands[1:]))
-    return False
-
-
-def _opposite(formula: Formula) -> Formula | None:
-    if formula.operator == "ap":
-        return ~formula
-    return formula.operands[0] if formula.operator == "!" else None
-
-
-# ---------------------------------------------------------------------------------------------
-# Simplification
-# ---------------------------------------------------------------------------------------------
-
-
-def is_limit(formula: Formula) -> bool:
-    """Whether the formula is `G F f` or `F G f`, so that no finite prefix matters to it."""
-    below = formula.operands[0].operator if formula.operands else ""
-    return (formula.operator, below) in (("G", "F"), ("F", "G"))
-
-
-@lru_cache(maxsize=1 << 14)
-def is_invariant(formula: Formula) -> bool:
-    """Whether the formula is a Boolean combination of limits: true now iff true later."""
-    if formula.operator in ("&", "|"):
-        return all(is_invariant(part) for part in formula.operands)
-    return is_limit(formula) or formula in (TRUE, FALSE)
-
-
-def simplify(formula: Formula) -> Formula:
-    """An equivalent formula in negation normal form, with limits pulled outwards.
-
-    >>> from jaxltl.core.ltl import parse_ltl
-    >>> print(simplify(parse_ltl("G F (a | X F b) & F F c")))
-    (G F a | G F b) & F c
-    """
-    form: dict[Formula, Formula] = {}
-    for node in subformulas(negation_normal_form(formula)):
-        if node.operator in ("true", "false", "ap", "!"):
-            form[node] = node
-            continue
-        form[node] = _rebuild(node.operator, [form[f] for f in node.operands])
-    return form[subformulas(negation_normal_form(formula))[-1]]
-
-
-def _rebuild(operator: str, operands: list[Formula]) -> Formula:
-    """The node over simplified operands, simplified."""
-    if operator == "&":
-        return conjunction(operands)
-    if operator == "|":
-        return disjunction(operands)
-    left, right = operands[0], operands[-1]
-    if operator == "X":
-        return left if is_invariant(left) else _next(left)
-    if operator == "F":
-        return eventually(right)
-    if operator == "G":
-        return always(right)
-    return _binary(operator, left, right)
-
-
-def _next(operand: Formula) -> Formula:
-    if is_invariant(operand):
-        return operand
-    if operand.operator in ("&", "|"):  # limits need no X
-        fixed = [f for f in operand.operands if is_invariant(f)]
-        if fixed:
-            moved = [f if is_invariant(f) else _next(f) for f in operand.operands]
-            return conjunction(moved) if operand.operator == "&" else disjunction(moved)
-    return Formula("X", (operand,))
-
-
-def eventually(operand: Formula) -> Formula:
-    """`F f`."""
-    if is_invariant(operand) or operand.operator == "F":
-        return operand
-    if operand.operator in ("U", "M"):  # F (f U g) = F g, F (f M g) = F (f & g)
-        if operand.operator == "U":
-            return eventually(operand.operands[1])
-        return eventually(conjunction(operand.operands))
-    if operand.operator == "X":
-        return _next(eventually(operand.operands[0]))
-    if operand.operator == "|":
-        pulled = [f for f in operand.operands if is_invariant(f) or f.operator == "F"]
-        if pulled:
-            rest = disjunction(f for f in operand.operands if f not in pulled)
-            return disjunction([eventually(rest), *pulled])
-    if operand.operator == "&":
-        fixed = [f for f in operand.operands if is_invariant(f)]
-        if fixed:
-            rest = conjunction(f for f in operand.operands if f not in fixed)
-            return conjunction([eventually(rest), *fixed])
-    if operand.operator == "G":
-        return _limit("F", "G", operand.operands[0])
-    return Formula("F", (operand,))
-
-
-def always(operand: Formula) -> Formula:
-    """`G f`."""
-    return negated(eventually(negated(operand)))
-
-
-@lru_cache(maxsize=1 << 14)
-def negated(formula: Formula) -> Formula:
-    """The negation of a formula in negation normal form, in that form."""
-    return negation_normal_form(~formula)
-
-
-def _limit(outer: str, inner: str, operand: Formula) -> Formula:
-    """`F G f` or `G F f`, with what X and limits of the same kind allow."""
-    while operand.operator == "X" or operand.operator == inner:
-        operand = operand.operands[0]
-    if operand in (TRUE, FALSE) or is_invariant(operand):
-        return operand
-    join, spread = ("&", conjunction) if outer == "F" else ("|", disjunction)
-    if operand.operator == join:  # F G (f & g) = F G f & F G g
-        return spread(_limit(outer, inner, f) for f in operand.operands)
-    return Formula(outer, (Formula(inner, (operand,)),))
-
-
-def _binary(operator: str, left: Formula, right: Formula) -> Formula:
-    """`f U g` and the like, by the laws for constants and invariants."""
-    if operator in ("R", "M"):
-        dual = {"R": "U", "M": "W"}[operator]
-        return negated(_binary(dual, negated(left), negated(right)))
-    if right == TRUE or implies(left, right):
-        return right
-    if left == TRUE:
-        return eventually(right) if operator == "U" else TRUE
-    if right == FALSE:
-        return FALSE if operator == "U" else always(left)
-    if is_invariant(right):
-        return right if operator == "U" else disjunction([right, always(left)])
-    if is_invariant(left):
-        if operator == "U":
-            return disjunction([conjunction([left, eventually(right)]), right])
-        return disjunction([left, right])
-    if operator == "U" and right.operator == "F":
-        return right
-    if right.operator == operator and right.operands[0] == left:
-        return right
-    return Formula(operator, (left, right))
 
 
 # ---------------------------------------------------------------------------------------------
@@ -299,21 +69,6 @@ def is_pi2(formula: Formula) -> bool:
 # ---------------------------------------------------------------------------------------------
 # Normalisation
 # ---------------------------------------------------------------------------------------------
-
-
-def replace_all(formula: Formula, old: Formula, new: Formula) -> Formula:
-    """The formula with every occurrence of a subformula replaced, simplified."""
-    form: dict[Formula, Formula] = {}
-    for node in subformulas(formula):
-        if node == old:
-            form[node] = new
-        elif node.operator in ("true", "false", "ap", "!"):
-            form[node] = node
-        else:
-            operands = [form[f] for f in node.operands]
-            same = all(a is b for a, b in zip(operands, node.operands, strict=True))
-            form[node] = node if same else _rebuild(node.operator, operands)
-    return form[formula]
 
 
 def _outermost(formula: Formula, chosen: Callable[[Formula], bool]) -> Formula | None:
@@ -366,9 +121,9 @@ class Rewriter:
         if greatest.operator == "G":
             kept, strong = greatest.operands[0], FALSE
         elif greatest.operator == "W":
-            kept, strong = greatest.operands[0], _binary("U", *greatest.operands)
+            kept, strong = greatest.operands[0], binary("U", *greatest.operands)
         else:
-            kept, strong = greatest.operands[1], _binary("M", *greatest.operands)
+            kept, strong = greatest.operands[1], binary("M", *greatest.operands)
         return disjunction([
             self.limit_often(replace_all(operand, greatest, strong)),
             conjunction([
@@ -384,7 +139,7 @@ class Rewriter:
     def map_limits(self, formula: Formula) -> Formula:
         """An invariant formula with each limit normalised."""
         if formula.operator in ("&", "|"):
-            return _rebuild(formula.operator, [self.map_limits(f) for f in formula.operands])
+            return rebuild(formula.operator, [self.map_limits(f) for f in formula.operands])
         if not is_limit(formula):
             return formula
         operand = formula.operands[0].operands[0]
@@ -424,13 +179,13 @@ class Rewriter:
 
     def _to_sigma2(self, formula: Formula) -> Formula:
         if formula.operator in ("&", "|"):
-            return _rebuild(formula.operator, [self.to_sigma2(f) for f in formula.operands])
+            return rebuild(formula.operator, [self.to_sigma2(f) for f in formula.operands])
         fixed = _outermost(formula, is_limit)
         if fixed is not None:
             return self._split(fixed, formula, self.to_sigma2)
         if is_sigma2(formula):
             return formula
-        normal = _rebuild(formula.operator, [self.to_sigma2(f) for f in formula.operands])
+        normal = rebuild(formula.operator, [self.to_sigma2(f) for f in formula.operands])
         if normal != formula:
             return self.to_sigma2(normal)
         assert formula.operator in GREATEST
@@ -440,22 +195,22 @@ class Rewriter:
         elif formula.operator == "R":  # f R g = g W (f & g)
             left, right = right, conjunction([left, right])
         if not is_pure(right, LEAST):
-            return disjunction([_binary("U", left, right), self.to_sigma2(always(left))])
+            return disjunction([binary("U", left, right), self.to_sigma2(always(left))])
         if is_pure(left, LEAST):
-            return self.to_sigma2(_binary("W", left, right))
+            return self.to_sigma2(binary("W", left, right))
         # The innermost, because its weak form must not bring an F U M below a G R W again.
         least = next(f for f in subformulas(left) if f.operator in LEAST)
         goal, weak = least.operands[-1], TRUE
         if least.operator == "U":
-            weak = _binary("W", *least.operands)
+            weak = binary("W", *least.operands)
         elif least.operator == "M":
-            goal, weak = conjunction(least.operands), _binary("R", *least.operands)
+            goal, weak = conjunction(least.operands), binary("R", *least.operands)
         often = self.limit_often(goal)
         without = always(replace_all(left, least, FALSE))
-        weaker = _binary("W", replace_all(left, least, weak), right)
+        weaker = binary("W", replace_all(left, least, weak), right)
         return disjunction([
             conjunction([often, self.to_sigma2(weaker)]),
-            self.to_sigma2(_binary("U", left, disjunction([right, without]))),
+            self.to_sigma2(binary("U", left, disjunction([right, without]))),
         ])
 
 
@@ -538,7 +293,7 @@ def _combine(formula: Formula, grouped: bool, dual: bool, rewriter: Rewriter) ->
         return Part(kind, formula)
     if formula.operator == "X" and formula.operands[0].operator in ("&", "|"):
         below = formula.operands[0]
-        spread = Formula(below.operator, tuple(_next(f) for f in below.operands))
+        spread = Formula(below.operator, tuple(next_step(f) for f in below.operands))
         return _combine(spread, grouped, dual, rewriter)
     if dual:
         return _combine(negated(rewriter.to_sigma2(negated(formula))), grouped, dual, rewriter)
@@ -567,7 +322,7 @@ def _join(formula: Formula, grouped: bool, dual: bool, rewriter: Rewriter) -> Co
         together["pi2" if together["pi2"] and not together["sigma2"] else "sigma2"] += either
     for kind, formulas in together.items():
         if formulas:
-            whole = _rebuild(formula.operator, formulas)
+            whole = rebuild(formula.operator, formulas)
             one = Part(kind, whole) if _kind(whole) else None
             parts.append(one or _combine(whole, grouped, dual, rewriter))
     flat = [p for part in parts for p in _same(formula.operator, part)]
@@ -595,15 +350,16 @@ def _joined_limits(
     moving = [f for f in single if f.operator == turning]
     joined: list[Formula] = []
     if len(plain) > 1:
-        below = _rebuild(operator, [f.operands[0].operands[0] for f in plain])
+        below = rebuild(operator, [f.operands[0].operands[0] for f in plain])
         joined.append(Formula(outer, (Formula(inner, (below,)),)))
         limits = [f for f in limits if f not in plain]
     if grouped and len(moving) > 1 and not all(map(_is_propositional_limit, moving)):
-        joined.append(_flat(operator, moving, TRUE, FALSE))
+        joined.append(rebuild(operator, moving))
         limits = [f for f in limits if f not in moving]
     others = [p for p in parts if not (isinstance(p, Part) and p.kind == "limit")]
-    return others + [Part("limit", f) for f in limits + joined]
+    constant = (TRUE, FALSE)
+    return others + [Part("sigma2" if f in constant else "limit", f) for f in limits + joined]
 
 
 def _is_propositional_limit(formula: Formula) -> bool:
-    return is_pure(formula.operands[0].operands[0], _TEMPORAL)
+    return is_pure(formula.operands[0].operands[0], TEMPORAL)

@@ -15,7 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.automaton import Automaton
-from jaxltl.core.emerson_lei import parity_condition, strong_components, to_parity
+from jaxltl.core.emerson_lei import (
+    parity_condition,
+    reached_from,
+    strong_components,
+    to_parity,
+)
 
 Integers: TypeAlias = NDArray[np.integer[Any]]
 
@@ -339,12 +344,7 @@ class _Pairs:
         """Whether the table with each state q replaced by target[q] has the same language."""
         follow = self.number[self.follow, target[self.delta[self.right]]]
         start = self.number[initial, target[initial]]
-        reached = np.zeros(len(follow), bool)
-        frontier = np.array([start])
-        while frontier.size:
-            reached[frontier] = True
-            following = np.unique(follow[frontier])
-            frontier = following[~reached[following]]
+        reached = reached_from(follow, start)
         place = np.cumsum(reached) - 1
         follow = place[follow[reached]]
         left, right = self.left_priority[reached], self.right_priority[reached]

@@ -15,16 +15,9 @@ from numpy.typing import NDArray
 
 from jaxltl.core.diagram import FALSE, TRUE
 from jaxltl.core.emerson_lei import MAX_COLORS, Condition
-from jaxltl.core.normal_form import (
-    GREATEST,
-    LEAST,
-    Combination,
-    Part,
-    is_pure,
-    limit_parts,
-    negated,
-)
+from jaxltl.core.normal_form import Combination, Part, is_pure, limit_parts
 from jaxltl.core.progression import Progression
+from jaxltl.core.simplify import GREATEST, LEAST, negated
 
 _State: TypeAlias = tuple[int, int, int]  # what is left of the formula, the guess, the turn
 _PROVEN, _REFUTED, _IDLE = -1, -2, -3

@@ -29,9 +29,10 @@ from jaxltl.core.ltl import (
     is_syntactically_safe,
     negation_normal_form,
 )
-from jaxltl.core.normal_form import Combination, combination, extent, simplify
+from jaxltl.core.normal_form import Combination, combination, extent
 from jaxltl.core.parity import Table, is_weak, reachable, reduce_table
 from jaxltl.core.progression import Namer, Progression
+from jaxltl.core.simplify import simplify
 from jaxltl.core.trackers import track
 
 Acceptance = Literal["auto", "dfa", "buchi", "parity"]

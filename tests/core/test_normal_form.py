@@ -6,16 +6,19 @@ import pytest
 
 from jaxltl.core.ltl import holds_on_lasso, negation_normal_form, parse_ltl
 from jaxltl.core.normal_form import (
-    GREATEST,
-    LEAST,
     Part,
     combination,
-    is_invariant,
-    is_limit,
     is_pi2,
     is_pure,
     is_sigma2,
     limit_parts,
+)
+from jaxltl.core.simplify import (
+    GREATEST,
+    LEAST,
+    implies,
+    is_invariant,
+    is_limit,
     negated,
     simplify,
 )
@@ -180,3 +183,17 @@ def test_limits_raise():
     many = " & ".join(f"(F a{i} | G b{i})" for i in range(401))
     with pytest.raises(ValueError, match="more than 400 parts"):
         combination(simplify(parse_ltl(many)), grouped=False)
+
+
+def test_what_the_rules_say_is_implied_is_implied():
+    rng = random.Random(9)
+    claimed = 0
+    for _ in range(3000):
+        one, two = (simplify(random_formula(rng, rng.randint(1, 5), "ab")) for _ in range(2))
+        if one == two or not implies(one, two):
+            continue
+        claimed += 1
+        for _ in range(12):
+            lasso = random_lasso(rng, [frozenset(), {"a"}, {"b"}, {"a", "b"}])
+            assert not holds_on_lasso(one, *lasso) or holds_on_lasso(two, *lasso), (one, two)
+    assert claimed > 200

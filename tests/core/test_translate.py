@@ -19,7 +19,7 @@ from jaxltl.core.ltl import (
     is_syntactically_safe,
     parse_ltl,
 )
-from jaxltl.core.normal_form import simplify
+from jaxltl.core.simplify import simplify
 from jaxltl.core.translate import to_automaton
 from tests.reference_logic import (
     holds_by_definition,
