@@ -157,7 +157,7 @@ def _missing_safety(world: MDP, shown: Trajectories, mu: float | None) -> dict[s
     problem = irl.make_problem(told, features.values, shown)
     [(_, policy, _)] = mlirl_cases(problem, (mu,))
     reached = restrict(told)
-    true = product(reached.mdp, TASK)
+    true = product(reached.model, TASK)
     lifted = lift_policy(true, policy[reached.base_state, reached.memory])
     base = np.asarray(reached.base_state)
     result = _evaluated(true, lifted, {"row_7_column_5": int(np.argmax(base == 6 * 10 + 4))})

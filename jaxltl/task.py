@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxltl.core.ltl import holds_on_lasso, parse_ltl
+from jaxltl.core.labels import satisfying
 from jaxltl.core.mdp import MDP, from_dense, make_mdp
 from jaxltl.core.product import Product
 from jaxltl.core.rollout import Trajectories, make_trajectories
@@ -348,17 +348,7 @@ def _load_model(path: Path, initial: str | None) -> World:
 
 def _where_holds(formula: str, mdp: MDP) -> jax.Array:
     """The uniform distribution over the states whose labels satisfy a propositional formula."""
-    condition = parse_ltl(formula)
-    unknown = set(condition.propositions) - set(mdp.propositions)
-    if unknown:
-        raise ValueError(
-            f"initial: {min(unknown)!r} is not a proposition of the model; "
-            f"it has {', '.join(mdp.propositions) or '(none)'}."
-        )
-    names = np.array(mdp.propositions, dtype=object)
-    rows, inverse = np.unique(np.asarray(mdp.label), axis=0, return_inverse=True)
-    truth = np.array([holds_on_lasso(condition, [], [set(names[row])]) for row in rows], bool)
-    holds = truth[inverse.ravel()]
+    holds = satisfying(np.asarray(mdp.label), mdp.propositions, formula, "initial")
     if not holds.any():
         raise ValueError(f"initial={formula!r} holds in no state.")
     return jax.numpy.asarray(holds / holds.sum(), mdp.dtype)

@@ -24,13 +24,13 @@ NO_JAX = tuple(
 # Lower rooms first: a module of the core imports only from rows above its own.
 LAYERS = [
     {"types", "ltl", "diagram", "emerson_lei"},
-    {"mdp", "automaton", "simplify", "progression"},
+    {"mdp", "automaton", "simplify", "progression", "labels"},
     {"operators", "parity", "normal_form"},
     {"game", "rollout", "language", "trackers"},
-    {"translate", "graph", "fixed_point"},
+    {"translate", "graph", "fixed_point", "objective"},
     {"product", "monitor"},
     {"acceptance", "stiff", "bellman", "occupancy", "winning"},
-    {"reachability"},
+    {"reachability", "verify", "permissive", "game_value"},
 ]
 
 PUBLIC = [

@@ -120,7 +120,7 @@ def test_a_missing_task_file(tmp_path):
 
 
 @pytest.mark.parametrize(("replacement", "message"), [
-    ((". . r\n", ". . .\n"), r"\[world\] initial: 'r' is not a proposition of the map"),
+    ((". . r\n", ". . .\n"), r"\[world\] mentions the proposition 'r'"),
     (("b . y", "b y"), r"\[world\] map row 2 has 2 cells, row 1 has 3"),
     (('absorbing = ["y"]', "slip = 0.1\nlegend = { b = [] }"), r"\(row 1, column 1\) is not in"),
 ])
@@ -217,7 +217,7 @@ def test_a_model_that_is_no_npz(write, tmp_path):
 
 def test_an_unknown_proposition_in_a_models_initial(write):
     task = _model_task(write, ("[task]", 'initial = "!q"\n[task]'), transition=CHAIN)
-    with pytest.raises(ValueError, match=r"initial: 'q' is not a proposition of the model"):
+    with pytest.raises(ValueError, match=r"initial: '!q' mentions the proposition 'q'"):
         load_world(task)
 
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxltl.core.game import Game
 from jaxltl.core.mdp import DenseMDP
 from jaxltl.core.operators import exists_successor, first_action, forall_successor
 
@@ -54,24 +55,30 @@ def attractor(
     goal: jax.Array,
     allowed: jax.Array | None = None,
     *,
-    rule: str = "exists",
+    rule: str | jax.Array = "exists",
+    chance: str = "some",
     among: jax.Array | None = None,
 ) -> Attractor:
     """States that a goal attracts: the least R with ``goal <= R`` closed under a rule.
+
+    With a rule for each state it is the attractor of a player in a game: ``"exists"`` where
+    that player moves, ``"forall"`` where the other does.
 
     Args:
       model: the model.
       goal: ``bool[S]``.
       allowed: ``bool[S, A]``, the actions that count; default the available ones.
-      rule: ``"exists"``: some allowed action reaches R with positive probability;
-        ``"forall"``: every allowed action does (so a state without any is attracted).
+      rule: ``"exists"``: some allowed action leads to R; ``"forall"``: every allowed
+        action does (so a state without any is attracted). Or ``bool[S]``: True for exists.
+      chance: what leading to R means: ``"some"`` successor lies in R, so that chance
+        helps, or ``"all"`` do, so that it does not.
       among: ``bool[S]``, the states outside the goal that may join; default all.
 
     Returns:
       :class:`Attractor`. With ``"exists"`` the action is the one that makes progress.
 
     Raises:
-      ValueError: unknown rule.
+      ValueError: unknown rule or chance.
 
     Example:
       >>> from jaxltl.core.mdp import from_dense
@@ -79,25 +86,31 @@ def attractor(
       >>> attractor(mdp, jnp.array([True, False])).region.tolist()
       [True, False]
     """
-    if rule not in ("exists", "forall"):
-        raise ValueError(f"rule={rule!r}; choose exists or forall.")
+    if isinstance(rule, str):
+        if rule not in ("exists", "forall"):
+            raise ValueError(f"rule={rule!r}; choose exists or forall, or give bool[S].")
+        rule = jnp.full(model.state_shape, rule == "exists")
+    if chance not in ("some", "all"):
+        raise ValueError(f"chance={chance!r}; choose some or all.")
     allowed = model.available if allowed is None else allowed
-    traced = is_traced((model, goal, allowed, among))
+    traced = is_traced((model, goal, allowed, rule, among))
     most = jnp.iinfo(jnp.int32).max if traced else _MAX_SWEEPS
     among = jnp.ones(model.state_shape, bool) if among is None else among
-    found, growing = _attractor_sweeps(model, goal, allowed, among, most, rule=rule)
+    found, growing = _attractor_sweeps(model, goal, allowed, rule, among, most, chance=chance)
     if traced or not growing:
         return found
-    return _attractor_worklist(model, found, allowed, among, rule)
+    return _attractor_worklist(model, found, allowed, rule, among, chance)
 
 
-@partial(jax.jit, static_argnames=("rule",))
-def _attractor_sweeps(model, goal, allowed, among, max_sweeps, *, rule):
+@partial(jax.jit, static_argnames=("chance",))
+def _attractor_sweeps(model, goal, allowed, rule, among, max_sweeps, *, chance):
+    leads = exists_successor if chance == "some" else forall_successor
+
     def body(carry):
         region, action, _, n = carry
-        hit = allowed & exists_successor(model, region)
+        hit = allowed & leads(model, region)
         some, first = first_action(hit)
-        joins = some if rule == "exists" else ~first_action(allowed & ~hit)[0]
+        joins = jnp.where(rule, some, ~first_action(allowed & ~hit)[0])
         new = joins & among & ~region
         action = jnp.where(new, first, action)
         return region | new, action, new.any(), n + 1
@@ -228,11 +241,12 @@ def is_traced(tree: Any) -> bool:
 
 
 def _label_on(model: Any) -> str:
-    return getattr(model, "label_on", "entry")
+    return getattr(model.mdp if isinstance(model, Game) else model, "label_on", "entry")
 
 
 def _support(model: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
     """``successor[S, A, K]``, whether it is one, and ``next_memory[S, Q]``."""
+    model = model.mdp if isinstance(model, Game) else model
     world = getattr(model, "mdp", model)
     used = world.successor_probability > 0
     if isinstance(world, DenseMDP):
@@ -260,8 +274,11 @@ def _predecessors(successor: np.ndarray, used: np.ndarray) -> Any:
     return sparse.csr_array((data, indices, indptr), shape=(rows, num_states)).tocsc()
 
 
+_SCALAR = 24  # transitions into a frontier up to which Python's own loop beats NumPy's overhead
+
+
 def _attractor_worklist(
-    model, found: Attractor, allowed: jax.Array, among: jax.Array, rule: str
+    model: Any, found: Attractor, allowed: jax.Array, rule: jax.Array, among: jax.Array, chance: str
 ) -> Attractor:
     """Finishes an attractor frontier by frontier, touching each transition once."""
     successor, used, next_memory = (np.asarray(x) for x in _support(model))
@@ -270,12 +287,17 @@ def _attractor_worklist(
     on_entry = _label_on(model) == "entry"
     region = np.array(found.region).ravel()
     action = np.array(found.action).ravel()
-    open_ = np.array(allowed).ravel()  # pairs that count and have not been hit
+    open_ = np.array(allowed).ravel()  # pairs that count and do not lead to the region yet
     remaining = open_.reshape(-1, num_actions).sum(-1)
-    closed = ~np.array(among).ravel()
+    exists = np.array(rule).ravel()
+    blocked = ~np.array(among).ravel()
+    missing = np.ones(open_.size, np.int64)  # successors that must still join before a pair leads
+    if chance == "all":
+        count = used.sum(-1)[:, None, :]
+        missing = np.broadcast_to(count, (*next_memory.shape, num_actions)).ravel().copy()
 
     def leading_to(frontier: np.ndarray) -> np.ndarray:
-        """Flat pairs ``(s * Q + q) * A + a`` with a successor in the frontier."""
+        """Flat pairs ``(s * Q + q) * A + a`` with a successor in the frontier, one a transition."""
         target, memory = np.divmod(frontier, num_memory)
         count = into.indptr[target + 1] - into.indptr[target]
         offset = np.arange(count.sum()) - np.repeat(count.cumsum() - count, count)
@@ -287,20 +309,45 @@ def _attractor_worklist(
         row, q = np.nonzero(next_memory[read] == np.repeat(memory, count)[:, None])
         return (s[row] * num_memory + q) * num_actions + a[row]
 
-    frontier = np.flatnonzero(region)
-    while frontier.size:
-        pair = leading_to(frontier)
-        pair = np.unique(pair[open_[pair]])
+    def join(pairs: np.ndarray) -> np.ndarray:
+        """The states that join by pairs that now lead to the region."""
+        np.subtract.at(missing, pairs, 1)
+        pair = np.unique(pairs[open_[pairs] & (missing[pairs] <= 0)])
         open_[pair] = False
         s, a = np.divmod(pair, num_actions)
-        if rule == "forall":
-            np.subtract.at(remaining, s, 1)
-            joins = (remaining[s] == 0) & ~region[s] & ~closed[s]
-        else:
-            joins = ~region[s] & ~closed[s]
+        np.subtract.at(remaining, s, 1)
+        joins = (exists[s] | (remaining[s] == 0)) & ~region[s] & ~blocked[s]
         frontier, first = np.unique(s[joins], return_index=True)
         action[frontier] = a[joins][first]
         region[frontier] = True
+        return frontier
+
+    def join_few(pairs: list[int]) -> list[int]:
+        """The same for few pairs, by plain loops."""
+        frontier = []
+        for pair in sorted(pairs):
+            missing[pair] -= 1
+            if missing[pair] > 0 or not open_[pair]:
+                continue
+            open_[pair] = False
+            s, a = divmod(pair, num_actions)
+            remaining[s] -= 1
+            if (exists[s] or remaining[s] == 0) and not region[s] and not blocked[s]:
+                action[s], region[s] = a, True
+                frontier.append(s)
+        return frontier
+
+    indptr, indices = into.indptr, into.indices
+    frontier = np.flatnonzero(region)
+    while len(frontier):
+        if num_memory == 1 and len(frontier) <= _SCALAR:
+            # Along a chain every frontier is small, and there are very many.
+            ends = [(indptr[t], indptr[t + 1]) for t in frontier]
+            if sum(stop - start for start, stop in ends) <= _SCALAR:
+                few = [x for start, stop in ends for x in indices[start:stop].tolist()]
+                frontier = join_few(few)
+                continue
+        frontier = join(leading_to(np.asarray(frontier)))
     shape = found.region.shape
     return Attractor(jnp.asarray(region.reshape(shape)), jnp.asarray(action.reshape(shape)))
 

@@ -135,7 +135,7 @@ def pushforward(model: Any, mass: jax.Array) -> jax.Array:
 
 
 def _unknown(model: Any) -> str:
-    return f"{type(model).__name__} is not a model: pass an MDP, a DenseMDP or a Product."
+    return f"{type(model).__name__} is not a model: pass an MDP, a DenseMDP, a Product or a Game."
 
 
 def _gather(value: jax.Array, index: jax.Array) -> jax.Array:

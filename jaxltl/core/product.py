@@ -6,12 +6,11 @@ decides at which memory state the value of a successor is read.
 
 from __future__ import annotations
 
-import difflib
 import functools
 import math
 from collections.abc import Collection
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -21,6 +20,8 @@ from flax import struct
 
 from jaxltl.core import operators
 from jaxltl.core.automaton import Automaton, letter_index
+from jaxltl.core.game import Game
+from jaxltl.core.labels import require_known
 from jaxltl.core.ltl import Formula, parse_ltl
 from jaxltl.core.mdp import MDP, DenseMDP, make_mdp
 from jaxltl.core.rollout import Trajectories
@@ -136,17 +137,19 @@ def letters(world: MDP | DenseMDP, propositions: Collection[str] | None = None) 
     return [frozenset(n for n, holds in zip(names, row, strict=True) if holds) for row in rows]
 
 
-def product(
-    world: MDP | DenseMDP, task: Automaton | Formula | str, *, label_on: str = "entry"
-) -> Product:
+def product(world: Any, task: Automaton | Formula | str, *, label_on: str = "entry") -> Any:
     """The lazy product of a world and a task.
 
     A formula is translated over the letters that occur in the world.
 
     Args:
-      world: the model; its labels are read on the host.
+      world: the model, an MDP, a DenseMDP or a Game; its labels are read on the host.
       task: an automaton, a formula, or a formula's text.
       label_on: ``"entry"`` or ``"exit"``, see :class:`Product`.
+
+    Returns:
+      A :class:`Product`; of a game, the :class:`~jaxltl.core.game.Game` on the product, in
+      which the same player moves in every memory state.
 
     Raises:
       ValueError: the task mentions a proposition that the world lacks, or the world
@@ -160,11 +163,14 @@ def product(
     """
     if label_on not in ("entry", "exit"):
         raise ValueError(f'label_on={label_on!r}; it must be "entry" or "exit".')
+    if isinstance(world, Game):
+        model = product(world.mdp, task, label_on=label_on)
+        return Game(model, jnp.broadcast_to(world.system[:, None], model.state_shape))
     if isinstance(task, str | Formula):
         formula = parse_ltl(task) if isinstance(task, str) else task
-        _require_known(formula.propositions, world.propositions)
+        require_known(formula.propositions, world.propositions, "the task")
         task = to_automaton(formula, letters=letters(world, formula.propositions))
-    _require_known(task.propositions, world.propositions)
+    require_known(task.propositions, world.propositions, "the task")
     column = [world.propositions.index(p) for p in task.propositions]
     rows, letter = np.unique(np.asarray(world.label)[:, column], axis=0, return_inverse=True)
     index = np.array(
@@ -172,17 +178,6 @@ def product(
     )
     automaton = jax.tree.map(jnp.asarray, task)
     return Product(world, automaton, jnp.asarray(index[letter.ravel()]), label_on)
-
-
-def _require_known(needed: Collection[str], known: tuple[str, ...]) -> None:
-    for name in needed:
-        if name not in known:
-            guess = difflib.get_close_matches(name, known, n=1)
-            raise ValueError(
-                f"the task mentions the proposition {name!r}, which the world does not have; "
-                f"its propositions are {', '.join(known) or '(none)'}."
-                + (f" Did you mean {guess[0]!r}?" if guess else "")
-            )
 
 
 def _letter(automaton: Automaton, row: np.ndarray, state: int) -> int:
@@ -391,58 +386,86 @@ def project_policy(model: Product, policy: jax.Array) -> FiniteMemoryPolicy:
 
 
 class Restriction(NamedTuple):
-    """The reachable part of a product as an ordinary model.
+    """The reachable part of a model as an ordinary one.
 
-    State i of `mdp` is the product state ``(base_state[i], memory[i])``.
+    State i of `model` is the state ``base_state[i]`` of the world, in a product with the
+    memory ``memory[i]`` (zero otherwise).
     """
 
-    mdp: MDP
+    model: Any
     base_state: jax.Array
     memory: jax.Array
 
 
-def restrict(model: Product, initial: chex.Array | None = None) -> Restriction:
-    """The states of a product that are reachable from its initial ones, on the host.
+def restrict(
+    model: Any, initial: chex.Array | None = None, *, allowed: chex.Array | None = None
+) -> Restriction:
+    """The states that are reachable from initial ones by allowed actions, on the host.
 
     Args:
-      model: a product over a sparse MDP.
-      initial: ``float[S, Q]``, a distribution to start from; default the product's own.
+      model: an MDP, a Product over one, or a Game on either.
+      initial: ``float[S]`` or ``[S, Q]``, a distribution to start from; default the model's.
+      allowed: ``bool[S, A]`` or ``[S, Q, A]``, the actions to keep, such as a permissive
+        strategy's mask; default the available ones.
 
     Returns:
-      A :class:`Restriction`; labels and propositions are the world's.
+      A :class:`Restriction` to an MDP, or to a Game on one; labels and propositions are
+      the world's.
 
     Raises:
-      ValueError: the world is not an MDP with successor lists.
+      ValueError: the world has no successor lists, or a reachable state keeps no action.
     """
-    if not isinstance(model.mdp, MDP):
+    lazy = model.mdp if isinstance(model, Game) else model
+    world = lazy.mdp if isinstance(lazy, Product) else lazy
+    if not isinstance(world, MDP):
         raise ValueError("restrict needs successor lists; convert the world by from_dense.")
-    initial = np.asarray(model.initial if initial is None else initial)
-    num_memory = model.num_memory
-    successor = np.asarray(model.mdp.successor)
-    used = np.asarray(model.mdp.probability) > 0
-    step = np.asarray(model.next_memory)
-    number = np.full(model.num_states, -1)
-    frontier = np.flatnonzero(initial.ravel() > 0)
-    found = []
+    initial = np.asarray(model.initial if initial is None else initial).ravel()
+    if not (initial > 0).any():
+        raise ValueError("the initial distribution is zero; give a state to start from.")
+    allowed = np.asarray(model.available if allowed is None else model.available & allowed)
+    allowed = allowed.reshape(-1, model.num_actions)
+    successor, used = np.asarray(world.successor), np.asarray(world.probability) > 0
+    num_memory, step, label_on = 1, np.zeros((world.num_states, 1), np.int32), "entry"
+    if isinstance(lazy, Product):
+        num_memory, step, label_on = lazy.num_memory, np.asarray(lazy.next_memory), lazy.label_on
+
+    def targets(states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        s, q = np.divmod(states, num_memory)
+        flat = _flat_successor(successor[s], step, *_columns(s, q), label_on)
+        return flat, used[s] & allowed[states][:, :, None], s
+
+    number = np.full(allowed.shape[0], -1)
+    seen = initial > 0
+    frontier = np.flatnonzero(seen)
     while frontier.size:
-        number[frontier] = 0
-        found.append(frontier)
-        s, q = np.divmod(frontier, num_memory)
-        targets = _flat_successor(successor[s], step, *_columns(s, q), model.label_on)[used[s]]
-        frontier = np.unique(targets[number[targets] < 0])
-    states = np.sort(np.concatenate(found))
+        flat, real, _ = targets(frontier)
+        new = flat[real]
+        frontier = np.unique(new[~seen[new]])
+        seen[frontier] = True
+    states = np.flatnonzero(seen)
+    stuck = states[~allowed[states].any(-1)]
+    if stuck.size:
+        s, q = divmod(int(stuck[0]), num_memory)
+        where = f"{s}" + (f" with memory {q}" if num_memory > 1 else "")
+        raise ValueError(
+            f"no action is allowed in state {where}, which is reachable; the mask is empty "
+            "there. Start inside the winning region, or allow an action."
+        )
     number[states] = np.arange(states.size)
-    s, q = np.divmod(states, num_memory)
-    flat = number[_flat_successor(successor[s], step, *_columns(s, q), model.label_on)]
+    flat, real, s = targets(states)
     mdp = make_mdp(
-        np.where(used[s], flat, 0),
-        np.asarray(model.mdp.probability)[s],
-        available=np.asarray(model.mdp.available)[s],
-        initial=initial.ravel()[states],
-        label=np.asarray(model.mdp.label)[s],
-        propositions=model.mdp.propositions,
+        np.where(real, number[flat], 0),
+        np.where(real, np.asarray(world.probability)[s], 0),
+        available=allowed[states],
+        initial=initial[states],
+        label=np.asarray(world.label)[s],
+        propositions=world.propositions,
     )
-    return Restriction(mdp, jnp.asarray(s, jnp.int32), jnp.asarray(q, jnp.int32))
+    memory = jnp.asarray(states - s * num_memory, jnp.int32)
+    result = mdp
+    if isinstance(model, Game):
+        result = Game(mdp, jnp.asarray(np.asarray(model.system).ravel()[states]))
+    return Restriction(result, jnp.asarray(s, jnp.int32), memory)
 
 
 def _columns(s: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 import chex
 import numpy as np
 
-from jaxltl.core.ltl import holds_on_lasso, parse_ltl
+from jaxltl.core.labels import satisfying
 from jaxltl.core.mdp import MDP, make_mdp
 
 ACTIONS = ("up", "down", "left", "right")
@@ -152,13 +152,7 @@ def _initial(
 ) -> np.ndarray:
     holds = place
     if formula is not None:
-        condition = parse_ltl(formula)
-        _holds_one_of(condition.propositions, label, propositions, "initial")
-        rows, inverse = np.unique(label, axis=0, return_inverse=True)
-        names = np.array(propositions, dtype=object)
-        # A stuttering word gives a propositional formula its truth in one letter.
-        truth = np.array([holds_on_lasso(condition, [], [set(names[row])]) for row in rows], bool)
-        holds = place & truth[inverse.ravel()]
+        holds = place & satisfying(label, propositions, formula, "initial")
     if not holds.any():
         raise ValueError(f"initial={formula!r} holds in no cell of the map.")
     return holds / holds.sum()

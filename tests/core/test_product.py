@@ -65,12 +65,12 @@ def test_restriction_is_the_reachable_part(label_on):
         number = np.asarray(found.base_state) * lazy.num_memory + np.asarray(found.memory)
         np.testing.assert_array_equal(number, np.flatnonzero(reachable))
         np.testing.assert_array_equal(
-            jl.to_dense(found.mdp).transition,
+            jl.to_dense(found.model).transition,
             explicit.transition[reachable][:, :, reachable],
         )
-        np.testing.assert_array_equal(found.mdp.initial, explicit.initial[reachable])
-        np.testing.assert_array_equal(found.mdp.label, lazy.mdp.label[found.base_state])
-        assert found.mdp.propositions == lazy.mdp.propositions
+        np.testing.assert_array_equal(found.model.initial, explicit.initial[reachable])
+        np.testing.assert_array_equal(found.model.label, lazy.mdp.label[found.base_state])
+        assert found.model.propositions == lazy.mdp.propositions
 
 
 def test_restriction_to_another_start():
@@ -81,7 +81,7 @@ def test_restriction_to_another_start():
     number = np.asarray(found.base_state) * lazy.num_memory + np.asarray(found.memory)
     step = (explicit.transition > 0).any(axis=1)
     np.testing.assert_array_equal(number, np.flatnonzero(reference.closure(step)[1 * 3 + 2]))
-    assert found.mdp.initial.sum() == 1
+    assert found.model.initial.sum() == 1
 
 
 def test_restriction_needs_successor_lists():

@@ -91,7 +91,7 @@ def test_maps_of_words_and_of_characters():
         ("ab", {"legend": {"a": "goal", "b": []}}, r"legend\['a'\] is a string; give a list"),
         ("ab", {"absorbing": ["z"]}, "absorbing: 'z' is not a proposition of the map; it has a, b"),
         ("..", {"absorbing": ["z"]}, r"absorbing: 'z' .* it has \(none\)"),
-        ("ab", {"initial": "z"}, "initial: 'z' is not a proposition of the map"),
+        ("ab", {"initial": "z"}, "mentions the proposition 'z'"),
         ("ab", {"initial": "a & b"}, "initial='a & b' holds in no cell"),
         ("##", {}, "initial=None holds in no cell"),
         ("ab", {"initial": [0.5, 0.4]}, "the initial distribution sums to 0.9"),
