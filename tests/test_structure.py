@@ -29,8 +29,9 @@ LAYERS = [
     {"game", "rollout", "language", "trackers"},
     {"translate", "graph", "fixed_point", "objective"},
     {"product", "monitor"},
-    {"acceptance", "stiff", "bellman", "occupancy", "winning"},
-    {"reachability", "verify", "permissive", "game_value"},
+    {"acceptance", "stiff", "bellman", "occupancy", "gr1"},
+    {"reachability", "winning", "game_value"},
+    {"verify", "permissive"},
 ]
 
 PUBLIC = [

@@ -170,12 +170,8 @@ def almost_surely_reaching(
         return smaller, jnp.any(smaller.region != found.region)
 
     # A state that cannot reach the goal at all is what removes others.
-    carry = (found, ~jnp.all(found.region))
-    if is_traced((model, goal, allowed, found)):
-        return lax.while_loop(lambda c: c[1], body, carry)[0]
-    while bool(carry[1]):
-        carry = body(carry)
-    return carry[0]
+    start = (found, ~jnp.all(found.region))
+    return repeat(body, start, (model, goal, allowed, found))[0]
 
 
 def end_components(
@@ -238,6 +234,19 @@ def _components(model: Any, core: jax.Array, allowed: jax.Array, closed: bool) -
 def is_traced(tree: Any) -> bool:
     """Whether any array in a tree is abstract, so that the host cannot read it."""
     return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
+
+
+def repeat(body: Any, start: tuple[Any, ...], arguments: Any) -> tuple[Any, ...]:
+    """Repeats while the last entry of what is carried is true.
+
+    With concrete arguments the loop runs on the host, so that worklists can serve in it.
+    """
+    if is_traced(arguments):
+        return lax.while_loop(lambda carry: carry[-1], body, start)
+    carry = start
+    while bool(carry[-1]):
+        carry = body(carry)
+    return carry
 
 
 def _label_on(model: Any) -> str:
