@@ -167,6 +167,11 @@ def _(game: Game, region: jax.Array) -> jax.Array:
     return operators.forall_successor(game.mdp, region)
 
 
+@operators.least_successor.register
+def _(game: Game, value: jax.Array) -> jax.Array:
+    return operators.least_successor(game.mdp, value)
+
+
 @operators.sample_successor.register
 def _(game: Game, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
     return operators.sample_successor(game.mdp, key, state, action)

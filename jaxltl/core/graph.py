@@ -31,10 +31,13 @@ class Attractor(NamedTuple):
       region: ``bool[S]``.
       action: ``int32[S]``: in the region outside the goal, an allowed action with a
         successor that is nearer to the goal; elsewhere the first available one.
+      rank: ``int32[S]``: the round in which the state joined, 0 in the goal; meaningless
+        outside of the region.
     """
 
     region: jax.Array
     action: jax.Array
+    rank: jax.Array
 
 
 class EndComponents(NamedTuple):
@@ -96,10 +99,10 @@ def attractor(
     traced = is_traced((model, goal, allowed, rule, among))
     most = jnp.iinfo(jnp.int32).max if traced else _MAX_SWEEPS
     among = jnp.ones(model.state_shape, bool) if among is None else among
-    found, growing = _attractor_sweeps(model, goal, allowed, rule, among, most, chance=chance)
+    found, n, growing = _attractor_sweeps(model, goal, allowed, rule, among, most, chance=chance)
     if traced or not growing:
         return found
-    return _attractor_worklist(model, found, allowed, rule, among, chance)
+    return _attractor_worklist(model, found, int(n), allowed, rule, among, chance)
 
 
 @partial(jax.jit, static_argnames=("chance",))
@@ -107,22 +110,22 @@ def _attractor_sweeps(model, goal, allowed, rule, among, max_sweeps, *, chance):
     leads = exists_successor if chance == "some" else forall_successor
 
     def body(carry):
-        region, action, _, n = carry
+        region, action, rank, _, n = carry
         hit = allowed & leads(model, region)
         some, first = first_action(hit)
         joins = jnp.where(rule, some, ~first_action(allowed & ~hit)[0])
         new = joins & among & ~region
         action = jnp.where(new, first, action)
-        return region | new, action, new.any(), n + 1
+        return region | new, action, jnp.where(new, n + 1, rank), new.any(), n + 1
 
     def unfinished(carry):
         *_, growing, n = carry
         return growing & (n < max_sweeps)
 
     _, first = first_action(model.available)
-    start = (goal, first, jnp.bool_(True), jnp.int32(0))
-    region, action, growing, _ = lax.while_loop(unfinished, body, start)
-    return Attractor(region, action), growing
+    start = (goal, first, jnp.zeros_like(first), jnp.bool_(True), jnp.int32(0))
+    region, action, rank, growing, n = lax.while_loop(unfinished, body, start)
+    return Attractor(region, action, rank), n, growing
 
 
 def avoidable(model: Any, goal: jax.Array, allowed: jax.Array | None = None) -> jax.Array:
@@ -287,15 +290,16 @@ _SCALAR = 24  # transitions into a frontier up to which Python's own loop beats 
 
 
 def _attractor_worklist(
-    model: Any, found: Attractor, allowed: jax.Array, rule: jax.Array, among: jax.Array, chance: str
+    model: Any, found: Attractor, round_: int, allowed: jax.Array, rule: jax.Array,
+    among: jax.Array, chance: str,
 ) -> Attractor:
-    """Finishes an attractor frontier by frontier, touching each transition once."""
+    """Finishes an attractor after some rounds, touching each transition once."""
     successor, used, next_memory = (np.asarray(x) for x in _support(model))
     num_actions, num_memory = successor.shape[1], next_memory.shape[1]
     into = _predecessors(successor, used)
     on_entry = _label_on(model) == "entry"
     region = np.array(found.region).ravel()
-    action = np.array(found.action).ravel()
+    action, rank = (np.array(x).ravel() for x in (found.action, found.rank))
     open_ = np.array(allowed).ravel()  # pairs that count and do not lead to the region yet
     remaining = open_.reshape(-1, num_actions).sum(-1)
     exists = np.array(rule).ravel()
@@ -329,6 +333,7 @@ def _attractor_worklist(
         frontier, first = np.unique(s[joins], return_index=True)
         action[frontier] = a[joins][first]
         region[frontier] = True
+        rank[frontier] = round_
         return frontier
 
     def join_few(pairs: list[int]) -> list[int]:
@@ -342,13 +347,14 @@ def _attractor_worklist(
             s, a = divmod(pair, num_actions)
             remaining[s] -= 1
             if (exists[s] or remaining[s] == 0) and not region[s] and not blocked[s]:
-                action[s], region[s] = a, True
+                action[s], region[s], rank[s] = a, True, round_
                 frontier.append(s)
         return frontier
 
     indptr, indices = into.indptr, into.indices
     frontier = np.flatnonzero(region)
     while len(frontier):
+        round_ += 1
         if num_memory == 1 and len(frontier) <= _SCALAR:
             # Along a chain every frontier is small, and there are very many.
             ends = [(indptr[t], indptr[t + 1]) for t in frontier]
@@ -358,7 +364,7 @@ def _attractor_worklist(
                 continue
         frontier = join(leading_to(np.asarray(frontier)))
     shape = found.region.shape
-    return Attractor(jnp.asarray(region.reshape(shape)), jnp.asarray(action.reshape(shape)))
+    return Attractor(*(jnp.asarray(x.reshape(shape)) for x in (region, action, rank)))
 
 
 def _end_components(label_on, closed, successor, used, next_memory, core, allowed):

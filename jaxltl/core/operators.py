@@ -1,10 +1,11 @@
-"""The five primitives through which every algorithm sees a model.
+"""The primitives through which every algorithm sees a model.
 
 A model is an :class:`~jaxltl.core.mdp.MDP`, a :class:`~jaxltl.core.mdp.DenseMDP` or a
 :class:`~jaxltl.core.product.Product`. Values have the shape of the model's states,
 ``[S]`` or ``[S, Q]``, and quantities on actions have one more axis, A. The functions
 are open (``functools.singledispatch``): a representation of one's own needs
-``expectation``, ``exists_successor``, ``forall_successor`` and ``sample_successor``.
+``expectation``, ``exists_successor``, ``forall_successor`` and ``sample_successor``, and
+``least_successor`` where ranks are compared.
 """
 
 from __future__ import annotations
@@ -59,6 +60,15 @@ def forall_successor(model: Any, region: jax.Array) -> jax.Array:
     """Whether all successors lie in a region: ``bool[S, A]`` from ``bool[S]``.
 
     Decided on the support; padding counts as true, so unavailable actions are True.
+    """
+    raise TypeError(_unknown(model))
+
+
+@singledispatch
+def least_successor(model: Any, value: jax.Array) -> jax.Array:
+    """Smallest value among the successors: ``[S, A]`` from ``[S]``.
+
+    Decided on the support; the largest value of the dtype at unavailable actions.
     """
     raise TypeError(_unknown(model))
 
@@ -168,6 +178,26 @@ def _(model: MDP, region: jax.Array) -> jax.Array:
     return ~exists_successor(model, ~jnp.asarray(region))
 
 
+@least_successor.register
+def _(model: MDP, value: jax.Array) -> jax.Array:
+    found = jnp.full(model.available.shape, largest(value.dtype), value.dtype)
+    for k in range(model.successor.shape[-1]):
+        term = only_real(model.probability[..., k], _gather(value, model.successor[..., k]))
+        found = jnp.minimum(found, term)
+    return found
+
+
+def only_real(weight: jax.Array, value: jax.Array) -> jax.Array:
+    """The value where a successor has positive weight, else the largest of its dtype."""
+    return jnp.where(weight > 0, value, largest(value.dtype))
+
+
+def largest(dtype: Any) -> Any:
+    """The largest value of a dtype."""
+    is_float = jnp.issubdtype(dtype, jnp.floating)
+    return jnp.inf if is_float else jnp.iinfo(dtype).max
+
+
 @sample_successor.register
 def _(model: MDP, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
     k = _sample(key, model.probability[state, action])
@@ -234,6 +264,11 @@ def _(model: DenseMDP, region: jax.Array) -> jax.Array:
 @forall_successor.register
 def _(model: DenseMDP, region: jax.Array) -> jax.Array:
     return jnp.all((model.transition <= 0) | region, axis=-1)
+
+
+@least_successor.register
+def _(model: DenseMDP, value: jax.Array) -> jax.Array:
+    return only_real(model.transition, value).min(-1)
 
 
 @sample_successor.register

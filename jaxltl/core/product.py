@@ -282,6 +282,11 @@ def _(model: Product, region: jax.Array) -> jax.Array:
     return ~operators.exists_successor(model, ~region)
 
 
+@operators.least_successor.register
+def _(model: Product, value: jax.Array) -> jax.Array:
+    return _through(model, operators.least_successor, value, operators.only_real, jnp.minimum)
+
+
 @operators.sample_successor.register
 def _(model: Product, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
     world, memory = state // model.num_memory, state % model.num_memory

@@ -112,7 +112,8 @@ def _claim(winning: Any) -> _Claim:
         priority, won = None, np.zeros(shape, bool)
     elif isinstance(objective, Parity):
         sets = (np.zeros((1, np.prod(shape, dtype=int)), bool),) * 2
-        priority, won = np.asarray(objective.priority).ravel(), np.asarray(objective.won)
+        priority = np.asarray(objective.priority).ravel()
+        won = np.asarray(objective.won & ~objective.lost)
     else:
         raise ValueError(f"objective is a {type(objective).__name__}; give a Parity or a GR1.")
 
@@ -153,9 +154,9 @@ def _refute_system(claim: _Claim) -> str:
         who = "strategy's" if claim.system[node // memories] else "environment's"
         return f"from {_where(claim, play, node)} the {who} action {action} leaves the region."
     for avoid, meet, what in _failures(claim):
-        node = _component(play, node_in & ~np.repeat(avoid, memories), meet)
-        if node is not None:
-            return f"around {_where(claim, play, node)} the run can {what}."
+        found = _component(play, node_in & ~np.repeat(avoid, memories), meet)
+        if found is not None:
+            return f"around {_where(claim, play, found)} the run can {what}."
     return ""
 
 
@@ -172,9 +173,10 @@ def _refute_environment(claim: _Claim) -> str:
     memories = play.memories
     node_in = np.repeat(undecided, memories)
     for avoid, meet, what in _successes(claim):
-        node = _component(play, node_in & ~np.repeat(avoid, memories), meet)
-        if node is not None:
-            return f"around {_where(claim, play, node)}, outside the region, the system can {what}."
+        found = _component(play, node_in & ~np.repeat(avoid, memories), meet)
+        if found is not None:
+            where = _where(claim, play, found)
+            return f"around {where}, outside the region, the system can {what}."
     # No component outside the region is a success, so all that is left is to enter the region.
     entering = _almost_surely(play, np.repeat(claim.region, memories), node_in)
     nodes = np.flatnonzero(entering & node_in)

@@ -100,7 +100,7 @@ def winning_region(
         objective = spec
     if chance == "adversarial":
         game, origin = adversarial_chance(game)
-        objective = _at(objective, origin)
+        objective = objective_at(objective, origin)
     if isinstance(objective, Parity):
         return _solve_parity(game, objective)
     found = solve_gr1(game, objective)
@@ -145,7 +145,7 @@ def task_game(game: Game, spec: Automaton | Formula | str) -> tuple[Game, Parity
     return joint, Parity(priority, none, none, int(np.max(np.asarray(automaton.priority))) + 1)
 
 
-def _at(objective: Parity | GR1, origin: jax.Array) -> Any:
+def objective_at(objective: Parity | GR1, origin: jax.Array) -> Any:
     """The objective on states that each stand for an original one."""
     states = objective.lost.ndim
 
