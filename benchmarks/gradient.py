@@ -14,7 +14,7 @@ from jaxltl.algos import mlirl
 from jaxltl.core.bellman import action_value, policy_logits
 from jaxltl.core.operators import action_mean
 from jaxltl.core.product import product
-from jaxltl.reproduce import two_goals
+from jaxltl.reproduce.mlirl import two_goals
 
 _TASK = "(!r & !y) -> ((!r U y) & (!y U g1) & (!y U g2) & F y)"
 

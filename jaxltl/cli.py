@@ -310,20 +310,38 @@ def _render(result: Automaton, form: str, formula: str) -> str:
 # --- reproduce ------------------------------------------------------------------------------
 
 
-@main.command()
-@click.argument("what", type=click.Choice(["mlirl"]))
+_EXPERIMENTS = {
+    "mlirl": "section 2.5, inverse reinforcement learning with a temporal-logic task",
+    "synthesis": "chapter 5, permissive strategies and learning inside them",
+}
+
+
+@main.command(epilog="\n\n".join(f"{k}: {v}." for k, v in _EXPERIMENTS.items()))
+@click.argument("what", type=click.Choice(list(_EXPERIMENTS)))
+@click.option("--out", type=click.Path(path_type=Path),
+              help="Directory for the pictures, if there are any.  [default: out/reproduce]")
 @click.option("--json", "as_json", is_flag=True, help="End with the figures as one JSON line.")
 @_plain_errors
-def reproduce(what: str, as_json: bool) -> None:
-    """Print published figures beside ours.
+def reproduce(what: str, out: Path | None, as_json: bool) -> None:
+    """Print published figures beside ours."""
+    import importlib
 
-    mlirl: section 2.5, inverse reinforcement learning with a temporal-logic task.
-    """
-    from jaxltl import reproduce as figures
-
-    del what  # the only choice so far
+    experiment = importlib.import_module(f"jaxltl.reproduce.{what}")
     with _float64():
-        result = figures.mlirl(progress=lambda text: click.echo(text, err=True))
-    click.echo(figures.mlirl_table(result))
+        result = experiment.figures(progress=lambda text: click.echo(text, err=True))
+        pictures = experiment.pictures(result) if hasattr(experiment, "pictures") else []
+    click.echo(experiment.table(result))
+    if pictures:
+        _write_pictures(pictures, out or Path("out") / "reproduce")
     if as_json:
         _print_json(result)
+
+
+def _write_pictures(pictures: list[tuple[str, bytes]], out: Path) -> None:
+    from jaxltl.algos.learner import atomic_write
+
+    out.mkdir(parents=True, exist_ok=True)
+    for name, picture in pictures:
+        with atomic_write(out / name) as file:
+            file.write(picture)
+    click.echo(f"\nwrote {', '.join(name for name, _ in pictures)} to {out}")

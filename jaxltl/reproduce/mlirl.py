@@ -1,7 +1,4 @@
-"""Published figures beside ours, from the same calls that a user makes.
-
-Run inside double precision (``with jax.enable_x64(True)``), as ``jaxltl reproduce`` does.
-"""
+"""Section 2.5: inverse reinforcement learning with a temporal-logic task."""
 
 from __future__ import annotations
 
@@ -73,7 +70,7 @@ def two_goals() -> tuple[MDP, Trajectories]:
     return world, make_trajectories(world, sequences)
 
 
-def mlirl_cases(
+def learn_cases(
     problem: irl.Problem, mus: tuple[float | None, ...]
 ) -> list[tuple[np.ndarray, jax.Array, float]]:
     """Learns for each mu from the three starts in one vmapped call, and keeps the best start.
@@ -155,7 +152,7 @@ def _missing_safety(world: MDP, shown: Trajectories, mu: float | None) -> dict[s
     told = product(world, TASK_WITHOUT_SAFETY)
     features = irl.task_features(told, shown, avoid=["r"])
     problem = irl.make_problem(told, features.values, shown)
-    [(_, policy, _)] = mlirl_cases(problem, (mu,))
+    [(_, policy, _)] = learn_cases(problem, (mu,))
     reached = restrict(told)
     true = product(reached.model, TASK)
     lifted = lift_policy(true, policy[reached.base_state, reached.memory])
@@ -165,7 +162,7 @@ def _missing_safety(world: MDP, shown: Trajectories, mu: float | None) -> dict[s
     return result
 
 
-def mlirl(progress: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
+def figures(progress: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
     """Section 2.5: three cases, the sweep of mu, and the task without its safety part.
 
     Args:
@@ -184,13 +181,13 @@ def mlirl(progress: Callable[[str], None] = lambda text: None) -> dict[str, Any]
     model = product(world, TASK)
     progress("case 1: in the world, without the task")
     features = irl.world_features(world, shown, goal=["y"], progress=["g1", "g2"], avoid=["r"])
-    [first] = mlirl_cases(irl.make_problem(world, features.values, shown), (None,))
+    [first] = learn_cases(irl.make_problem(world, features.values, shown), (None,))
     progress("case 2: in the product")
     features = irl.task_features(model, shown, avoid=["r"])
     problem = irl.make_problem(model, features.values, shown)
-    [second] = mlirl_cases(problem, (None,))
+    [second] = learn_cases(problem, (None,))
     progress(f"case 3: with the satisfaction term, for {len(MUS)} weights mu side by side")
-    sweep = [_case(model, found) for found in mlirl_cases(problem, MUS)]
+    sweep = [_case(model, found) for found in learn_cases(problem, MUS)]
     progress("without the safety part of the task")
     missing = _missing_safety(world, shown, None)
     result = {
@@ -204,7 +201,7 @@ def mlirl(progress: Callable[[str], None] = lambda text: None) -> dict[str, Any]
     return plain(result)
 
 
-def mlirl_table(result: dict[str, Any]) -> str:
+def table(result: dict[str, Any]) -> str:
     """Section 2.5, published beside measured, with what differs and why."""
     lines = [
         "Section 2.5: inverse reinforcement learning with a temporal-logic task",
