@@ -49,18 +49,20 @@ class Layers(NamedTuple):
 NEVER = jnp.iinfo(jnp.int32).max
 
 
-def solve_gr1(game: Game, objective: GR1) -> Reactive:
+def solve_gr1(game: Game, objective: GR1, moves: jax.Array | None = None) -> Reactive:
     """From where the system achieves a GR(1) objective, and winning strategies of both.
 
     Args:
       game: the game.
       objective: what the system is to achieve.
+      moves: ``bool[S, A]``, those that there are; default the available ones.
 
     Returns:
       :class:`Reactive`.
     """
     num_guarantees, num_assumptions = len(objective.guarantees), len(objective.assumptions)
-    _, first = first_action(game.available)
+    moves = game.available if moves is None else moves
+    _, first = first_action(moves)
     actions = jnp.repeat(first[None], num_guarantees, axis=0)
     counters = jnp.repeat(first[None], num_assumptions, axis=0)
 
@@ -68,10 +70,11 @@ def solve_gr1(game: Game, objective: GR1) -> Reactive:
         inside, actions, counters, _ = carry
         before = inside
         for j in range(num_guarantees):
-            inside, counters = _keep(game, inside, counters)
-            found, action = _pursue(game, objective, j, inside)
+            inside, counters = _keep(game, moves, inside, counters)
+            allowed = _within(game, moves, inside)
+            found, action = _pursue(game, objective, j, inside, allowed)
             actions = actions.at[j].set(action)
-            against = _prevent(game, objective, inside, found)
+            against = _prevent(game, objective, inside, allowed, found)
             counters = jnp.where(inside & ~found, against, counters)
             inside = found
         return inside, actions, counters, jnp.any(inside != before)
@@ -81,15 +84,17 @@ def solve_gr1(game: Game, objective: GR1) -> Reactive:
     return Reactive(region, jnp.moveaxis(actions, 0, -1), jnp.moveaxis(counters, 0, -1))
 
 
-def _keep(game: Game, inside: jax.Array, counters: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _keep(
+    game: Game, moves: jax.Array, inside: jax.Array, counters: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """The part of a set that the environment cannot force the play out of."""
-    out = attractor(game, ~inside, rule=~game.system, among=inside)
+    out = attractor(game, ~inside, moves, rule=~game.system, among=inside)
     return inside & ~out.region, jnp.where(inside & out.region, out.action, counters)
 
 
-def _allowed(game: Game, inside: jax.Array) -> jax.Array:
+def _within(game: Game, moves: jax.Array, inside: jax.Array) -> jax.Array:
     """The system's moves that surely stay inside, and all of the environment's."""
-    return game.available & (forall_successor(game, inside) | ~game.system[..., None])
+    return moves & (forall_successor(game, inside) | ~game.system[..., None])
 
 
 def _near(game: Game, found: jax.Array) -> jax.Array:
@@ -98,7 +103,7 @@ def _near(game: Game, found: jax.Array) -> jax.Array:
 
 
 def _pursue(
-    game: Game, objective: GR1, j: int, inside: jax.Array
+    game: Game, objective: GR1, j: int, inside: jax.Array, allowed: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Where the system, without leaving a set, meets guarantee j or an assumption fails.
 
@@ -106,7 +111,6 @@ def _pursue(
       ``bool[S]``, and the system's moves there, ``int32[S]``.
     """
     goal = inside & objective.guarantees[j]
-    allowed = _allowed(game, inside)
 
     def body(carry):
         found, action, _ = carry
@@ -114,7 +118,7 @@ def _pursue(
         action = jnp.where(near.region & ~found, near.action, action)
         grown = near.region
         for i in range(len(objective.assumptions)):
-            covered = _waiting(game, objective, i, inside, near.region, near.region)
+            covered = _waiting(game, objective, i, inside, allowed, near.region, near.region)
             stays = first_action(allowed & forall_successor(game, covered))[1]
             action = jnp.where(covered & ~grown, stays, action)
             grown = grown | covered
@@ -126,21 +130,24 @@ def _pursue(
 
 
 def _waiting(
-    game: Game, objective: GR1, i: int, inside: jax.Array, near: jax.Array, found: jax.Array
+    game: Game, objective: GR1, i: int, inside: jax.Array, allowed: jax.Array, near: jax.Array,
+    found: jax.Array,
 ) -> jax.Array:
     """Where assumption i fails for as long as the play is not near to a set `found`."""
     missed = inside & ~near
     forced = attractor(
         game, ~inside | (missed & objective.assumptions[i]),
-        _allowed(game, inside) & ~_near(game, found), rule=~game.system, among=missed,
+        allowed & ~_near(game, found), rule=~game.system, among=missed,
     )
     return inside & ~forced.region
 
 
-def _prevent(game: Game, objective: GR1, inside: jax.Array, found: jax.Array) -> jax.Array:
+def _prevent(
+    game: Game, objective: GR1, inside: jax.Array, allowed: jax.Array, found: jax.Array
+) -> jax.Array:
     """The environment's moves, ``int32[M, S]``, that meet every assumption and avoid a set."""
     missed = inside & ~found
-    allowed = _allowed(game, inside) & ~_near(game, found)
+    allowed = allowed & ~_near(game, found)
     moves = []
     for assumption in objective.assumptions:
         goal = missed & assumption
@@ -164,7 +171,7 @@ def gr1_layers(game: Game, objective: GR1) -> Layers:
       :class:`Layers`.
     """
     region = solve_gr1(game, objective).region
-    allowed = _allowed(game, region)
+    allowed = _within(game, game.available, region)
     rows = []
     for j in range(len(objective.guarantees)):
         goal = region & objective.guarantees[j]
@@ -175,7 +182,7 @@ def gr1_layers(game: Game, objective: GR1) -> Layers:
             some, all_ = first_action(leads)[0], ~first_action(allowed & ~leads)[0]
             near = goal | (region & jnp.where(game.system, some, all_))
             covered = jnp.stack([
-                _waiting(game, objective, i, region, near, found)
+                _waiting(game, objective, i, region, allowed, near, found)
                 for i in range(len(objective.assumptions))
             ])
             rounds = jnp.where(covered & (rounds == NEVER), n, rounds)

@@ -59,8 +59,34 @@ def satisfying(
         )
     require_known(condition.propositions, propositions, f"{place}: {str(condition)!r}")
     column = [list(propositions).index(p) for p in condition.propositions]
-    rows, inverse = np.unique(np.asarray(label, bool)[:, column], axis=0, return_inverse=True)
+    rows, number = distinct_rows(np.asarray(label, bool)[:, column])
     names = np.array(condition.propositions, dtype=object)
     # A formula without temporal operators has its truth in the first letter of any word.
     truth = np.array([holds_on_lasso(condition, [], [set(names[row])]) for row in rows], bool)
-    return np.asarray(truth[inverse.ravel()])
+    return np.asarray(truth[number])
+
+
+_COUNTED = 16  # columns up to which every combination has a counter of its own
+
+
+def distinct_rows(rows: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """The different rows of a Boolean array, and the number of each row among them.
+
+    Args:
+      rows: ``bool[S, P]``.
+
+    Returns:
+      ``bool[L, P]`` and ``int64[S]``. Without sorting where P is small.
+    """
+    width = rows.shape[1]
+    if width > _COUNTED:
+        found, number = np.unique(rows, axis=0, return_inverse=True)
+        return found, number.ravel()
+    code = np.zeros(len(rows), np.int32)
+    for i in range(width):
+        code = code << 1 | rows[:, i]
+    present = np.flatnonzero(np.bincount(code, minlength=1 << width))
+    number = np.zeros(1 << width, np.int64)
+    number[present] = np.arange(present.size)
+    bits = np.arange(width - 1, -1, -1)
+    return (present[:, None] >> bits & 1).astype(bool), number[code]

@@ -26,7 +26,7 @@ from jaxltl.core.operators import (
     least_successor,
 )
 from jaxltl.core.product import Product, Restriction, restrict
-from jaxltl.core.winning import objective_at, task_game, winning_region
+from jaxltl.core.winning import objective_at, solve, task_game
 
 METHODS = ("auto", "stay", "rank", "counter", "parity")
 
@@ -117,7 +117,9 @@ def permissive_strategy(
             base_state=origin.base_state[found.base_state],
             automaton_state=origin.memory[found.base_state],
         )
-    region = winning_region(game, objective).region
+    if isinstance(objective, Parity):
+        objective = _without_won(objective)
+    region = solve(game, objective).region
     _require_start(game, region)
     stay = _staying(game, region)
     maximal = _always_wins(game, objective, region, stay)
@@ -212,12 +214,9 @@ def _always_wins(game: Game, objective: Any, region: jax.Array, mask: jax.Array)
     """Whether every run within a mask achieves the objective, whoever chooses."""
     if isinstance(objective, Parity) and objective.num_priorities == 1:
         return True  # nothing but safety
-    inside = jnp.where(region, 1.0, 0.0)
-    found = restrict(game, inside / inside.sum(), allowed=mask)
-    hostile = Game(found.model.mdp, jnp.zeros(found.model.state_shape, bool))
-    width = game.state_shape[1] if len(game.state_shape) > 1 else 1
-    origin = found.base_state * width + found.memory
-    return bool(jnp.all(winning_region(hostile, objective_at(objective, origin)).region))
+    hostile = Game(game.mdp, jnp.zeros(game.state_shape, bool))
+    within = objective.replace(lost=objective.lost | ~region)
+    return bool(jnp.all(solve(hostile, within, mask).region | ~region))
 
 
 def _is_buchi(objective: Any) -> bool:
@@ -270,6 +269,14 @@ def _beside(
 
 def _closed(game: Game, region: jax.Array) -> bool:
     return bool(jnp.all(~region[..., None] | ~game.available | forall_successor(game, region)))
+
+
+def _without_won(objective: Parity) -> Parity:
+    """The same objective where what is won is never left: the best priority from then on."""
+    return objective.replace(
+        priority=jnp.where(objective.won, 0, objective.priority),
+        won=jnp.zeros_like(objective.won), lost=objective.lost & ~objective.won,
+    )
 
 
 def _remember_won(game: Game, objective: Parity) -> tuple[Game, Parity, Restriction]:
@@ -438,12 +445,15 @@ def budgets(caps: list[int], num_priorities: int) -> np.ndarray:
 def _safe_beside(
     joint: Game, objective: Parity, spent: jax.Array, origin: Restriction | None, reason: str
 ) -> Permissive:
-    """The maximal strategy that avoids some memory states and what is lost."""
-    lost = spent | objective.lost[:, None]
-    safe = Parity(
-        priority=jnp.zeros(joint.state_shape, jnp.int32),
-        won=jnp.zeros(joint.state_shape, bool), lost=lost, num_priorities=1,
+    """The strategy that stays where the objective can be achieved without some memory states."""
+    # The objective itself still counts: the environment may move for ever where the system
+    # does not, and then no counter of the system's moves runs out.
+    kept = Parity(
+        priority=jnp.broadcast_to(objective.priority[:, None], joint.state_shape),
+        won=jnp.zeros(joint.state_shape, bool),
+        lost=spent | objective.lost[:, None],
+        num_priorities=objective.num_priorities,
     )
-    region = winning_region(joint, safe).region
+    region = solve(joint, kept).region
     _require_start(joint, region)
     return _on(joint, region, _staying(joint, region), False, reason, origin)

@@ -21,7 +21,7 @@ from flax import struct
 from jaxltl.core import operators
 from jaxltl.core.automaton import Automaton, letter_index
 from jaxltl.core.game import Game
-from jaxltl.core.labels import require_known
+from jaxltl.core.labels import distinct_rows, require_known
 from jaxltl.core.ltl import Formula, parse_ltl
 from jaxltl.core.mdp import MDP, DenseMDP, make_mdp
 from jaxltl.core.rollout import Trajectories
@@ -133,7 +133,7 @@ def letters(world: MDP | DenseMDP, propositions: Collection[str] | None = None) 
     keep = [i for i, p in enumerate(world.propositions)
             if propositions is None or p in propositions]
     names = [world.propositions[i] for i in keep]
-    rows = np.unique(np.asarray(world.label)[:, keep], axis=0)
+    rows, _ = distinct_rows(np.asarray(world.label)[:, keep])
     return [frozenset(n for n, holds in zip(names, row, strict=True) if holds) for row in rows]
 
 
@@ -172,7 +172,7 @@ def product(world: Any, task: Automaton | Formula | str, *, label_on: str = "ent
         task = to_automaton(formula, letters=letters(world, formula.propositions))
     require_known(task.propositions, world.propositions, "the task")
     column = [world.propositions.index(p) for p in task.propositions]
-    rows, letter = np.unique(np.asarray(world.label)[:, column], axis=0, return_inverse=True)
+    rows, letter = distinct_rows(np.asarray(world.label)[:, column])
     index = np.array(
         [_letter(task, row, int(np.argmax(letter == i))) for i, row in enumerate(rows)], np.int32
     )
@@ -445,7 +445,10 @@ def restrict(
     while frontier.size:
         flat, real, _ = targets(frontier)
         new = flat[real]
-        frontier = np.unique(new[~seen[new]])
+        new = new[~seen[new]]
+        # One of each without sorting: of equal entries, the one that `number` has kept.
+        number[new] = np.arange(new.size)
+        frontier = new[number[new] == np.arange(new.size)]
         seen[frontier] = True
     states = np.flatnonzero(seen)
     stuck = states[~allowed[states].any(-1)]

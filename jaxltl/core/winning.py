@@ -101,10 +101,24 @@ def winning_region(
     if chance == "adversarial":
         game, origin = adversarial_chance(game)
         objective = objective_at(objective, origin)
-    if isinstance(objective, Parity):
-        return _solve_parity(game, objective)
-    found = solve_gr1(game, objective)
-    return Winning(game, objective, found.region, found.action, found.counter_action)
+    return solve(game, objective)
+
+
+def solve(game: Game, objective: Parity | GR1, moves: jax.Array | None = None) -> Winning:
+    """:func:`winning_region` of an objective, where only some moves exist.
+
+    Args:
+      game: the game.
+      objective: what the system is to achieve.
+      moves: ``bool[S, A]``; default the available ones. A state without any is won for the
+        player who need not move there.
+    """
+    if isinstance(objective, GR1):
+        return Winning(game, objective, *solve_gr1(game, objective, moves))
+    moves = game.available if moves is None else moves
+    start = _Found(objective.won & ~objective.lost, first_action(moves)[1])
+    found = _level(game, objective, 0, start, ~(objective.won | objective.lost), moves)
+    return Winning(game, objective, found.region, found.action, found.action)
 
 
 def almost_sure_buchi(game: Any, accepting: States) -> Winning:
@@ -208,14 +222,6 @@ class _Found(NamedTuple):
     action: jax.Array
 
 
-def _solve_parity(game: Game, objective: Parity) -> Winning:
-    open_ = ~(objective.won | objective.lost)
-    _, first = first_action(game.available)
-    start = _Found(objective.won & ~objective.lost, first)
-    found = _level(game, objective, 0, start, open_, game.available)
-    return Winning(game, objective, found.region, found.action, found.action)
-
-
 def _level(
     game: Game, objective: Parity, p: int, won: _Found, open_: jax.Array, allowed: jax.Array
 ) -> _Found:
@@ -250,7 +256,7 @@ def _even(game, objective, p, won, open_, allowed) -> _Found:
 
     inside = won.region | open_
     inside, found, _ = repeat(body, (inside, won, jnp.bool_(True)), (game, objective, won, open_))
-    stays = first_action(game.available & forall_successor(game, inside))[1]
+    stays = first_action(allowed & forall_successor(game, inside))[1]
     return _Found(inside, jnp.where(here & inside & game.system, stays, found.action))
 
 

@@ -1,0 +1,398 @@
+"""Games of two robots that move in turns on a grid, and a game whose reward opposes its task.
+
+State ``(environment * C + system) * 2 + turn``, where `environment` and `system` are the
+numbers of the robots' places, 0 to C - 1, and `turn` is 1 where the system moves; so
+``np.unravel_index(state, (C, C, 2))`` takes a state apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.core import operators
+from jaxltl.core.game import Game, make_game
+from jaxltl.core.labels import satisfying
+from jaxltl.core.mdp import MDP, make_mdp
+from jaxltl.core.objective import States, states_where
+from jaxltl.envs import gridworld as grid
+
+ACTIONS = (*grid.ACTIONS, "stay")
+CORNERS = ("lower_left", "lower_right", "upper_left", "upper_right")
+_STAY = ACTIONS.index("stay")
+
+
+def robots(size: int) -> Game:
+    """Two robots on a square grid, strictly in turns (dissertation, section 5.5).
+
+    The system's robot goes to an adjacent cell or stays; the environment's goes to an
+    adjacent cell. A move off the grid is not available. Runs start in any two different
+    cells, the system to move. The robots can run into each other, so that there is
+    something to avoid, and move on from there.
+
+    Cells are numbered in rows from the lower left, so that `size` is the upward
+    neighbour of cell 0. Propositions: ``collision``; ``diagonal``, where the cells share
+    a corner alone; ``system_turn``; and each robot in each corner, such as
+    ``system_lower_left`` and ``environment_upper_right``.
+
+    Args:
+      size: cells along a side, at least 2.
+
+    Returns:
+      A deterministic game with ``2 * size**4`` states, numbered as this module says, and
+      the actions :data:`ACTIONS`.
+
+    Raises:
+      ValueError: the size is not an integer of at least 2.
+
+    Example:
+      >>> game = robots(3)
+      >>> game.num_states, game.num_actions, game.num_successors
+      (162, 5, 1)
+      >>> state = (4 * 9 + 0) * 2 + 1  # environment in the middle, system in the lower left
+      >>> [a for a, can in zip(ACTIONS, game.available[state]) if can]
+      ['up', 'right', 'stay']
+      >>> [p for p, holds in zip(game.propositions, game.label[state]) if holds]
+      ['diagonal', 'system_turn', 'system_lower_left']
+    """
+    if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 2:
+        raise ValueError(f"size={size!r}; give the cells along a side, an integer from 2 on.")
+    size = int(size)
+    world = grid.gridworld("\n".join(["." * size] * size))
+    cells = np.arange(size * size).reshape(size, size)[::-1].ravel()  # the map's first row is up
+    walk = _moves(world, cells)
+    mark = np.eye(size * size, dtype=bool)[:, [0, size - 1, size * (size - 1), size**2 - 1]]
+    anywhere = np.ones(size * size, bool)
+    return _in_turns(
+        walk,
+        _without_stay(walk),
+        position=np.stack(np.divmod(np.arange(size * size), size), axis=-1),
+        mark=mark,
+        names=CORNERS,
+        start=_different(anywhere, anywhere),
+    )
+
+
+def grid_game(
+    text: str,
+    *,
+    system_start: str | Sequence[int] | None = None,
+    environment_start: str | Sequence[int] | None = None,
+    slip: float = 0.0,
+    system_stays: bool = True,
+    environment_stays: bool = False,
+    legend: Mapping[str, Collection[str]] | None = None,
+    wall: str = "#",
+) -> Game:
+    """Two robots on a text map, strictly in turns.
+
+    A robot moves up, down, left or right to a cell that is not a wall, or stays where that
+    is permitted; other moves are not available. With probability `slip` a move of the
+    system goes to one of the two sides instead, half each, and stays where that is blocked;
+    staying never slips, and neither does the environment.
+
+    Places, the cells that are not walls, are numbered in reading order, see :func:`places`.
+    Propositions: ``collision``; ``diagonal``, where the robots' cells share a corner alone;
+    ``system_turn``; and ``system_p`` and ``environment_p`` for each proposition p of the map.
+
+    Args:
+      text: the map, see :func:`~jaxltl.envs.gridworld.parse_map`.
+      system_start, environment_start: where the robots start: a propositional formula over
+        the map's propositions, or one cell's row and column, from 0 at the top left; default
+        anywhere. Runs start uniformly in the pairs of two different cells, the system to move.
+      slip: probability in [0, 1] of moving sideways.
+      system_stays, environment_stays: whether the robot may stay.
+      legend, wall: as in :func:`~jaxltl.envs.gridworld.gridworld`.
+
+    Returns:
+      A game with ``2 * C**2`` states for C places, numbered as this module says, and the
+      actions :data:`ACTIONS`; deterministic without slip.
+
+    Raises:
+      ValueError: a bad map, legend or probability, a start in a wall, off the map or nowhere,
+        robots that can only start in one cell, or a place that a robot can neither leave nor
+        stay in.
+
+    Example:
+      >>> game = grid_game('''
+      ... a.#
+      ... ..b
+      ... ''', system_start="a", environment_start=(1, 2))
+      >>> game.num_states
+      50
+      >>> [p for p, holds in zip(game.propositions, game.label[game.initial.argmax()]) if holds]
+      ['system_turn', 'environment_b', 'system_a']
+    """
+    world = grid.gridworld(text, slip=slip, legend=legend, wall=wall)
+    position = places(text, wall=wall)
+    rows_columns = grid.parse_map(text).shape
+    cells = np.ravel_multi_index(tuple(position.T), rows_columns)
+    if "turn" in world.propositions:
+        raise ValueError(
+            "'turn' is a proposition of the map, and system_turn says whose turn it is; "
+            "give the cells another name by a legend."
+        )
+    straight = _moves(grid.gridworld(text, legend=legend, wall=wall), cells)
+    # Which ways are open is read off the world without slip: at slip 1 the cell ahead is padding.
+    walk = _moves(world, cells)._replace(available=straight.available)
+    system = walk if system_stays else _without_stay(walk)
+    environment = straight if environment_stays else _without_stay(straight)
+    _require_moves("system", system, position)
+    _require_moves("environment", environment, position)
+    label = np.asarray(world.label)[cells]
+    start = [
+        _start(where, argument, position, rows_columns, label, world.propositions)
+        for argument, where in (
+            ("environment_start", environment_start), ("system_start", system_start)
+        )
+    ]
+    return _in_turns(
+        system, environment, position=position, mark=label, names=world.propositions,
+        start=_different(*start),
+    )
+
+
+def places(text: str, *, wall: str = "#") -> np.ndarray:
+    """Row and column of each place of a map, in the order of their numbers: ``int[C, 2]``.
+
+    Args:
+      text: the map, see :func:`~jaxltl.envs.gridworld.parse_map`.
+      wall: the kind of cell that is not a place.
+
+    Example:
+      >>> places("a#\\n.b").tolist()
+      [[0, 0], [1, 0], [1, 1]]
+    """
+    return np.argwhere(grid.parse_map(text) != wall)
+
+
+def arrival_reward(game: Any, condition: States) -> jax.Array:
+    """The chance that the system's move arrives where a condition holds: ``float[S, A]``.
+
+    ``R(s, a) = sum_t P(t | s, a) [t satisfies the condition]`` where the system moves, and 0
+    where the environment does and for unavailable actions.
+
+    Args:
+      game: the game, whole or restricted; of a product the reward has shape ``[S, Q, A]``.
+      condition: ``bool[S]``, or a Boolean formula over the game's propositions.
+
+    Returns:
+      ``float[S, A]``. Under ``jit`` if the condition is an array.
+
+    Raises:
+      ValueError: the condition mentions an unknown proposition, or has the wrong shape.
+
+    Example:
+      >>> game = robots(2)
+      >>> state = (3 * 4 + 1) * 2 + 1  # the system in the lower right, below the environment
+      >>> arrival_reward(game, "system_lower_left")[state].tolist()
+      [0.0, 0.0, 1.0, 0.0, 0.0]
+    """
+    arrives = states_where(game, condition).astype(game.dtype)
+    counts = game.system[..., None] & game.available
+    return jnp.where(counts, operators.expectation(game, arrives), 0)
+
+
+def diagonal_reward(game: Any) -> jax.Array:
+    """1 where the system's move arrives diagonally to the environment: ``float[S, A]``.
+
+    The instantaneous reward of the dissertation, section 5.5; see :func:`arrival_reward`.
+
+    Args:
+      game: a game of robots, whole or restricted.
+
+    Example:
+      >>> game = robots(3)
+      >>> state = (4 * 9 + 0) * 2 + 1  # the environment in the middle, the system in a corner
+      >>> diagonal_reward(game)[state].tolist()  # up, down, left, right, stay
+      [0.0, 0.0, 0.0, 0.0, 1.0]
+    """
+    return arrival_reward(game, "diagonal")
+
+
+def reward_against_task() -> tuple[Game, jax.Array]:
+    """A game whose reward is best collected by never doing the task (dissertation, figure 12).
+
+    The system alone moves. In state 0 the action 0 stays and the action 1 goes to state 1,
+    each for a reward of 10; in state 1, where ``b2`` holds, the action 2 stays for nothing.
+    The task ``F b2`` is won from state 0 by leaving after n moves, for every n; the values
+    ``10 * (1 - discount**(n + 1)) / (1 - discount)`` have a supremum that none attains.
+
+    Returns:
+      The game and its reward, ``float[2, 3]``.
+
+    Example:
+      >>> game, reward = reward_against_task()
+      >>> reward.tolist()
+      [[10.0, 10.0, 0.0], [0.0, 0.0, 0.0]]
+    """
+    available = np.array([[True, True, False], [False, False, True]])
+    model = make_mdp(
+        [[[0], [1], [0]], [[0], [0], [1]]],
+        available[:, :, None].astype(float),
+        available=available,
+        label=[[False], [True]],
+        propositions=["b2"],
+    )
+    reward = jnp.asarray([[10.0, 10.0, 0.0], [0.0, 0.0, 0.0]], model.dtype)
+    return make_game(model, [True, True]), reward
+
+
+# --- one robot's moves, and two robots in turns -----------------------------------------------
+
+
+class _Moves(NamedTuple):
+    """One robot's moves among C places: ``[C, A, K]``, ``[C, A, K]`` and ``[C, A]``."""
+
+    target: np.ndarray
+    probability: np.ndarray
+    available: np.ndarray
+
+
+def _moves(world: MDP, cells: np.ndarray) -> _Moves:
+    """The moves of a robot in a grid world, staying included; places are ``cells[0], ...``."""
+    count = cells.size
+    number = np.zeros(world.num_states, np.int32)
+    number[cells] = np.arange(count)
+    own = np.arange(count, dtype=np.int32)[:, None]
+    width = world.num_successors
+    target = np.broadcast_to(own[:, :, None], (count, len(ACTIONS), width)).copy()
+    target[:, :_STAY] = number[np.asarray(world.successor)[cells]]
+    probability = np.zeros(target.shape)
+    probability[:, :_STAY] = np.asarray(world.probability)[cells]
+    probability[:, _STAY, 0] = 1
+    # Without slip the first successor is the cell ahead, the robot's own where that is blocked.
+    available = target[:, :, 0] != own
+    available[:, _STAY] = True
+    return _Moves(target, probability, available)
+
+
+def _without_stay(moves: _Moves) -> _Moves:
+    available = moves.available.copy()
+    available[:, _STAY] = False
+    return moves._replace(available=available)
+
+
+def _require_moves(player: str, moves: _Moves, position: np.ndarray) -> None:
+    stuck = np.flatnonzero(~moves.available.any(axis=1))
+    if stuck.size:
+        row, column = position[stuck[0]]
+        raise ValueError(
+            f"the {player} has no move from the cell in row {row + 1}, column {column + 1}, "
+            f"which walls enclose; open it, make it a wall, or set {player}_stays=True."
+        )
+
+
+def _start(
+    where: str | Sequence[int] | None,
+    argument: str,
+    position: np.ndarray,
+    rows_columns: tuple[int, ...],
+    label: np.ndarray,
+    propositions: tuple[str, ...],
+) -> np.ndarray:
+    """The places in which a robot may start: ``bool[C]``."""
+    if where is None:
+        return np.ones(len(position), bool)
+    if isinstance(where, str):
+        holds = satisfying(label, propositions, where, argument)
+        if not holds.any():
+            raise ValueError(f"{argument}={where!r} holds in no cell of the map.")
+        return holds
+    cell = np.asarray(where)
+    if cell.shape != (2,) or not np.issubdtype(cell.dtype, np.integer):
+        raise ValueError(
+            f"{argument}={where!r}; give a formula over the map's propositions, or a cell's "
+            "row and column, from 0 at the top left."
+        )
+    row, column = (int(i) for i in cell)
+    rows, columns = rows_columns
+    if not (0 <= row < rows and 0 <= column < columns):
+        raise ValueError(
+            f"{argument}=({row}, {column}) is off the map, whose rows are 0 to {rows - 1} and "
+            f"columns 0 to {columns - 1}."
+        )
+    here = (position == cell).all(axis=1)
+    if not here.any():
+        raise ValueError(
+            f"{argument}=({row}, {column}) is a wall (row {row + 1}, column {column + 1} of the "
+            "map); start in another cell."
+        )
+    return here
+
+
+def _different(environment: np.ndarray, system: np.ndarray) -> np.ndarray:
+    """The distribution ``float[C, C]`` on pairs of different places."""
+    pairs = environment[:, None] & system & ~np.eye(system.size, dtype=bool)
+    if not pairs.any():
+        raise ValueError("the robots can only start in one and the same cell; give them two.")
+    return pairs / pairs.sum()
+
+
+def _in_turns(
+    system: _Moves,
+    environment: _Moves,
+    *,
+    position: np.ndarray,
+    mark: np.ndarray,
+    names: Sequence[str],
+    start: np.ndarray,
+) -> Game:
+    """The game of two robots.
+
+    Args:
+      system, environment: the robots' moves; the system's K is at least the environment's.
+      position: ``int[C, 2]``, where the places lie.
+      mark: ``bool[C, P]``, the P propositions `names` of the places.
+      start: ``float[C, C]``, the distribution of the robots' places (environment, system).
+    """
+    count, num_actions, width = system.target.shape
+    shape = (count, count, 2, num_actions)
+    here = np.arange(count, dtype=np.int32)
+    successor = np.zeros((*shape, width), np.int32)
+    probability = np.zeros((*shape, width))
+    available = np.empty(shape, bool)
+    first = slice(environment.target.shape[2])
+    successor[:, :, 1] = (here[:, None, None, None] * count + system.target) * 2
+    successor[:, :, 0, :, first] = (
+        environment.target[:, None] * count + here[:, None, None]
+    ) * 2 + 1
+    probability[:, :, 1] = system.probability
+    probability[:, :, 0, :, first] = environment.probability[:, None]
+    available[:, :, 1] = system.available
+    available[:, :, 0] = environment.available[:, None]
+    initial = np.zeros(shape[:3])
+    initial[:, :, 1] = start
+    label, propositions = _labels(position, mark, names)
+    num_states = 2 * count**2
+    model = make_mdp(
+        successor.reshape(num_states, num_actions, width),
+        probability.reshape(num_states, num_actions, width),
+        available=available.reshape(num_states, num_actions),
+        initial=initial.ravel(),
+        label=label.reshape(num_states, -1),
+        propositions=propositions,
+    )
+    return make_game(model, np.tile([False, True], count**2))
+
+
+def _labels(
+    position: np.ndarray, mark: np.ndarray, names: Sequence[str]
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """``bool[C, C, 2, 3 + 2 P]``, and the names of its columns."""
+    count, each = mark.shape
+    label = np.zeros((count, count, 2, 3 + 2 * each), bool)
+    apart = np.abs(position[:, None] - position).astype(np.int32)
+    label[..., 0] = np.eye(count, dtype=bool)[..., None]
+    label[..., 1] = (apart == 1).all(axis=-1)[..., None]
+    label[..., 1, 2] = True
+    label[..., 3 : 3 + each] = mark[:, None, None]
+    label[..., 3 + each :] = mark[None, :, None]
+    robots = ("environment", "system")
+    return label, (
+        "collision", "diagonal", "system_turn", *(f"{robot}_{p}" for robot in robots for p in names)
+    )
