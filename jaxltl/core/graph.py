@@ -352,7 +352,7 @@ def _attractor_worklist(
         return frontier
 
     indptr, indices = into.indptr, into.indices
-    frontier = np.flatnonzero(region)
+    frontier: Any = np.flatnonzero(region)
     while len(frontier):
         round_ += 1
         if num_memory == 1 and len(frontier) <= _SCALAR:

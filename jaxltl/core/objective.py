@@ -8,7 +8,7 @@ Boolean arrays, or Boolean formulas over the propositions of the game.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import chex
 import jax
@@ -19,7 +19,7 @@ from flax import struct
 from jaxltl.core.labels import satisfying
 from jaxltl.core.ltl import Formula
 
-States = chex.Array | Formula | str
+States: TypeAlias = chex.Array | Formula | str  # a set of states
 
 
 @struct.dataclass

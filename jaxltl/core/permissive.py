@@ -6,8 +6,10 @@ its mask is therefore correct from the first move on.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +28,7 @@ from jaxltl.core.operators import (
     least_successor,
 )
 from jaxltl.core.product import Product, Restriction, restrict
-from jaxltl.core.winning import objective_at, solve, task_game
+from jaxltl.core.winning import objective_at, on_states, solve
 
 METHODS = ("auto", "stay", "rank", "counter", "parity")
 
@@ -105,16 +107,12 @@ def permissive_strategy(
         raise ValueError(f"method={method!r}; choose one of {', '.join(METHODS)}.")
     if bound is not None and bound < 1:
         raise ValueError(f"bound={bound}; it must be at least 1.")
-    game = as_game(game)
-    if isinstance(spec, str | Formula | Automaton):
-        game, objective = task_game(game, spec)
-    else:
-        objective = spec
+    game, objective = on_states(as_game(game), spec)
     if isinstance(objective, Parity) and not _closed(game, objective.won):
         game, objective, origin = _remember_won(game, objective)
         found = permissive_strategy(game, objective, method=method, bound=bound)
-        return found.replace(
-            base_state=origin.base_state[found.base_state],
+        return replace(
+            found, base_state=origin.base_state[found.base_state],
             automaton_state=origin.memory[found.base_state],
         )
     if isinstance(objective, Parity):
@@ -215,7 +213,7 @@ def _always_wins(game: Game, objective: Any, region: jax.Array, mask: jax.Array)
     if isinstance(objective, Parity) and objective.num_priorities == 1:
         return True  # nothing but safety
     hostile = Game(game.mdp, jnp.zeros(game.state_shape, bool))
-    within = objective.replace(lost=objective.lost | ~region)
+    within = replace(objective, lost=objective.lost | ~region)
     return bool(jnp.all(solve(hostile, within, mask).region | ~region))
 
 
@@ -254,16 +252,16 @@ def _explicit(
 
 
 def _beside(
-    game: Game, delta: np.ndarray, initial: int, letter: jax.Array, label_on: str
+    game: Game, delta: np.ndarray, initial: int, letter: chex.Array, label_on: str
 ) -> Game:
     """The game beside a memory that reads a letter of each state."""
     num_letters = delta.shape[1]
     automaton = Automaton(
-        delta=jnp.asarray(delta, jnp.int32), initial=jnp.int32(initial),
-        priority=jnp.zeros(delta.shape, jnp.int32), letters=jnp.eye(num_letters, dtype=bool),
+        delta=delta.astype(np.int32), initial=initial,
+        priority=np.zeros(delta.shape, np.int32), letters=np.eye(num_letters, dtype=bool),
         propositions=tuple(f"letter_{i}" for i in range(num_letters)), acceptance="parity",
     )
-    joint = Product(game.mdp, automaton, jnp.asarray(letter, jnp.int32), label_on)
+    joint = Product(game.mdp, jax.tree.map(jnp.asarray, automaton), jnp.asarray(letter, jnp.int32), label_on)
     return Game(joint, jnp.broadcast_to(game.system[:, None], joint.state_shape))
 
 
@@ -273,8 +271,8 @@ def _closed(game: Game, region: jax.Array) -> bool:
 
 def _without_won(objective: Parity) -> Parity:
     """The same objective where what is won is never left: the best priority from then on."""
-    return objective.replace(
-        priority=jnp.where(objective.won, 0, objective.priority),
+    return replace(
+        objective, priority=jnp.where(objective.won, 0, objective.priority),
         won=jnp.zeros_like(objective.won), lost=objective.lost & ~objective.won,
     )
 
@@ -397,7 +395,7 @@ def _by_parity(game, objective, region, stay, bound) -> Permissive:
     odd = range(1, objective.num_priorities, 2)
     caps = [int((inside & (priority == p)).sum()) for p in odd]
     exact = bound is None or all(cap <= bound for cap in caps)
-    caps = caps if bound is None else [min(cap, bound) for cap in caps]
+    caps = caps if bound is None else [bound] * len(caps)
     delta = budgets(caps, objective.num_priorities)
     joint = _beside(game, delta, len(delta) - 2, objective.priority, "exit")
     spent = jnp.arange(len(delta)) == len(delta) - 1

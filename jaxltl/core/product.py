@@ -430,9 +430,10 @@ def restrict(
     allowed = np.asarray(model.available if allowed is None else model.available & allowed)
     allowed = allowed.reshape(-1, model.num_actions)
     successor, used = np.asarray(world.successor), np.asarray(world.probability) > 0
-    num_memory, step, label_on = 1, np.zeros((world.num_states, 1), np.int32), "entry"
+    step, label_on = np.zeros((world.num_states, 1), np.int32), "entry"
     if isinstance(lazy, Product):
-        num_memory, step, label_on = lazy.num_memory, np.asarray(lazy.next_memory), lazy.label_on
+        step, label_on = np.asarray(lazy.next_memory), lazy.label_on
+    num_memory = step.shape[1]
 
     def targets(states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         s, q = np.divmod(states, num_memory)
@@ -470,10 +471,11 @@ def restrict(
         propositions=world.propositions,
     )
     memory = jnp.asarray(states - s * num_memory, jnp.int32)
-    result = mdp
-    if isinstance(model, Game):
-        result = Game(mdp, jnp.asarray(np.asarray(model.system).ravel()[states]))
-    return Restriction(result, jnp.asarray(s, jnp.int32), memory)
+    base = jnp.asarray(s, jnp.int32)
+    if not isinstance(model, Game):
+        return Restriction(mdp, base, memory)
+    owner = jnp.asarray(np.asarray(model.system).ravel()[states])
+    return Restriction(Game(mdp, owner), base, memory)
 
 
 def _columns(s: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

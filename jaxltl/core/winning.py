@@ -94,10 +94,7 @@ def winning_region(
     if chance not in ("random", "adversarial"):
         raise ValueError(f"chance={chance!r}; choose random or adversarial.")
     game = as_game(game)
-    if isinstance(spec, str | Formula | Automaton):
-        game, objective = task_game(game, spec)
-    else:
-        objective = spec
+    game, objective = on_states(game, spec)
     if chance == "adversarial":
         game, origin = adversarial_chance(game)
         objective = objective_at(objective, origin)
@@ -136,6 +133,13 @@ def almost_sure_buchi(game: Any, accepting: States) -> Winning:
       [True, True, False, False]
     """
     return winning_region(game, buchi(game, accepting))
+
+
+def on_states(
+    game: Game, spec: Parity | GR1 | Automaton | Formula | str
+) -> tuple[Game, Parity | GR1]:
+    """A game and an objective on its states; of a formula or an automaton, :func:`task_game`."""
+    return (game, spec) if isinstance(spec, Parity | GR1) else task_game(game, spec)
 
 
 def task_game(game: Game, spec: Automaton | Formula | str) -> tuple[Game, Parity]:
@@ -269,9 +273,9 @@ def _odd(game, objective, p, won, open_, allowed) -> _Found:
 
     def body(carry):
         found, _ = carry
-        near = attractor(game, found.region, allowed, rule=game.system, among=open_)
-        action = jnp.where(near.region & ~found.region & game.system, near.action, found.action)
-        near = _Found(near.region, action)
+        drawn = attractor(game, found.region, allowed, rule=game.system, among=open_)
+        new = drawn.region & ~found.region & game.system
+        near = _Found(drawn.region, jnp.where(new, drawn.action, found.action))
         closer = exists_successor(game, near.region) & ~game.system[..., None]
         deeper = _level(
             game, objective, p + 1, near, open_ & ~here & ~near.region, allowed & ~closer
