@@ -1,4 +1,4 @@
-"""The command line: learn from a task file, translate formulas, reproduce published figures.
+"""The command line: learn, synthesize, translate formulas, reproduce published figures.
 
 Heavy modules are imported inside the commands, so that help is quick.
 """
@@ -98,13 +98,7 @@ def learn(task_file: Path, out: Path | None, seed: int, seeds: int, as_json: boo
     from jaxltl.task import read_task
 
     task = read_task(task_file)
-    out = out or Path("out") / task.name.replace("/", "-").replace(" ", "_")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(
-            f"cannot write into {str(out)!r}: {error.strerror}; choose another with --out."
-        ) from None
+    out = _directory(out, task.name)
     with _float64():
         outcome = _learn(task, out, seed, seeds)
         result = _write(outcome, out, task_file)
@@ -227,6 +221,102 @@ def check(task_file: Path) -> None:
         f"ok: {setup.world.mdp.num_states} states, {setup.model.num_memory} memory states, "
         f"{len(lengths)} demonstrations of {int(lengths.sum())} pairs"
     )
+
+
+# --- synthesize -----------------------------------------------------------------------------
+
+
+@main.command()
+@click.argument("game_file", metavar="GAME.toml", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="Directory for the results.  "
+              "[default: out/NAME]")
+@click.option("--environment", nargs=2, type=int, metavar="ROW COLUMN",
+              help="The cell of the environment's robot in moves.svg, from 1.  "
+              "[default: where the strategy forbids most]")
+@click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
+@_plain_errors
+def synthesize(
+    game_file: Path, out: Path | None, environment: tuple[int, int] | None, as_json: bool
+) -> None:
+    """Find who wins a game from where, and all the ways to win that one strategy can hold.
+
+    Prints the winning region, a permissive strategy of the system, which allows many moves and
+    wins whichever it makes, what an independent check says of them, and a play that the
+    environment wins where it does. Writes strategy.npz, counter_strategy.npz, result.json and
+    pictures, those that there are.
+
+    The exit status is 0 whoever wins; 2 for mistakes, and for a task that is unrealizable from
+    every initial state where the file demands a strategy by a table [strategy].
+    """
+    from jaxltl import synthesis
+    from jaxltl import synthesis_report as report
+    from jaxltl.algos.learner import atomic_write
+    from jaxltl.game_file import read_game
+
+    begin = time.perf_counter()
+    file = read_game(game_file)
+    out = _directory(out, file.name)
+    # A place that cannot be written to must be known before the work, not after.
+    with atomic_write(out / "game.toml") as copy:
+        copy.write(game_file.read_bytes())
+    with _float64(), _stages(synthesis.STAGES) as progress:
+        found = synthesis.synthesize(file, progress)
+        place = report.place_of(found, environment)
+        progress("writing")
+        written = _write_synthesis(found, out, place, begin)
+    click.echo(report.table(written, found))
+    click.echo(f"\nwrote {out}/result.json and the files beside it")
+    if as_json:
+        _print_json(written)
+    if not report.is_confirmed(written):
+        raise _Failure("the independent check refutes the result, which is a mistake of jaxltl; "
+                       "please report it with the game file.")
+    synthesis.demand(found)
+
+
+def _directory(out: Path | None, name: str) -> Path:
+    """The directory for results, made if it is not there."""
+    out = out or Path("out") / name.replace("/", "-").replace(" ", "_")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(
+            f"cannot write into {str(out)!r}: {error.strerror}; choose another with --out."
+        ) from None
+    return out
+
+
+@contextlib.contextmanager
+def _stages(names: tuple[str, ...]) -> Iterator[Callable[[str], None]]:
+    """A progress bar over named stages, which shows itself if they take long."""
+    from tqdm import tqdm
+
+    form = "{desc} {bar} {elapsed}"
+    # disable=None: none where standard error is no terminal.
+    with tqdm(total=len(names), leave=False, delay=1, bar_format=form, disable=None) as bar:
+
+        def begin(name: str) -> None:
+            bar.set_description_str(f"{name:9}", refresh=False)
+            bar.update(names.index(name) - bar.n)
+
+        yield begin
+
+
+def _write_synthesis(found: Any, out: Path, place: int | None, begin: float) -> dict[str, Any]:
+    from jaxltl import synthesis_report as report
+    from jaxltl.algos.learner import atomic_write
+
+    for stale in ("result.json", *report.FILES):
+        (out / stale).unlink(missing_ok=True)
+    report.save(out, found)
+    for name, picture in report.pictures(found, place):
+        with atomic_write(out / name) as file:
+            file.write(picture)
+    result = report.summary(found, time.perf_counter() - begin)
+    # Last, so that its presence says that all the rest is there.
+    with atomic_write(out / "result.json") as file:
+        file.write((json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
+    return result
 
 
 # --- automaton ------------------------------------------------------------------------------

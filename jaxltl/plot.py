@@ -1,4 +1,4 @@
-"""Pictures, one call each: automata, grid maps with values and policies, learning curves.
+"""Pictures, one call each: automata, grid maps, games of two robots, learning curves.
 
 Each function returns a new matplotlib ``Figure`` and touches no global state, so it works
 without a display and in any thread. ``figure.savefig("name.svg")`` writes it.
@@ -11,14 +11,16 @@ import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, FancyArrowPatch, Rectangle
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, FancyArrowPatch, Polygon, Rectangle
 from matplotlib.path import Path
 from numpy.typing import ArrayLike, NDArray
 
@@ -455,6 +457,338 @@ def _arrows(
             shapes.append([base + side * width, tip, base - side * width])
             colors.append(PAPER if dark else INK)
     axes.add_collection(PolyCollection(shapes, facecolors=colors, lw=0, alpha=0.92, zorder=4))
+
+
+# --- games of two robots --------------------------------------------------------------------
+
+
+_ROBOT, _LOSES, _WALL = "#c2571a", "#ead0cb", "#55606c"
+_TURNS = {**_STEPS, "stay": (0, 0)}
+_CELLS = "The cells of a map are those of the system's robot."
+
+
+class _Board(NamedTuple):
+    """The cells of a game's map, and where its C places lie."""
+
+    cells: NDArray[np.str_]
+    places: NDArray[np.int_]  # [C, 2], row and column from 0 at the top left
+    wall: str
+
+
+def game_values(
+    values: ArrayLike,
+    board: int | str,
+    *,
+    policy: ArrayLike | None = None,
+    actions: Sequence[str] = (*_STEPS, "stay"),
+    environment: Sequence[int] | None = None,
+    label: str = "",
+    limits: tuple[float, float] | None = None,
+    wall: str = "#",
+) -> Figure:
+    """A value where the system moves: for each cell of the environment a map of the system's.
+
+    Args:
+      values: ``float[2 * C * C]``, of the states of :func:`jaxltl.envs.robots.robots` or
+        :func:`jaxltl.envs.robots.grid_game`; NaN leaves a cell blank.
+      board: the size of the former, or the text map of the latter.
+      policy: ``int[S]``, the system's moves, as arrows instead of figures; negative for none. Or
+        ``bool[S, A]``, several moves.
+      actions: the name of each action, of up, down, left, right and stay.
+      environment: numbers of the environment's places to show; default all, laid out as they lie.
+      label: what the colours mean.
+      limits: values at the ends of the scale; default the data's.
+      wall: the kind of cell that is not a place.
+
+    Returns:
+      The figure, with one scale for all maps.
+
+    Raises:
+      ValueError: values or policy do not fit the board, or an action has no direction.
+    """
+    world = _board(board, wall)
+    table = _of_turns(np.asarray(values, float), world, "values")
+    allowed = None
+    if policy is not None:
+        allowed = _of_turns(_as_mask(policy, len(actions)), world, "policy")
+    finite = table[np.isfinite(table)]
+    if limits is None:
+        limits = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+        limits = limits if limits[0] < limits[1] else (limits[0] - 1, limits[1])
+    figure, maps, size = _small_multiples(world, environment, bar=0.75)
+    image: Any = None
+    for place, axes in maps.items():
+        image = _shade(axes, world, table[place], limits)
+        _robot(axes, world, place)
+        if allowed is not None:
+            _moves(axes, world, allowed[place], actions, table[place] < sum(limits) / 2)
+        elif size >= 0.27:
+            _figures(axes, world, table[place], place, sum(limits) / 2)
+    bar = figure.colorbar(image, ax=list(maps.values()), shrink=0.6, pad=0.015, aspect=28)
+    bar.set_label(label, fontsize=9, color=INK)
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(labelsize=8, color=MUTED, labelcolor=INK, length=2)
+    _note(figure, [(_ROBOT, "the environment's robot", "o")], _CELLS)
+    return figure
+
+
+def game_region(
+    region: ArrayLike,
+    board: int | str,
+    *,
+    environment: Sequence[int] | None = None,
+    wall: str = "#",
+) -> Figure:
+    """From where the system wins on its turn: for each cell of the environment a map.
+
+    Args:
+      region: ``bool[2 * C * C]``, see :func:`game_values`.
+      board, environment, wall: as there.
+
+    Returns:
+      The figure.
+
+    Raises:
+      ValueError: the region does not fit the board.
+    """
+    world = _board(board, wall)
+    table = _of_turns(np.asarray(region, bool), world, "region")
+    figure, maps, _ = _small_multiples(world, environment)
+    for place, axes in maps.items():
+        _paint(axes, world, table[place])
+        _robot(axes, world, place)
+    _note(figure, _REGION_MARKS, _CELLS)
+    return figure
+
+
+_REGION_MARKS = [
+    ("#cfe6d6", "the system wins", "s"),
+    (_LOSES, "the environment wins", "s"),
+    (_ROBOT, "the environment's robot", "o"),
+]
+
+
+def game_moves(
+    allowed: ArrayLike,
+    board: int | str,
+    environment: int,
+    *,
+    region: ArrayLike | None = None,
+    available: ArrayLike | None = None,
+    system: int | None = None,
+    actions: Sequence[str] = (*_STEPS, "stay"),
+    titles: Sequence[str] | str = "",
+    wall: str = "#",
+) -> Figure:
+    """What the system may do in each cell while the environment's robot is in a certain one.
+
+    Args:
+      allowed: ``bool[2 * C * C, A]``, or with M panels first, such as one for each memory
+        state of a strategy; see :func:`game_values` for the states.
+      board, actions, wall: as there.
+      environment: the number of the environment's place.
+      region: ``bool[2 * C * C]``, or with M panels first: where the system wins.
+      available: ``bool[2 * C * C, A]``: those that are not allowed get a hollow mark.
+      system: the number of the system's place, to be ringed.
+      titles: one per panel.
+
+    Returns:
+      The figure. A triangle is an allowed move, a dot is staying.
+
+    Raises:
+      ValueError: an array does not fit the board, or an action has no direction.
+    """
+    world = _board(board, wall)
+    for name in actions:
+        if name not in _TURNS:
+            raise ValueError(f"action {name!r} has no direction; use {', '.join(_TURNS)}.")
+    panels = np.asarray(allowed, bool)
+    panels = panels[None] if panels.ndim == 2 else panels
+    regions = None if region is None else np.asarray(region, bool)
+    if regions is not None and regions.ndim == 1:
+        regions = np.broadcast_to(regions, (len(panels), *regions.shape))
+    titles = [titles] * len(panels) if isinstance(titles, str) else list(titles)
+    rows, columns = world.cells.shape
+    size = float(np.clip(5.2 / max(rows, columns), 0.3, 0.6))
+    across = min(len(panels), 3 if columns * size > 1.5 else 4)
+    down = -(-len(panels) // across)
+    figure = Figure(
+        figsize=(max(across * (columns * size + 0.4), 3.4), down * (rows * size + 0.55) + 0.6),
+        layout=ConstrainedLayoutEngine(h_pad=0.1), facecolor=PAPER,
+    )
+    every = figure.subplots(down, across, squeeze=False).ravel()
+    for axes in every[len(panels):]:
+        axes.axis("off")
+    for m, axes in enumerate(every[: len(panels)]):
+        mask = _of_turns(panels[m], world, "allowed")[environment]
+        wins = mask.any(-1)
+        if regions is not None:
+            wins = _of_turns(regions[m], world, "region")[environment]
+        _paint(axes, world, wins)
+        _number_cells(axes, rows, columns)
+        if available is not None:
+            can = _of_turns(np.asarray(available, bool), world, "available")[environment]
+            _moves(axes, world, can & ~mask & wins[:, None], actions, hollow=True)
+        _moves(axes, world, mask, actions)
+        _robot(axes, world, environment)
+        if system is not None:
+            row, column = world.places[system]
+            axes.add_patch(Circle((column + 0.5, row + 0.5), 0.44, fill=False, lw=1.6,
+                                  edgecolor=ACCENT, zorder=6))
+        axes.set_title(titles[m], fontsize=9.5, color=INK, pad=5, loc="left", parse_math=False)
+    marks = [*_REGION_MARKS, (INK, "allowed", "^")]
+    _note(figure, marks + ([(PAPER, "not allowed", "^")] if available is not None else []))
+    return figure
+
+
+def _board(board: int | str, wall: str) -> _Board:
+    if isinstance(board, str):
+        cells = parse_map(board)
+        return _Board(cells, np.argwhere(cells != wall), wall)
+    row, column = np.divmod(np.arange(board * board), board)  # numbered from the lower left
+    places = np.stack([board - 1 - row, column], axis=-1)
+    return _Board(np.full((board, board), "."), places, wall)
+
+
+def _of_turns(array: NDArray[Any], world: _Board, name: str) -> NDArray[Any]:
+    """An array over states as ``[environment, system, ...]``, where the system moves."""
+    count = len(world.places)
+    if array.ndim < 1 or len(array) != 2 * count**2:
+        raise ValueError(
+            f"{name} has shape {array.shape}; the board has {count} places, so that the game has "
+            f"2 * {count}**2 = {2 * count**2} states."
+        )
+    return np.asarray(array.reshape(count, count, 2, *array.shape[1:])[:, :, 1])
+
+
+def _as_mask(policy: ArrayLike, num_actions: int) -> NDArray[np.bool_]:
+    given = np.asarray(policy)
+    if given.dtype.kind in "iu":
+        return np.asarray(given[:, None] == np.arange(num_actions))
+    return given.astype(bool)
+
+
+def _small_multiples(
+    world: _Board, environment: Sequence[int] | None, bar: float = 0.0
+) -> tuple[Figure, dict[int, Axes], float]:
+    """A figure, its axes by the environment's place, and the inches of a cell."""
+    rows, columns = world.cells.shape
+    if environment is None:
+        down, across = rows, columns
+        spots = [int(r * columns + c) for r, c in world.places]
+        chosen = list(range(len(spots)))
+    else:
+        chosen = [int(e) for e in environment]
+        across = min(int(np.ceil(np.sqrt(len(chosen)))), 4)
+        down, spots = -(-len(chosen) // across), list(range(len(chosen)))
+    size = float(np.clip(8.5 / max(across * columns, down * rows), 0.085, 0.42))
+    gap = 0.18 if environment is None else 0.32
+    width = across * (columns * size + 0.14) + bar + 0.2
+    figure = Figure(
+        figsize=(max(width, 3.4), down * (rows * size + gap) + 0.5), layout="constrained",
+        facecolor=PAPER,
+    )
+    every = figure.subplots(down, across, squeeze=False).ravel()
+    maps = {place: every[spot] for place, spot in zip(chosen, spots, strict=True)}
+    for axes in every:
+        if all(axes is not shown for shown in maps.values()):
+            axes.axis("off")
+    if environment is not None:
+        for place, axes in maps.items():
+            row, column = world.places[place] + 1
+            axes.set_title(f"row {row}, column {column}", fontsize=8, color=MUTED, pad=3)
+    return figure, maps, size
+
+
+def _on_board(world: _Board, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    shown: NDArray[np.float64] = np.full(world.cells.shape, np.nan)
+    shown[tuple(world.places.T)] = values
+    return shown
+
+
+def _shade(
+    axes: Axes, world: _Board, values: NDArray[np.float64], limits: tuple[float, float]
+) -> Any:
+    rows, columns = world.cells.shape
+    image = axes.imshow(
+        np.ma.masked_invalid(_on_board(world, values)), cmap=_SCALE, vmin=limits[0],
+        vmax=limits[1], extent=(0, columns, rows, 0), interpolation="nearest",
+    )
+    _frame(axes, world)
+    return image
+
+
+def _paint(axes: Axes, world: _Board, wins: NDArray[np.bool_]) -> None:
+    for (row, column), good in zip(world.places, wins, strict=True):
+        color = _REGION_MARKS[0][0] if good else _LOSES
+        axes.add_patch(Rectangle((column, row), 1, 1, facecolor=color, lw=0))
+        kind = world.cells[row, column]
+        if kind != "." and max(world.cells.shape) <= 16:
+            axes.text(column + 0.07, row + 0.07, kind, ha="left", va="top", fontsize=6.5,
+                      color=MUTED, weight="bold", parse_math=False, zorder=5)
+    _frame(axes, world)
+
+
+def _frame(axes: Axes, world: _Board) -> None:
+    rows, columns = world.cells.shape
+    for row, column in np.argwhere(world.cells == world.wall):
+        axes.add_patch(Rectangle((column, row), 1, 1, facecolor=_WALL, lw=0))
+    lines = [((0, r), (columns, r)) for r in range(rows + 1)]
+    lines += [((c, 0), (c, rows)) for c in range(columns + 1)]
+    axes.add_collection(LineCollection(lines, colors=PAPER, linewidths=0.6, zorder=2))
+    axes.set(xlim=(0, columns), ylim=(rows, 0), aspect="equal", xticks=[], yticks=[])
+    for spine in axes.spines.values():
+        spine.set(color=FAINT, lw=0.8)
+
+
+def _robot(axes: Axes, world: _Board, place: int) -> None:
+    row, column = world.places[place]
+    axes.add_patch(Circle((column + 0.5, row + 0.5), 0.3, facecolor=_ROBOT, lw=0, zorder=5))
+
+
+def _figures(
+    axes: Axes, world: _Board, values: NDArray[np.float64], robot: int, middle: float
+) -> None:
+    for place, (row, column) in enumerate(world.places):
+        if place != robot and np.isfinite(values[place]):
+            axes.text(column + 0.5, row + 0.5, f"{values[place]:.3g}", ha="center", va="center",
+                      fontsize=6.5, color=PAPER if values[place] < middle else INK, zorder=4)
+
+
+def _moves(
+    axes: Axes, world: _Board, mask: NDArray[np.bool_], actions: Sequence[str],
+    dark: NDArray[np.bool_] | None = None, *, hollow: bool = False,
+) -> None:
+    """A triangle towards each neighbour that a mask allows, and a dot for staying."""
+    for place, a in np.argwhere(mask):
+        # Above the environment's robot, whose cell may be shared.
+        color = PAPER if dark is not None and dark[place] else INK
+        face, edge = ("none", MUTED) if hollow else (color, "none")
+        row, column = world.places[place]
+        center, step = np.array([column + 0.5, row + 0.5]), np.array(_TURNS[actions[a]], float)
+        if not step.any():
+            axes.add_patch(Circle(tuple(center), 0.09, facecolor=face, edgecolor=edge, lw=0.7,
+                                  zorder=6))
+            continue
+        side = step[::-1] * 0.12
+        base, tip = center + step * 0.18, center + step * 0.42
+        axes.add_patch(Polygon([base + side, tip, base - side], facecolor=face, edgecolor=edge,
+                               lw=0.7, zorder=6))
+
+
+def _note(figure: Figure, marks: Sequence[tuple[str, str, str]], title: str = "") -> None:
+    """What colours and marks mean, under the maps."""
+    handles = [
+        Line2D([], [], ls="", marker=marker, color=color, markersize=7, label=text,
+               markeredgecolor=MUTED if color == PAPER else "none")
+        for color, text, marker in marks
+    ]
+    across = max(1, min(len(handles), int(figure.get_figwidth() / 1.6)))
+    legend = figure.legend(
+        handles=handles, loc="outside lower left", ncols=across, frameon=False, fontsize=8,
+        labelcolor=INK, handletextpad=0.1, columnspacing=1.2, title=title, alignment="left",
+    )
+    legend.get_title().set(fontsize=8, color=MUTED)
 
 
 # --- curves ---------------------------------------------------------------------------------

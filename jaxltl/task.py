@@ -7,13 +7,11 @@ beside it.
 
 from __future__ import annotations
 
-import difflib
 import hashlib
+import io
 import json
-import math
-import tomllib
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,6 +24,21 @@ from jaxltl.core.mdp import MDP, from_dense, make_mdp
 from jaxltl.core.product import Product
 from jaxltl.core.rollout import Trajectories, make_trajectories
 from jaxltl.envs.gridworld import ACTIONS, gridworld, parse_map
+from jaxltl.tables import (
+    COUNT,
+    LEGEND,
+    MAP,
+    NAMES,
+    TABLE,
+    TEXT,
+    Rule,
+    check_table,
+    choice,
+    is_list,
+    number_in,
+    read_bytes,
+    read_toml,
+)
 
 
 @dataclass(frozen=True)
@@ -75,92 +88,46 @@ class World(NamedTuple):
 # --- the keys of each table -----------------------------------------------------------------
 
 
-class _Rule(NamedTuple):
-    holds: Callable[[Any], bool]
-    wanted: str
-
-
-def _number(low: float, high: float = math.inf, *, below: bool = False) -> _Rule:
-    def holds(value: Any) -> bool:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            return False
-        return low <= value <= high and math.isfinite(value) and not (below and value == high)
-
-    if high == math.inf:
-        return _Rule(holds, f"a number of at least {low:g}")
-    return _Rule(holds, f"a number in [{low:g}, {high:g}{')' if below else ']'}")
-
-
-def _choice(*options: str) -> _Rule:
-    return _Rule(lambda value: value in options, " or ".join(f'"{o}"' for o in options))
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
-
-
-def _is_list(value: Any, kind: type | tuple[type, ...]) -> bool:
-    return isinstance(value, list) and all(
-        isinstance(x, kind) and not isinstance(x, bool) for x in value
-    )
-
-
-_TEXT = _Rule(lambda v: isinstance(v, str) and bool(v.strip()), "a text")
-_COUNT = _Rule(_is_count, "a whole number of at least 1")
-_NAMES = _Rule(lambda v: _is_list(v, str), 'a list of propositions, such as ["r"]')
-_MAP = _Rule(
-    lambda v: isinstance(v, str)
-    or (isinstance(v, dict) and set(v) == {"file"} and isinstance(v["file"], str)),
-    'the rows as a text, or { file = "map.txt" }',
-)
-_LEGEND = _Rule(
-    lambda v: isinstance(v, dict) and all(_is_list(x, str) for x in v.values()),
-    'a table of cells and their propositions, such as { w = [], r = ["r"] }',
-)
-
-_KEYS: dict[str, dict[str, _Rule]] = {
+_KEYS: dict[str, dict[str, Rule]] = {
     "": {
-        "name": _TEXT,
-        **dict.fromkeys(
-            ("world", "task", "demonstrations", "learner"),
-            _Rule(lambda v: isinstance(v, dict), "a table"),
-        ),
+        "name": TEXT,
+        **dict.fromkeys(("world", "task", "demonstrations", "learner"), TABLE),
     },
     "world": {
-        "map": _MAP,
-        "legend": _LEGEND,
-        "wall": _TEXT,
-        "slip": _number(0, 1),
-        "absorbing": _NAMES,
-        "initial": _TEXT,
-        "model": _TEXT,
+        "map": MAP,
+        "legend": LEGEND,
+        "wall": TEXT,
+        "slip": number_in(0, 1),
+        "absorbing": NAMES,
+        "initial": TEXT,
+        "model": TEXT,
     },
-    "task": {"formula": _TEXT, "label_on": _choice("entry", "exit")},
+    "task": {"formula": TEXT, "label_on": choice("entry", "exit")},
     "demonstrations": {
-        "file": _TEXT,
-        "synthetic": _COUNT,
-        "discount": _number(0, 1, below=True),
-        "length": _COUNT,
+        "file": TEXT,
+        "synthetic": COUNT,
+        "discount": number_in(0, 1, below=True),
+        "length": COUNT,
     },
     "learner": {
-        "method": _choice("mlirl"),
-        "in": _choice("product", "world"),
-        "discount": _number(0, 1, below=True),
-        "mu": _number(0),
-        "l2": _number(0),
-        "policy": _choice("boltzmann", "soft"),
-        "adjoint": _choice("exact", "approximate"),
-        "optimizer": _choice("lbfgs", "adam", "sgd"),
-        "learning_rate": _number(0),
-        "steps": _COUNT,
-        "tolerance": _number(0),
-        "start": _Rule(lambda v: _is_list(v, int | float), "a list of numbers, one per feature"),  # type: ignore[arg-type]
-        "start_scale": _number(0),
-        "watched": _choice("initial", "all"),
-        "avoid": _NAMES,
-        "goal": _NAMES,
-        "progress": _Rule(
-            lambda v: _is_list(v, str) or _is_list(v, int),
+        "method": choice("mlirl"),
+        "in": choice("product", "world"),
+        "discount": number_in(0, 1, below=True),
+        "mu": number_in(0),
+        "l2": number_in(0),
+        "policy": choice("boltzmann", "soft"),
+        "adjoint": choice("exact", "approximate"),
+        "optimizer": choice("lbfgs", "adam", "sgd"),
+        "learning_rate": number_in(0),
+        "steps": COUNT,
+        "tolerance": number_in(0),
+        "start": Rule(lambda v: is_list(v, int | float), "a list of numbers, one per feature"),  # type: ignore[arg-type]
+        "start_scale": number_in(0),
+        "watched": choice("initial", "all"),
+        "avoid": NAMES,
+        "goal": NAMES,
+        "progress": Rule(
+            lambda v: is_list(v, str) or is_list(v, int),
             "a list of propositions (in the world) or of automaton states (in the product)",
         ),
     },
@@ -180,45 +147,22 @@ def read_task(path: str | Path) -> Task:
         unknown, missing or wrong. The message names the file, the place and the fix.
     """
     path = Path(path)
-    raw = _bytes(path, "the task file")
-    try:
-        data = tomllib.loads(raw.decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: this is not TOML: {error}") from None
-    _check_table(path, "", data)
+    data, raw = read_toml(path, "the task file")
+    check_table(path, "", data, _KEYS[""], _REQUIRED[""])
     for table in _REQUIRED[""]:
-        _check_table(path, table, data[table])
+        check_table(path, table, data[table], _KEYS[table], _REQUIRED.get(table, ()))
     world, shown, learner = data["world"], data["demonstrations"], data["learner"]
     _check_world(path, world)
     _check_demonstrations(path, shown)
     _check_learner(path, learner)
     digest = hashlib.sha256(raw)
     for name in _named_files(data):
-        digest.update(_bytes(path.parent / name, f"{path} names a file that"))
+        digest.update(read_bytes(path.parent / name, f"{path} names a file that"))
     return Task(
         path=path, name=data.get("name", path.stem), world=world,
         formula=data["task"]["formula"], label_on=data["task"].get("label_on", "entry"),
         demonstrations=shown, learner=learner, digest=digest.hexdigest(),
     )
-
-
-def _check_table(path: Path, table: str, data: Mapping[str, Any]) -> None:
-    where = f"{path}: [{table}]" if table else f"{path}:"
-    known = _KEYS[table]
-    for key, value in data.items():
-        if key not in known:
-            guess = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-            raise ValueError(
-                f"{where} has no key {key!r}; "
-                + (f"did you mean {guess[0]!r}? " if guess else "")
-                + f"Its keys are {', '.join(known)}."
-            )
-        if not known[key].holds(value):
-            raise ValueError(f"{where} {key} = {value!r}; it must be {known[key].wanted}.")
-    for key in _REQUIRED.get(table, ()):
-        if key not in data:
-            kind = f"the table [{key}]" if not table else f"{key}, {known[key].wanted}"
-            raise ValueError(f"{where} lacks {kind}.")
 
 
 def _check_world(path: Path, world: Mapping[str, Any]) -> None:
@@ -275,13 +219,6 @@ def _named_files(data: Mapping[str, Any]) -> list[str]:
     return names + ([data["demonstrations"]["file"]] if "file" in data["demonstrations"] else [])
 
 
-def _bytes(path: Path, what: str) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise ValueError(f"{what} cannot be read: {str(path)!r}: {error.strerror}.") from None
-
-
 # --- the world ------------------------------------------------------------------------------
 
 
@@ -295,10 +232,10 @@ def load_world(task: Task) -> World:
     try:
         if "model" in spec:
             path = task.path.parent / spec["model"]
-            return _load_model(path, spec.get("initial"))
+            return load_model(path, spec.get("initial"))[0]
         text = spec.pop("map")
         if isinstance(text, dict):
-            text = _bytes(task.path.parent / text["file"], "the map").decode()
+            text = read_bytes(task.path.parent / text["file"], "the map").decode()
         return World(gridworld(text, **spec), parse_map(text), ACTIONS)
     except ValueError as error:
         raise ValueError(f"{task.path}: [world] {error}") from None
@@ -310,16 +247,25 @@ _ARRAYS = (
 )
 
 
-def _load_model(path: Path, initial: str | None) -> World:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{str(path)!r} is not an .npz of plain arrays: {error}") from None
+def load_model(
+    path: Path, initial: str | None, more: Sequence[str] = ()
+) -> tuple[World, dict[str, np.ndarray]]:
+    """A model from an ``.npz`` of arrays, and those of `more` arrays that it holds.
+
+    Args:
+      path: the file.
+      initial: a Boolean formula, uniformly where it holds; default the file's own.
+      more: names of arrays that it may hold beside a model's.
+
+    Raises:
+      ValueError: the file is no ``.npz``, or an array is unknown, missing or wrong.
+    """
+    arrays = _read_arrays(path)
+    known = (*_ARRAYS, *more)
     for name in arrays:
-        if name not in _ARRAYS:
+        if name not in known:
             raise ValueError(
-                f"{str(path)!r} holds an array {name!r}; it may hold {', '.join(_ARRAYS)}."
+                f"{str(path)!r} holds an array {name!r}; it may hold {', '.join(known)}."
             )
     options: dict[str, Any] = {k: arrays[k] for k in ("available", "initial", "label")
                                if k in arrays}
@@ -343,7 +289,27 @@ def _load_model(path: Path, initial: str | None) -> World:
             f"{str(path)!r}: actions has {len(set(actions))} distinct names; the model has "
             f"{mdp.num_actions} actions."
         )
-    return World(mdp, None, actions)
+    return World(mdp, None, actions), {k: arrays[k] for k in more if k in arrays}
+
+
+def _read_arrays(path: Path) -> dict[str, np.ndarray]:
+    raw = read_bytes(path, "the model")
+    arrays, what = {}, f"{str(path)!r} is not an .npz of plain arrays"
+    try:
+        file = np.load(io.BytesIO(raw), allow_pickle=False)
+        if not isinstance(file, np.lib.npyio.NpzFile):
+            raise ValueError("it holds a single array; write it by numpy.savez(path, name=...).")
+        for name in file.files:
+            what = f"{str(path)!r}: the array {name!r} is malformed"
+            arrays[name] = file[name]
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        if "Object arrays" in str(error):
+            raise ValueError(
+                f"{what}: it holds Python objects, such as None; save numbers, truth values or "
+                "texts."
+            ) from None
+        raise ValueError(f"{what}: {error}") from None
+    return arrays
 
 
 def _where_holds(formula: str, mdp: MDP) -> jax.Array:
@@ -371,7 +337,7 @@ def load_demonstrations(task: Task, world: World) -> Trajectories:
     """
     path = task.path.parent / task.demonstrations["file"]
     try:
-        data = json.loads(_bytes(path, "the demonstrations"))
+        data = json.loads(read_bytes(path, "the demonstrations"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: this is not JSON: {error}") from None
     shown = data.get("demonstrations") if isinstance(data, dict) else None
@@ -435,7 +401,7 @@ def _at_step(step: int, read: Callable[[Any, World], int], value: Any, world: Wo
 def _read_cell(value: Any, world: World) -> int:
     if world.cells is None:
         raise ValueError('the model has no map, so give "states" instead of "cells".')
-    if not (_is_list(value, int) and len(value) == 2):
+    if not (is_list(value, int) and len(value) == 2):
         raise ValueError(f"the cell is {value!r}; it must be [row, column].")
     row, column = value
     rows, columns = world.cells.shape
@@ -449,7 +415,7 @@ def _read_cell(value: Any, world: World) -> int:
 
 def _read_state(value: Any, world: World) -> int:
     last = world.mdp.num_states - 1
-    if not _is_list([value], int) or not 0 <= value <= last:
+    if not is_list([value], int) or not 0 <= value <= last:
         raise ValueError(f"the state is {value!r}; states are 0 to {last}.")
     return int(value)
 
@@ -457,7 +423,7 @@ def _read_state(value: Any, world: World) -> int:
 def _read_action(value: Any, world: World) -> int:
     if value in world.actions:
         return world.actions.index(value)
-    if _is_list([value], int) and 0 <= value < len(world.actions):
+    if is_list([value], int) and 0 <= value < len(world.actions):
         return int(value)
     raise ValueError(
         f"the action {value!r} is unknown; the actions are {', '.join(world.actions)}."

@@ -261,7 +261,8 @@ def _beside(
         priority=np.zeros(delta.shape, np.int32), letters=np.eye(num_letters, dtype=bool),
         propositions=tuple(f"letter_{i}" for i in range(num_letters)), acceptance="parity",
     )
-    joint = Product(game.mdp, jax.tree.map(jnp.asarray, automaton), jnp.asarray(letter, jnp.int32), label_on)
+    tables = jax.tree.map(jnp.asarray, automaton)
+    joint = Product(game.mdp, tables, jnp.asarray(letter, jnp.int32), label_on)
     return Game(joint, jnp.broadcast_to(game.system[:, None], joint.state_shape))
 
 

@@ -454,8 +454,8 @@ def restrict(
     states = np.flatnonzero(seen)
     stuck = states[~allowed[states].any(-1)]
     if stuck.size:
-        s, q = divmod(int(stuck[0]), num_memory)
-        where = f"{s}" + (f" with memory {q}" if num_memory > 1 else "")
+        first, memory_of = divmod(int(stuck[0]), num_memory)
+        where = f"{first}" + (f" with memory {memory_of}" if num_memory > 1 else "")
         raise ValueError(
             f"no action is allowed in state {where}, which is reachable; the mask is empty "
             "there. Start inside the winning region, or allow an action."

@@ -26,7 +26,7 @@ class Verification(NamedTuple):
     Attributes:
       system: the system's strategy wins almost surely in the region.
       environment: the environment's strategy prevents that outside of the region.
-      reason: for each claim that fails a sentence that names a state; else empty.
+      reason: for each claim that fails what goes wrong, and in which state; else empty.
     """
 
     system: bool
@@ -79,11 +79,11 @@ def verify(winning: Any) -> Verification:
       True
       >>> found.action = np.array([0, 0])
       >>> verify(found).reason
-      'around state 0 the run can stay for ever with least priority 1, which is odd.'
+      'around state 0 the run can stay for ever with least priority 1, which is odd'
     """
     claim = _claim(winning)
     system, environment = _refute_system(claim), _refute_environment(claim)
-    reason = " ".join(x for x in (system, environment) if x)
+    reason = "; ".join(x for x in (system, environment) if x)
     return Verification(not system, not environment, reason)
 
 
@@ -138,11 +138,11 @@ def _refute_system(claim: _Claim) -> str:
     """What is wrong with the system's claim; nothing if it holds."""
     bad = np.flatnonzero(claim.region & claim.lost)
     if bad.size:
-        return f"state {_name(claim, bad[0])} is in the region but already lost."
+        return f"state {_name(claim, bad[0])} is in the region but already lost"
     undecided = claim.region & ~claim.won
     missing = _unavailable(claim, claim.action, undecided & claim.system)
     if missing:
-        return f"the system's strategy has no valid action: {missing}."
+        return f"the system's strategy has no valid action: {missing}"
     play = _fix(claim, claim.system, claim.action, claim.guarantees)
     memories = play.memories
     node_in = np.repeat(undecided, memories)
@@ -152,11 +152,11 @@ def _refute_system(claim: _Claim) -> str:
     if edge.size:
         node, action = divmod(int(play.pair[edge[0]]), play.actions)
         who = "strategy's" if claim.system[node // memories] else "environment's"
-        return f"from {_where(claim, play, node)} the {who} action {action} leaves the region."
+        return f"from {_where(claim, play, node)} the {who} action {action} leaves the region"
     for avoid, meet, what in _failures(claim):
         found = _component(play, node_in & ~np.repeat(avoid, memories), meet)
         if found is not None:
-            return f"around {_where(claim, play, found)} the run can {what}."
+            return f"around {_where(claim, play, found)} the run can {what}"
     return ""
 
 
@@ -164,11 +164,11 @@ def _refute_environment(claim: _Claim) -> str:
     """What is wrong with the environment's claim; nothing if it holds."""
     bad = np.flatnonzero(claim.won & ~claim.region)
     if bad.size:
-        return f"state {_name(claim, bad[0])} is already won but outside the region."
+        return f"state {_name(claim, bad[0])} is already won but outside the region"
     undecided = ~claim.region & ~claim.lost
     missing = _unavailable(claim, claim.counter_action, undecided & ~claim.system)
     if missing:
-        return f"the environment's strategy has no valid action: {missing}."
+        return f"the environment's strategy has no valid action: {missing}"
     play = _fix(claim, ~claim.system, claim.counter_action, claim.assumptions)
     memories = play.memories
     node_in = np.repeat(undecided, memories)
@@ -176,13 +176,14 @@ def _refute_environment(claim: _Claim) -> str:
         found = _component(play, node_in & ~np.repeat(avoid, memories), meet)
         if found is not None:
             where = _where(claim, play, found)
-            return f"around {where}, outside the region, the system can {what}."
+            return f"around {where}, outside the region, the system can {what}"
     # No component outside the region is a success, so all that is left is to enter the region.
-    entering = _almost_surely(play, np.repeat(claim.region, memories), node_in)
+    goal = np.repeat(claim.region & ~claim.lost, memories)
+    entering = _almost_surely(play, goal, node_in)
     nodes = np.flatnonzero(entering & node_in)
     if nodes.size:
         where = _where(claim, play, nodes[0])
-        return f"from {where}, outside the region, the system can enter the region almost surely."
+        return f"from {where}, outside the region, the system can enter the region almost surely"
     return ""
 
 

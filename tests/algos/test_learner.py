@@ -14,7 +14,8 @@ import pytest
 from flax import struct
 
 import jaxltl as jl
-from jaxltl.algos import learner, mlirl
+from jaxltl.algos import learner, maximin_q, mlirl
+from jaxltl.core.game import make_game
 from tests.support import counted_traces
 
 
@@ -77,11 +78,36 @@ def mlirl_product():
     )
 
 
+def alternating_game():
+    """Two of the system's states between two of the environment's, where chance plays."""
+    successor = [[[2, 0], [3, 0]], [[3, 0], [2, 0]], [[0, 1], [1, 0]], [[1, 0], [0, 1]]]
+    certain, fair = [[1, 0], [1, 0]], [[0.5, 0.5], [1, 0]]
+    mdp = jl.make_mdp(successor, [certain, certain, fair, fair])
+    reward = [[1.0, 0.0], [0.0, 0.5], [0.2, 0.0], [0.0, 0.3]]
+    return make_game(mdp, [True, True, False, False]), reward
+
+
+def q_learning(method):
+    setting = partial(
+        maximin_q.Hparams, step_size=1.0, step_power=0.7, epsilon=0.5, environment_epsilon=0.5,
+        num_chains=3, moves_per_step=5,
+    )
+    return Case(
+        maximin_q, maximin_q.make_problem(*alternating_game(), method=method),
+        setting(discount=0.5), setting(discount=0.7, step_size=0.5, restart=0.2, epsilon=0.1),
+    )
+
+
 LEARNERS = {
     "toy": lambda: Case(TOY, jnp.arange(3.0), 0.1, 0.2),
     "mlirl-world": mlirl_world,
     "mlirl-product": mlirl_product,
+    "q-generalized": partial(q_learning, "generalized"),
+    "q-maximin": partial(q_learning, "maximin"),
 }
+
+# What a state has learned, by name; the first that it has.
+LEARNED = ("parameters", "q", "position")
 
 
 @cache
@@ -116,7 +142,7 @@ def assert_bitwise(one, other):
         np.testing.assert_array_equal(x, y)
 
 
-SLOW = {"mlirl-product"}  # to compile, which is done several times
+SLOW = {"mlirl-product", "q-maximin"}  # to compile, which is done several times
 by_learner = pytest.mark.parametrize(
     "name",
     [pytest.param(n, marks=[pytest.mark.exhaustive] if n in SLOW else []) for n in LEARNERS],
@@ -144,7 +170,7 @@ def test_a_lane_is_as_if_alone(name):
     alone, _ = six_steps(name)
     for x, y in zip(leaves(states), leaves(alone), strict=True):
         np.testing.assert_allclose(x[0], y, rtol=1e-8, atol=1e-8)
-    learned = leaves(states.parameters if name != "toy" else states.position)
+    learned = leaves(next(getattr(states, x) for x in LEARNED if hasattr(states, x)))
     assert any((x[0] != x[1]).any() for x in learned), "distinct keys give distinct runs"
 
 

@@ -1,0 +1,794 @@
+"""Q-learning in turn-based games with unknown rewards (dissertation, section 5.4.2).
+
+The system maximises, the environment minimises, and both play only moves that a mask
+allows, for example a permissive strategy's. Many chains play at once and share one table.
+A reward is read only of a move that was made.
+
+Two methods, chosen by ``make_problem(..., method=...)``. Generalized Q-learning for
+alternating Markov games (Littman and Szepesvari 1996) keeps a value for each move of
+either player::
+
+    Q(s, a) <- (1 - alpha) Q(s, a) + alpha (r + g(s) V(t)),    s -a-> t,
+    V(t) = max_a Q(t, a) where the system moves, min_a Q(t, a) where the environment does,
+
+with ``g(s) = discount`` at the system's states, and at the environment's 1 if the discount
+is paid per system move. Maximin Q-learning, a variation of minimax-Q (Littman 1994), keeps
+a value for each system move and answer, where turns strictly alternate::
+
+    Q(s, a, o) <- (1 - alpha) Q(s, a, o) + alpha (r + g(s) (r' + g(e) V(t))),  s -a-> e -o-> t,
+    V(s) = max_a min_o Q(s, a, o).
+
+Both converge to the minimax value if every allowed move is made infinitely often and
+either the game is deterministic and ``alpha = 1``, or ``alpha`` decays as is usual.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+
+from jaxltl.algos import learner
+from jaxltl.core.game import Game, as_game
+from jaxltl.core.graph import bottom_components
+from jaxltl.core.mdp import MDP
+from jaxltl.core.operators import action_argmax, sample_successor
+from jaxltl.core.product import restrict
+from jaxltl.core.types import require_shape, status_code
+
+
+@struct.dataclass
+class Problem:
+    """A game to play, with what the learner may not see before it plays.
+
+    Attributes:
+      game: on an explicit MDP, such as ``restrict`` returns.
+      reward: ``float[S, A]`` or ``float[S, A, K]``, read only along moves that are made.
+      allowed: ``bool[S, A]``: the mask at the system's states, all moves at the environment's.
+      behavior: ``float[S, A]``, how moves are drawn where they are not greedy.
+      start: ``float[S]``, where chains begin and begin anew.
+      exact: ``float[S]``, the true value if it is known, to measure the error; else None.
+      measured: ``bool[S]``, the states over which the error is measured; None with `exact`.
+      behavior_table: ``uint32[S, A]``, `behavior` as alias tables.
+      start_table: ``uint32[S]``, `start` as cumulative thresholds.
+      method: ``"generalized"`` or ``"maximin"``; static.
+    """
+
+    game: Game
+    reward: jax.Array
+    allowed: jax.Array
+    behavior: jax.Array
+    start: jax.Array
+    exact: Any
+    measured: Any
+    behavior_table: jax.Array
+    start_table: jax.Array
+    method: str = struct.field(pytree_node=False, default="generalized")
+
+
+@struct.dataclass
+class Hparams:
+    """How to learn. Numbers are traced, so new values do not recompile; None is static.
+
+    Attributes:
+      discount: in [0, 1).
+      step_size: alpha; None is 1 for games without chance, where the new value replaces
+        the old one, which is fastest.
+      step_power: with omega in (1/2, 1], the n-th visit of a pair has the step size
+        ``alpha / n ** omega``; None: always alpha. Near 1 the old is forgotten very slowly
+        (Even-Dar and Mansour 2003).
+      epsilon: the system plays greedily with probability ``1 - epsilon``; None: never.
+      environment_epsilon: the same for the environment, which is then adversarial.
+      epsilon_decay: both epsilons are multiplied by ``epsilon_decay ** step``.
+      epsilon_min: and are at least this.
+      restart: the probability with which a chain starts anew at the beginning of a step.
+      initial_value: of every entry of the table. The environment's untried moves count.
+      per: ``"system_move"`` or ``"move"``: which moves pay the discount; static.
+      num_chains: static.
+      moves_per_step: of each chain; static. A step reports once, so few moves cost more each.
+    """
+
+    discount: jax.Array | float
+    step_size: jax.Array | float | None = None
+    step_power: jax.Array | float | None = None
+    epsilon: jax.Array | float | None = None
+    environment_epsilon: jax.Array | float | None = None
+    epsilon_decay: jax.Array | float = 1.0
+    epsilon_min: jax.Array | float = 0.0
+    restart: jax.Array | float = 0.0
+    initial_value: jax.Array | float = 0.0
+    per: str = struct.field(pytree_node=False, default="system_move")
+    num_chains: int = struct.field(pytree_node=False, default=1024)
+    moves_per_step: int = struct.field(pytree_node=False, default=64)
+
+
+@struct.dataclass
+class State:
+    """A table on its way, and the chains that fill it.
+
+    Attributes:
+      key: of the whole run.
+      step: steps made.
+      q: ``float[S, A]``, or ``float[S, A, A]`` of a system state, its move and the answer;
+        minus infinity at system moves that are not allowed, plus infinity at the
+        environment's, so that maxima and minima pass over them.
+      visits: ``int32`` like `q`, how often each entry was updated.
+      value: ``float[S]``, of `q`.
+      residual: the largest change of `value` in the last step.
+      violations: moves made that were not allowed, of all chains. It stays zero.
+      position: ``int32[num_chains]``, where the chains are.
+      pending: ``int32[num_chains]``, the system's move ``s * A + a`` that waits for its
+        answer, or -1; None unless the method is maximin.
+      held: ``float[num_chains]``, the reward of that move; None likewise.
+    """
+
+    key: jax.Array
+    step: jax.Array
+    q: jax.Array
+    visits: jax.Array
+    value: jax.Array
+    residual: jax.Array
+    violations: jax.Array
+    position: jax.Array
+    pending: Any
+    held: Any
+
+
+@struct.dataclass
+class Metrics:
+    """Figures after a step.
+
+    Attributes:
+      residual: the largest change of the value in the step.
+      moves: made so far by all chains, as a float.
+      visited: distinct entries of the table that were updated.
+      violations: moves made so far that were not allowed.
+      error: the largest error over the measured states; NaN where the value is not known.
+    """
+
+    residual: jax.Array
+    moves: jax.Array
+    visited: jax.Array
+    violations: jax.Array
+    error: jax.Array
+
+
+@struct.dataclass
+class Learned:
+    """What :func:`train_until` ends with; ``check`` accepts it.
+
+    Attributes:
+      state: where the run ended.
+      metrics: after the last step, with the residual of the last window.
+      residual: the largest change of the value in the last window.
+      num_steps: steps made by this run.
+      status: a code of :class:`~jaxltl.core.types.Status`.
+    """
+
+    state: State
+    metrics: Metrics
+    residual: jax.Array
+    num_steps: jax.Array
+    status: jax.Array
+
+
+# --- problems, on the host ------------------------------------------------------------------
+
+
+def make_problem(
+    game: Any,
+    reward: chex.Array,
+    *,
+    allowed: chex.Array | None = None,
+    environment: chex.Array | None = None,
+    start: chex.Array | None = None,
+    exact: chex.Array | None = None,
+    measured: chex.Array | None = None,
+    method: str = "generalized",
+) -> Problem:
+    """A checked :class:`Problem`, on the host.
+
+    Args:
+      game: a Game on an explicit MDP, or an MDP, in which the system always moves.
+      reward: ``float[S, A]`` or ``float[S, A, K]``, of the moves of both players.
+      allowed: ``bool[S, A]``, such as a permissive strategy's mask; default the available
+        moves. Only the system's states count: the environment is free.
+      environment: ``float[S, A]``, how the environment plays where it is not greedy;
+        default uniformly. Only its own states count. The value that is learned is a
+        minimum over all its moves, so it should try them all.
+      start: ``float[S]``, a distribution over the states where chains begin; default the
+        game's.
+      exact: ``float[S]``, the true value, to measure the error.
+      measured: ``bool[S]``, where to measure it, such as :func:`recurrent_states`; default
+        wherever a move is allowed (with maximin: at the system's states).
+      method: ``"generalized"`` or ``"maximin"``.
+
+    Raises:
+      ValueError: a wrong shape, a reward that is not finite, a mask that allows a move
+        that does not exist or none in a state that can be reached, rows or a start that
+        are no distributions, or a game that does not fit the method.
+
+    Example:
+      >>> from jaxltl.core.mdp import from_dense
+      >>> mdp = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]])
+      >>> problem = make_problem(mdp, [[0.0, 0.0], [1.0, 1.0]])
+      >>> hparams = Hparams(discount=0.5, restart=0.5, num_chains=4, moves_per_step=8)
+      >>> state, metrics = train(jax.random.key(0), problem, hparams, num_steps=10)
+      >>> [round(v, 3) for v in state.value.tolist()], greedy(state, problem).tolist()
+      ([1.0, 2.0], [1, 0])
+    """
+    if method not in ("generalized", "maximin"):
+        raise ValueError(f'method={method!r}; choose "generalized" or "maximin".')
+    game = as_game(game)
+    if not isinstance(game.mdp, MDP):
+        raise ValueError(
+            f"the game's model is a {type(game.mdp).__name__}; learning plays in an explicit MDP: "
+            "pass restrict(game).model, or convert it."
+        )
+    shape, system = (game.num_states, game.num_actions), np.asarray(game.system)
+    if shape[1] > 256:
+        raise ValueError(f"the game has {shape[1]} actions; drawing moves works up to 256.")
+    mask = _mask(game, system, allowed)
+    start = np.asarray(game.initial if start is None else start, float)
+    require_shape("start", start, shape[:1])
+    _check_distributions("start", start[None], np.ones((1, shape[0]), bool))
+    reachable = np.asarray(restrict(game, start, allowed=mask).base_state)
+    if method == "maximin":
+        _check_alternating(game, system, reachable)
+    behavior = _behavior(mask, system, environment)
+    if exact is not None:
+        exact = jnp.asarray(exact, game.dtype)
+        require_shape("exact", exact, shape[:1])
+        default = mask.any(-1) & (system if method == "maximin" else True)
+        measured = jnp.asarray(default if measured is None else measured, bool)
+        require_shape("measured", measured, shape[:1])
+    return Problem(
+        game=game, reward=_reward(game, reward), allowed=jnp.asarray(mask),
+        behavior=jnp.asarray(behavior, game.dtype), start=jnp.asarray(start, game.dtype),
+        exact=exact, measured=None if exact is None else measured,
+        behavior_table=jnp.asarray(_alias(behavior)), start_table=jnp.asarray(_cumulative(start)),
+        method=method,
+    )
+
+
+def recurrent_states(problem: Problem) -> jax.Array:
+    """States that chains without restarts visit infinitely often, if nobody plays greedily.
+
+    They are the bottom components of the reachable part, ``bool[S]``; on the host.
+    """
+    part = restrict(problem.game, problem.start, allowed=problem.behavior > 0)
+    inside = bottom_components(part.model, part.model.available).inside.any(-1)
+    found = np.zeros(problem.game.num_states, bool)
+    found[np.asarray(part.base_state)[np.asarray(inside)]] = True
+    return jnp.asarray(found)
+
+
+def _mask(game: Game, system: np.ndarray, allowed: Any) -> np.ndarray:
+    available = np.asarray(game.available)
+    if allowed is None:
+        return available
+    allowed = np.asarray(allowed)
+    require_shape("allowed", allowed, available.shape)
+    if allowed.dtype != bool:
+        raise ValueError(f"allowed has dtype {allowed.dtype}; it must be bool.")
+    wrong = np.argwhere(allowed & ~available & system[:, None])
+    if wrong.size:
+        raise ValueError(
+            f"allowed: state {wrong[0][0]} has no action {wrong[0][1]}; allow available "
+            "actions only."
+        )
+    return np.where(system[:, None], allowed, available)
+
+
+def _reward(game: Game, reward: Any) -> jax.Array:
+    """The checked reward, zero where there is no move; equal successors share one reward."""
+    reward = np.asarray(reward, float)
+    used = np.asarray(game.mdp.probability) > 0
+    if reward.ndim == 2:
+        require_shape("reward", reward, used.shape[:2])
+        used = np.asarray(game.available)
+    else:
+        require_shape("reward", reward, used.shape)
+    wrong = np.argwhere(used & ~np.isfinite(reward))
+    if wrong.size:
+        raise ValueError(
+            f"the reward of state {wrong[0][0]}, action {wrong[0][1]} is "
+            f"{reward[tuple(wrong[0])]}; it must be finite."
+        )
+    reward = np.where(used, reward, 0)
+    if reward.ndim == 3:
+        # Only the successor is seen, not which entry of the list it came from.
+        successor, weight = np.asarray(game.mdp.successor), np.asarray(game.mdp.probability)
+        same = (successor[..., :, None] == successor[..., None, :]) * weight[..., None, :]
+        total = same.sum(-1)
+        mean = (same * reward[..., None, :]).sum(-1) / np.where(total > 0, total, 1)
+        reward = np.where(used, mean, 0)
+    return jnp.asarray(reward, game.dtype)
+
+
+def _behavior(mask: np.ndarray, system: np.ndarray, environment: Any) -> np.ndarray:
+    """Uniform over allowed moves, or the environment's rows where it moves."""
+    uniform = mask / np.maximum(mask.sum(-1, keepdims=True), 1)
+    if environment is None:
+        return uniform
+    environment = np.asarray(environment, float)
+    require_shape("environment", environment, mask.shape)
+    rows = np.where(system[:, None], uniform, environment)
+    _check_distributions("environment", rows, mask, system)
+    return rows
+
+
+def _check_distributions(
+    name: str, rows: np.ndarray, support: np.ndarray, skip: np.ndarray | bool = False
+) -> None:
+    bad = ~np.isfinite(rows).all(-1) | (rows < 0).any(-1) | ((rows > 0) & ~support).any(-1)
+    bad |= np.abs(rows.sum(-1) - 1) > 1e-6
+    bad &= ~np.asarray(skip)
+    if bad.any():
+        where = f" of state {int(np.argmax(bad))}" if len(rows) > 1 else ""
+        raise ValueError(
+            f"{name}: the row{where} is no distribution over available moves: entries must be "
+            "at least 0, zero at others, and sum to 1."
+            if len(rows) > 1 else f"{name} is no distribution: entries must be at least 0 and "
+            "sum to 1."
+        )
+
+
+def _check_alternating(game: Game, system: np.ndarray, reachable: np.ndarray) -> None:
+    used = np.asarray(game.mdp.probability) > 0
+    owner = system[np.asarray(game.mdp.successor)]
+    again = np.argwhere((used & (owner == system[:, None, None]))[reachable])
+    if again.size:
+        raise ValueError(
+            f"method='maximin' needs strictly alternating turns, but in state "
+            f"{reachable[again[0][0]]} action {again[0][1]} leads to a state of the same player; "
+            "use method='generalized'."
+        )
+    chance = np.argwhere(((used.sum(-1) > 1) & system[:, None])[reachable])
+    if chance.size:
+        raise ValueError(
+            f"method='maximin' needs system moves with one successor, but in state "
+            f"{reachable[chance[0][0]]} action {chance[0][1]} has several; use "
+            "method='generalized'."
+        )
+
+
+# An alias table (Walker 1977) draws from any row with one look-up: 24 bits of a threshold
+# and 8 of the action to take above it.
+_BITS = 24
+
+_WRITTEN_OUT = 16  # actions up to which a maximum over them is written out
+
+
+def _alias(rows: np.ndarray) -> np.ndarray:
+    """``uint32[S, A]`` alias tables of distributions ``float[S, A]``."""
+    num_states, num_actions = rows.shape
+    left = rows * num_actions
+    share, alias = np.ones(rows.shape), np.tile(np.arange(num_actions), (num_states, 1))
+    unfilled, s = np.ones(rows.shape, bool), np.arange(num_states)
+    for _ in range(num_actions - 1):
+        least = np.where(unfilled, left, np.inf).argmin(-1)
+        most = np.where(unfilled, left, -np.inf).argmax(-1)
+        share[s, least], alias[s, least] = left[s, least], most
+        left[s, most] -= 1 - left[s, least]
+        unfilled[s, least] = False
+    # Rounding must not give weight to a move without any.
+    threshold = np.where(rows > 0, np.rint(np.clip(share, 0, 1) * 2**_BITS), 0).astype(np.int64)
+    heaviest = rows.argmax(-1)[:, None]
+    alias = np.where(np.take_along_axis(rows, alias, -1) > 0, alias, heaviest)
+    full = threshold == 2**_BITS
+    alias = np.where(full, np.arange(num_actions), alias)
+    threshold = np.where(full, 0, threshold)
+    return (threshold << 8 | alias).astype(np.uint32)
+
+
+def _cumulative(distribution: np.ndarray) -> np.ndarray:
+    """``uint32[S]``, cumulative weights in units of ``2 ** -31``."""
+    total = np.rint(np.cumsum(distribution) * 2.0**31)
+    last = np.flatnonzero(distribution > 0)[-1]
+    total[last:] = 2.0**31
+    return np.minimum(total, 2.0**31).astype(np.uint32)
+
+
+# --- the learner ----------------------------------------------------------------------------
+
+
+@jax.jit
+def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """A table of ``hparams.initial_value``, and chains at states drawn from the start.
+
+    Raises:
+      ValueError: unknown `per`, no chain or move, or no step size for a game with chance.
+    """
+    _check(problem, hparams)
+    dtype, system = problem.game.dtype, problem.game.system
+    legal = problem.allowed
+    if problem.method == "maximin":
+        legal = _answers(problem)
+        worst = jnp.where(problem.allowed & system[:, None], jnp.inf, -jnp.inf)[..., None]
+    else:
+        worst = jnp.where(system, -jnp.inf, jnp.inf)[:, None]
+    q = jnp.where(legal, jnp.asarray(hparams.initial_value, dtype), worst.astype(dtype))
+    # Steps fold in their own numbers, which stay below this one.
+    words = jax.random.bits(jax.random.fold_in(key, 0xFFFFFFFF), (hparams.num_chains,), jnp.uint32)
+    waiting = problem.method == "maximin"
+    return State(
+        key=key, step=jnp.int32(0), q=q, visits=jnp.zeros(q.shape, jnp.int32),
+        value=value(q, problem), residual=jnp.asarray(jnp.inf, dtype), violations=jnp.int32(0),
+        position=_draw_start(problem, words),
+        pending=jnp.full(hparams.num_chains, -1, jnp.int32) if waiting else None,
+        held=jnp.zeros(hparams.num_chains, dtype) if waiting else None,
+    )
+
+
+def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """``moves_per_step`` moves of every chain.
+
+    The chains move together: all read the table, then all write. Where m of them make the
+    same move from one state, all m take the step size a of its next visit, and together
+    do what m visits in turn would do with the mean of their targets::
+
+        Q <- (1 - a)^m Q + (1 - (1 - a)^m) mean.
+
+    Cost: a few nanoseconds for each move and allowed action, without arrays of their number.
+    """
+    _check(problem, hparams)
+    state_key = jax.random.fold_in(state.key, state.step)
+    restart, play, chance = jax.random.split(state_key, 3)
+    state = _restart(restart, state, problem, hparams)
+    # A stream for each chain: a start and an odd increment, both from the key.
+    words = jax.random.bits(play, (2, hparams.num_chains), jnp.uint32)
+    stream = (words[0], words[1] | 1)
+    table = _Table(
+        state.q.ravel(), state.visits.ravel(), state.position,
+        _take(problem.game.system, state.position), state.pending, state.held, state.violations,
+    )
+    move = partial(_move, problem, hparams, _epsilons(state.step, hparams), stream, chance)
+    count = jnp.arange(hparams.moves_per_step, dtype=jnp.uint32)
+    table, _ = lax.scan(lambda t, i: (move(t, i), None), table, count)
+    q = table.q.reshape(state.q.shape)
+    image = value(q, problem)
+    residual = jnp.max(jnp.abs(image - state.value))
+    state = State(
+        key=state.key, step=state.step + 1, q=q, visits=table.visits.reshape(q.shape),
+        value=image, residual=residual, violations=table.violations, position=table.position,
+        pending=table.pending, held=table.held,
+    )
+    return state, measure(state, problem, hparams)
+
+
+run = partial(learner.run, step)
+train = partial(learner.train, init, step)
+
+
+def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
+    """The :class:`Metrics` of a state."""
+    dtype = problem.game.dtype
+    error = jnp.asarray(jnp.nan, dtype)
+    if problem.exact is not None:
+        gap = jnp.abs(state.value - problem.exact)
+        error = jnp.max(jnp.where(problem.measured, gap, 0))
+    return Metrics(
+        residual=state.residual,
+        moves=state.step.astype(dtype) * (hparams.num_chains * hparams.moves_per_step),
+        visited=jnp.sum(state.visits > 0, dtype=jnp.int32),
+        violations=state.violations,
+        error=error,
+    )
+
+
+@jax.jit
+def run_until(
+    state: State,
+    problem: Problem,
+    hparams: Hparams,
+    *,
+    tolerance: jax.Array | float,
+    max_steps: jax.Array | int,
+    check_every: jax.Array | int = 10,
+) -> Learned:
+    """Steps until the value changes by at most `tolerance` within a window.
+
+    A window in which a move was made for the first time never ends the run. That the
+    value rests is evidence of convergence and no proof of it: the longer the window, the
+    better the evidence.
+
+    Args:
+      state: where to go on from.
+      problem, hparams: as for :func:`step`.
+      tolerance: largest change of a state's value.
+      max_steps: steps at most.
+      check_every: steps in a window.
+
+    Returns:
+      :class:`Learned`.
+    """
+    window = jnp.maximum(jnp.asarray(check_every, jnp.int32), 1)
+    first = state.step
+
+    def body(carry):
+        state, _, _ = carry
+        before, seen = state.value, jnp.sum(state.visits > 0)
+        length = jnp.minimum(window, max_steps - (state.step - first))
+        state = lax.fori_loop(0, length, lambda _, s: step(s, problem, hparams)[0], state)
+        residual = jnp.max(jnp.abs(state.value - before))
+        quiet = (residual <= tolerance) & (jnp.sum(state.visits > 0) == seen)
+        return state, residual, quiet & (length == window)
+
+    def unfinished(carry):
+        state, residual, done = carry
+        return ~done & ~jnp.isnan(residual) & (state.step - first < max_steps)
+
+    begin = (state, jnp.asarray(jnp.inf, state.value.dtype), jnp.bool_(False))
+    state, residual, done = lax.while_loop(unfinished, body, begin)
+    return Learned(
+        state=state, metrics=replace(measure(state, problem, hparams), residual=residual),
+        residual=residual, num_steps=state.step - first,
+        status=status_code(done, ~jnp.isnan(residual)),
+    )
+
+
+def train_until(
+    key: chex.PRNGKey,
+    problem: Problem,
+    hparams: Hparams,
+    *,
+    tolerance: jax.Array | float,
+    max_steps: jax.Array | int,
+    check_every: jax.Array | int = 10,
+) -> Learned:
+    """:func:`run_until` from a fresh state."""
+    state = init(key, problem, hparams)
+    return run_until(
+        state, problem, hparams, tolerance=tolerance, max_steps=max_steps, check_every=check_every
+    )
+
+
+def value(q: jax.Array, problem: Problem) -> jax.Array:
+    """The value of each state by a table: ``float[S]``.
+
+    Zero where no move is allowed, and at the environment's states with maximin, whose
+    table holds none for them.
+    """
+    if problem.method == "maximin":
+        return _finite(_reduce(jnp.maximum, _reduce(jnp.minimum, q)))
+    least, most = _reduce(jnp.minimum, q), _reduce(jnp.maximum, q)
+    return _finite(jnp.where(problem.game.system, most, least))
+
+
+def greedy(state: State, problem: Problem) -> jax.Array:
+    """Each player's first best move by the table, ``int32[S]``; the policy that was learned.
+
+    With maximin the environment's moves are its first ones: its best answer depends on the
+    system's move, and is the minimum of ``state.q[s, a]``.
+    """
+    if problem.method == "maximin":
+        worst = jnp.where(problem.game.system[:, None], state.q.min(-1), 0)
+        return action_argmax(worst, problem.allowed)[1]
+    sign = jnp.where(problem.game.system, 1, -1)[:, None]
+    return action_argmax(sign * state.q, problem.allowed)[1]
+
+
+# --- one move of all chains -----------------------------------------------------------------
+
+
+class _Table(NamedTuple):
+    """What a move changes: flat tables, and the chains."""
+
+    q: jax.Array
+    visits: jax.Array
+    position: jax.Array
+    system: jax.Array
+    pending: Any
+    held: Any
+    violations: jax.Array
+
+
+def _move(problem, hparams, epsilons, stream, chance, table: _Table, i: jax.Array) -> _Table:
+    """The i-th move of every chain in a step, and what it teaches."""
+    game, num_actions = problem.game, problem.game.num_actions
+    source, system = table.position, table.system
+    action = _choose(problem, epsilons, stream, table, i)
+    pair = source * num_actions + action
+    violations = table.violations + jnp.sum(
+        ~_take(problem.allowed.ravel(), pair), dtype=jnp.int32)
+    target = _sample(game, jax.random.fold_in(chance, i), source, action)
+    reward = _observed(problem, source, action, target)
+    discount = jnp.asarray(hparams.discount, table.q.dtype)
+    after = discount if hparams.per == "move" else jnp.ones_like(discount)
+    whose = _take(game.system, target)
+    ahead = _value_at(problem, table.q, target, whose)
+    if problem.method == "generalized":
+        mine = system.astype(discount.dtype)
+        aim = reward + (mine * discount + (1 - mine) * after) * ahead
+        q, visits = _learn(hparams, table.q, table.visits, pair, aim, "promise_in_bounds")
+        return _Table(q, visits, target, whose, None, None, violations)
+    answered = ~system & (table.pending >= 0)
+    # A system move teaches nothing yet: its entry lies outside and is dropped.
+    entry = jnp.where(answered, table.pending * num_actions + action, table.q.size)
+    aim = table.held + discount * (reward + after * ahead)
+    q, visits = _learn(hparams, table.q, table.visits, entry, aim, "drop")
+    pending = jnp.where(system, pair, -1)
+    return _Table(q, visits, target, whose, pending, jnp.where(system, reward, 0), violations)
+
+
+def _learn(hparams, q, visits, entry, aim, mode) -> tuple[jax.Array, jax.Array]:
+    """The table after all chains have moved, and its counts."""
+    if hparams.step_size is None:
+        # Without chance all chains at one entry aim at the same number.
+        return q.at[entry].set(aim, mode=mode), visits.at[entry].add(1, mode=mode)
+    before = _take(visits, jnp.minimum(entry, q.size - 1))
+    old = _take(q, jnp.minimum(entry, q.size - 1))
+    visits = visits.at[entry].add(1, mode=mode)
+    together = (_take(visits, jnp.minimum(entry, q.size - 1)) - before).astype(q.dtype)
+    size = jnp.asarray(hparams.step_size, q.dtype)
+    if hparams.step_power is not None:
+        size = size * (1 + before.astype(q.dtype)) ** -jnp.asarray(hparams.step_power, q.dtype)
+    share = (1 - (1 - size) ** together) / together
+    return q.at[entry].add(share * (aim - old), mode=mode), visits
+
+
+def _choose(problem, epsilons, stream, table: _Table, i) -> jax.Array:
+    """Each chain's action: greedy with the probability of its player, else by behaviour."""
+    num_actions = problem.game.num_actions
+    word = (_word(stream, 2 * i) >> 8) * jnp.uint32(num_actions)
+    slot = (word >> _BITS).astype(jnp.int32)
+    entry = _take(problem.behavior_table.ravel(), table.position * num_actions + slot)
+    alias = (entry & 0xFF).astype(jnp.int32)
+    action = jnp.where((word & (2**_BITS - 1)) < entry >> 8, slot, alias)
+    if epsilons == (None, None):
+        return action
+    best, known = _best(problem, table)
+    uniform = _uniform(_word(stream, 2 * i + 1), table.q.dtype)
+    mine, theirs = (jnp.inf if e is None else e for e in epsilons)
+    return jnp.where(known & (uniform >= jnp.where(table.system, mine, theirs)), best, action)
+
+
+def _best(problem, table: _Table) -> tuple[jax.Array, jax.Array]:
+    """Each chain's greedy action, and whether the table knows one there."""
+    num_actions, system = problem.game.num_actions, table.system[:, None]
+    if problem.method == "generalized":
+        row = _take(table.q.reshape(-1, num_actions), table.position)
+        known = jnp.ones(table.position.shape, bool)
+    else:
+        q = table.q.reshape(-1, num_actions, num_actions)
+        answers = _take(q.reshape(-1, num_actions), jnp.maximum(table.pending, 0))
+        row = jnp.where(system, _take(q, table.position).min(-1), answers)
+        known = table.system | (table.pending >= 0)
+    return action_argmax(jnp.where(system, row, -row), jnp.bool_(True))[1], known
+
+
+def _value_at(problem, q, state, system) -> jax.Array:
+    """Values of chains' states by a flat table, without those of all states.
+
+    Whose turn it is changes from chain to chain at random: signs are faster than a choice.
+    """
+    num_actions = problem.game.num_actions
+    if problem.method == "maximin":
+        block = _take(q.reshape(-1, num_actions, num_actions), state)
+        return _finite(_reduce(jnp.maximum, _reduce(jnp.minimum, block)))
+    sign = 2 * system.astype(q.dtype) - 1
+    if num_actions > _WRITTEN_OUT:
+        return sign * jnp.max(sign[:, None] * _take(q.reshape(-1, num_actions), state), axis=-1)
+    best = sign * _take(q, state * num_actions)
+    for a in range(1, num_actions):
+        best = jnp.maximum(best, sign * _take(q, state * num_actions + a))
+    return sign * best
+
+
+def _sample(game: Game, key, state, action) -> jax.Array:
+    """The chains' successors. Where chance plays no part, keys are not worth drawing."""
+    if game.num_successors == 1:
+        return jax.vmap(sample_successor, (None, None, 0, 0))(game, key, state, action)
+    keys = jax.random.split(key, state.shape[0])
+    return jax.vmap(sample_successor, (None, 0, 0, 0))(game, keys, state, action)
+
+
+def _observed(problem, state, action, successor) -> jax.Array:
+    """The rewards of the transitions made, and of no others."""
+    num_actions, width = problem.game.num_actions, problem.game.num_successors
+    pair = state * num_actions + action
+    if problem.reward.ndim == 2:
+        return _take(problem.reward.ravel(), pair)
+    mdp = problem.game.mdp
+    listed = mdp.successor[state, action] == successor[:, None]
+    k = jnp.argmax(listed & (mdp.probability[state, action] > 0), axis=-1).astype(jnp.int32)
+    return _take(problem.reward.ravel(), pair * width + k)
+
+
+def _restart(key, state: State, problem, hparams) -> State:
+    """Some chains start anew, and forget a move that waits for its answer."""
+    def draw(position, pending):
+        words = jax.random.bits(key, (2, hparams.num_chains), jnp.uint32)
+        anew = _uniform(words[0], state.value.dtype) < hparams.restart
+        pending = None if pending is None else jnp.where(anew, -1, pending)
+        return jnp.where(anew, _draw_start(problem, words[1]), position), pending
+
+    position, pending = lax.cond(
+        jnp.asarray(hparams.restart) > 0, draw, lambda *x: x, state.position, state.pending)
+    return replace(state, position=position, pending=pending)
+
+
+def _draw_start(problem, words) -> jax.Array:
+    found = jnp.searchsorted(problem.start_table, words >> 1, side="right")
+    return found.astype(jnp.int32)
+
+
+def _epsilons(step, hparams) -> tuple[Any, Any]:
+    """Both players' probabilities of not being greedy; None: never greedy."""
+    def at(epsilon):
+        if epsilon is None:
+            return None
+        decayed = epsilon * jnp.asarray(hparams.epsilon_decay) ** step
+        return jnp.maximum(decayed, hparams.epsilon_min)
+
+    return at(hparams.epsilon), at(hparams.environment_epsilon)
+
+
+def _word(stream, i) -> jax.Array:
+    """The i-th 32 random bits of each chain: a Weyl sequence, mixed.
+
+    The construction of SplitMix (Steele, Lea and Flood 2014) with a 32-bit mixer. It is
+    several times cheaper than a keyed hash for each move, and starts afresh from the key
+    at every step.
+    """
+    x = stream[0] + stream[1] * i
+    x = (x ^ (x >> 16)) * jnp.uint32(0x7FEB352D)
+    x = (x ^ (x >> 15)) * jnp.uint32(0x846CA68B)
+    return x ^ (x >> 16)
+
+
+def _uniform(word, dtype) -> jax.Array:
+    """24 random bits as a number in [0, 1)."""
+    return (word >> 8).astype(dtype) / 2.0**24
+
+
+def _answers(problem: Problem) -> jax.Array:
+    """Which answers each system move leaves to the environment: ``bool[S, A, A]``."""
+    mdp = problem.game.mdp
+    k = jnp.argmax(mdp.probability, axis=-1)[..., None]
+    between = jnp.take_along_axis(mdp.successor, k, axis=-1)[..., 0]
+    mine = problem.allowed & problem.game.system[:, None]
+    return mine[..., None] & problem.allowed[between]
+
+
+def _check(problem: Problem, hparams: Hparams) -> None:
+    if hparams.per not in ("move", "system_move"):
+        raise ValueError(f'per={hparams.per!r}; choose "move" or "system_move".')
+    if hparams.num_chains < 1 or hparams.moves_per_step < 1:
+        raise ValueError(
+            f"num_chains={hparams.num_chains}, moves_per_step={hparams.moves_per_step}; both "
+            "must be at least 1."
+        )
+    if hparams.step_size is None and problem.game.num_successors > 1:
+        raise ValueError(
+            "step_size=None replaces old values, which is for games without chance (lists of "
+            "one successor); give a number, and a step_power to converge."
+        )
+    if hparams.step_size is None and hparams.step_power is not None:
+        raise ValueError("step_power needs a step_size to start from; give step_size=1.0.")
+
+
+def _finite(x: jax.Array) -> jax.Array:
+    return jnp.where(jnp.isinf(x), 0, x)
+
+
+def _reduce(function, x: jax.Array) -> jax.Array:
+    """A reduction over a last axis; written out over a short one, which is several times faster."""
+    if x.shape[-1] > _WRITTEN_OUT:
+        return function.reduce(x, axis=-1)
+    result = x[..., 0]
+    for i in range(1, x.shape[-1]):
+        result = function(result, x[..., i])
+    return result
+
+
+def _take(x: jax.Array, index: jax.Array) -> jax.Array:
+    return x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)

@@ -1,0 +1,112 @@
+"""Tables of TOML files: reading one, and checking its keys against rules."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+
+class Rule(NamedTuple):
+    """What a key's value must be, as a test and in words."""
+
+    holds: Callable[[Any], bool]
+    wanted: str
+
+
+def number_in(low: float, high: float = math.inf, *, below: bool = False) -> Rule:
+    """A finite number in ``[low, high]``, or below `high`."""
+    def holds(value: Any) -> bool:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return False
+        return low <= value <= high and math.isfinite(value) and not (below and value == high)
+
+    if high == math.inf:
+        return Rule(holds, f"a number of at least {low:g}")
+    return Rule(holds, f"a number in [{low:g}, {high:g}{')' if below else ']'}")
+
+
+def choice(*options: str) -> Rule:
+    """One of some texts."""
+    return Rule(lambda value: value in options, " or ".join(f'"{o}"' for o in options))
+
+
+def is_list(value: Any, kind: type | tuple[type, ...]) -> bool:
+    """Whether a value is a list of one kind of things; a truth value is no number."""
+    return isinstance(value, list) and all(
+        isinstance(x, kind) and not isinstance(x, bool) for x in value
+    )
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
+
+
+TEXT = Rule(lambda v: isinstance(v, str) and bool(v.strip()), "a text")
+COUNT = Rule(_is_count, "a whole number of at least 1")
+TRUTH = Rule(lambda v: isinstance(v, bool), "true or false")
+TABLE = Rule(lambda v: isinstance(v, dict), "a table")
+NAMES = Rule(lambda v: is_list(v, str), 'a list of propositions, such as ["r"]')
+MAP = Rule(
+    lambda v: isinstance(v, str)
+    or (isinstance(v, dict) and set(v) == {"file"} and isinstance(v["file"], str)),
+    'the rows as a text, or { file = "map.txt" }',
+)
+LEGEND = Rule(
+    lambda v: isinstance(v, dict) and all(is_list(x, str) for x in v.values()),
+    'a table of cells and their propositions, such as { w = [], r = ["r"] }',
+)
+
+
+def read_toml(path: Path, what: str) -> tuple[dict[str, Any], bytes]:
+    """The tables of a TOML file, and its bytes.
+
+    Raises:
+      ValueError: the file cannot be read or is malformed.
+    """
+    raw = read_bytes(path, what)
+    try:
+        return tomllib.loads(raw.decode()), raw
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: this is not TOML: {error}") from None
+
+
+def read_bytes(path: Path, what: str) -> bytes:
+    """A file's bytes; `what` it is begins the error."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{what} cannot be read: {str(path)!r}: {error.strerror}.") from None
+
+
+def check_table(
+    path: Path, table: str, data: Mapping[str, Any], known: Mapping[str, Rule],
+    required: Sequence[str] = (),
+) -> None:
+    """Raises a ValueError for the first key of a table that is unknown, wrong or missing.
+
+    Args:
+      path: the file.
+      table: the table's name; empty for the whole file.
+      data: its keys and values.
+      known: its keys and their rules.
+      required: the keys that it must have.
+    """
+    where = f"{path}: [{table}]" if table else f"{path}:"
+    for key, value in data.items():
+        if key not in known:
+            guess = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+            raise ValueError(
+                f"{where} has no key {key!r}; "
+                + (f"did you mean {guess[0]!r}? " if guess else "")
+                + f"Its keys are {', '.join(known)}."
+            )
+        if not known[key].holds(value):
+            raise ValueError(f"{where} {key} = {value!r}; it must be {known[key].wanted}.")
+    for key in required:
+        if key not in data:
+            kind = f"the table [{key}]" if not table else f"{key}, {known[key].wanted}"
+            raise ValueError(f"{where} lacks {kind}.")
