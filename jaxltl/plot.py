@@ -510,6 +510,7 @@ def game_values(
     table = _of_turns(np.asarray(values, float), world, "values")
     allowed = None
     if policy is not None:
+        _require_directions(actions)
         allowed = _of_turns(_as_mask(policy, len(actions)), world, "policy")
     finite = table[np.isfinite(table)]
     if limits is None:
@@ -599,9 +600,8 @@ def game_moves(
       ValueError: an array does not fit the board, or an action has no direction.
     """
     world = _board(board, wall)
-    for name in actions:
-        if name not in _TURNS:
-            raise ValueError(f"action {name!r} has no direction; use {', '.join(_TURNS)}.")
+    _require_place(world, environment)
+    _require_directions(actions)
     panels = np.asarray(allowed, bool)
     panels = panels[None] if panels.ndim == 2 else panels
     regions = None if region is None else np.asarray(region, bool)
@@ -650,6 +650,21 @@ def _board(board: int | str, wall: str) -> _Board:
     return _Board(np.full((board, board), "."), places, wall)
 
 
+def _require_directions(actions: Sequence[str]) -> None:
+    for name in actions:
+        if name not in _TURNS:
+            raise ValueError(f"action {name!r} has no direction; use {', '.join(_TURNS)}.")
+
+
+def _require_place(world: _Board, number: int) -> int:
+    if not 0 <= number < len(world.places):
+        raise ValueError(
+            f"environment {number} is no place of the board, whose places are 0 to "
+            f"{len(world.places) - 1}."
+        )
+    return int(number)
+
+
 def _of_turns(array: NDArray[Any], world: _Board, name: str) -> NDArray[Any]:
     """An array over states as ``[environment, system, ...]``, where the system moves."""
     count = len(world.places)
@@ -678,7 +693,7 @@ def _small_multiples(
         spots = [int(r * columns + c) for r, c in world.places]
         chosen = list(range(len(spots)))
     else:
-        chosen = [int(e) for e in environment]
+        chosen = [_require_place(world, e) for e in environment]
         across = min(int(np.ceil(np.sqrt(len(chosen)))), 4)
         down, spots = -(-len(chosen) // across), list(range(len(chosen)))
     size = float(np.clip(8.5 / max(across * columns, down * rows), 0.085, 0.42))

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
-from matplotlib.patches import Circle, FancyArrowPatch
+from matplotlib.patches import Circle, FancyArrowPatch, Rectangle
 
 from jaxltl import drawing, plot
 from jaxltl.core.automaton import Automaton, complement, make_automaton
@@ -228,3 +228,98 @@ def test_curves_with_and_without_spread():
     assert len(alone.axes[0].collections) == 0
     with pytest.raises(ValueError, match="nothing to show among unknown"):
         plot.curves({"unknown": [np.nan]})
+
+
+def states(count, environment, system, turn=1):
+    """The number of a state of a game of two robots."""
+    return (environment * count + system) * 2 + turn
+
+
+def shown_values(axes):
+    """The values that a map shades, by row and column."""
+    return axes.images[0].get_array()
+
+
+def test_values_of_a_game_lie_as_its_places_do():
+    values = np.full(2 * 4 * 4, 0.0)
+    values[states(4, 0, 3)] = 7.29  # the environment in the lower left, the system opposite
+    values[states(4, 0, 3, turn=0)] = 100  # not where the system moves
+    values[states(4, 1, 1)] = np.nan
+    figure = plot.game_values(values, 2, label="reward")
+    maps = figure.axes[:4]
+    tables = [shown_values(axes) for axes in maps]
+    assert tables[2][0, 1] == 7.29 and sum(float(x.sum()) for x in tables) == 7.29
+    assert tables[3].mask.tolist() == [[False, False], [False, True]]
+    assert {x.norm.vmax for axes in maps for x in axes.images} == {7.29}
+    robots = [[x.center for x in axes.patches if isinstance(x, Circle)] for axes in maps]
+    assert robots == [[(0.5, 0.5)], [(1.5, 0.5)], [(0.5, 1.5)], [(1.5, 1.5)]]
+    assert "7.29" in {text.get_text() for text in maps[2].texts}
+    assert b"</svg>" in plot.to_bytes(figure)
+
+
+def test_walls_have_no_map_of_their_own():
+    game = "a#\n.b"
+    figure = plot.game_region(np.ones(18, bool), game)
+    assert [axes.axison for axes in figure.axes] == [True, False, True, True]
+    few = plot.game_region(np.ones(18, bool), game, environment=[2, 0])
+    assert [axes.get_title() for axes in few.axes] == ["row 2, column 2", "row 1, column 1"]
+    won = np.zeros(18, bool)
+    won[states(3, 0, 2)] = True
+    cells = plot.game_region(won, game).axes[0].patches
+    fills = {x.get_xy(): to_hex(x.get_facecolor()) for x in cells if not isinstance(x, Circle)}
+    assert fills[(1, 1)] != fills[(0, 1)] == fills[(0, 0)] and len(fills) == 4
+
+
+def marks_of_moves(axes):
+    """Where the filled triangles and dots of a map lie, as the places that they point to."""
+    ink = to_hex(plot.INK)
+    return sorted(
+        tuple(x.center if isinstance(x, Circle) else x.get_xy()[1]) for x in axes.patches
+        if not isinstance(x, Rectangle) and x.get_facecolor()[3] > 0
+        and to_hex(x.get_facecolor()) == ink
+    )
+
+
+def test_moves_point_where_they_lead():
+    allowed = np.zeros((2, 18, 5), bool)
+    allowed[0, states(3, 0, 2), [2, 4]] = True  # left and stay, in the lower right
+    allowed[1, states(3, 0, 1), 3] = True  # right, in the lower left
+    allowed[:, states(3, 1, 2), 0] = True  # while the environment is elsewhere
+    allowed[:, states(3, 0, 2, turn=0), 1] = True
+    available = allowed[0] | allowed[1]
+    figure = plot.game_moves(allowed, "a#\n.b", 0, available=available, titles=["one", "two"],
+                             region=available.any(-1), system=2)
+    first, second = figure.axes
+    np.testing.assert_allclose(marks_of_moves(first), [(1.08, 1.5), (1.5, 1.5)])
+    np.testing.assert_allclose(marks_of_moves(second), [(0.92, 1.5)])
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["one", "two"]
+    assert [t.get_text() for t in figure.legends[0].texts] == [
+        "the system wins", "the environment wins", "the environment's robot", "allowed",
+        "not allowed"]
+    assert b"</svg>" in plot.to_bytes(figure)
+
+
+def test_a_policy_over_the_values_of_a_game():
+    policy = np.full(32, -1)
+    policy[states(4, 0, 3)] = 2
+    figure = plot.game_values(np.zeros(32), 2, policy=policy)
+    assert [len(marks_of_moves(axes)) for axes in figure.axes[:4]] == [0, 0, 1, 0]
+    several = plot.game_values(np.zeros(32), 2, policy=policy[:, None] == np.arange(5))
+    assert [len(marks_of_moves(axes)) for axes in several.axes[:4]] == [0, 0, 1, 0]
+
+
+@pytest.mark.parametrize(("draw", "message"), [
+    (lambda: plot.game_values(np.zeros(31), 2),
+     r"values has shape \(31,\); the board has 4 places, so that the game has 2 \* 4\*\*2 = 32"),
+    (lambda: plot.game_values(np.zeros(32), 2, policy=np.zeros(4, int)), r"policy has shape \(4,"),
+    (lambda: plot.game_region(np.zeros(32, bool), "..#"), r"region has shape .* 2 places"),
+    (lambda: plot.game_moves(np.zeros((32, 1), bool), 2, 0, actions=["jump"]),
+     r"action 'jump' has no direction; use up, down, left, right, stay"),
+    (lambda: plot.game_values(np.zeros(32), 2, policy=np.zeros(32, int), actions=["hop"]),
+     r"action 'hop' has no direction"),
+    (lambda: plot.game_moves(np.zeros((32, 5), bool), 2, 4), r"environment 4 .* places are 0 to 3"),
+    (lambda: plot.game_values(np.zeros(32), 2, environment=[-1]), r"environment -1 "),
+])
+def test_game_misfits(draw, message):
+    with pytest.raises(ValueError, match=message):
+        draw()

@@ -35,16 +35,20 @@ LAYERS = [
 ]
 
 PUBLIC = [
-    "MDP", "Automaton", "DenseMDP", "FiniteMemoryPolicy", "Formula", "Monitor", "NotConverged",
-    "Product", "Solution", "Status", "Trajectories", "Verdict", "almost_surely_reaching",
-    "attractor", "avoidable", "boltzmann_fixed_points", "boltzmann_value", "check", "complement",
-    "end_components", "exists_successor", "expectation", "feature_expectation", "find_difference",
-    "forall_successor", "from_dense", "gridworld", "holds_on_lasso", "is_equivalent", "letters",
-    "lift_policy", "lift_trajectories", "make_automaton", "make_mdp", "make_monitor",
-    "make_trajectories", "monitor_step", "occupancy_measure", "optimal_satisfaction",
-    "optimal_value", "parse_ltl", "policy_value", "product", "project_policy", "pushforward",
-    "reachability_probability", "read_hoa", "restrict", "rollout", "sample_successor",
-    "satisfaction_probability", "soft_value", "to_automaton", "to_dense", "verdict", "write_hoa",
+    "GR1", "MDP", "Automaton", "DenseMDP", "FiniteMemoryPolicy", "Formula", "Game", "Monitor",
+    "NotConverged", "Parity", "Permissive", "Product", "Solution", "Status", "Trajectories",
+    "Verdict", "Verification", "Winning", "almost_sure_buchi", "almost_surely_reaching",
+    "apply_strategy", "attractor", "avoidable", "boltzmann_fixed_points", "boltzmann_value",
+    "buchi", "check", "cobuchi", "complement", "end_components", "exists_successor", "expectation",
+    "feature_expectation", "find_difference", "forall_successor", "from_dense",
+    "generalized_buchi", "gr1", "grid_game", "gridworld", "holds_on_lasso", "is_equivalent",
+    "letters", "lift_policy", "lift_trajectories", "make_automaton", "make_game", "make_mdp",
+    "make_monitor", "make_trajectories", "mean_payoff", "minimax_value", "monitor_step",
+    "occupancy_measure", "optimal_satisfaction", "optimal_value", "parity", "parse_ltl",
+    "permissive_strategy", "policy_value", "product", "project_policy", "pushforward", "reach",
+    "reachability_probability", "read_hoa", "restrict", "rollout", "safety", "sample_successor",
+    "satisfaction_probability", "shield", "soft_value", "states_where", "strategy_value",
+    "to_automaton", "to_dense", "verdict", "verify", "winning_region", "write_hoa",
 ]
 
 
