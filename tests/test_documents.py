@@ -11,9 +11,12 @@ ROOT = Path(__file__).parent.parent
 
 
 def test_the_readme_example_runs():
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert len(blocks) == 2
     names: dict = {}
-    exec(compile(code, "README.md", "exec"), names)
+    for code in blocks:
+        exec(compile(code, "README.md", "exec"), names)
+    assert names["allowed"].maximal and not names["state"].violations
     assert names["metrics"].loss.shape == (4, 20)
     assert (names["metrics"].loss[:, -1] < names["metrics"].loss[:, 0]).all()
 

@@ -400,8 +400,8 @@ def _solve(play: _Play, tolerance, max_steps, evaluation_sweeps, *, method: str)
     solution = Solution(
         value=middle,
         policy=still.distribution(action),
-        lower=live(middle - evidence.half),
-        upper=live(middle + evidence.half),
+        lower=live(jnp.where(evidence.half < jnp.inf, middle - evidence.half, -jnp.inf)),
+        upper=live(jnp.where(evidence.half < jnp.inf, middle + evidence.half, jnp.inf)),
         residual=jnp.max(jnp.abs(image - value)),
         num_steps=num_steps,
         status=status_code(verdict.converged, verdict.finite),
