@@ -120,7 +120,7 @@ def test_a_missing_task_file(tmp_path):
 
 
 @pytest.mark.parametrize(("replacement", "message"), [
-    ((". . r\n", ". . .\n"), r"\[world\] mentions the proposition 'r'"),
+    ((". . r\n", ". . .\n"), r"\[world\] initial: .* mentions the proposition 'r'"),
     (("b . y", "b y"), r"\[world\] map row 2 has 2 cells, row 1 has 3"),
     (('absorbing = ["y"]', "slip = 0.1\nlegend = { b = [] }"), r"\(row 1, column 1\) is not in"),
 ])
