@@ -75,6 +75,8 @@ def states_where(model: Any, condition: States, place: str = "condition") -> jax
       >>> states_where(world, "!a").tolist()
       [True, False]
     """
+    if isinstance(condition, str) and condition in ("true", "false"):
+        return jnp.full(model.state_shape, condition == "true")  # of traced games too
     if isinstance(condition, str | Formula):
         world = model
         while hasattr(world, "mdp"):

@@ -185,3 +185,11 @@ def test_objectives_on_a_product_have_its_shape():
     found = buchi(joint, "b", safe=np.ones(shape, bool))
     assert found.priority.shape == found.lost.shape == shape
     assert gr1(joint, ["a"], ["b"]).guarantees.shape == (1, *shape)
+
+
+def test_objectives_are_made_of_traced_games_too():
+    def region(game, accepting):
+        return jl.winning_region(game, buchi(game, accepting)).region
+
+    accepting = jnp.array([True, False, False])
+    np.testing.assert_array_equal(jax.jit(region)(game(), accepting), region(game(), accepting))
