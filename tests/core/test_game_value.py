@@ -200,17 +200,32 @@ def test_discounts_near_one_do_not_keep_any_method_from_ending():
         assert gap.max() <= 2e-5
 
 
-def test_a_cycle_of_strategies_that_are_greedy_against_each_other_is_left(batch):
-    """Newton steps for both players at once go in circles in some of these games."""
-    games, rewards, _ = batch
-    discounts = jnp.full(NUM_GAMES, 0.99)
-    found, slow = (
-        solver(method, "system_move")(games, rewards, discounts, games.available, 1e-5)
-        for method in (METHODS[0], "value_iteration")
-    )
-    assert (found.status == Status.CONVERGED).all()
-    assert (jnp.abs(found.value - slow.value) <= 2e-5).all()
-    assert found.num_steps.mean() < slow.num_steps.mean() / 4
+def cycling_game():
+    """Strategies that are greedy for the value of the last two come back after three steps."""
+    successor = np.array([[3, 1], [1, 1], [0, 1], [2, 0]])
+    reward = np.array([[-3.0, 2.0], [2.0, -3.0], [-2.0, -1.0], [-2.0, -3.0]])
+    return successor, np.array([True, False, True, False]), reward
+
+
+def test_evaluating_both_players_greedy_choices_in_full_goes_in_circles():
+    """Why modified policy iteration has to look at its residual."""
+    successor, system, reward = cycling_game()
+    states, sign = np.arange(4), np.where(system, 1, -1)[:, None]
+    policy, seen = (sign * reward).argmax(1), []
+    while tuple(policy) not in seen:
+        seen.append(tuple(policy))
+        step = np.eye(4)[successor[states, policy]]
+        value = np.linalg.solve(np.eye(4) - 0.99 * step, reward[states, policy])
+        policy = (sign * (reward + 0.99 * value[successor])).argmax(1)
+    assert tuple(policy) != seen[-1]
+
+    game = make_game(from_dense(np.eye(4)[successor]), system)
+    full = {"evaluation_sweeps": 10_000, "tolerance": 1e-9, "max_steps": 5000}
+    found = {method: check(minimax_value(game, reward, 0.99, method=method, **full))
+             for method in METHODS}
+    assert found["strategy_iteration"].num_steps < 20
+    for method in METHODS:
+        np.testing.assert_allclose(found[method].value, found[METHODS[1]].value, atol=2e-9)
 
 
 # --- the mask ------------------------------------------------------------------------------
@@ -481,13 +496,17 @@ def as_deterministic_game(successor, available, system):
 
 
 def assert_mean_payoff(rng, num_states, num_actions, reward):
-    successor, available, system = deterministic(rng, num_states, num_actions)
+    assert_solved(*deterministic(rng, num_states, num_actions), reward)
+
+
+def assert_solved(successor, available, system, reward):
+    """The exact value, and strategies of both players that secure it."""
     found = mean_payoff(as_deterministic_game(successor, available, system), jnp.asarray(reward))
     assert found.status == Status.CONVERGED
     exact = brute.mean_payoff(successor, available, system, reward)
     assert_encloses(found, exact)
     np.testing.assert_array_equal(found.value, exact.astype(float))
-    chosen = np.arange(num_actions) == np.asarray(found.policy)[:, None]
+    chosen = np.arange(available.shape[1]) == np.asarray(found.policy)[:, None]
     assert (chosen & available).any(axis=1).all()
     for mine in (system, ~system):
         fixed = np.where(mine[:, None], chosen, available)
@@ -502,6 +521,13 @@ def test_mean_payoffs_are_those_of_all_strategy_pairs():
         shape = (num_states, num_actions)
         reward = rng.integers(-1 - i % 3, 2 + i % 3, shape).astype(float)
         assert_mean_payoff(rng, num_states, num_actions, reward)
+
+
+def test_an_answer_that_is_best_only_before_biases_are_taken_over_is_not_kept():
+    successor = np.array([[1, 4], [3, 0], [4, 4], [4, 0], [3, 3]])
+    reward = np.array([[1.0, -1], [1, -1], [0, -1], [1, 0], [-1, 1]])
+    system = np.array([True, False, False, True, False])
+    assert_solved(successor, np.ones((5, 2), bool), system, reward)
 
 
 def test_mean_payoffs_of_any_floats_are_exact():
@@ -559,7 +585,8 @@ def test_mean_payoffs_in_products_and_dense_games():
     found = mean_payoff(Game(lazy, jnp.asarray(system)), reward)
     flat = as_game(model, system.ravel())
     other = mean_payoff(flat, reward.reshape(-1, 2))
-    dense = mean_payoff(Game(to_dense(flat.mdp), flat.system), reward.reshape(-1, 2, 1) * np.ones(9))
+    on_transitions = np.repeat(reward.reshape(-1, 2, 1), model.num_states, axis=2)
+    dense = mean_payoff(Game(to_dense(flat.mdp), flat.system), on_transitions)
     np.testing.assert_array_equal(found.value.ravel(), other.value)
     np.testing.assert_array_equal(dense.value, other.value)
 
