@@ -179,13 +179,7 @@ def _strategy(file: GameFile, nodes: Nodes) -> Permissive:
     try:
         return permissive_strategy(nodes.game, nodes.objective, method=method, bound=bound)
     except ValueError as error:
-        reason = str(error)
-        if bound is not None and "unrealizable" in reason:
-            reason = (
-                f"bound = {bound} is too small: the system wins, but not within it from any "
-                "initial state; raise it."
-            )
-        raise ValueError(f"{file.path}: [strategy] {reason}") from None
+        raise ValueError(f"{file.path}: [strategy] {error}") from None
 
 
 def check_strategy(nodes: Nodes, strategy: Permissive, restricted: Restriction) -> Verification:

@@ -396,5 +396,5 @@ def test_methods_that_do_not_fit(arrays, tmp_path):
     far = {"successor": [[[1], [1]], [[2], [2]], [[3], [3]], [[0], [0]]],
            "probability": np.ones((4, 2, 1)), "system": [True] * 4, "initial": [1, 0, 0, 0],
            "label": [[0], [0], [0], [1]]}
-    assert "[strategy] bound = 2 is too small: the system wins, but not within it" in message(
+    assert "[strategy] bound=2 is too small: the system wins, but not surely within it" in message(
         "G F bad", 'method = "counter"\nbound = 2', **far)

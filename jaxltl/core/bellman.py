@@ -104,17 +104,20 @@ def _certified(
     tolerance: jax.Array | float | None,
     value: jax.Array,
     image: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Midpoint shift of the enclosure, its half width, and whether it meets the tolerance."""
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Midpoint shift of the enclosure, its half width, whether that meets the tolerance, and
+    whether it is mostly rounding, so that further sweeps would not help."""
     down, up, rounding, finite = _macqueen(model, reward, discount, value, image)
     half = (up - down) / 2
     goal = 4 * rounding if tolerance is None else tolerance
     half = jnp.where(finite, half, jnp.inf)
-    return (up + down) / 2, half, half <= goal
+    return (up + down) / 2, half, half <= goal, half <= 2 * rounding
 
 
 def _solution(model, reward, discount, tolerance, value, image, policy, num_steps) -> Solution:
-    shift, half, converged = _certified(model, reward, discount, tolerance, value, image)
+    shift, half, converged, exhausted = _certified(
+        model, reward, discount, tolerance, value, image
+    )
     finite = jnp.all(jnp.isfinite(image)) & (discount < 1)
     # Without a certificate the shift is meaningless and the iterate itself is the answer.
     middle = image + jnp.where(jnp.isfinite(half), shift, 0)
@@ -125,7 +128,7 @@ def _solution(model, reward, discount, tolerance, value, image, policy, num_step
         upper=middle + half,
         residual=jnp.max(jnp.abs(image - value)),
         num_steps=num_steps,
-        status=status_code(converged, finite),
+        status=status_code(converged, finite, exhausted),
     )
 
 
@@ -299,8 +302,8 @@ def optimal_value(
         _, image, policy, n, _ = carry
         value = image if method == "value_iteration" else evaluate(image, policy)
         image, policy = greedy(value)
-        _, _, done = _certified(model, reward, discount, tolerance, value, image)
-        return value, image, policy, n + 1, done | ~jnp.isfinite(image.ravel()[0])
+        *_, done, exhausted = _certified(model, reward, discount, tolerance, value, image)
+        return value, image, policy, n + 1, done | exhausted | ~jnp.isfinite(image.ravel()[0])
 
     def unfinished(carry):
         *_, n, done = carry
@@ -366,8 +369,8 @@ def soft_value(
         value, image, n, _ = carry
         value = jacobian(value).newton(value, image) if method == "newton" else image
         image = backup(value)
-        _, _, done = _certified(model, reward, discount, tolerance, value, image)
-        return value, image, n + 1, done | ~jnp.isfinite(image.ravel()[0])
+        *_, done, exhausted = _certified(model, reward, discount, tolerance, value, image)
+        return value, image, n + 1, done | exhausted | ~jnp.isfinite(image.ravel()[0])
 
     def unfinished(carry):
         *_, n, done = carry
@@ -488,6 +491,7 @@ def boltzmann_value(
     magnitude = jnp.max(jnp.abs(jnp.where(model.available, reward, 0))) / (1 - discount)
     rounding = _rounding(model, reward, magnitude, gap)
     goal = 4 * rounding if tolerance is None else jnp.asarray(tolerance, model.dtype)
+    enough = jnp.maximum(goal, 2 * rounding)  # below which there is little but rounding
 
     def error(value: jax.Array, image: jax.Array) -> jax.Array:
         """Certified where the operator contracts; elsewhere the residual."""
@@ -514,17 +518,17 @@ def boltzmann_value(
         width = n + (0 if method == "newton" else 4 * (1 + n // 16))
         again = (value, image, bound, jnp.bool_(True), n)
         value, image, bound, _, n = lax.while_loop(
-            lambda c: (c[2] > goal) & (c[4] < jnp.minimum(width, max_steps)), damped, again
+            lambda c: (c[2] > enough) & (c[4] < jnp.minimum(width, max_steps)), damped, again
         )
         again = (value, image, bound, jnp.bool_(True), n)
         value, image, bound, _, n = lax.while_loop(
-            lambda c: (c[2] > goal) & c[3] & (c[4] < max_steps), newton, again
+            lambda c: (c[2] > enough) & c[3] & (c[4] < max_steps), newton, again
         )
         return value, image, bound, n
 
     def unfinished(carry):
         _, _, bound, n = carry
-        return (bound > goal) & (n < max_steps) & jnp.isfinite(bound)
+        return (bound > enough) & (n < max_steps) & jnp.isfinite(bound)
 
     start = jnp.zeros(model.state_shape, model.dtype) if initial is None else initial
     image = backup(start)
@@ -535,7 +539,7 @@ def boltzmann_value(
     solution = Solution(
         value=value, policy=value, lower=value - half, upper=value + half,
         residual=jnp.max(jnp.abs(image - value)), num_steps=n,
-        status=status_code(converged, jnp.isfinite(bound) & (discount < 1)),
+        status=status_code(converged, jnp.isfinite(bound) & (discount < 1), bound <= enough),
     )
     constant = adjoint == "approximate"
     solution = _attach(

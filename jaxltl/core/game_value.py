@@ -348,6 +348,7 @@ class _Evidence(NamedTuple):
     shift: jax.Array
     half: jax.Array
     converged: jax.Array
+    exhausted: jax.Array  # as narrow as rounding lets it be
     finite: jax.Array
 
 
@@ -372,6 +373,7 @@ def _certify(play: _Play, horizon, tolerance, value, image) -> _Evidence:
         shift=jnp.where(known, (up + down) / 2, 0),
         half=jnp.where(known, half, jnp.inf),
         converged=known & jnp.all(half <= goal),
+        exhausted=known & jnp.all(half <= 2 * unit * horizon),
         finite=jnp.isfinite(top - bottom) & ~jnp.any(jnp.isnan(horizon)),
     )
 
@@ -404,7 +406,7 @@ def _solve(play: _Play, tolerance, max_steps, evaluation_sweeps, *, method: str)
         upper=live(jnp.where(evidence.half < jnp.inf, middle + evidence.half, jnp.inf)),
         residual=jnp.max(jnp.abs(image - value)),
         num_steps=num_steps,
-        status=status_code(verdict.converged, verdict.finite),
+        status=status_code(verdict.converged, verdict.finite, verdict.exhausted),
     )
     solution = jax.tree.map(lax.stop_gradient, solution)
     return replace(solution, value=live(implicit(play.backup, middle)))
@@ -412,7 +414,8 @@ def _solve(play: _Play, tolerance, max_steps, evaluation_sweeps, *, method: str)
 
 def _unfinished(evidence: _Evidence, n: jax.Array, max_steps) -> jax.Array:
     # Where the horizon is not finite no number of sweeps proves anything.
-    return ~evidence.converged & evidence.finite & (n < max_steps)
+    done = evidence.converged | evidence.exhausted
+    return ~done & evidence.finite & (n < max_steps)
 
 
 def _policy_sweeps(play: _Play, horizon, tolerance, max_steps, sweeps):

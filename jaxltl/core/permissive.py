@@ -196,10 +196,13 @@ def _staying(game: Game, region: jax.Array) -> jax.Array:
     return game.available & region[..., None] & forall_successor(game, region)
 
 
+def _wins_somewhere(game: Game, region: jax.Array) -> bool:
+    return bool(np.asarray(region)[np.asarray(game.initial) > 0].any())
+
+
 def _require_start(game: Game, region: jax.Array) -> None:
-    starts = np.argwhere(np.asarray(game.initial) > 0)
-    if not np.asarray(region)[tuple(starts.T)].any():
-        state = starts[0].tolist()
+    if not _wins_somewhere(game, region):
+        state = np.argwhere(np.asarray(game.initial) > 0)[0].tolist()
         name = state[0] if len(state) == 1 else tuple(state)
         raise ValueError(
             "the specification is unrealizable: the environment wins from every initial state, "
@@ -380,7 +383,7 @@ def _by_counter(game, objective, region, stay, bound) -> Permissive:
     joint = _beside(game, delta, 0, letter, "entry")
     late = jnp.arange(2 * bound + 1) == 2 * bound
     return _safe_beside(
-        joint, objective, late, origin,
+        joint, objective, late, bound, origin,
         f"not maximal: it includes every strategy that surely meets the accepting states again "
         f"within {bound} of the system's moves",
     )
@@ -402,7 +405,7 @@ def _by_parity(game, objective, region, stay, bound) -> Permissive:
     spent = jnp.arange(len(delta)) == len(delta) - 1
     counts = ", ".join(f"{cap} of priority {p}" for p, cap in zip(odd, caps, strict=True))
     return _safe_beside(
-        joint, objective, spent, origin,
+        joint, objective, spent, bound, origin,
         ("not maximal: it includes every memoryless winning strategy; " if exact
          else "not maximal: it includes every strategy that keeps to these counts; ")
         + f"between lower even priorities at most {counts} are met",
@@ -442,7 +445,8 @@ def budgets(caps: list[int], num_priorities: int) -> np.ndarray:
 
 
 def _safe_beside(
-    joint: Game, objective: Parity, spent: jax.Array, origin: Restriction | None, reason: str
+    joint: Game, objective: Parity, spent: jax.Array, bound: int | None,
+    origin: Restriction | None, reason: str,
 ) -> Permissive:
     """The strategy that stays where the objective can be achieved without some memory states."""
     # The objective itself still counts: the environment may move for ever where the system
@@ -454,5 +458,15 @@ def _safe_beside(
         num_priorities=objective.num_priorities,
     )
     region = solve(joint, kept).region
-    _require_start(joint, region)
+    if not _wins_somewhere(joint, region):
+        if bound is None:
+            raise ValueError(
+                "the system wins, but chance can put it off any number of times, so that no "
+                "counts hold surely; choose rank for a Buchi objective, or one strategy by "
+                "winning_region."
+            )
+        raise ValueError(
+            f"bound={bound} is too small: the system wins, but not surely within it from any "
+            "initial state; raise it."
+        )
     return _on(joint, region, _staying(joint, region), False, reason, origin)

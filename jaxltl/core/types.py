@@ -20,11 +20,13 @@ class Status(enum.IntEnum):
     CONVERGED = 0
     MAX_STEPS = 1
     NONFINITE = 2
+    PRECISION = 3
 
 
 _REMEDY = {
     Status.MAX_STEPS: "raise max_steps, loosen tolerance, or use float64",
     Status.NONFINITE: "look for NaN or infinity in the reward, the policy or the discount",
+    Status.PRECISION: "rounding alone exceeds the tolerance; loosen it, or use float64",
 }
 
 
@@ -84,9 +86,15 @@ def check(solution: SolutionT) -> SolutionT:
     return solution
 
 
-def status_code(converged: chex.Array, finite: chex.Array) -> jax.Array:
-    """The :class:`Status` of a loop that has ended, as ``int32``."""
-    code = jnp.where(converged, Status.CONVERGED, Status.MAX_STEPS)
+def status_code(
+    converged: chex.Array, finite: chex.Array, exhausted: chex.Array | bool = False
+) -> jax.Array:
+    """The :class:`Status` of a loop that has ended, as ``int32``.
+
+    `exhausted`: whether the bounds are as narrow as rounding lets them be.
+    """
+    code = jnp.where(exhausted, Status.PRECISION, Status.MAX_STEPS)
+    code = jnp.where(converged, Status.CONVERGED, code)
     return jnp.where(finite, code, Status.NONFINITE).astype(jnp.int32)
 
 

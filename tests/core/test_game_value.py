@@ -472,6 +472,10 @@ def test_how_it_ends_when_it_cannot_converge(cases, method):
     assert short.status == Status.MAX_STEPS
     assert short.num_steps == 1
     assert_encloses(short, brute.minimax_value(model, system, reward, 0.9, "move"))
+    single = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, game)
+    vain = minimax_value(single, reward, 0.9, method=method, tolerance=1e-12, max_steps=10_000)
+    assert vain.status == Status.PRECISION
+    assert vain.num_steps < 1000
     for bad in (minimax_value(game, reward, 1.0, method=method),
                 minimax_value(game, reward, -0.5, method=method),
                 minimax_value(game, np.full_like(reward, np.nan), 0.5, method=method)):

@@ -11,6 +11,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.core import objective as goals
 from jaxltl.core.game import Game, make_game
+from jaxltl.core.mdp import make_mdp
 from jaxltl.core.permissive import apply_strategy, budgets, permissive_strategy, shield
 from jaxltl.core.verify import verify
 from jaxltl.core.winning import objective_at, winning_region
@@ -317,8 +318,11 @@ def test_bad_requests_are_refused():
     task = goals.buchi(game, CORNERS, safe="!collision")
     with pytest.raises(ValueError, match=r"unrealizable.*every initial state.*counter_action"):
         permissive_strategy(game, "F collision & G !collision")
-    with pytest.raises(ValueError, match=r"unrealizable"):
+    with pytest.raises(ValueError, match=r"bound=1 is too small.*raise it"):
         permissive_strategy(game, task, method="counter", bound=1)
+    lucky = make_mdp([[[0, 1]], [[0, 0]]], [[[0.5, 0.5]], [[1, 0]]], initial=[1, 0])
+    with pytest.raises(ValueError, match=r"chance can put it off.*choose rank"):
+        permissive_strategy(lucky, goals.buchi(lucky, jnp.array([False, True])), method="parity")
     with pytest.raises(ValueError, match=r'method="stay".*does not win'):
         permissive_strategy(game, task, method="stay")
     with pytest.raises(ValueError, match="choose one of auto, stay"):

@@ -238,6 +238,20 @@ def test_one_step_is_not_enough(name):
         jl.check(solution)
 
 
+@pytest.mark.parametrize(
+    "name", [n for n, s in DISCOUNTED.items() if s.steps and n != "policy_value"])
+def test_an_impossible_tolerance_does_not_use_up_all_steps(name):
+    solver = SOLVERS[name]
+    model, _, inputs = example("product" if solver.kinds == ("product",) else "sparse")
+    inputs = {**inputs, "discount": 0.5}
+    possible = solver.solve(model, inputs)
+    solution = solver.solve(model, inputs, tolerance=0.0)
+    assert solution.status == Status.PRECISION
+    assert solution.num_steps <= possible.num_steps + 60
+    with pytest.raises(jl.NotConverged, match=r"PRECISION.*use float64"):
+        jl.check(solution)
+
+
 def test_one_round_is_not_enough_for_a_long_ring():
     size = 500
     ring = jl.make_mdp((np.arange(size)[:, None, None] + 1) % size, np.ones((size, 1, 1)))
