@@ -13,7 +13,7 @@ from jaxltl.core.bellman import (
     soft_value,
 )
 from jaxltl.core.game import Game, make_game
-from jaxltl.core.game_value import mean_payoff, minimax_value, strategy_value
+from jaxltl.core.game_value import minimax_value, strategy_value
 from jaxltl.core.graph import (
     almost_surely_reaching,
     attractor,
@@ -23,6 +23,7 @@ from jaxltl.core.graph import (
 from jaxltl.core.language import find_difference, is_equivalent
 from jaxltl.core.ltl import Formula, holds_on_lasso, parse_ltl
 from jaxltl.core.mdp import MDP, DenseMDP, from_dense, make_mdp, to_dense
+from jaxltl.core.mean_payoff import mean_payoff
 from jaxltl.core.monitor import Monitor, Verdict, make_monitor, monitor_step, verdict
 from jaxltl.core.objective import (
     GR1,

@@ -30,7 +30,7 @@ LAYERS = [
     {"translate", "graph", "fixed_point", "objective"},
     {"product", "monitor"},
     {"acceptance", "stiff", "bellman", "occupancy", "gr1"},
-    {"reachability", "winning", "game_value"},
+    {"reachability", "winning", "game_value", "mean_payoff"},
     {"verify", "permissive"},
 ]
 
