@@ -21,7 +21,7 @@ def test_the_readme_example_runs():
     assert (names["metrics"].loss[:, -1] < names["metrics"].loss[:, 0]).all()
 
 
-@pytest.mark.exhaustive  # a minute each
+@pytest.mark.notebook
 @pytest.mark.parametrize("path", sorted(ROOT.glob("notebooks/*.ipynb")), ids=lambda p: p.stem)
 def test_a_notebook_runs(path, tmp_path):
     notebook = nbformat.read(path, as_version=4)

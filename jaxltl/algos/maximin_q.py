@@ -36,6 +36,15 @@ from flax import struct
 from jax import lax
 
 from jaxltl.algos import learner
+from jaxltl.algos.play import (
+    check_distributions,
+    check_reward,
+    cumulative,
+    draw,
+    observed_reward,
+    take,
+    uniform,
+)
 from jaxltl.core.game import Game, as_game
 from jaxltl.core.graph import bottom_components
 from jaxltl.core.mdp import MDP
@@ -238,7 +247,7 @@ def make_problem(
     mask = _mask(game, system, allowed)
     start = np.asarray(game.initial if start is None else start, float)
     require_shape("start", start, shape[:1])
-    _check_distributions("start", start[None], np.ones((1, shape[0]), bool))
+    check_distributions("start", start[None], np.ones((1, shape[0]), bool))
     reachable = np.asarray(restrict(game, start, allowed=mask).base_state)
     if method == "maximin":
         _check_alternating(game, system, reachable)
@@ -250,10 +259,10 @@ def make_problem(
         measured = jnp.asarray(default if measured is None else measured, bool)
         require_shape("measured", measured, shape[:1])
     return Problem(
-        game=game, reward=_reward(game, reward), allowed=jnp.asarray(mask),
+        game=game, reward=check_reward(game, reward), allowed=jnp.asarray(mask),
         behavior=jnp.asarray(behavior, game.dtype), start=jnp.asarray(start, game.dtype),
         exact=exact, measured=None if exact is None else measured,
-        behavior_table=jnp.asarray(_alias(behavior)), start_table=jnp.asarray(_cumulative(start)),
+        behavior_table=jnp.asarray(_alias(behavior)), start_table=jnp.asarray(cumulative(start)),
         method=method,
     )
 
@@ -287,58 +296,16 @@ def _mask(game: Game, system: np.ndarray, allowed: Any) -> np.ndarray:
     return np.where(system[:, None], allowed, available)
 
 
-def _reward(game: Game, reward: Any) -> jax.Array:
-    """The checked reward, zero where there is no move; equal successors share one reward."""
-    reward = np.asarray(reward, float)
-    used = np.asarray(game.mdp.probability) > 0
-    if reward.ndim == 2:
-        require_shape("reward", reward, used.shape[:2])
-        used = np.asarray(game.available)
-    else:
-        require_shape("reward", reward, used.shape)
-    wrong = np.argwhere(used & ~np.isfinite(reward))
-    if wrong.size:
-        raise ValueError(
-            f"the reward of state {wrong[0][0]}, action {wrong[0][1]} is "
-            f"{reward[tuple(wrong[0])]}; it must be finite."
-        )
-    reward = np.where(used, reward, 0)
-    if reward.ndim == 3:
-        # Only the successor is seen, not which entry of the list it came from.
-        successor, weight = np.asarray(game.mdp.successor), np.asarray(game.mdp.probability)
-        same = (successor[..., :, None] == successor[..., None, :]) * weight[..., None, :]
-        total = same.sum(-1)
-        mean = (same * reward[..., None, :]).sum(-1) / np.where(total > 0, total, 1)
-        reward = np.where(used, mean, 0)
-    return jnp.asarray(reward, game.dtype)
-
-
 def _behavior(mask: np.ndarray, system: np.ndarray, environment: Any) -> np.ndarray:
     """Uniform over allowed moves, or the environment's rows where it moves."""
-    uniform = mask / np.maximum(mask.sum(-1, keepdims=True), 1)
+    evenly = mask / np.maximum(mask.sum(-1, keepdims=True), 1)
     if environment is None:
-        return uniform
+        return evenly
     environment = np.asarray(environment, float)
     require_shape("environment", environment, mask.shape)
-    rows = np.where(system[:, None], uniform, environment)
-    _check_distributions("environment", rows, mask, system)
+    rows = np.where(system[:, None], evenly, environment)
+    check_distributions("environment", rows, mask, system)
     return rows
-
-
-def _check_distributions(
-    name: str, rows: np.ndarray, support: np.ndarray, skip: np.ndarray | bool = False
-) -> None:
-    bad = ~np.isfinite(rows).all(-1) | (rows < 0).any(-1) | ((rows > 0) & ~support).any(-1)
-    bad |= np.abs(rows.sum(-1) - 1) > 1e-6
-    bad &= ~np.asarray(skip)
-    if bad.any():
-        where = f" of state {int(np.argmax(bad))}" if len(rows) > 1 else ""
-        raise ValueError(
-            f"{name}: the row{where} is no distribution over available moves: entries must be "
-            "at least 0, zero at others, and sum to 1."
-            if len(rows) > 1 else f"{name} is no distribution: entries must be at least 0 and "
-            "sum to 1."
-        )
 
 
 def _check_alternating(game: Game, system: np.ndarray, reachable: np.ndarray) -> None:
@@ -389,14 +356,6 @@ def _alias(rows: np.ndarray) -> np.ndarray:
     return (threshold << 8 | alias).astype(np.uint32)
 
 
-def _cumulative(distribution: np.ndarray) -> np.ndarray:
-    """``uint32[S]``, cumulative weights in units of ``2 ** -31``."""
-    total = np.rint(np.cumsum(distribution) * 2.0**31)
-    last = np.flatnonzero(distribution > 0)[-1]
-    total[last:] = 2.0**31
-    return np.minimum(total, 2.0**31).astype(np.uint32)
-
-
 # --- the learner ----------------------------------------------------------------------------
 
 
@@ -422,7 +381,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     return State(
         key=key, step=jnp.int32(0), q=q, visits=jnp.zeros(q.shape, jnp.int32),
         value=value(q, problem), residual=jnp.asarray(jnp.inf, dtype), violations=jnp.int32(0),
-        position=_draw_start(problem, words),
+        position=draw(problem.start_table, words),
         pending=jnp.full(hparams.num_chains, -1, jnp.int32) if waiting else None,
         held=jnp.zeros(hparams.num_chains, dtype) if waiting else None,
     )
@@ -448,7 +407,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     stream = (words[0], words[1] | 1)
     table = _Table(
         state.q.ravel(), state.visits.ravel(), state.position,
-        _take(problem.game.system, state.position), state.pending, state.held, state.violations,
+        take(problem.game.system, state.position), state.pending, state.held, state.violations,
     )
     move = partial(_move, problem, hparams, _epsilons(state.step, hparams), stream, chance)
     count = jnp.arange(hparams.moves_per_step, dtype=jnp.uint32)
@@ -598,12 +557,12 @@ def _move(problem, hparams, epsilons, stream, chance, table: _Table, i: jax.Arra
     action = _choose(problem, epsilons, stream, table, i)
     pair = source * num_actions + action
     violations = table.violations + jnp.sum(
-        ~_take(problem.allowed.ravel(), pair), dtype=jnp.int32)
+        ~take(problem.allowed.ravel(), pair), dtype=jnp.int32)
     target = _sample(game, jax.random.fold_in(chance, i), source, action)
-    reward = _observed(problem, source, action, target)
+    reward = observed_reward(game, problem.reward, source, action, target)
     discount = jnp.asarray(hparams.discount, table.q.dtype)
     after = discount if hparams.per == "move" else jnp.ones_like(discount)
-    whose = _take(game.system, target)
+    whose = take(game.system, target)
     ahead = _value_at(problem, table.q, target, whose)
     if problem.method == "generalized":
         mine = system.astype(discount.dtype)
@@ -624,10 +583,10 @@ def _learn(hparams, q, visits, entry, aim, mode) -> tuple[jax.Array, jax.Array]:
     if hparams.step_size is None:
         # Without chance all chains at one entry aim at the same number.
         return q.at[entry].set(aim, mode=mode), visits.at[entry].add(1, mode=mode)
-    before = _take(visits, jnp.minimum(entry, q.size - 1))
-    old = _take(q, jnp.minimum(entry, q.size - 1))
+    before = take(visits, jnp.minimum(entry, q.size - 1))
+    old = take(q, jnp.minimum(entry, q.size - 1))
     visits = visits.at[entry].add(1, mode=mode)
-    together = (_take(visits, jnp.minimum(entry, q.size - 1)) - before).astype(q.dtype)
+    together = (take(visits, jnp.minimum(entry, q.size - 1)) - before).astype(q.dtype)
     size = jnp.asarray(hparams.step_size, q.dtype)
     if hparams.step_power is not None:
         size = size * (1 + before.astype(q.dtype)) ** -jnp.asarray(hparams.step_power, q.dtype)
@@ -640,27 +599,27 @@ def _choose(problem, epsilons, stream, table: _Table, i) -> jax.Array:
     num_actions = problem.game.num_actions
     word = (_word(stream, 2 * i) >> 8) * jnp.uint32(num_actions)
     slot = (word >> _BITS).astype(jnp.int32)
-    entry = _take(problem.behavior_table.ravel(), table.position * num_actions + slot)
+    entry = take(problem.behavior_table.ravel(), table.position * num_actions + slot)
     alias = (entry & 0xFF).astype(jnp.int32)
     action = jnp.where((word & (2**_BITS - 1)) < entry >> 8, slot, alias)
     if epsilons == (None, None):
         return action
     best, known = _best(problem, table)
-    uniform = _uniform(_word(stream, 2 * i + 1), table.q.dtype)
+    chance = uniform(_word(stream, 2 * i + 1), table.q.dtype)
     mine, theirs = (jnp.inf if e is None else e for e in epsilons)
-    return jnp.where(known & (uniform >= jnp.where(table.system, mine, theirs)), best, action)
+    return jnp.where(known & (chance >= jnp.where(table.system, mine, theirs)), best, action)
 
 
 def _best(problem, table: _Table) -> tuple[jax.Array, jax.Array]:
     """Each chain's greedy action, and whether the table knows one there."""
     num_actions, system = problem.game.num_actions, table.system[:, None]
     if problem.method == "generalized":
-        row = _take(table.q.reshape(-1, num_actions), table.position)
+        row = take(table.q.reshape(-1, num_actions), table.position)
         known = jnp.ones(table.position.shape, bool)
     else:
         q = table.q.reshape(-1, num_actions, num_actions)
-        answers = _take(q.reshape(-1, num_actions), jnp.maximum(table.pending, 0))
-        row = jnp.where(system, _take(q, table.position).min(-1), answers)
+        answers = take(q.reshape(-1, num_actions), jnp.maximum(table.pending, 0))
+        row = jnp.where(system, take(q, table.position).min(-1), answers)
         known = table.system | (table.pending >= 0)
     return action_argmax(jnp.where(system, row, -row), jnp.bool_(True))[1], known
 
@@ -672,14 +631,14 @@ def _value_at(problem, q, state, system) -> jax.Array:
     """
     num_actions = problem.game.num_actions
     if problem.method == "maximin":
-        block = _take(q.reshape(-1, num_actions, num_actions), state)
+        block = take(q.reshape(-1, num_actions, num_actions), state)
         return _finite(_reduce(jnp.maximum, _reduce(jnp.minimum, block)))
     sign = 2 * system.astype(q.dtype) - 1
     if num_actions > _WRITTEN_OUT:
-        return sign * jnp.max(sign[:, None] * _take(q.reshape(-1, num_actions), state), axis=-1)
-    best = sign * _take(q, state * num_actions)
+        return sign * jnp.max(sign[:, None] * take(q.reshape(-1, num_actions), state), axis=-1)
+    best = sign * take(q, state * num_actions)
     for a in range(1, num_actions):
-        best = jnp.maximum(best, sign * _take(q, state * num_actions + a))
+        best = jnp.maximum(best, sign * take(q, state * num_actions + a))
     return sign * best
 
 
@@ -691,34 +650,17 @@ def _sample(game: Game, key, state, action) -> jax.Array:
     return jax.vmap(sample_successor, (None, 0, 0, 0))(game, keys, state, action)
 
 
-def _observed(problem, state, action, successor) -> jax.Array:
-    """The rewards of the transitions made, and of no others."""
-    num_actions, width = problem.game.num_actions, problem.game.num_successors
-    pair = state * num_actions + action
-    if problem.reward.ndim == 2:
-        return _take(problem.reward.ravel(), pair)
-    mdp = problem.game.mdp
-    listed = mdp.successor[state, action] == successor[:, None]
-    k = jnp.argmax(listed & (mdp.probability[state, action] > 0), axis=-1).astype(jnp.int32)
-    return _take(problem.reward.ravel(), pair * width + k)
-
-
 def _restart(key, state: State, problem, hparams) -> State:
     """Some chains start anew, and forget a move that waits for its answer."""
-    def draw(position, pending):
+    def redraw(position, pending):
         words = jax.random.bits(key, (2, hparams.num_chains), jnp.uint32)
-        anew = _uniform(words[0], state.value.dtype) < hparams.restart
+        anew = uniform(words[0], state.value.dtype) < hparams.restart
         pending = None if pending is None else jnp.where(anew, -1, pending)
-        return jnp.where(anew, _draw_start(problem, words[1]), position), pending
+        return jnp.where(anew, draw(problem.start_table, words[1]), position), pending
 
     position, pending = lax.cond(
-        jnp.asarray(hparams.restart) > 0, draw, lambda *x: x, state.position, state.pending)
+        jnp.asarray(hparams.restart) > 0, redraw, lambda *x: x, state.position, state.pending)
     return replace(state, position=position, pending=pending)
-
-
-def _draw_start(problem, words) -> jax.Array:
-    found = jnp.searchsorted(problem.start_table, words >> 1, side="right")
-    return found.astype(jnp.int32)
 
 
 def _epsilons(step, hparams) -> tuple[Any, Any]:
@@ -743,11 +685,6 @@ def _word(stream, i) -> jax.Array:
     x = (x ^ (x >> 16)) * jnp.uint32(0x7FEB352D)
     x = (x ^ (x >> 15)) * jnp.uint32(0x846CA68B)
     return x ^ (x >> 16)
-
-
-def _uniform(word, dtype) -> jax.Array:
-    """24 random bits as a number in [0, 1)."""
-    return (word >> 8).astype(dtype) / 2.0**24
 
 
 def _answers(problem: Problem) -> jax.Array:
@@ -788,7 +725,3 @@ def _reduce(function, x: jax.Array) -> jax.Array:
     for i in range(1, x.shape[-1]):
         result = function(result, x[..., i])
     return result
-
-
-def _take(x: jax.Array, index: jax.Array) -> jax.Array:
-    return x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
