@@ -29,7 +29,7 @@ LAYERS = [
     {"game", "rollout", "language", "trackers"},
     {"translate", "graph", "fixed_point", "objective"},
     {"product", "monitor"},
-    {"acceptance", "stiff", "bellman", "occupancy", "gr1"},
+    {"acceptance", "stiff", "bellman", "occupancy", "gr1", "pac", "span_iteration"},
     {"reachability", "winning", "game_value", "mean_payoff"},
     {"verify", "permissive"},
 ]

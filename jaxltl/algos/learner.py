@@ -83,6 +83,41 @@ def train(
     return run(step, state, problem, hparams, num_steps=num_steps, max_rows=max_rows)
 
 
+def while_active(
+    active: Callable[..., Any], body: Callable[..., Any], carry: Any, given: Any
+) -> Any:
+    """``while active(carry, given): carry = body(carry, given)``, cheap under ``vmap``.
+
+    A vmapped ``lax.while_loop`` copies all of a finished lane's arrays in every pass to keep
+    them as they are. Here `body` promises to leave a finished lane as it is, so that an
+    entry that it writes is all that is touched.
+
+    Args:
+      active: whether a lane goes on, ``bool[]``.
+      body: changes nothing in a lane that does not.
+      carry, given: what changes and what does not.
+    """
+    carry, given = jax.tree.map(jnp.asarray, (carry, given))
+
+    @jax.custom_batching.custom_vmap
+    def loop(carry: Any, given: Any) -> Any:
+        return lax.while_loop(lambda c: active(c, given), lambda c: body(c, given), carry)
+
+    @loop.def_vmap
+    def _(size: int, batched: Any, carry: Any, given: Any) -> Any:
+        lanes, shared = batched
+        carry = jax.tree.map(
+            lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape)), carry, lanes)
+        axes = (0, jax.tree.map(lambda b: 0 if b else None, shared))
+        found = lax.while_loop(
+            lambda c: jnp.any(jax.vmap(active, axes)(c, given)),
+            lambda c: jax.vmap(body, axes)(c, given), carry,
+        )
+        return found, jax.tree.map(lambda _: True, lanes)
+
+    return loop(carry, given)
+
+
 def run_in_chunks(
     step: Step,
     state: Any,

@@ -41,6 +41,7 @@ from jaxltl.algos.play import (
     check_reward,
     cumulative,
     draw,
+    mixed_bits,
     observed_reward,
     take,
     uniform,
@@ -597,7 +598,7 @@ def _learn(hparams, q, visits, entry, aim, mode) -> tuple[jax.Array, jax.Array]:
 def _choose(problem, epsilons, stream, table: _Table, i) -> jax.Array:
     """Each chain's action: greedy with the probability of its player, else by behaviour."""
     num_actions = problem.game.num_actions
-    word = (_word(stream, 2 * i) >> 8) * jnp.uint32(num_actions)
+    word = (mixed_bits(stream, 2 * i) >> 8) * jnp.uint32(num_actions)
     slot = (word >> _BITS).astype(jnp.int32)
     entry = take(problem.behavior_table.ravel(), table.position * num_actions + slot)
     alias = (entry & 0xFF).astype(jnp.int32)
@@ -605,7 +606,7 @@ def _choose(problem, epsilons, stream, table: _Table, i) -> jax.Array:
     if epsilons == (None, None):
         return action
     best, known = _best(problem, table)
-    chance = uniform(_word(stream, 2 * i + 1), table.q.dtype)
+    chance = uniform(mixed_bits(stream, 2 * i + 1), table.q.dtype)
     mine, theirs = (jnp.inf if e is None else e for e in epsilons)
     return jnp.where(known & (chance >= jnp.where(table.system, mine, theirs)), best, action)
 
@@ -672,19 +673,6 @@ def _epsilons(step, hparams) -> tuple[Any, Any]:
         return jnp.maximum(decayed, hparams.epsilon_min)
 
     return at(hparams.epsilon), at(hparams.environment_epsilon)
-
-
-def _word(stream, i) -> jax.Array:
-    """The i-th 32 random bits of each chain: a Weyl sequence, mixed.
-
-    The construction of SplitMix (Steele, Lea and Flood 2014) with a 32-bit mixer. It is
-    several times cheaper than a keyed hash for each move, and starts afresh from the key
-    at every step.
-    """
-    x = stream[0] + stream[1] * i
-    x = (x ^ (x >> 16)) * jnp.uint32(0x7FEB352D)
-    x = (x ^ (x >> 15)) * jnp.uint32(0x846CA68B)
-    return x ^ (x >> 16)
 
 
 def _answers(problem: Problem) -> jax.Array:

@@ -1,0 +1,840 @@
+"""PAC learning inside the almost-sure winning region (dissertation, chapter 6, algorithm 5).
+
+The graph of a stochastic game is known, its probabilities and rewards are not. The learner
+stays in the almost-surely winning region and at every moment plays a strategy that wins
+almost surely: with a small probability any move of the region, else a move that is near-optimal
+in an optimistic model (Brafman and Tennenholtz 2002). A pair of a state and a move becomes
+known after enough visits; then its frequencies and observed rewards enter the model, and the
+model is solved anew, from the last values.
+
+The true game is touched through ``sample_successor`` and the rewards of the transitions made
+only. Shapes are written for the S states of ``problem.game``; states outside the region stay
+where they are and are never entered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.algos import learner
+from jaxltl.algos.play import (
+    check_distributions,
+    check_reward,
+    cumulative,
+    draw,
+    mixed_bits,
+    observed_reward,
+    successor_slot,
+    take,
+    uniform,
+)
+from jaxltl.core import pac
+from jaxltl.core.automaton import Automaton
+from jaxltl.core.game import Game, as_game
+from jaxltl.core.game_value import minimax_value, strategy_value
+from jaxltl.core.graph import attractor
+from jaxltl.core.ltl import Formula
+from jaxltl.core.mdp import MDP
+from jaxltl.core.objective import Parity, buchi
+from jaxltl.core.operators import forall_successor, sample_successor
+from jaxltl.core.product import restrict
+from jaxltl.core.span_iteration import span_iteration
+from jaxltl.core.types import Solution, require_shape, status_code
+from jaxltl.core.winning import objective_at, solve, task_game
+
+UPDATES = ("every", "printed")
+
+
+@struct.dataclass
+class Problem:
+    """A game with a task and a reward; made by :func:`make_problem`.
+
+    Attributes:
+      game: the explicit game that is played; equal successors of a move are merged.
+      reward: ``float[S, A]`` or ``[S, A, K]``, seen one transition at a time.
+      accepting: ``bool[S]``, to be met infinitely often.
+      region: ``bool[S]``, from where the system wins almost surely.
+      allowed: ``bool[S, A]``, the moves that surely stay in the region; none outside.
+      environment: ``float[S, A]``, how the environment plays.
+      start: ``float[S]``, where runs start; `start_table` the same for drawing.
+      base_state, memory: ``int32[S]``, which state of the given game with which state of the
+        task's automaton each state is.
+    """
+
+    game: Game
+    reward: jax.Array
+    accepting: jax.Array
+    region: jax.Array
+    allowed: jax.Array
+    environment: jax.Array
+    start: jax.Array
+    start_table: jax.Array
+    base_state: jax.Array
+    memory: jax.Array
+
+
+@struct.dataclass
+class Hparams:
+    """What is asked for, and how to learn. Numbers are traced; None is static.
+
+    Attributes:
+      discount: in (0, 1), paid by every move.
+      reward_bound: R_max; rewards lie in [0, R_max].
+      epsilon: how far from optimal the strategy may end.
+      failure: delta_c, the probability with which it may end further.
+      known_after: visits after which a pair of several successors is known. None: the K of
+        the theorem, which is out of reach for all but toys; with a number the theorem's
+        guarantee is void, and what remains is the evidence of :func:`evidence`.
+      restart: the probability with which a run starts anew before a move.
+      update: ``"every"`` observed reward enters the model; ``"printed"``: as algorithm 5 has it
+        in line 16, only that of a pair's last successor before it is known, which is wrong
+        where a move has several successors; static.
+      moves_per_step: a step ends when something new is known, or after this many moves; static.
+    """
+
+    discount: jax.Array | float
+    reward_bound: jax.Array | float
+    epsilon: jax.Array | float
+    failure: jax.Array | float = 0.1
+    known_after: jax.Array | int | None = None
+    restart: jax.Array | float = 0.0
+    update: str = struct.field(pytree_node=False, default="every")
+    moves_per_step: int = struct.field(pytree_node=False, default=128)
+
+
+@struct.dataclass
+class State:
+    """What has been seen, and what is made of it.
+
+    Attributes:
+      key: of the whole run.
+      step: steps made.
+      moves: moves made.
+      position: ``int32[]``, the state of the game.
+      counts: ``int32[S, A, K]``, how often each transition was seen until its pair was known;
+        from then on, whether it was seen at all.
+      reward: ``float[S, A, K]``, the rewards seen; ``R_max / (1 - discount)`` at others.
+      known_at: ``int32[S, A]``, the number of moves after which a pair was known; -1 before.
+      probability, gain: ``float[S, A, K]`` and ``[S, A]``, transitions and expected rewards of
+        the optimistic model.
+      value: ``float[S]``, its value.
+      best: ``bool[S, A]``, the moves that the strategy prefers.
+      error: how far `value` may be from the model's, up to a constant.
+      last_update: the number of moves after which the strategy was last computed.
+      num_updates: how often it was.
+      always_almost_sure: whether every strategy so far made each move of the region with positive
+        probability, so that it wins almost surely (lemma 6).
+      fault: the first pair ``s * A + a`` with a reward outside [0, R_max]; -1 if there is none.
+    """
+
+    key: jax.Array
+    step: jax.Array
+    moves: jax.Array
+    position: jax.Array
+    counts: jax.Array
+    reward: jax.Array
+    known_at: jax.Array
+    probability: jax.Array
+    gain: jax.Array
+    value: jax.Array
+    best: jax.Array
+    error: jax.Array
+    last_update: jax.Array
+    num_updates: jax.Array
+    always_almost_sure: jax.Array
+    fault: jax.Array
+
+
+@struct.dataclass
+class Metrics:
+    """Figures after a step.
+
+    Attributes:
+      moves, num_known, last_update, num_updates: so far.
+      value: of the optimistic model at the start.
+      always_almost_sure, fault: see :class:`State`.
+    """
+
+    moves: jax.Array
+    num_known: jax.Array
+    last_update: jax.Array
+    num_updates: jax.Array
+    value: jax.Array
+    always_almost_sure: jax.Array
+    fault: jax.Array
+
+
+@struct.dataclass
+class Learned:
+    """What :func:`train_until` ends with; ``check`` accepts it.
+
+    Attributes:
+      state, metrics: at the end.
+      residual: ``state.error``.
+      num_steps: steps made by this run.
+      status: CONVERGED if the strategy rested for as long as was asked.
+    """
+
+    state: State
+    metrics: Metrics
+    residual: jax.Array
+    num_steps: jax.Array
+    status: jax.Array
+
+
+@struct.dataclass
+class Evidence:
+    """What is known of a learned strategy in the true game; made by :func:`evidence`.
+
+    Attributes:
+      strategy: ``float[S, A]``, of the system.
+      almost_sure: whether it wins almost surely from every state of the region, by the graph.
+      optimal: the best that any strategy in the region secures.
+      worst: what this one secures against every environment.
+      met: its value against the environment that was played.
+      epsilon_optimal: ``bool[S]``, where `worst` is certified to be within epsilon of `optimal`.
+      epsilon_optimal_met: the same for `met`, which is what theorem 6 promises: moves that the
+        environment never makes stay unknown, so that `worst` can stay low.
+      reachable: ``bool[S]``, the states of the region that can be reached from the start.
+      known_at: ``int32[S, A]``, see :class:`State`.
+    """
+
+    strategy: jax.Array
+    almost_sure: jax.Array
+    optimal: Solution
+    worst: Solution
+    met: Solution
+    epsilon_optimal: jax.Array
+    epsilon_optimal_met: jax.Array
+    reachable: jax.Array
+    known_at: jax.Array
+
+
+# --- problems, on the host ------------------------------------------------------------------
+
+
+def make_problem(
+    game: Any,
+    spec: chex.Array | Parity | Automaton | Formula | str,
+    reward: chex.Array,
+    *,
+    environment: chex.Array | str = "random",
+    discount: float | None = None,
+    start: chex.Array | None = None,
+) -> Problem:
+    """A checked :class:`Problem`: the task's automaton beside the game, and the region.
+
+    Args:
+      game: a Game, or an MDP, in which the system always moves.
+      spec: states ``bool[S]`` or an objective to be met infinitely often; or a formula or an
+        automaton, which is put beside the game (read when a state is left). It has to be
+        a deterministic Buchi condition, or weaker.
+      reward: ``float[S, A]`` or ``float[S, A, K]`` on the given game; both players' moves count.
+      environment: ``"random"``; ``"adversarial"``: optimal against an optimal system, which
+        takes the `discount`; or a policy ``int32[S]`` or ``float[S, A]`` on the given game.
+      discount: for the adversarial environment only.
+      start: ``float[S]``, on the given game; default its initial distribution.
+
+    Returns:
+      The problem. Of a game with an automaton beside it only states that can be reached are kept.
+
+    Raises:
+      ValueError: a wrong shape; an environment or a start that is no distribution; a reward
+        that is not finite; a task that is no Buchi condition; or a start outside the region.
+
+    Example:
+      >>> from jaxltl.core.mdp import from_dense
+      >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[1.0, 0], [1.0, 0]]],
+      ...                    label=[[0], [1]], propositions=["home"], initial=[1, 0])
+      >>> problem = make_problem(world, "G F home", [[1.0, 0.0], [0.0, 0.0]])
+      >>> problem.region.tolist()
+      [True, True]
+      >>> hparams = Hparams(discount=0.5, reward_bound=1.0, epsilon=0.1)
+      >>> learned = train_until(jax.random.key(0), problem, hparams, quiet=1000)
+      >>> sure = evidence(learned.state, problem, hparams)
+      >>> bool(sure.almost_sure), sure.epsilon_optimal.all().tolist()
+      (True, True)
+    """
+    game = as_game(game)
+    reward = _shaped_reward(game, reward)
+    start = np.asarray(game.initial if start is None else start, float)
+    require_shape("start", start, (game.num_states,))
+    check_distributions("start", start[None], np.ones((1, game.num_states), bool))
+    played, accepting, origin = _joint(game, spec, start)
+    base, memory = origin
+    played, reward = _merged(played, reward[base])
+    objective = buchi(played, jnp.asarray(accepting))
+    region = solve(played, objective).region
+    _require_start(played, region, base, memory)
+    closed = played.available & region[:, None]
+    allowed = closed & (~played.system[:, None] | forall_successor(played, region))
+    rows = _environment(game, base, played, reward, allowed, environment, discount)
+    return Problem(
+        game=played, reward=reward, accepting=jnp.asarray(accepting), region=region,
+        allowed=allowed, environment=jnp.asarray(rows, played.dtype), start=played.initial,
+        start_table=jnp.asarray(cumulative(np.asarray(played.initial, float))),
+        base_state=jnp.asarray(base, jnp.int32), memory=jnp.asarray(memory, jnp.int32),
+    )
+
+
+def _shaped_reward(game: Game, reward: Any) -> np.ndarray:
+    if not isinstance(game.mdp, MDP):
+        raise ValueError(
+            f"the game's model is a {type(game.mdp).__name__}; learning plays in an explicit MDP: "
+            "pass restrict(game).model, or convert it."
+        )
+    reward = np.asarray(reward, float)
+    shape = game.mdp.probability.shape
+    require_shape("reward", reward, shape if reward.ndim == 3 else shape[:2])
+    return reward
+
+
+def _joint(game: Game, spec: Any, start: np.ndarray):
+    """The explicit game of the task, its accepting states, and whose states they are."""
+    game = Game(game.mdp.replace(initial=jnp.asarray(start, game.dtype)), game.system)
+    own = np.arange(game.num_states)
+    if not isinstance(spec, Parity | Automaton | Formula | str):
+        accepting = np.asarray(spec)
+        require_shape("spec", accepting, (game.num_states,))
+        return game, accepting.astype(bool), (own, np.zeros_like(own))
+    if isinstance(spec, Parity):
+        return game, _accepting(spec), (own, np.zeros_like(own))
+    joint, objective = task_game(game, spec)
+    found = restrict(joint)
+    base, memory = np.asarray(found.base_state), np.asarray(found.memory)
+    number = base * joint.state_shape[1] + memory
+    accepting = _accepting(objective_at(objective, jnp.asarray(number)))
+    return found.model, accepting, (base, memory)
+
+
+def _accepting(objective: Parity) -> np.ndarray:
+    """States to be met infinitely often: those of priority 0, and those that have won."""
+    if objective.num_priorities > 2:
+        raise ValueError(
+            f"the task needs {objective.num_priorities} priorities, and only conditions met by "
+            "visiting states infinitely often can be learned; strengthen it, for example to G F."
+        )
+    won = np.asarray(objective.won)
+    return ((np.asarray(objective.priority) == 0) | won) & ~np.asarray(objective.lost)
+
+
+def _merged(game: Game, reward: np.ndarray) -> tuple[Game, jax.Array]:
+    """The game with each successor of a move once, for only successors are seen."""
+    observed = check_reward(game, reward)
+    successor, weight = np.asarray(game.mdp.successor), np.asarray(game.mdp.probability)
+    same = (successor[..., :, None] == successor[..., None, :]) & (weight[..., None, :] > 0)
+    first = same.argmax(-1) == np.arange(successor.shape[-1])
+    merged = np.where(first & (weight > 0), (same * weight[..., None, :]).sum(-1), 0)
+    mdp = game.mdp.replace(
+        successor=jnp.asarray(np.where(merged > 0, successor, 0), jnp.int32),
+        probability=jnp.asarray(merged, game.dtype),
+    )
+    return Game(mdp, game.system), observed
+
+
+def _require_start(game: Game, region: jax.Array, base: np.ndarray, memory: np.ndarray) -> None:
+    outside = np.flatnonzero((np.asarray(game.initial) > 0) & ~np.asarray(region))
+    if outside.size == 0:
+        return
+    named = ", ".join(
+        f"{base[i]}" + (f" (automaton state {memory[i]})" if memory.any() else "")
+        for i in outside[:5]
+    ) + (", ..." if outside.size > 5 else "")
+    raise ValueError(
+        f"{outside.size} of the states where runs start lie outside of the almost-surely winning "
+        f"region: {named}. From there the environment can keep the accepting states from being "
+        "met again, with positive probability (winning_region(...).counter_action shows how); "
+        "start elsewhere, or weaken the task."
+    )
+
+
+def _environment(game, base, played, reward, allowed, environment, discount) -> np.ndarray:
+    """How the environment plays, one row a state; zero at the system's states."""
+    mask = np.asarray(played.available)
+    system = np.asarray(played.system)
+    if isinstance(environment, str):
+        if environment == "random":
+            rows = mask / np.maximum(mask.sum(-1, keepdims=True), 1)
+        elif environment == "adversarial" and discount is not None:
+            found = minimax_value(played, reward, discount, allowed=allowed)
+            rows = np.eye(mask.shape[1])[np.asarray(found.policy)]
+        else:
+            raise ValueError(
+                f"environment={environment!r}; choose random, adversarial (with discount=), or "
+                "give a policy."
+            )
+        return np.where(system[:, None], 0, rows)
+    environment = np.asarray(environment)
+    if environment.ndim == 1:
+        require_shape("environment", environment, (game.num_states,))
+        environment = np.eye(mask.shape[1])[environment]
+    require_shape("environment", environment, game.available.shape)
+    rows = environment[base]
+    check_distributions("environment", rows, mask, system)
+    return np.where(system[:, None], 0, rows)
+
+
+# --- the learner ----------------------------------------------------------------------------
+
+
+@jax.jit
+def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """Nothing known: every unknown move is taken to pay ``R_max / (1 - discount)`` for ever.
+
+    Raises:
+      ValueError: an unknown `update`, or steps without moves.
+    """
+    _check(hparams)
+    game, shape = problem.game, problem.game.mdp.probability.shape
+    listed = game.mdp.probability > 0
+    bound = jnp.asarray(_bound(hparams), game.dtype)
+    gain = jnp.where(problem.allowed, bound, 0)
+    value = jnp.where(problem.region, bound / (1 - hparams.discount), 0)
+    # Steps fold in their own numbers, which stay below this one.
+    word = jax.random.bits(jax.random.fold_in(key, 0xFFFFFFFF), (), jnp.uint32)
+    return State(
+        key=key, step=jnp.int32(0), moves=jnp.int32(0), position=draw(problem.start_table, word),
+        counts=jnp.zeros(shape, jnp.int32), reward=jnp.full(shape, bound, game.dtype),
+        known_at=jnp.full(shape[:2], -1, jnp.int32),
+        probability=listed / jnp.maximum(listed.sum(-1, keepdims=True), 1).astype(game.dtype),
+        gain=gain, value=value.astype(game.dtype),
+        best=problem.allowed & game.system[:, None], error=jnp.zeros((), game.dtype),
+        last_update=jnp.int32(0), num_updates=jnp.int32(0), always_almost_sure=jnp.bool_(True),
+        fault=jnp.int32(-1),
+    )
+
+
+def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """Moves until something new is known, at most ``moves_per_step``, and then the new strategy.
+
+    Under ``vmap`` every lane goes on to its next update, and then one solve serves all.
+    """
+    _check(hparams)
+    state = _advance(state, problem, hparams, jnp.int32(hparams.moves_per_step))
+    return state, measure(state, problem)
+
+
+run = partial(learner.run, step)
+train = partial(learner.train, init, step)
+
+
+def measure(state: State, problem: Problem) -> Metrics:
+    """The :class:`Metrics` of a state."""
+    return Metrics(
+        moves=state.moves,
+        num_known=jnp.sum(state.known_at >= 0, dtype=jnp.int32),
+        last_update=state.last_update, num_updates=state.num_updates,
+        value=jnp.sum(problem.start * state.value),
+        always_almost_sure=state.always_almost_sure, fault=state.fault,
+    )
+
+
+@jax.jit
+def run_until(
+    state: State,
+    problem: Problem,
+    hparams: Hparams,
+    *,
+    quiet: jax.Array | int,
+    max_moves: jax.Array | int = 10_000_000,
+) -> Learned:
+    """Steps until the strategy has rested for `quiet` moves.
+
+    Args:
+      state: where to go on from.
+      problem, hparams: as for :func:`step`.
+      quiet: moves without an update after which the run ends.
+      max_moves: moves at most, of the whole run.
+
+    Returns:
+      :class:`Learned`.
+    """
+    _check(hparams)
+    first = state.step
+
+    def left(state: State, limits: Any) -> jax.Array:
+        quiet, most = limits
+        rest = jnp.minimum(quiet - (state.moves - state.last_update), most - state.moves)
+        return jnp.maximum(rest, 0)
+
+    def body(state: State, given: Any) -> State:
+        problem, hparams, limits = given
+        moves = jnp.minimum(left(state, limits), hparams.moves_per_step)
+        return _advance(state, problem, hparams, moves)
+
+    limits = (jnp.asarray(quiet, jnp.int32), jnp.asarray(max_moves, jnp.int32))
+    state = learner.while_active(
+        lambda s, given: left(s, given[2]) > 0, body, state, (problem, hparams, limits))
+    done = state.moves - state.last_update >= limits[0]
+    return Learned(
+        state=state, metrics=measure(state, problem), residual=state.error,
+        num_steps=state.step - first, status=status_code(done, jnp.isfinite(state.error)),
+    )
+
+
+def train_until(
+    key: chex.PRNGKey,
+    problem: Problem,
+    hparams: Hparams,
+    *,
+    quiet: jax.Array | int,
+    max_moves: jax.Array | int = 10_000_000,
+) -> Learned:
+    """:func:`run_until` from a fresh state."""
+    state = init(key, problem, hparams)
+    return run_until(state, problem, hparams, quiet=quiet, max_moves=max_moves)
+
+
+def strategy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """The system's strategy, ``float[S, A]``: Remark 4 of section 6.5.2; zero elsewhere."""
+    allowed = problem.allowed & problem.game.system[:, None]
+    return pac.hat_strategy(state.best, allowed, _exploration(problem, hparams))
+
+
+def observe(
+    state: State,
+    problem: Problem,
+    hparams: Hparams,
+    action: int,
+    successor: int,
+    reward: float,
+) -> State:
+    """One move of a world outside, seen by the learner; on the host.
+
+    Whoever moves at ``state.position`` has made it; the system's moves are drawn from
+    ``strategy(state, problem, hparams)[state.position]``.
+
+    Raises:
+      ValueError: the move is not allowed there, the successor is not in the graph, or the
+        reward lies outside [0, R_max]. The state is then unchanged.
+    """
+    game, s = problem.game, int(state.position)
+    if not 0 <= action < game.num_actions or not bool(problem.allowed[s, action]):
+        moves = np.flatnonzero(np.asarray(problem.allowed[s])).tolist()
+        raise ValueError(f"state {s}: action {action} leaves the region; choose one of {moves}.")
+    used = np.asarray(game.mdp.probability[s, action]) > 0
+    listed = np.asarray(game.mdp.successor[s, action])[used]
+    if successor not in listed:
+        raise ValueError(
+            f"state {s}, action {action}: successor {successor} is not in the given graph, which "
+            f"has {listed.tolist()}. Without the true graph nothing is guaranteed: mend the model."
+        )
+    if not 0 <= reward <= float(hparams.reward_bound):
+        raise ValueError(_outside(s, action, hparams, f"{reward:g}"))
+    return _observe(state, problem, hparams, action, successor, reward)
+
+
+@jax.jit
+def _observe(state, problem, hparams, action, successor, reward) -> State:
+    walk = _walk_from(state, jnp.int32(1))
+    seen = _Seen(state.position, jnp.int32(action), jnp.int32(successor),
+                 jnp.asarray(reward, problem.game.dtype))
+    rules = _rules(state, problem, hparams)
+    walk = _record(walk, seen, rules, jnp.bool_(True))
+    if problem.game.num_successors == 1:
+        walk = _noted(walk, rules, walk.known, jnp.bool_(False))
+    return _updated(state, walk, problem, hparams)
+
+
+def evidence(state: State, problem: Problem, hparams: Hparams) -> Evidence:
+    """What the strategy of a state is worth in the true game, certified; on the host.
+
+    Raises:
+      ValueError: a reward outside [0, R_max] was observed, which voids every guarantee.
+    """
+    fault = int(state.fault)
+    if fault >= 0:
+        s, a = divmod(fault, problem.game.num_actions)
+        raise ValueError(_outside(s, a, hparams, f"{float(jnp.max(problem.reward[s, a])):g}"))
+    play, game = strategy(state, problem, hparams), problem.game
+    value = partial(strategy_value, _inside(problem), play, problem.reward, hparams.discount)
+    worst, met = value(), value(environment=problem.environment)
+    optimal = minimax_value(game, problem.reward, hparams.discount, allowed=problem.allowed)
+    near = partial(pac.epsilon_optimal_states, optimal, epsilon=hparams.epsilon)
+    reached = restrict(game, problem.start, allowed=problem.allowed).base_state
+    return Evidence(
+        strategy=play, almost_sure=wins_almost_surely(problem, play), optimal=optimal,
+        worst=worst, met=met, epsilon_optimal=near(worst) & problem.region,
+        epsilon_optimal_met=near(met) & problem.region,
+        reachable=jnp.zeros(game.num_states, bool).at[reached].set(True),
+        known_at=state.known_at,
+    )
+
+
+@jax.jit
+def wins_almost_surely(problem: Problem, play: jax.Array) -> jax.Array:
+    """Whether a memoryless strategy wins almost surely from every state of the region.
+
+    On the graph: it never leaves the region, and from each of its states an accepting one is
+    met with positive probability whatever the environment does, and so almost surely again
+    and again.
+
+    Args:
+      problem: the problem.
+      play: ``float[S, A]``; only what is positive counts.
+
+    Returns:
+      ``bool[]``.
+    """
+    game = problem.game
+    used = jnp.where(game.system[:, None], play > 0, problem.allowed)
+    moves = problem.region & used.any(-1)
+    kept = jnp.all(~used | problem.allowed)
+    met = attractor(
+        game, problem.accepting & problem.region, used & problem.allowed,
+        rule=game.system, chance="some",
+    ).region
+    return kept & jnp.all(moves | ~problem.region) & jnp.all(met | ~problem.region)
+
+
+# --- moves ----------------------------------------------------------------------------------
+
+
+class _Rules(NamedTuple):
+    """What the moves of one step need."""
+
+    problem: Problem
+    best: jax.Array
+    known_at: jax.Array
+    key: jax.Array
+    stream: tuple[jax.Array, jax.Array]
+    explore: jax.Array
+    enough: jax.Array
+    bound: jax.Array
+    restart: jax.Array
+    every: jax.Array
+
+
+def _rules(state: State, problem: Problem, hparams: Hparams) -> _Rules:
+    dtype, key = problem.game.dtype, jax.random.fold_in(state.key, state.step)
+    words = jax.random.bits(key, (2,), jnp.uint32)
+    return _Rules(
+        problem, state.best, state.known_at, key, (words[0], words[1] | 1),
+        _exploration(problem, hparams), _enough(problem, hparams),
+        jnp.asarray(hparams.reward_bound, dtype), jnp.asarray(hparams.restart, dtype),
+        jnp.bool_(hparams.update == "every"),
+    )
+
+
+class _Seen(NamedTuple):
+    """A transition and its reward."""
+
+    state: jax.Array
+    action: jax.Array
+    successor: jax.Array
+    reward: jax.Array
+
+
+class _Walk(NamedTuple):
+    """What changes from move to move; `left` moves remain, none once there is something new.
+
+    `pair` and `slot` are of the last move, `seen` is its reward, `known` whether its pair
+    has become known by it, and `fresh` whether a known pair has shown a transition for the
+    first time.
+    """
+
+    moves: jax.Array
+    left: jax.Array
+    position: jax.Array
+    counts: jax.Array
+    reward: jax.Array
+    pair: jax.Array
+    slot: jax.Array
+    seen: jax.Array
+    known: jax.Array
+    fresh: jax.Array
+    fault: jax.Array
+
+
+def _walk_from(state: State, moves: jax.Array) -> _Walk:
+    zero, false = jnp.int32(0), jnp.bool_(False)
+    return _Walk(
+        state.moves, moves, state.position, state.counts, state.reward,
+        zero, zero, jnp.zeros((), state.reward.dtype), false, false, state.fault,
+    )
+
+
+def _advance(state: State, problem: Problem, hparams: Hparams, moves: jax.Array) -> State:
+    """At most so many moves, and the update that they lead to; none of them if that is zero."""
+    rules = _rules(state, problem, hparams)
+    walk = learner.while_active(
+        lambda w, _: w.left > 0, _move, _walk_from(state, moves), rules)
+    if problem.game.num_successors == 1:
+        walk = _noted(walk, rules, walk.known, jnp.bool_(False))
+    after = _updated(state, walk, problem, hparams)
+    return replace(after, step=state.step + (moves > 0))
+
+
+def _move(walk: _Walk, rules: _Rules) -> _Walk:
+    """One move, if any are left. It writes one entry of each array, so that they stay in place."""
+    active, game = walk.left > 0, rules.problem.game
+    dtype = game.dtype
+    count = walk.moves.astype(jnp.uint32)
+    words = [mixed_bits(rules.stream, 4 * count + i) for i in range(4)]
+    anew = uniform(words[0], dtype) < rules.restart
+    s = jnp.where(anew, draw(rules.problem.start_table, words[1]), walk.position)
+    mine = jnp.where(
+        uniform(words[2], dtype) < rules.explore,
+        take(rules.problem.allowed, s), take(rules.best, s),
+    )
+    weight = jnp.where(take(game.system, s), mine, take(rules.problem.environment, s))
+    action = _draw_action(weight, uniform(words[3], dtype))
+    # Where chance plays no part the key is not worth making.
+    key = rules.key if game.num_successors == 1 else jax.random.fold_in(rules.key, walk.moves)
+    successor = sample_successor(game, key, s, action)
+    reward = observed_reward(game, rules.problem.reward, s, action, successor)
+    return _record(walk, _Seen(s, action, successor, reward), rules, active)
+
+
+def _draw_action(weight: jax.Array, chance: jax.Array) -> jax.Array:
+    """An action with the probability of its weight; never one without any."""
+    total = jnp.cumsum(weight)
+    # The largest weight that rounding lets be drawn stays below the total.
+    drawn = jnp.minimum(chance, 1 - jnp.finfo(weight.dtype).eps) * total[-1]
+    return jnp.argmax(total > drawn).astype(jnp.int32)
+
+
+def _record(walk: _Walk, seen: _Seen, rules: _Rules, active: jax.Array) -> _Walk:
+    """What a transition adds to the counts and rewards, and whether the model changes."""
+    game = rules.problem.game
+    width, pair = game.num_successors, seen.state * game.num_actions + seen.action
+    slot = successor_slot(game, seen.state, seen.action, seen.successor)
+    row = take(walk.counts.reshape(-1, width), pair)
+    was_known, first = take(rules.known_at.ravel(), pair) >= 0, row[slot] == 0
+    alone = jnp.sum(take(game.mdp.probability.reshape(-1, width), pair) > 0) == 1
+    visits = (jnp.sum(row) + 1).astype(game.dtype)
+    known = active & ~was_known & (alone | (visits >= rules.enough))
+    fresh = active & was_known & first & rules.every
+    wrong = active & ~((seen.reward >= 0) & (seen.reward <= rules.bound))
+    walk = walk._replace(
+        moves=walk.moves + active,
+        left=jnp.where(active, jnp.where(known | fresh, 0, walk.left - 1), walk.left),
+        position=jnp.where(active, seen.successor, walk.position),
+        pair=jnp.where(active, pair, walk.pair), slot=jnp.where(active, slot, walk.slot),
+        seen=jnp.where(active, seen.reward, walk.seen),
+        known=known | (~active & walk.known), fresh=fresh | (~active & walk.fresh),
+        fault=jnp.where(wrong & (walk.fault < 0), pair, walk.fault),
+    )
+    # Without chance only a walk's last move can have something to note.
+    return walk if width == 1 else _noted(walk, rules, active, was_known)
+
+
+def _noted(walk: _Walk, rules: _Rules, active: jax.Array, was_known: jax.Array) -> _Walk:
+    """The last move of a walk in the counts and rewards."""
+    entry = walk.pair * walk.counts.shape[-1] + walk.slot
+    before = take(walk.counts.ravel(), entry)
+    old = take(walk.reward.ravel(), entry)
+    # A known pair's frequencies rest: only that a transition was seen at all is noted.
+    added = active & (~was_known | (before == 0))
+    new = active & jnp.where(rules.every, before == 0, walk.known)
+    return walk._replace(
+        counts=_write(walk.counts, entry, before + added),
+        reward=_write(walk.reward, entry, jnp.where(new, walk.seen, old)),
+    )
+
+
+def _write(array: jax.Array, place: jax.Array, entry: jax.Array) -> jax.Array:
+    return array.ravel().at[place].set(entry, mode="promise_in_bounds").reshape(array.shape)
+
+
+# --- the model and its solution -------------------------------------------------------------
+
+def _updated(state: State, walk: _Walk, problem: Problem, hparams: Hparams) -> State:
+    """The state after a walk; with something new, the model and the strategy are too."""
+    game = problem.game
+    width, pair, news = game.num_successors, walk.pair, walk.known | walk.fresh
+    listed = take(game.mdp.probability.reshape(-1, width), pair) > 0
+    # Every listed successor is taken to have been seen once, which keeps the graph.
+    row = jnp.where(listed, jnp.maximum(take(walk.counts.reshape(-1, width), pair), 1), 0)
+    share = row / jnp.sum(row).astype(game.dtype)
+    old = take(state.probability.reshape(-1, width), pair)
+    share = jnp.where(walk.known, share, old)
+    gain = jnp.sum(share * take(walk.reward.reshape(-1, width), pair))
+    probability = state.probability.reshape(-1, width).at[pair].set(share)
+    state = replace(
+        state, moves=walk.moves, position=walk.position, counts=walk.counts,
+        reward=walk.reward, fault=walk.fault,
+        known_at=_write(state.known_at, pair, jnp.where(
+            walk.known, walk.moves, take(state.known_at.ravel(), pair))),
+        probability=probability.reshape(state.probability.shape),
+        gain=_write(state.gain, pair, jnp.where(news, gain, take(state.gain.ravel(), pair))),
+        last_update=jnp.where(news, walk.moves, state.last_update),
+        num_updates=state.num_updates + news,
+    )
+    return _solved(state, problem, hparams, news)
+
+
+def _solved(state: State, problem: Problem, hparams: Hparams, news: jax.Array) -> State:
+    """The optimistic model's value and near-optimal moves; the same state without news."""
+    dtype = problem.game.dtype
+    asked = pac.action_tolerance(hparams.epsilon, hparams.discount)
+    discount = jnp.asarray(hparams.discount, dtype)
+    rounding = 8 * jnp.finfo(dtype).eps * jnp.asarray(_bound(hparams), dtype) / (1 - discount)
+    value, error, quantity = span_iteration(
+        problem.game, problem.allowed, state.gain, state.probability, state.value, discount,
+        enough=jnp.maximum(asked / 4, rounding), active=news,
+    )
+    # What is within eps_1 by these values less twice their error is within eps_1 by the true.
+    strict = jnp.maximum(asked - 2 * error, 0).astype(dtype)
+    mine = problem.allowed & problem.game.system[:, None]
+    best = pac.near_optimal(quantity, mine, strict)
+    # Every allowed move then has a positive probability, unless that is too small a number.
+    least = _exploration(problem, hparams) / problem.game.num_actions
+    return replace(
+        state, value=value, error=jnp.where(news, error, state.error),
+        best=jnp.where(news, best, state.best),
+        always_almost_sure=state.always_almost_sure & (least > 0),
+    )
+
+
+# --- constants ------------------------------------------------------------------------------
+
+
+def _bound(hparams: Hparams) -> jax.Array:
+    """What an unknown move is taken to pay."""
+    return jnp.asarray(hparams.reward_bound) / (1 - jnp.asarray(hparams.discount))
+
+
+def _exploration(problem: Problem, hparams: Hparams) -> jax.Array:
+    p = pac.exploration(hparams.epsilon, hparams.discount, hparams.reward_bound)
+    return jnp.asarray(p, problem.game.dtype)
+
+
+def _enough(problem: Problem, hparams: Hparams) -> jax.Array:
+    """Visits after which a pair is known."""
+    if hparams.known_after is not None:
+        return jnp.asarray(hparams.known_after, problem.game.dtype)
+    visits = pac.visits(
+        hparams.epsilon, hparams.failure, hparams.discount, hparams.reward_bound,
+        jnp.sum(problem.region), problem.game.num_actions,
+    )
+    return jnp.asarray(visits, problem.game.dtype)
+
+
+def _inside(problem: Problem) -> Game:
+    """The game in which only moves that stay in the region exist."""
+    game = problem.game
+    return Game(game.mdp.replace(available=problem.allowed), game.system)
+
+
+def _outside(s: int, a: int, hparams: Hparams, reward: str) -> str:
+    return (
+        f"state {s}, action {a}: a reward of {reward} was observed, outside of [0, "
+        f"reward_bound={float(hparams.reward_bound):g}]. The guarantee rests on that bound: "
+        "give a larger reward_bound and learn anew."
+    )
+
+
+def _check(hparams: Hparams) -> None:
+    if hparams.update not in UPDATES:
+        raise ValueError(f'update={hparams.update!r}; choose "every" or "printed".')
+    if hparams.moves_per_step < 1:
+        raise ValueError(f"moves_per_step={hparams.moves_per_step}; it must be at least 1.")

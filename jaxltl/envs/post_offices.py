@@ -1,0 +1,195 @@
+"""Two post offices and a signal light: a game whose reward does not do its task.
+
+The example of the dissertation's section 6.7. State ``(cell * 2 + light) * 2 + turn``: cells
+are numbered in rows from the upper left, 0 to 8; `light` is 1 where the light is on, and
+`turn` 1 where the system moves; so ``np.unravel_index(state, (9, 2, 2))`` takes a state apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.core.automaton import Automaton, make_automaton
+from jaxltl.core.game import Game, make_game
+from jaxltl.core.mdp import make_mdp
+from jaxltl.core.product import product, restrict
+from jaxltl.envs import gridworld as grid
+
+ACTIONS = (*grid.ACTIONS, "off", "on")
+_CELLS, _WORLD_STATES = 9, 36
+_MAP = """
+.  . p1
+.  . .
+p2 . .
+"""
+# The four cells of the dangerous block in the order in which going round it is rewarded, by the
+# light: off, the lower right block clockwise; on, the upper left block counterclockwise.
+_ROUND = ((4, 5, 8, 7), (0, 3, 4, 1))
+
+
+def post_offices() -> Game:
+    """A robot on a 3 by 3 grid and a light, strictly in turns (dissertation, section 6.7).
+
+    The system moves to an adjacent cell; moves off the grid are not available, and neither
+    is staying. The environment then switches the light off or on, whichever it was. Where
+    the light is on, the upper left block of four cells is dangerous, else the lower right
+    one, see :func:`patrol_reward`. Runs start anywhere, the system to move.
+
+    Propositions: ``p1`` in the upper right cell and ``p2`` in the lower left, at both turns.
+
+    Returns:
+      A deterministic game with 36 states, numbered as this module says, and the actions
+      :data:`ACTIONS`.
+
+    Example:
+      >>> game = post_offices()
+      >>> game.num_states, game.num_actions, game.num_successors
+      (36, 6, 1)
+      >>> state = (2 * 2 + 1) * 2 + 1  # in the upper right, the light on, the system to move
+      >>> [a for a, can in zip(ACTIONS, game.available[state]) if can]
+      ['down', 'left']
+      >>> [p for p, holds in zip(game.propositions, game.label[state]) if holds]
+      ['p1']
+    """
+    world = grid.gridworld(_MAP)
+    cell, light, turn = np.unravel_index(np.arange(_WORLD_STATES), (_CELLS, 2, 2))
+    system = turn == 1
+    walk = np.asarray(world.successor)[cell, :, 0]  # [36, 4]; off the grid, the cell itself
+    moves = len(grid.ACTIONS)
+    successor = np.zeros((_WORLD_STATES, len(ACTIONS), 1), np.int32)
+    successor[:, :moves, 0] = (walk * 2 + light[:, None]) * 2
+    successor[:, moves:, 0] = (cell[:, None] * 2 + np.arange(2)) * 2 + 1
+    available = np.zeros((_WORLD_STATES, len(ACTIONS)), bool)
+    available[:, :moves] = system[:, None] & (walk != cell[:, None])
+    available[:, moves:] = ~system[:, None]
+    mdp = make_mdp(
+        successor, available[:, :, None].astype(float), available=available,
+        initial=system / system.sum(), label=np.asarray(world.label)[cell],
+        propositions=world.propositions,
+    )
+    return make_game(mdp, system)
+
+
+def surveillance() -> Automaton:
+    """Visit both post offices again and again: ``G F p1 & G F p2`` (dissertation, figure 17a).
+
+    A deterministic Buchi automaton that first waits in ``q1``; ``q2`` has seen p1 and waits
+    for p2, ``q3`` has seen p2 and waits for p1; ``q4``, in which both have been seen, is
+    accepting, and goes on like ``q1``. It differs from the translation of the formula in that
+    it takes the visits in either order.
+
+    Example:
+      >>> automaton = surveillance()
+      >>> automaton.delta.tolist()  # reading neither, p1, p2, both
+      [[0, 1, 2, 3], [1, 1, 3, 3], [2, 3, 2, 3], [0, 1, 2, 3]]
+    """
+    return make_automaton(
+        [[0, 1, 2, 3], [1, 1, 3, 3], [2, 3, 2, 3], [0, 1, 2, 3]],
+        0,
+        [[False, False], [True, False], [False, True], [True, True]],
+        ["p1", "p2"],
+        accepting=[False, False, False, True],
+        state_names=["q1", "q2", "q3", "q4"],
+    )
+
+
+def patrol_reward(game: Any) -> jax.Array:
+    """What the system is paid for patrolling the dangerous block: ``float[S, A]``.
+
+    1 for a move into the block that the light marks as dangerous, and for a move inside it
+    that goes round it counterclockwise where the light is on, clockwise where it is off; else
+    0. The light is that of the state in which the system moves. (Dissertation, section 6.7,
+    which leaves open what a move inside the block against that sense is paid: here nothing,
+    since it does not enter.)
+
+    Args:
+      game: :func:`post_offices`, or a product of it, for which the reward has shape
+        ``[S, Q, A]``. Of ``restrict(game)`` it is the reward of `game` at ``base_state``.
+
+    Raises:
+      ValueError: the game has other states.
+
+    Example:
+      >>> reward = patrol_reward(post_offices())
+      >>> state = (4 * 2 + 1) * 2 + 1  # in the middle, the light on, the system to move
+      >>> reward[state].tolist()  # up, down, left, right, off, on
+      [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    """
+    shape = (*game.state_shape, game.num_actions)
+    if shape[0] != _WORLD_STATES or shape[-1] != len(ACTIONS):
+        raise ValueError(
+            f"the game has states and actions {shape}; give post_offices() or a product of it, "
+            "and of a restricted game take the rows at its base_state."
+        )
+    world = game
+    while hasattr(world, "mdp"):
+        world = world.mdp
+    cell, light, turn = np.unravel_index(np.arange(_WORLD_STATES), (_CELLS, 2, 2))
+    target = np.asarray(world.successor)[:, :, 0] // 4
+    paid = _paid_moves()[light[:, None], cell[:, None], target]
+    paid &= np.asarray(world.available) & (turn == 1)[:, None]
+    reward = jnp.asarray(paid, game.dtype)
+    return jnp.broadcast_to(jnp.expand_dims(reward, tuple(range(1, len(shape) - 1))), shape)
+
+
+def _paid_moves() -> np.ndarray:
+    """Whether a move is paid, by the light, the cell and the next cell: ``bool[2, 9, 9]``."""
+    paid = np.zeros((2, _CELLS, _CELLS), bool)
+    for light, block in enumerate(_ROUND):
+        inside = np.isin(np.arange(_CELLS), block)
+        paid[light] = ~inside[:, None] & inside
+        paid[light, block, np.roll(block, -1)] = True
+    return paid
+
+
+class Patrol(NamedTuple):
+    """The game with its task's memory, as it is learned; states are ``world * 4 + memory``.
+
+    Attributes:
+      game: an explicit game of all 144 states; runs start in any cell under any light, the
+        system to move and the memory in q1. 108 states are reachable.
+      accepting: ``bool[144]``, to be met infinitely often: the memory is in q4.
+      reward: ``float[144, 6]``.
+      cell, light, memory: ``int32[144]``, see this module and :func:`surveillance`.
+    """
+
+    game: Game
+    accepting: jax.Array
+    reward: jax.Array
+    cell: jax.Array
+    light: jax.Array
+    memory: jax.Array
+
+
+def patrol() -> Patrol:
+    """The game of the post offices beside the automaton of its task (dissertation, 6.7).
+
+    The automaton reads the label of the state that is left, at both turns. The system can
+    visit both post offices for ever from every state; the best patrol visits neither.
+
+    Example:
+      >>> model = patrol()
+      >>> moves = model.game.available.sum(axis=1)
+      >>> int(moves[model.game.system].sum()), int(moves.sum())
+      (192, 336)
+    """
+    world = post_offices()
+    joint = product(world, surveillance(), label_on="exit")
+    everywhere = np.full(joint.num_states, 1 / joint.num_states)
+    whole = restrict(joint, everywhere)  # keeps what is reachable, here everything, in order
+    initial = joint.initial.ravel()
+    game = replace(whole.model, mdp=replace(whole.model.mdp, initial=initial))
+    cell, light, _ = jnp.unravel_index(whole.base_state, (_CELLS, 2, 2))
+    return Patrol(
+        game=game,
+        accepting=whole.memory == 3,
+        reward=patrol_reward(world)[whole.base_state],
+        cell=cell.astype(jnp.int32),
+        light=light.astype(jnp.int32),
+        memory=whole.memory,
+    )
