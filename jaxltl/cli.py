@@ -403,6 +403,7 @@ def _render(result: Automaton, form: str, formula: str) -> str:
 _EXPERIMENTS = {
     "mlirl": "section 2.5, inverse reinforcement learning with a temporal-logic task",
     "synthesis": "chapter 5, permissive strategies and learning inside them",
+    "pac": "section 6.7, learning with a guarantee while winning almost surely",
 }
 
 
@@ -410,15 +411,22 @@ _EXPERIMENTS = {
 @click.argument("what", type=click.Choice(list(_EXPERIMENTS)))
 @click.option("--out", type=click.Path(path_type=Path),
               help="Directory for the pictures, if there are any.  [default: out/reproduce]")
+@click.option("--seeds", type=click.IntRange(1),
+              help="How often learning is repeated, in pac.  [default: 10]")
 @click.option("--json", "as_json", is_flag=True, help="End with the figures as one JSON line.")
 @_plain_errors
-def reproduce(what: str, out: Path | None, as_json: bool) -> None:
+def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> None:
     """Print published figures beside ours."""
     import importlib
+    import inspect
 
     experiment = importlib.import_module(f"jaxltl.reproduce.{what}")
+    options = {} if seeds is None else {"seeds": seeds}
+    if seeds is not None and "seeds" not in inspect.signature(experiment.figures).parameters:
+        raise ValueError(f"reproduce {what} does not learn with several seeds; leave --seeds out.")
     with _float64():
-        result = experiment.figures(progress=lambda text: click.echo(text, err=True))
+        result = experiment.figures(
+            progress=lambda text: click.echo(text, err=True), **options)
         pictures = experiment.pictures(result) if hasattr(experiment, "pictures") else []
     click.echo(experiment.table(result))
     if pictures:

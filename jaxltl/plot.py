@@ -459,6 +459,102 @@ def _arrows(
     axes.add_collection(PolyCollection(shapes, facecolors=colors, lw=0, alpha=0.92, zorder=4))
 
 
+def strategies(
+    cells: str | NDArray[np.str_],
+    play: ArrayLike,
+    *,
+    marked: ArrayLike | None = None,
+    mark: str = "",
+    titles: Sequence[str] | str = "",
+    across: int = 4,
+    seldom: float = 0.01,
+    actions: Sequence[str] = ("up", "down", "left", "right"),
+    wall: str = "#",
+) -> Figure:
+    """Mixed strategies on a map: big arrows for what is played often, small ones for the rest.
+
+    For strategies with moves so rare that :func:`grid` would not show them.
+
+    Args:
+      cells: a text map (see :func:`jaxltl.envs.gridworld.parse_map`) or its cells.
+      play: ``float[S, A]``, or ``float[M, S, A]`` for M panels: the probability of each move;
+        zero draws nothing, and a cell whose row is NaN is grey, since it is never reached.
+      marked: ``bool[S]``, or with M panels first: cells with a coloured background.
+      mark: what that colour means.
+      titles: one per panel.
+      across: panels in a row, at most.
+      seldom: moves of a smaller probability get a small arrow.
+      actions: the name of each action, of up, down, left, right and stay.
+      wall: the kind of cell that is not a place.
+
+    Returns:
+      The figure.
+
+    Raises:
+      ValueError: an array does not fit the map, or an action has no direction.
+    """
+    _require_directions(actions)
+    kinds = parse_map(cells) if isinstance(cells, str) else np.asarray(cells)
+    world = _Board(kinds, np.argwhere(np.ones(kinds.shape, bool)), wall)
+    panels = np.asarray(play, float)
+    panels = panels[None] if panels.ndim == 2 else panels
+    if panels.ndim != 3 or panels.shape[1:] != (kinds.size, len(actions)):
+        raise ValueError(
+            f"play has shape {np.shape(play)}; the map has {kinds.size} cells and there are "
+            f"{len(actions)} actions, so pass [{kinds.size}, {len(actions)}], or panels of that."
+        )
+    colored = np.zeros(panels.shape[:2], bool) if marked is None else np.asarray(marked, bool)
+    if colored.shape not in (panels.shape[:2], panels.shape[1:2]):
+        raise ValueError(
+            f"marked has shape {colored.shape}; play has {len(panels)} panels of {kinds.size} "
+            f"cells, so pass [{kinds.size}] or [{len(panels)}, {kinds.size}]."
+        )
+    colored = np.broadcast_to(colored, panels.shape[:2])
+    titles = [titles] * len(panels) if isinstance(titles, str) else list(titles)
+    figure, every = _rows_of_maps(kinds.shape, len(panels), min(len(panels), across))
+    for axes, chance, here, title in zip(every, panels, colored, titles, strict=True):
+        blank = np.isnan(chance).any(-1)
+        _fill(axes, world, [
+            _NEVER if never else _MARKED if good else PAPER
+            for never, good in zip(blank, here, strict=True)
+        ], FAINT)
+        _number_cells(axes, *kinds.shape)
+        _moves(axes, world, chance >= seldom, actions, scale=1.15)
+        _moves(axes, world, (chance > 0) & (chance < seldom), actions, scale=0.5)
+        axes.set_title(title, fontsize=9.5, color=INK, pad=5, loc="left", parse_math=False)
+    rare = ((panels > 0) & (panels < seldom)).any()
+    _note(figure, [
+        *([(_MARKED, mark, "s")] if mark else []),
+        *([(_NEVER, "never reached", "s")] if np.isnan(panels).any() else []),
+        *([(INK, "often", "^", 7), (INK, "seldom", "^", 4)] if rare else []),
+    ])
+    return figure
+
+
+_MARKED, _NEVER = "#f9e69a", "#e4e7eb"
+
+
+def _cell_size(shape: tuple[int, ...]) -> float:
+    """The inches of a cell that holds arrows."""
+    return float(np.clip(5.2 / max(shape), 0.3, 0.6))
+
+
+def _rows_of_maps(
+    shape: tuple[int, ...], count: int, across: int
+) -> tuple[Figure, NDArray[Any]]:
+    """A figure with so many axes of maps, in rows."""
+    (rows, columns), size = shape, _cell_size(shape)
+    down = -(-count // across)
+    figure = Figure(
+        figsize=(max(across * (columns * size + 0.4), 3.4), down * (rows * size + 0.55) + 0.6),
+        layout=ConstrainedLayoutEngine(h_pad=0.1), facecolor=PAPER,
+    )
+    every = figure.subplots(down, across, squeeze=False).ravel()
+    for axes in every[count:]:
+        axes.axis("off")
+    return figure, every[:count]
+
+
 # --- games of two robots --------------------------------------------------------------------
 
 
@@ -609,17 +705,9 @@ def game_moves(
         regions = np.broadcast_to(regions, (len(panels), *regions.shape))
     titles = [titles] * len(panels) if isinstance(titles, str) else list(titles)
     rows, columns = world.cells.shape
-    size = float(np.clip(5.2 / max(rows, columns), 0.3, 0.6))
-    across = min(len(panels), 3 if columns * size > 1.5 else 4)
-    down = -(-len(panels) // across)
-    figure = Figure(
-        figsize=(max(across * (columns * size + 0.4), 3.4), down * (rows * size + 0.55) + 0.6),
-        layout=ConstrainedLayoutEngine(h_pad=0.1), facecolor=PAPER,
-    )
-    every = figure.subplots(down, across, squeeze=False).ravel()
-    for axes in every[len(panels):]:
-        axes.axis("off")
-    for m, axes in enumerate(every[: len(panels)]):
+    most = 3 if columns * _cell_size((rows, columns)) > 1.5 else 4
+    figure, every = _rows_of_maps((rows, columns), len(panels), min(len(panels), most))
+    for m, axes in enumerate(every):
         mask = _of_turns(panels[m], world, "allowed")[environment]
         wins = mask.any(-1)
         if regions is not None:
@@ -734,23 +822,27 @@ def _shade(
 
 
 def _paint(axes: Axes, world: _Board, wins: NDArray[np.bool_]) -> None:
-    for (row, column), good in zip(world.places, wins, strict=True):
-        color = _REGION_MARKS[0][0] if good else _LOSES
+    _fill(axes, world, [_REGION_MARKS[0][0] if good else _LOSES for good in wins])
+
+
+def _fill(axes: Axes, world: _Board, colors: Sequence[str], lines: str = PAPER) -> None:
+    """A colour for each place, and the names of cells in their corners."""
+    for (row, column), color in zip(world.places, colors, strict=True):
         axes.add_patch(Rectangle((column, row), 1, 1, facecolor=color, lw=0))
         kind = world.cells[row, column]
-        if kind != "." and max(world.cells.shape) <= 16:
+        if kind not in (".", world.wall) and max(world.cells.shape) <= 16:
             axes.text(column + 0.07, row + 0.07, kind, ha="left", va="top", fontsize=6.5,
                       color=MUTED, weight="bold", parse_math=False, zorder=5)
-    _frame(axes, world)
+    _frame(axes, world, lines)
 
 
-def _frame(axes: Axes, world: _Board) -> None:
+def _frame(axes: Axes, world: _Board, color: str = PAPER) -> None:
     rows, columns = world.cells.shape
     for row, column in np.argwhere(world.cells == world.wall):
         axes.add_patch(Rectangle((column, row), 1, 1, facecolor=_WALL, lw=0))
     lines = [((0, r), (columns, r)) for r in range(rows + 1)]
     lines += [((c, 0), (c, rows)) for c in range(columns + 1)]
-    axes.add_collection(LineCollection(lines, colors=PAPER, linewidths=0.6, zorder=2))
+    axes.add_collection(LineCollection(lines, colors=color, linewidths=0.6, zorder=2))
     axes.set(xlim=(0, columns), ylim=(rows, 0), aspect="equal", xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set(color=FAINT, lw=0.8)
@@ -772,7 +864,7 @@ def _figures(
 
 def _moves(
     axes: Axes, world: _Board, mask: NDArray[np.bool_], actions: Sequence[str],
-    dark: NDArray[np.bool_] | None = None, *, hollow: bool = False,
+    dark: NDArray[np.bool_] | None = None, *, hollow: bool = False, scale: float = 1.0,
 ) -> None:
     """A triangle towards each neighbour that a mask allows, and a dot for staying."""
     for place, a in np.argwhere(mask):
@@ -782,28 +874,100 @@ def _moves(
         row, column = world.places[place]
         center, step = np.array([column + 0.5, row + 0.5]), np.array(_TURNS[actions[a]], float)
         if not step.any():
-            axes.add_patch(Circle(tuple(center), 0.09, facecolor=face, edgecolor=edge, lw=0.7,
-                                  zorder=6))
+            axes.add_patch(Circle(tuple(center), 0.09 * scale, facecolor=face, edgecolor=edge,
+                                  lw=0.7, zorder=6))
             continue
-        side = step[::-1] * 0.12
-        base, tip = center + step * 0.18, center + step * 0.42
+        side = step[::-1] * 0.12 * scale
+        base, tip = center + step * 0.18, center + step * (0.18 + 0.24 * scale)
         axes.add_patch(Polygon([base + side, tip, base - side], facecolor=face, edgecolor=edge,
                                lw=0.7, zorder=6))
 
 
-def _note(figure: Figure, marks: Sequence[tuple[str, str, str]], title: str = "") -> None:
-    """What colours and marks mean, under the maps."""
+def _note(figure: Figure, marks: Sequence[tuple[Any, ...]], title: str = "") -> None:
+    """What colours and marks mean, under the maps: colour, text, marker and, if not 7, its size."""
     handles = [
-        Line2D([], [], ls="", marker=marker, color=color, markersize=7, label=text,
-               markeredgecolor=MUTED if color == PAPER else "none")
-        for color, text, marker in marks
+        Line2D([], [], ls="", marker=marker, color=color, markersize=size[0] if size else 7,
+               label=text, markeredgecolor=MUTED if color == PAPER else "none")
+        for color, text, marker, *size in marks
     ]
+    if not handles:
+        return
     across = max(1, min(len(handles), int(figure.get_figwidth() / 1.6)))
     legend = figure.legend(
         handles=handles, loc="outside lower left", ncols=across, frameon=False, fontsize=8,
         labelcolor=INK, handletextpad=0.1, columnspacing=1.2, title=title, alignment="left",
     )
     legend.get_title().set(fontsize=8, color=MUTED)
+
+
+# --- values side by side --------------------------------------------------------------------
+
+
+def compare(
+    values: Mapping[str, ArrayLike],
+    *,
+    groups: Sequence[str] | None = None,
+    label: str = "value",
+) -> Figure:
+    """Values of the same states under several strategies, a column of marks for each state.
+
+    Args:
+      values: ``float[S]`` by the name of the strategy. States are sorted by the first, then by
+        the second, and so on; those that come first are drawn on top.
+      groups: the name of each state's group; groups stand side by side as they first occur.
+      label: what the values are.
+
+    Returns:
+      The figure.
+
+    Raises:
+      ValueError: there is nothing to show, or lengths differ.
+    """
+    series = {name: np.asarray(value, float) for name, value in values.items()}
+    sizes = {len(value) for value in series.values()}
+    if len(sizes) != 1 or 0 in sizes:
+        found = ", ".join(f"{name}: {len(value)}" for name, value in series.items())
+        raise ValueError(f"compare needs values of the same states; it has {found or 'none'}.")
+    count = sizes.pop()
+    names = [""] * count if groups is None else list(groups)
+    if len(names) != count:
+        raise ValueError(f"groups has {len(names)} names; there are {count} states.")
+    kinds = list(dict.fromkeys(names))
+    group = np.array([kinds.index(name) for name in names])
+    order = np.lexsort((*reversed(series.values()), group))
+    place = np.arange(count) + 1.5 * group[order]
+    figure = Figure(
+        figsize=(float(np.clip(0.085 * count + 1.2, 4, 10)), 3.2),
+        layout=ConstrainedLayoutEngine(h_pad=0.1), facecolor=PAPER,
+    )
+    axes = figure.subplots()
+    styles = [("_", 8), ("o", 4.5), ("x", 4), ("D", 3.5), ("v", 4), ("s", 3.5)]
+    for i, (name, value) in reversed(list(enumerate(series.items()))):
+        marker, size = styles[i % len(styles)]
+        axes.plot(place, value[order], ls="", marker=marker, ms=size, label=name,
+                  color=_SERIES[i % len(_SERIES)], mew=1.4 if marker in "_x" else 0)
+    for i, name in enumerate(kinds):
+        here = place[group[order] == i]
+        axes.text(here.mean(), 1.02, name, transform=axes.get_xaxis_transform(), ha="center",
+                  va="bottom", fontsize=8.5, color=MUTED, parse_math=False)
+        if i:
+            axes.axvline(here[0] - 1.25, color=FAINT, lw=1)
+    axes.set_ylabel(label, fontsize=9, color=INK)
+    axes.set(xticks=[], ylim=(min(0, axes.get_ylim()[0]), None))
+    _plain_axes(axes)
+    handles, texts = axes.get_legend_handles_labels()
+    figure.legend(handles[::-1], texts[::-1], loc="outside lower left", ncols=len(series),
+                  frameon=False, fontsize=8.5, labelcolor=INK, handletextpad=0.2)
+    return figure
+
+
+def _plain_axes(axes: Axes) -> None:
+    axes.tick_params(labelsize=8, color=FAINT, labelcolor=INK, length=3)
+    axes.grid(color=FAINT, lw=0.5)
+    axes.set_axisbelow(True)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(FAINT)
 
 
 # --- curves ---------------------------------------------------------------------------------
@@ -859,9 +1023,4 @@ def _curve(
         axes.set_yscale("log")
     axes.set_title(name, fontsize=9.5, color=INK, loc="left")
     axes.set_xlabel("step", fontsize=8.5, color=MUTED)
-    axes.tick_params(labelsize=8, color=FAINT, labelcolor=INK, length=3)
-    axes.grid(color=FAINT, lw=0.5)
-    axes.set_axisbelow(True)
-    for side, spine in axes.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color(FAINT)
+    _plain_axes(axes)

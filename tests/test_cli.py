@@ -283,3 +283,79 @@ def test_help_does_not_load_the_pictures():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+# --- reproduce ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def patrolled(tmp_path_factory):
+    """What section 6.7 comes to with two seeds, and what was printed and written."""
+    out = tmp_path_factory.mktemp("pac")
+    result = run("reproduce", "pac", "--seeds", 2, "--json", "--out", out)
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout.splitlines()[-1]), result.stdout, out
+
+
+def test_the_game_of_section_6_7(patrolled):
+    found, _, _ = patrolled
+    sizes = [found[k] for k in ("states", "system_states", "system_transitions", "transitions",
+                                "reachable_system_states", "almost_sure_states")]
+    assert sizes == [144, 72, 192, 336, 54, 144]
+    assert found["values"] == {"0.545417": 8, "1.196350": 8, "1.430686": 16, "1.515047": 24,
+                               "1.545417": 16}
+    initial = [found["initial_strategy"][k] for k in ("min", "max", "mean")]
+    np.testing.assert_allclose(initial, [0.175092, 0.675092, 0.507881], atol=1e-6)
+    assert found["winning_strategy"]["min"] >= 0
+    assert found["winning_strategy"]["mean"] < found["initial_strategy"]["mean"]
+    assert found["hat_strategy_gap"] == pytest.approx(9.494e-7, rel=1e-3)
+    assert found["uniform_hat_strategy_gap"] == pytest.approx(5.878e-7, rel=1e-3)
+
+
+def test_what_is_learned_in_section_6_7(patrolled):
+    found, _, _ = patrolled
+    for anew, straight in zip(found["learned"], found["learned_without_restarts"], strict=True):
+        assert anew["seed"] == straight["seed"]
+        assert (anew["restart"], straight["restart"]) == (0.02, 0.0)
+        assert anew["always_almost_sure"] is True is straight["always_almost_sure"]
+        assert 50 <= anew["eps_optimal_states"] <= anew["eps_optimal_states_met"] <= 54
+        assert 10 <= straight["eps_optimal_states"] <= straight["eps_optimal_states_met"] < 45
+        for row in (anew, straight):
+            assert row["moves"] == row["last_update_step"] + 20_000
+            assert 54 < row["updates"] <= 336
+    assert [row["seed"] for row in found["learned"]] == [0, 1]
+    shown = {k: np.array(v) for k, v in found["figure18"].items()}
+    near = shown["optimal"] - shown["learned"] <= 1e-4
+    assert np.sum(near & shown["reachable"]) >= found["learned"][0]["eps_optimal_states"]
+    assert (shown["learned"] <= shown["optimal"] + 1e-9).all()
+    marked = np.array(found["figure19"]["epsilon_optimal"])
+    assert marked.shape == (2, 4, 9) and marked.sum() == found["learned"][0]["eps_optimal_states"]
+
+
+def test_the_best_moves_by_the_reward_alone(patrolled):
+    found, _, _ = patrolled
+    on, off = np.array(found["figure17"]["best"])  # for each cell: up, down, left, right
+    # Round the block, counterclockwise in the upper left and clockwise in the lower right.
+    assert [on[cell].argmax() for cell in (0, 3, 4, 1)] == [1, 3, 0, 2]
+    assert [off[cell].argmax() for cell in (4, 5, 8, 7)] == [3, 1, 2, 0]
+    assert on.sum(axis=1).tolist() == off.sum(axis=1).tolist() == [1] * 9
+
+
+def test_the_table_and_the_pictures_of_section_6_7(patrolled):
+    found, printed, out = patrolled
+    for words in ("published", "measured", "58.05", "29.77", "1.545417: 16",
+                  "4 of 4 runs won almost surely"):
+        assert words in printed
+    row = found["learned"][1]
+    assert re.search(rf"^ +1 +{row['last_update_step']} +{row['updates']} ", printed, re.MULTILINE)
+    pictures = sorted(path.name for path in out.iterdir())
+    assert pictures == [
+        "figure_17_automaton.svg", "figure_17_best_moves.svg", "figure_18_values.svg",
+        "figure_19_initial.svg", "figure_19_learned.svg",
+    ]
+    assert all((out / name).read_bytes().rstrip().endswith(b"</svg>") for name in pictures)
+
+
+def test_seeds_are_for_experiments_that_repeat_themselves():
+    assert "reproduce mlirl does not learn with several seeds" in failure(
+        "reproduce", "mlirl", "--seeds", 2)

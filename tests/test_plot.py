@@ -230,6 +230,80 @@ def test_curves_with_and_without_spread():
         plot.curves({"unknown": [np.nan]})
 
 
+def arrows(axes, base=0.2):
+    """Tips of a map's arrows, those with a wide base and the others."""
+    found = [x.get_xy() for x in axes.patches if not isinstance(x, Circle | Rectangle)]
+    wide = [float(np.abs(xy[0] - xy[2]).sum()) > base for xy in found]
+    tips = [tuple(np.round(xy[1], 2)) for xy in found]
+    return (sorted(t for t, big in zip(tips, wide, strict=True) if big),
+            sorted(t for t, big in zip(tips, wide, strict=True) if not big))
+
+
+def test_rare_moves_have_small_arrows():
+    play = np.zeros((2, 6, 4))
+    play[0, 1] = [0, 1 - 1e-6, 1e-6, 0]  # b . r over . # y
+    play[0, 5] = [0.5, 0, 0.5, 0]
+    play[1, 0] = np.nan
+    play[1, 4] = 0
+    marked = np.zeros((2, 6), bool)
+    marked[0, 5] = marked[1, 0] = True
+    figure = plot.strategies(MAP, play, marked=marked, mark="good", titles=["one", "two"])
+    first, second = figure.axes
+    assert arrows(first) == ([(1.5, 0.96), (2.04, 1.5), (2.5, 1.04)], [(1.2, 0.5)])
+    assert arrows(second) == ([], [])
+    fills = [
+        {x.get_xy(): to_hex(x.get_facecolor()) for x in axes.patches if isinstance(x, Rectangle)}
+        for axes in (first, second)
+    ]
+    assert fills[0][2, 1] == plot._MARKED and fills[0][0, 0] == plot.PAPER
+    assert fills[1][0, 0] == plot._NEVER and fills[1][1, 1] == plot._WALL
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["one", "two"]
+    assert [t.get_text() for t in figure.legends[0].texts] == [
+        "good", "never reached", "often", "seldom"]
+    assert {t.get_text() for t in first.texts} == {"b", "r", "y"}
+    assert b"</svg>" in plot.to_bytes(figure)
+    single = plot.strategies(MAP, play[0], seldom=1e-7)
+    assert len(arrows(single.axes[0])[0]) == 4 and not single.legends
+    # A row of maps has at most so many.
+    assert len(plot.strategies(MAP, play[[0] * 5], across=3).axes) == 6
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"play": np.zeros((6, 3))}, r"play has shape \(6, 3\); the map has 6 cells and there are 4"),
+    ({"play": np.zeros((6, 4)), "marked": np.zeros((2, 6))}, r"marked has shape \(2, 6\); play"),
+    ({"play": np.zeros((6, 1)), "actions": ["jump"]}, r"action 'jump' has no direction"),
+])
+def test_misfits_of_strategies(options, message):
+    with pytest.raises(ValueError, match=message):
+        plot.strategies(MAP, **options)
+
+
+def test_values_are_compared_state_by_state():
+    best, mine = [3.0, 1.0, 2.0, 1.0], [0.5, 0.9, 2.0, 0.1]
+    figure = plot.compare({"best": best, "mine": mine}, groups=["x", "x", "y", "x"], label="worth")
+    axes = figure.axes[0]
+    found = {line.get_label(): line for line in axes.lines if len(line.get_xdata()) == 4}
+    assert found["best"].get_ydata().tolist() == [1.0, 1.0, 3.0, 2.0]
+    assert found["mine"].get_ydata().tolist() == [0.1, 0.9, 0.5, 2.0]
+    np.testing.assert_array_equal(found["best"].get_xdata(), found["mine"].get_xdata())
+    left, right = (text.get_position()[0] for text in axes.texts)
+    assert [text.get_text() for text in axes.texts] == ["x", "y"] and left < right
+    assert [t.get_text() for t in figure.legends[0].texts] == ["best", "mine"]
+    assert axes.get_ylabel() == "worth"
+    assert b"</svg>" in plot.to_bytes(plot.compare({"alone": best}))
+
+
+@pytest.mark.parametrize(("values", "groups", "message"), [
+    ({}, None, "compare needs values of the same states; it has none"),
+    ({"a": []}, None, "it has a: 0"),
+    ({"a": [1.0], "b": [1.0, 2.0]}, None, "it has a: 1, b: 2"),
+    ({"a": [1.0]}, ["x", "y"], "groups has 2 names; there are 1 states"),
+])
+def test_misfits_of_values_to_compare(values, groups, message):
+    with pytest.raises(ValueError, match=message):
+        plot.compare(values, groups=groups)
+
+
 def states(count, environment, system, turn=1):
     """The number of a state of a game of two robots."""
     return (environment * count + system) * 2 + turn

@@ -119,8 +119,8 @@ class State:
       step: steps made.
       moves: moves made.
       position: ``int32[]``, the state of the game.
-      counts: ``int32[S, A, K]``, how often each transition was seen until its pair was known;
-        from then on, whether it was seen at all.
+      counts: ``int32[S, A, K]``, how often each transition was seen; in a game without chance,
+        whether it was.
       reward: ``float[S, A, K]``, the rewards seen; ``R_max / (1 - discount)`` at others.
       known_at: ``int32[S, A]``, the number of moves after which a pair was known; -1 before.
       probability, gain: ``float[S, A, K]`` and ``[S, A]``, transitions and expected rewards of
@@ -350,8 +350,9 @@ def _require_start(game: Game, region: jax.Array, base: np.ndarray, memory: np.n
     ) + (", ..." if outside.size > 5 else "")
     raise ValueError(
         f"{outside.size} of the states where runs start lie outside of the almost-surely winning "
-        f"region: {named}. From there the environment can keep the accepting states from being "
-        "met again, with positive probability (winning_region(...).counter_action shows how); "
+        f"region: {named}. From there the task is lost, or the environment can keep the accepting "
+        "states from being met again with positive probability (winning_region(...).counter_action "
+        "shows how); "
         "start elsewhere, or weaken the task."
     )
 
@@ -510,7 +511,8 @@ def observe(
     """One move of a world outside, seen by the learner; on the host.
 
     Whoever moves at ``state.position`` has made it; the system's moves are drawn from
-    ``strategy(state, problem, hparams)[state.position]``.
+    ``strategy(state, problem, hparams)[state.position]``. Where a run starts anew, give the
+    place first: ``state.replace(position=jnp.int32(s))``.
 
     Raises:
       ValueError: the move is not allowed there, the successor is not in the graph, or the
@@ -538,14 +540,14 @@ def _observe(state, problem, hparams, action, successor, reward) -> State:
     seen = _Seen(state.position, jnp.int32(action), jnp.int32(successor),
                  jnp.asarray(reward, problem.game.dtype))
     rules = _rules(state, problem, hparams)
-    walk = _record(walk, seen, rules, jnp.bool_(True))
-    if problem.game.num_successors == 1:
-        walk = _noted(walk, rules, walk.known, jnp.bool_(False))
+    walk = _noted(_record(walk, seen, rules, jnp.bool_(True)), problem)
     return _updated(state, walk, problem, hparams)
 
 
 def evidence(state: State, problem: Problem, hparams: Hparams) -> Evidence:
     """What the strategy of a state is worth in the true game, certified; on the host.
+
+    One state at a time: of vmapped seeds, ``jax.tree.map(itemgetter(i), states)``.
 
     Raises:
       ValueError: a reward outside [0, R_max] was observed, which voids every guarantee.
@@ -636,9 +638,9 @@ class _Seen(NamedTuple):
 class _Walk(NamedTuple):
     """What changes from move to move; `left` moves remain, none once there is something new.
 
-    `pair` and `slot` are of the last move, `seen` is its reward, `known` whether its pair
-    has become known by it, and `fresh` whether a known pair has shown a transition for the
-    first time.
+    Counts and rewards are flat. `pair` is of the last move, `seen` its reward, `known` whether
+    the pair has become known by it, and `fresh` whether a known pair has shown a transition
+    for the first time.
     """
 
     moves: jax.Array
@@ -647,7 +649,6 @@ class _Walk(NamedTuple):
     counts: jax.Array
     reward: jax.Array
     pair: jax.Array
-    slot: jax.Array
     seen: jax.Array
     known: jax.Array
     fresh: jax.Array
@@ -657,8 +658,8 @@ class _Walk(NamedTuple):
 def _walk_from(state: State, moves: jax.Array) -> _Walk:
     zero, false = jnp.int32(0), jnp.bool_(False)
     return _Walk(
-        state.moves, moves, state.position, state.counts, state.reward,
-        zero, zero, jnp.zeros((), state.reward.dtype), false, false, state.fault,
+        state.moves, moves, state.position, state.counts.ravel(), state.reward.ravel(),
+        zero, jnp.zeros((), state.reward.dtype), false, false, state.fault,
     )
 
 
@@ -667,9 +668,7 @@ def _advance(state: State, problem: Problem, hparams: Hparams, moves: jax.Array)
     rules = _rules(state, problem, hparams)
     walk = learner.while_active(
         lambda w, _: w.left > 0, _move, _walk_from(state, moves), rules)
-    if problem.game.num_successors == 1:
-        walk = _noted(walk, rules, walk.known, jnp.bool_(False))
-    after = _updated(state, walk, problem, hparams)
+    after = _updated(state, _noted(walk, problem), problem, hparams)
     return replace(after, step=state.step + (moves > 0))
 
 
@@ -707,38 +706,49 @@ def _record(walk: _Walk, seen: _Seen, rules: _Rules, active: jax.Array) -> _Walk
     game = rules.problem.game
     width, pair = game.num_successors, seen.state * game.num_actions + seen.action
     slot = successor_slot(game, seen.state, seen.action, seen.successor)
-    row = take(walk.counts.reshape(-1, width), pair)
-    was_known, first = take(rules.known_at.ravel(), pair) >= 0, row[slot] == 0
+    entry = pair * width + slot
+    # Written before it is read: the other way round whole arrays would be copied. Without
+    # chance a pair is known after one move, the last of a walk, which is noted after it.
+    counts = walk.counts if width == 1 else _counted(walk.counts, entry, active)
+    row = take(counts, pair * width + jnp.arange(width))
+    was_known, first = take(rules.known_at.ravel(), pair) >= 0, row[slot] == 1
     alone = jnp.sum(take(game.mdp.probability.reshape(-1, width), pair) > 0) == 1
-    visits = (jnp.sum(row) + 1).astype(game.dtype)
-    known = active & ~was_known & (alone | (visits >= rules.enough))
-    fresh = active & was_known & first & rules.every
+    enough = alone | (jnp.sum(row).astype(game.dtype) >= rules.enough)
+    known = active & ~was_known & enough
+    fresh = active & was_known & first & rules.every & (width > 1)
     wrong = active & ~((seen.reward >= 0) & (seen.reward <= rules.bound))
-    walk = walk._replace(
+    noted = active & jnp.where(rules.every, first, known)
+    return _Walk(
         moves=walk.moves + active,
         left=jnp.where(active, jnp.where(known | fresh, 0, walk.left - 1), walk.left),
         position=jnp.where(active, seen.successor, walk.position),
-        pair=jnp.where(active, pair, walk.pair), slot=jnp.where(active, slot, walk.slot),
+        counts=counts,
+        reward=walk.reward if width == 1 else _rewarded(walk.reward, entry, seen.reward, noted),
+        pair=jnp.where(active, pair, walk.pair),
         seen=jnp.where(active, seen.reward, walk.seen),
         known=known | (~active & walk.known), fresh=fresh | (~active & walk.fresh),
         fault=jnp.where(wrong & (walk.fault < 0), pair, walk.fault),
     )
-    # Without chance only a walk's last move can have something to note.
-    return walk if width == 1 else _noted(walk, rules, active, was_known)
 
 
-def _noted(walk: _Walk, rules: _Rules, active: jax.Array, was_known: jax.Array) -> _Walk:
-    """The last move of a walk in the counts and rewards."""
-    entry = walk.pair * walk.counts.shape[-1] + walk.slot
-    before = take(walk.counts.ravel(), entry)
-    old = take(walk.reward.ravel(), entry)
-    # A known pair's frequencies rest: only that a transition was seen at all is noted.
-    added = active & (~was_known | (before == 0))
-    new = active & jnp.where(rules.every, before == 0, walk.known)
+def _noted(walk: _Walk, problem: Problem) -> _Walk:
+    """In a game without chance, the last move of a walk if it made its pair known."""
+    if problem.game.num_successors > 1:
+        return walk
     return walk._replace(
-        counts=_write(walk.counts, entry, before + added),
-        reward=_write(walk.reward, entry, jnp.where(new, walk.seen, old)),
+        counts=_counted(walk.counts, walk.pair, walk.known),
+        reward=_rewarded(walk.reward, walk.pair, walk.seen, walk.known),
     )
+
+
+def _counted(counts: jax.Array, entry: jax.Array, once: jax.Array) -> jax.Array:
+    return counts.at[entry].add(once.astype(counts.dtype), mode="promise_in_bounds")
+
+
+def _rewarded(reward, entry, seen, noted) -> jax.Array:
+    """A reward where none was noted, for which a larger number stands."""
+    least = jnp.where(noted, seen, jnp.inf).astype(reward.dtype)
+    return reward.at[entry].min(least, mode="promise_in_bounds")
 
 
 def _write(array: jax.Array, place: jax.Array, entry: jax.Array) -> jax.Array:
@@ -751,17 +761,19 @@ def _updated(state: State, walk: _Walk, problem: Problem, hparams: Hparams) -> S
     """The state after a walk; with something new, the model and the strategy are too."""
     game = problem.game
     width, pair, news = game.num_successors, walk.pair, walk.known | walk.fresh
+    entries = pair * width + jnp.arange(width)
     listed = take(game.mdp.probability.reshape(-1, width), pair) > 0
     # Every listed successor is taken to have been seen once, which keeps the graph.
-    row = jnp.where(listed, jnp.maximum(take(walk.counts.reshape(-1, width), pair), 1), 0)
+    row = jnp.where(listed, jnp.maximum(take(walk.counts, entries), 1), 0)
     share = row / jnp.sum(row).astype(game.dtype)
     old = take(state.probability.reshape(-1, width), pair)
     share = jnp.where(walk.known, share, old)
-    gain = jnp.sum(share * take(walk.reward.reshape(-1, width), pair))
+    gain = jnp.sum(share * take(walk.reward, entries))
     probability = state.probability.reshape(-1, width).at[pair].set(share)
     state = replace(
-        state, moves=walk.moves, position=walk.position, counts=walk.counts,
-        reward=walk.reward, fault=walk.fault,
+        state, moves=walk.moves, position=walk.position, fault=walk.fault,
+        counts=walk.counts.reshape(state.counts.shape),
+        reward=walk.reward.reshape(state.reward.shape),
         known_at=_write(state.known_at, pair, jnp.where(
             walk.known, walk.moves, take(state.known_at.ravel(), pair))),
         probability=probability.reshape(state.probability.shape),

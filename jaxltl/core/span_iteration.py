@@ -16,6 +16,7 @@ from jax import lax
 from jaxltl.core.game import Game
 
 _MOST_SWEEPS = 100_000
+_WRITTEN_OUT = 16  # successors up to which a sum over them is written out
 
 
 class _Graph(NamedTuple):
@@ -90,16 +91,30 @@ def _plain(graph: _Graph, models: _Models) -> tuple[jax.Array, jax.Array, jax.Ar
     live = beside(graph.allowed.any(-1))
     ahead = models.discount / (1 - models.discount)
 
-    def quantities(value: jax.Array) -> jax.Array:
-        reached = value.at[graph.successor].get(
+    def reached(value: jax.Array, *where: Any) -> jax.Array:
+        return value.at[graph.successor[:, *where]].get(
             mode="promise_in_bounds", wrap_negative_indices=False)
-        if reached.shape[2] == 1:  # what is certain need not be weighed
-            return models.gain + models.discount * reached[:, :, 0]
-        return models.gain + models.discount * jnp.sum(models.probability * reached, axis=2)
+
+    def quantities(value: jax.Array) -> list[jax.Array]:
+        """One column for each action: written out, it is read in the order of memory."""
+        num_actions, width = graph.successor.shape[1:]
+        columns = []
+        for a in range(num_actions):
+            if width == 1:  # what is certain need not be weighed
+                mean = reached(value, a, 0)
+            elif width > _WRITTEN_OUT:
+                mean = jnp.sum(models.probability[:, a] * reached(value, a), axis=1)
+            else:
+                terms = [models.probability[:, a, k] * reached(value, a, k) for k in range(width)]
+                mean = sum(terms[1:], start=terms[0])
+            columns.append(models.gain[:, a] + models.discount * mean)
+        return columns
 
     def sweep(carry):
         value, error, n = carry
-        best = jnp.where(allowed, sign[:, None] * quantities(value), -jnp.inf).max(axis=1)
+        best = jnp.full_like(value, -jnp.inf)
+        for a, column in enumerate(quantities(value)):
+            best = jnp.maximum(best, jnp.where(allowed[:, a], sign * column, -jnp.inf))
         change = jnp.where(live, sign * best - value, 0)
         top = jnp.where(live, change, -jnp.inf).max(axis=0)
         bottom = jnp.where(live, change, jnp.inf).min(axis=0)
@@ -113,7 +128,7 @@ def _plain(graph: _Graph, models: _Models) -> tuple[jax.Array, jax.Array, jax.Ar
 
     start = (models.value, jnp.full_like(models.enough, jnp.inf), jnp.int32(0))
     value, error, _ = lax.while_loop(unfinished, sweep, start)
-    return value, error, quantities(value)
+    return value, error, jnp.stack(quantities(value), axis=1)
 
 
 _iterate = jax.custom_batching.custom_vmap(_plain)

@@ -14,7 +14,7 @@ import pytest
 from flax import struct
 
 import jaxltl as jl
-from jaxltl.algos import learner, maximin_q, mlirl
+from jaxltl.algos import learner, maximin_q, mlirl, rmax
 from jaxltl.core.game import make_game
 from tests.support import counted_traces
 
@@ -98,16 +98,26 @@ def q_learning(method):
     )
 
 
+def pac_learning():
+    game, reward = alternating_game()
+    setting = partial(rmax.Hparams, known_after=3, epsilon=0.1, reward_bound=1.0, moves_per_step=7)
+    return Case(
+        rmax, rmax.make_problem(game, np.arange(4) == 0, reward, start=np.full(4, 0.25)),
+        setting(discount=0.5, restart=0.1), setting(discount=0.6, restart=0.3),
+    )
+
+
 LEARNERS = {
     "toy": lambda: Case(TOY, jnp.arange(3.0), 0.1, 0.2),
     "mlirl-world": mlirl_world,
     "mlirl-product": mlirl_product,
     "q-generalized": partial(q_learning, "generalized"),
     "q-maximin": partial(q_learning, "maximin"),
+    "rmax": pac_learning,
 }
 
 # What a state has learned, by name; the first that it has.
-LEARNED = ("parameters", "q", "position")
+LEARNED = ("parameters", "q", "counts", "position")
 
 
 @cache
