@@ -268,6 +268,31 @@ def test_runs_have_at_least_one_step_and_row(limits):
         module.run(start("toy"), problem, hparams, **limits)
 
 
+def test_a_loop_of_lanes_is_a_while_loop():
+    """Lanes of different lengths; what is given shared or not; nested."""
+    def active(carry, given):
+        return carry["n"] < given["most"]
+
+    def body(carry, given):
+        go = active(carry, given)
+        return {"n": carry["n"] + go, "sum": carry["sum"].at[0].add(go * given["step"])}
+
+    def loop(n, most, step):
+        carry = {"n": n, "sum": jnp.zeros(2)}
+        return learner.while_active(active, body, carry, {"most": most, "step": step})
+
+    most = jnp.array([[3, 0, 7], [1, 5, 2]])
+    step = jnp.array([1.0, 10.0])
+    alone = loop(jnp.int32(1), most[0, 2], step[1])
+    assert alone["n"] == 7 and alone["sum"].tolist() == [60.0, 0.0]
+    inner = jax.vmap(loop, (None, 0, None))
+    found = jax.jit(jax.vmap(inner, (None, 0, 0)))(jnp.int32(1), most, step)
+    np.testing.assert_array_equal(found["n"], np.maximum(most, 1))
+    np.testing.assert_array_equal(
+        found["sum"][..., 0], (np.maximum(most, 1) - 1) * np.array([[1], [10]]))
+    assert (found["sum"][..., 1] == 0).all()
+
+
 def test_a_run_in_chunks_is_the_run():
     module, problem, hparams, _ = case("toy")
     reports = []

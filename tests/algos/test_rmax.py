@@ -15,7 +15,7 @@ from jaxltl.core.game_value import minimax_value
 from jaxltl.core.types import Status
 from jaxltl.envs.post_offices import patrol, post_offices
 from tests import reference_games
-from tests.support import counted_traces, lane, stack
+from tests.support import as_mdp, counted_traces, lane, stack
 
 
 @cache
@@ -29,18 +29,17 @@ def settings(**changed):
         "discount": 0.6, "reward_bound": 1.0, "epsilon": 1e-4, "restart": 1 / 50, **changed})
 
 
-def random_problem(seed, num_states=7):
+def random_problem(seed, num_states=7, least=2):
     """A random stochastic game whose almost-sure region is neither empty nor all of it."""
     rng = np.random.default_rng(seed)
     while True:
-        play = reference_games.random_game(rng, num_states)
-        mdp = jl.make_mdp(play.successor, play.probability, available=play.available)
-        game = make_game(mdp, play.system)
+        play = reference_games.random_game(rng, num_states, kind="mixed")
+        game = make_game(as_mdp(play.model), play.system)
         accepting = rng.random(num_states) < 0.4
         region = np.asarray(jl.almost_sure_buchi(game, jnp.asarray(accepting)).region)
-        if 2 <= region.sum() < num_states:
+        if least <= region.sum() < num_states:
             break
-    reward = rng.random((num_states, *play.successor.shape[1:]))
+    reward = rng.random(game.mdp.probability.shape)
     return rmax.make_problem(
         game, accepting, reward, start=region / region.sum()), rng
 
@@ -118,11 +117,14 @@ class Plain:
 
 @pytest.mark.parametrize("update", rmax.UPDATES)
 def test_observed_moves_are_kept_as_by_plain_bookkeeping(update):
-    problem, rng = random_problem(3)
+    problem, rng = random_problem(1, num_states=9, least=7)
     hparams = settings(known_after=3, update=update, epsilon=0.01)
     plain, state = Plain(problem, hparams, update), rmax.init(jax.random.key(0), problem, hparams)
-    rewards = rng.random((7, 2, 7))
-    for _ in range(150):
+    rewards = rng.random((9, 2, 9))
+    live = np.flatnonzero(plain.allowed.any(1))
+    for n in range(150):
+        if n % 10 == 0:  # a new start, or some places would never be seen
+            state = state.replace(position=jnp.int32(rng.choice(live)))
         s = int(state.position)
         play = np.asarray(rmax.strategy(state, problem, hparams))[s]
         if not plain.system[s]:
