@@ -24,12 +24,13 @@ NO_JAX = tuple(
 # Lower rooms first: a module of the core imports only from rows above its own.
 LAYERS = [
     {"types", "ltl", "diagram", "emerson_lei"},
-    {"mdp", "automaton", "simplify", "progression", "labels"},
+    {"mdp", "automaton", "simplify", "progression", "labels", "exponential_family"},
     {"operators", "parity", "normal_form"},
     {"game", "rollout", "language", "trackers"},
     {"translate", "graph", "fixed_point", "objective"},
     {"product", "monitor"},
-    {"acceptance", "stiff", "bellman", "occupancy", "gr1", "pac", "span_iteration"},
+    {"acceptance", "stiff", "bellman", "occupancy", "gr1", "pac", "span_iteration",
+     "finite_task"},
     {"reachability", "winning", "game_value", "mean_payoff"},
     {"verify", "permissive"},
 ]
