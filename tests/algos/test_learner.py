@@ -14,7 +14,8 @@ import pytest
 from flax import struct
 
 import jaxltl as jl
-from jaxltl.algos import learner, maximin_q, mlirl, rmax
+from jaxltl.algos import cce, learner, maximin_q, mlirl, rmax
+from jaxltl.core.exponential_family import diagonal_gaussian
 from jaxltl.core.game import make_game
 from tests.support import counted_traces
 
@@ -107,6 +108,19 @@ def pac_learning():
     )
 
 
+def noisy_quadratic(x, key):
+    return jax.random.normal(key) - jnp.sum((x - 1.0) ** 2), jnp.sum(x)
+
+
+def cross_entropy():
+    problem = cce.make_problem(noisy_quadratic, diagonal_gaussian(jnp.zeros(2), 1.0), limit=1.0)
+    setting = partial(cce.Hparams, population=10, elite_reuse=True)
+    return Case(
+        cce, problem, setting(rate=cce.Polynomial(0.5, -0.5)),
+        setting(rate=cce.Polynomial(0.9, -0.2), temperature=2.0),
+    )
+
+
 LEARNERS = {
     "toy": lambda: Case(TOY, jnp.arange(3.0), 0.1, 0.2),
     "mlirl-world": mlirl_world,
@@ -114,10 +128,11 @@ LEARNERS = {
     "q-generalized": partial(q_learning, "generalized"),
     "q-maximin": partial(q_learning, "maximin"),
     "rmax": pac_learning,
+    "cce": cross_entropy,
 }
 
 # What a state has learned, by name; the first that it has.
-LEARNED = ("parameters", "q", "counts", "position")
+LEARNED = ("parameters", "q", "counts", "family", "position")
 
 
 @cache

@@ -1,0 +1,918 @@
+"""The constrained cross-entropy method (dissertation, chapter 4, algorithm 2).
+
+A policy is a vector of parameters, and all that is asked of it is ``evaluate(parameters, key) ->
+(objective, cost)``: an objective to be maximised and costs that are feasible up to limits.
+Policies are drawn from a natural exponential family. While fewer than ``k = ceil(rho n)`` of the
+n samples are feasible the elites are the k with the least violation, else the k feasible ones
+of the highest objective. The mean parameter of the family moves towards theirs,
+
+    eta' = alpha sum_i w_i Gamma(x_i) + (1 - alpha) (lambda mean_i Gamma(x_i) + (1 - lambda) eta),
+
+(4.14), and starts at the initial family's. The dissertation's objective G is positive and weighs
+the elites; here it is given by its logarithm, or is any number, and the weights are
+``exp(objective / temperature)``, shifted so that nothing overflows.
+
+Only the share of feasible *samples* is controlled: the mean policy can be infeasible, and the best
+sample can owe its place to luck. :func:`result` evaluates both anew and names a solution
+only if it is feasible.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+
+from jaxltl.algos import learner
+from jaxltl.core import exponential_family as families
+from jaxltl.core.types import Status, require_shape
+
+WEIGHTINGS = ("until_feasible", "literal", "uniform")
+
+# Products such as .07 * 100 come out a little above the integer that they are.
+_SLACK = 1e-9
+
+
+@struct.dataclass
+class Polynomial:
+    """The schedule ``scale * (l + offset) ** power`` of the steps l = 1, 2, ...
+
+    A negative power decays. Numbers are traced.
+
+    Example:
+      >>> [round(float(at(Polynomial(0.5, -1.0), step)), 3) for step in range(3)]
+      [0.5, 0.25, 0.167]
+    """
+
+    scale: jax.Array | float
+    power: jax.Array | float
+    offset: jax.Array | float = 0.0
+
+
+Schedule = Any  # a number, a Polynomial, or a pytree that is called with l = 1, 2, ...
+
+
+@struct.dataclass
+class Problem:
+    """What is searched; made by :func:`make_problem`.
+
+    Attributes:
+      evaluate: ``(float[D], key) -> (objective, cost)``, a pytree.
+      family: the first distribution of policies.
+      limit: ``float[C]``, feasible is a cost of at most this.
+      scale: ``float[C]``, what violations are divided by to compare constraints.
+    """
+
+    evaluate: Any
+    family: Any
+    limit: jax.Array
+    scale: jax.Array
+
+
+@struct.dataclass
+class Hparams:
+    """How to search. Numbers are traced, so new values do not recompile; None is static.
+
+    The theorem's schedules are ``rate=Polynomial(a, p)`` with p in [-1, 0) and
+    ``num_samples=Polynomial(n, beta)``, with `weighting` ``"literal"``: see
+    :func:`theorem_conditions`. The defaults are outside of it.
+
+    Attributes:
+      rate: alpha_l, in (0, 1]; a schedule.
+      sample_share: lambda_l, the weight in [0, 1] of the samples' own mean instead of the last mean
+        parameter; a schedule, or None for 0.
+      num_samples: n_l, a schedule, rounded and kept between 1 / rho and `population`; later samples
+        are masked, but drawn and evaluated. None: always `population`.
+      temperature: of the weights, positive. At 1 the objective is the logarithm of G.
+      margin: taken off the limits for the search, a number or ``float[C]``; :func:`result` is not
+        concerned. Where costs are random, samples are feasible by luck: with normal noise of
+        deviation s and a rho of .2 the search can rest .84 s above a limit without margin.
+      population: the largest n_l; static.
+      rho: the share of elites; static.
+      weighting: static. ``"until_feasible"``: elites count equally until k of them are feasible,
+        then by G, because G-weights while nothing is feasible narrow the search around policies
+        that are merely good; ``"literal"``: always by G; ``"uniform"``: always equally.
+
+      Outside of the theorem:
+      elite_reuse: the last elites compete again with the values they had; static. Where values are
+        random, lucky ones stay.
+      antithetic: samples come in pairs mirrored about the mean; static.
+      variance_floor: the variance is at least this in every direction.
+      noise: a variance added after every step, a schedule (Szita and Lorincz 2006).
+      restart_below: the search starts again from the first distribution when all standard
+        deviations are below this. What was found is kept.
+
+      sharding: a ``NamedSharding`` whose spec names the mesh axis over which the population's axis
+        is split, such as ``NamedSharding(mesh, PartitionSpec("population"))``; static.
+    """
+
+    rate: Schedule = 0.1
+    sample_share: Schedule = None
+    num_samples: Schedule = None
+    temperature: jax.Array | float = 1.0
+    margin: jax.Array | float = 0.0
+    population: int = struct.field(pytree_node=False, default=100)
+    rho: float = struct.field(pytree_node=False, default=0.2)
+    weighting: str = struct.field(pytree_node=False, default="until_feasible")
+    elite_reuse: bool = struct.field(pytree_node=False, default=False)
+    antithetic: bool = struct.field(pytree_node=False, default=False)
+    variance_floor: jax.Array | float | None = None
+    noise: Schedule = None
+    restart_below: jax.Array | float | None = None
+    sharding: Any = struct.field(pytree_node=False, default=None)
+
+
+@struct.dataclass
+class Sample:
+    """One evaluated policy: ``float[D]``, its objective, costs ``float[C]``, and its excess.
+
+    `excess` is ``max_c (cost_c - limit_c) / scale_c``; `found` whether there is such a policy.
+    """
+
+    parameters: jax.Array
+    objective: jax.Array
+    cost: jax.Array
+    excess: jax.Array
+    found: jax.Array
+
+
+@struct.dataclass
+class Pool:
+    """Evaluated policies: ``float[n, D]``, ``float[n]``, ``float[n, C]`` and which count."""
+
+    parameters: jax.Array
+    objective: jax.Array
+    cost: jax.Array
+    active: jax.Array
+
+
+@struct.dataclass
+class State:
+    """A distribution on its way, and the best that it has drawn.
+
+    Attributes:
+      key: of the whole run.
+      step: steps made.
+      family: the distribution of policies.
+      best: the feasible sample of the highest objective; by its one evaluation.
+      least: the sample of the least violation, likewise.
+      elites: the last ones; None without reuse.
+      num_evaluated, num_invalid: samples so far, and those that could not be used: an objective
+        that is NaN or plus infinity, or a cost that is NaN.
+      num_restarts: so far.
+      status: NONFINITE if no sample of the last step could be used (the distribution then stays
+        as it was), else MAX_STEPS: the search has no end of its own.
+    """
+
+    key: jax.Array
+    step: jax.Array
+    family: Any
+    best: Sample
+    least: Sample
+    elites: Any
+    num_evaluated: jax.Array
+    num_invalid: jax.Array
+    num_restarts: jax.Array
+    status: jax.Array
+
+
+@struct.dataclass
+class Metrics:
+    """Figures of a step.
+
+    Attributes:
+      num_evaluated: samples so far.
+      num_feasible, num_invalid: of this step's samples.
+      enough_feasible: whether the elites were chosen by the objective (case 2).
+      objective: mean over this step's samples that could be used.
+      cost: ``float[C]``, likewise.
+      best_objective: of the best feasible sample so far; minus infinity before there is one.
+      least_excess: of the sample of the least violation so far.
+      spread: the largest standard deviation after the step.
+      rate: alpha_l.
+      num_restarts, status: see :class:`State`.
+    """
+
+    num_evaluated: jax.Array
+    num_feasible: jax.Array
+    num_invalid: jax.Array
+    enough_feasible: jax.Array
+    objective: jax.Array
+    cost: jax.Array
+    best_objective: jax.Array
+    least_excess: jax.Array
+    spread: jax.Array
+    rate: jax.Array
+    num_restarts: jax.Array
+    status: jax.Array
+
+
+# --- problems, on the host ------------------------------------------------------------------
+
+
+def make_problem(
+    evaluate: Callable[..., Any],
+    family: Any,
+    *,
+    limit: chex.Array | float | None = None,
+    scale: chex.Array | float | None = None,
+) -> Problem:
+    """A checked :class:`Problem`, on the host.
+
+    Args:
+      evaluate: ``(parameters float[D], key) -> (objective, cost)`` of one policy, with a scalar
+        objective, a scalar cost or ``float[C]``; or the objective alone, for the
+        unconstrained method. Give arrays that it needs by
+        ``jax.tree_util.Partial(function, *arrays)``: what a function closes over is compiled in.
+      family: the first distribution, such as ``diagonal_gaussian(mean, std)``.
+      limit: feasible is ``cost <= limit``, a number or ``float[C]``; infinite for none. None:
+        no constraint.
+      scale: what violations are divided by before the largest counts, a number or ``float[C]``;
+        default ``|limit|``, or 1 where that is zero or infinite. Of no effect with one cost.
+
+    Raises:
+      ValueError: evaluate returns other shapes, or a limit or scale that does not fit or is no
+        limit or scale.
+
+    Example:
+      >>> def evaluate(x, key):
+      ...     return -jnp.sum((x - 1.0) ** 2), x[0]
+      >>> problem = make_problem(evaluate, families.diagonal_gaussian(jnp.zeros(2), 1.0), limit=0.5)
+      >>> key, fresh = jax.random.split(jax.random.key(0))
+      >>> state, _ = train(key, problem, Hparams(rate=0.5), num_steps=50)
+      >>> found = result(state, problem, Hparams(), fresh)
+      >>> found.solution.round(2).tolist(), bool(found.solution[0] <= 0.5)
+      ([0.5, 1.0], True)
+    """
+    if not isinstance(evaluate, jax.tree_util.Partial):
+        evaluate = jax.tree_util.Partial(evaluate)
+    point = families.center(family)
+    shapes = jax.eval_shape(lambda e, x, k: _split(e(x, k)), evaluate, point, jax.random.key(0))
+    num_costs = shapes[1].shape[0]
+    if num_costs == 0 and limit is not None:
+        raise ValueError(
+            f"limit={limit}, but evaluate returns no cost; return (objective, cost), or give no "
+            "limit."
+        )
+    limits = _per_cost("limit", math.inf if limit is None else limit, num_costs)
+    if np.isnan(limits).any() or (limits == -np.inf).any():
+        raise ValueError(
+            f"limit={limits.tolist()}; no cost is at most NaN or minus infinity: give numbers, or "
+            "infinity for no limit."
+        )
+    if scale is None:
+        size = np.abs(limits)
+        scale = np.where((size > 0) & np.isfinite(size), size, 1.0)
+    scales = _per_cost("scale", scale, num_costs)
+    if not ((scales > 0) & np.isfinite(scales)).all():
+        raise ValueError(f"scale={scales.tolist()}; it must be positive and finite.")
+    return Problem(
+        evaluate, family, jnp.asarray(limits, point.dtype), jnp.asarray(scales, point.dtype)
+    )
+
+
+def _per_cost(name: str, value: Any, num_costs: int) -> np.ndarray:
+    value = np.asarray(value, float)
+    if value.ndim:
+        require_shape(name, value, (num_costs,))
+    return np.broadcast_to(value, (num_costs,))
+
+
+def _split(value: Any) -> tuple[jax.Array, jax.Array]:
+    """The objective and ``[C]`` costs in whatever evaluate returned."""
+    if isinstance(value, tuple | list):
+        if len(value) != 2:
+            raise ValueError(
+                f"evaluate returned {len(value)} things; return (objective, cost), or the "
+                "objective alone."
+            )
+        objective, cost = map(jnp.asarray, value)
+    else:
+        objective, cost = jnp.asarray(value), jnp.zeros((0,))
+    if objective.shape != ():
+        raise ValueError(
+            f"evaluate returned an objective of shape {objective.shape}; it is called with one "
+            "policy at a time and returns one number, shape ()."
+        )
+    if cost.ndim > 1:
+        raise ValueError(
+            f"evaluate returned a cost of shape {cost.shape}; return a number or one axis of "
+            "costs, [C]."
+        )
+    return objective, jnp.atleast_1d(cost)
+
+
+# --- schedules ------------------------------------------------------------------------------
+
+
+def at(schedule: Schedule, step: jax.Array | int) -> Any:
+    """A schedule's number in the step after `step` steps, l = step + 1."""
+    l = jnp.asarray(step) + 1  # noqa: E741
+    if isinstance(schedule, Polynomial):
+        return schedule.scale * (l + jnp.asarray(schedule.offset)) ** jnp.asarray(schedule.power)
+    return schedule(l) if callable(schedule) else schedule
+
+
+def num_elites(rho: float, num_samples: int) -> int:
+    """``k = ceil(rho n)``, where a product that should be an integer is one.
+
+    Example:
+      >>> num_elites(0.07, 100), math.ceil(0.07 * 100)
+      (7, 8)
+    """
+    return math.ceil(rho * num_samples - _SLACK)
+
+
+class Condition(NamedTuple):
+    """One of theorem 1's conditions, whether it holds (None: cannot be told), and why."""
+
+    name: str
+    holds: bool | None
+    reason: str
+
+
+class Conditions(NamedTuple):
+    """What :func:`theorem_conditions` tells.
+
+    Attributes:
+      holds: True if all conditions hold, False if one fails, else None.
+      failing: the names of those that fail.
+      conditions: all, with reasons.
+      assumed: what the theorem assumes of the problem, which settings cannot show.
+    """
+
+    holds: bool | None
+    failing: tuple[str, ...]
+    conditions: tuple[Condition, ...]
+    assumed: tuple[str, ...]
+
+
+_ASSUMED = (
+    "(1) the covariance of the sufficient statistics is positive definite",
+    "(2a) the differential equation (4.12) is continuous with unique solutions",
+    "(2c) the quantiles of H and U are unique",
+    "(2d) policies and distributions lie in compact sets",
+    "(2e) G is bounded and bounded away from 0, and H is bounded",
+    "(2f) the distribution stays in the interior of its set",
+)
+
+
+def theorem_conditions(hparams: Hparams, *, num_steps: int | None = None) -> Conditions:
+    """Whether the settings meet the conditions of theorem 1, on the host.
+
+    They are (assumption 2b): ``n_l`` grows as ``l^beta`` with beta > 0; ``alpha_l`` is positive,
+    decreases to 0 and has an infinite sum; ``lambda_l = O(l^-lambda)`` for some lambda > 0 with
+    ``beta + 2 lambda > 1``; and that the method is algorithm 2 as printed.
+
+    Args:
+      hparams: concrete numbers.
+      num_steps: the length of the run. `population` bounds n_l, so that the samples can grow
+        only for so long; None asks for ever.
+
+    Example:
+      >>> theorem_conditions(Hparams(weighting="literal")).failing
+      ('samples grow', 'rate decreases', 'rate vanishes')
+      >>> hparams = Hparams(rate=Polynomial(0.5, -0.7), num_samples=Polynomial(10, 0.5),
+      ...                   weighting="literal")
+      >>> theorem_conditions(hparams, num_steps=90).holds
+      True
+    """
+    growth, samples = _samples_condition(hparams, num_steps)
+    decay, share = _share_condition(hparams.sample_share)
+    both = None if growth is None or decay is None else growth + 2 * decay > 1
+    found = (
+        samples,
+        *_rate_conditions(hparams.rate),
+        share,
+        Condition("beta + 2 lambda > 1", both, f"beta = {growth}, lambda = {decay}"),
+        Condition(
+            "weights are G", hparams.weighting == "literal", f"weighting={hparams.weighting!r}"),
+        *(
+            Condition(f"no {name}", getattr(hparams, name) in (None, False),
+                      "not part of algorithm 2")
+            for name in ("elite_reuse", "antithetic", "variance_floor", "noise", "restart_below")
+        ),
+    )
+    failing = tuple(c.name for c in found if c.holds is False)
+    unknown = any(c.holds is None for c in found)
+    return Conditions(False if failing else None if unknown else True, failing, found, _ASSUMED)
+
+
+def _polynomial(schedule: Schedule) -> tuple[float, float, float] | None:
+    """Scale, power and offset, or None of a function."""
+    if isinstance(schedule, Polynomial):
+        return float(schedule.scale), float(schedule.power), float(schedule.offset)
+    return None if callable(schedule) else (float(schedule), 0.0, 0.0)
+
+
+_FUNCTION = "it is a function; its limits cannot be told"
+
+
+def _samples_condition(
+    hparams: Hparams, num_steps: int | None
+) -> tuple[float | None, Condition]:
+    name = "samples grow"
+    if hparams.num_samples is None:
+        return 0.0, Condition(name, False, f"n_l is always {hparams.population}")
+    found = _polynomial(hparams.num_samples)
+    if found is None:
+        return None, Condition(name, None, f"num_samples: {_FUNCTION}")
+    scale, power, offset = found
+    if not (scale > 0 and power > 0):
+        return min(power, 0.0), Condition(name, False, f"n_l = {scale:g} l^{power:g}")
+    full = max(math.floor((hparams.population / scale) ** (1 / power) - offset + _SLACK), 0)
+    reason = f"n_l ~ l^{power:g} until step {full}, then population={hparams.population}"
+    return power, Condition(name, num_steps is not None and num_steps <= full, reason)
+
+
+def _rate_conditions(rate: Schedule) -> list[Condition]:
+    names = ("rate in (0, 1]", "rate decreases", "rate vanishes", "rate has an infinite sum")
+    found = _polynomial(rate)
+    if found is None:
+        return [Condition(name, None, f"rate: {_FUNCTION}") for name in names]
+    scale, power, offset = found
+    first = scale * (1 + offset) ** power if offset > -1 else math.nan
+    decays = power < 0 and scale > 0
+    holds = (0 < first <= 1 and power <= 0, decays, decays, power >= -1 and scale > 0)
+    reason = f"alpha_l = {scale:g} (l + {offset:g})^{power:g}"
+    return [Condition(name, held, reason) for name, held in zip(names, holds, strict=True)]
+
+
+def _share_condition(share: Schedule) -> tuple[float | None, Condition]:
+    name = "sample share decays"
+    found = (0.0, 0.0, 0.0) if share is None else _polynomial(share)
+    if found is None:
+        return None, Condition(name, None, f"sample_share: {_FUNCTION}")
+    scale, power, offset = found
+    if scale == 0:  # of any order
+        return math.inf, Condition(name, True, "lambda_l = 0")
+    first = scale * (1 + offset) ** power if offset > -1 else math.nan
+    reason = f"lambda_l = {scale:g} (l + {offset:g})^{power:g}"
+    return -power, Condition(name, power < 0 and 0 <= first <= 1, reason)
+
+
+# --- elites ---------------------------------------------------------------------------------
+
+
+@struct.dataclass
+class Elites:
+    """Who was chosen among n samples.
+
+    Attributes:
+      index: ``int32[num]``, the chosen ones, best first.
+      taken: ``bool[num]``, which of these count: the first k_l, if they can be used.
+      enough_feasible: whether at least k_l are feasible, so that the objective decided.
+      feasible, usable: ``bool[n]``.
+      excess: ``float[n]``, the largest normalised violation.
+    """
+
+    index: jax.Array
+    taken: jax.Array
+    enough_feasible: jax.Array
+    feasible: jax.Array
+    usable: jax.Array
+    excess: jax.Array
+
+
+def select(
+    objective: jax.Array,
+    cost: jax.Array,
+    limit: jax.Array,
+    *,
+    num: int,
+    count: jax.Array | int | None = None,
+    scale: jax.Array | float = 1.0,
+    active: jax.Array | bool = True,
+) -> Elites:
+    """The elites of algorithm 2, steps 7 to 10.
+
+    With at least k feasible samples the k of them with the highest objective; else the k with
+    the least ``max_c (cost_c - limit_c) / scale_c``, feasible or not. Of equals the earlier
+    sample is taken, so that there are always k, where the indicator of (4.4) takes all equals;
+    the two agree if there are none. A sample with an objective that is NaN or plus infinity,
+    or a cost that is NaN, comes last and is never taken.
+
+    Args:
+      objective: ``float[n]``.
+      cost: ``float[n, C]``.
+      limit: ``float[C]``.
+      num: how many are returned; static.
+      count: k_l, at most `num`; default `num`.
+      scale: ``float[C]`` or a number.
+      active: ``bool[n]``, which samples exist.
+
+    Example:
+      >>> cost = jnp.array([[0.0], [2.0], [1.0], [0.0]])
+      >>> objective = jnp.array([1.0, 9.0, 9.0, 2.0])
+      >>> select(objective, cost, jnp.zeros(1), num=2).index.tolist()
+      [3, 0]
+      >>> select(objective, cost, jnp.zeros(1), num=3).index.tolist()
+      [0, 3, 2]
+    """
+    count = num if count is None else count
+    usable = active & (objective < jnp.inf) & ~jnp.isnan(cost).any(-1)
+    feasible = usable & (cost <= limit).all(-1)
+    excess = jnp.max((cost - limit) / scale, axis=-1, initial=-jnp.inf)
+    enough = jnp.sum(feasible) >= count
+    rank = jnp.where(enough, objective, -excess)
+    # What cannot be used has to come after the worst that can, and -0 beside 0.
+    most = jnp.finfo(rank.dtype).max
+    rank = jnp.where(rank == 0, 0, jnp.clip(rank, -most, most))
+    rank = jnp.where(jnp.where(enough, feasible, usable), rank, -jnp.inf)
+    top, index = lax.top_k(rank, num)
+    taken = (top > -jnp.inf) & (jnp.arange(num) < count)
+    return Elites(index, taken, enough, feasible, usable, excess)
+
+
+def elite_weights(
+    objective: jax.Array,
+    taken: jax.Array,
+    enough_feasible: jax.Array,
+    *,
+    weighting: str = "until_feasible",
+    temperature: jax.Array | float = 1.0,
+) -> jax.Array:
+    """Weights of the elites, which sum to 1 (to 0 if none is taken).
+
+    Args:
+      objective: ``float[k]``, the elites'.
+      taken: ``bool[k]``.
+      enough_feasible: as :func:`select` tells.
+      weighting, temperature: see :class:`Hparams`.
+
+    Example:
+      >>> half = jnp.log(jnp.array([3.0, 1.0]))
+      >>> elite_weights(half, jnp.ones(2, bool), jnp.bool_(True)).tolist()
+      [0.75, 0.25]
+    """
+    least = jnp.finfo(objective.dtype).min
+    logit = jnp.clip(objective / temperature, least, -least)
+    if weighting != "literal":
+        by_objective = enough_feasible & (weighting == "until_feasible")
+        logit = jnp.where(by_objective, logit, 0)
+    top = jnp.max(jnp.where(taken, logit, least))
+    weight = jnp.where(taken, jnp.exp(jnp.where(taken, logit - top, 0)), 0)
+    return weight / jnp.maximum(jnp.sum(weight), 1)
+
+
+# --- the learner ----------------------------------------------------------------------------
+
+
+def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """The first distribution, before any sample.
+
+    Raises:
+      ValueError: settings that leave no elite or that are out of range.
+    """
+    _check(problem, hparams)
+    point = families.center(problem.family)
+    dtype = point.dtype
+
+    def sample(objective: float, excess: float) -> Sample:
+        return Sample(
+            jnp.zeros_like(point), jnp.asarray(objective, dtype),
+            jnp.full_like(problem.limit, jnp.nan), jnp.asarray(excess, dtype), jnp.bool_(False),
+        )
+
+    elites = None
+    if hparams.elite_reuse:
+        num = num_elites(hparams.rho, hparams.population)
+        elites = Pool(
+            jnp.zeros((num, *point.shape), dtype), jnp.zeros(num, dtype),
+            jnp.zeros((num, *problem.limit.shape), dtype), jnp.zeros(num, bool),
+        )
+    zero = jnp.int32(0)
+    return State(
+        key=key, step=zero, family=problem.family, best=sample(-jnp.inf, jnp.inf),
+        least=sample(jnp.nan, jnp.inf), elites=elites, num_evaluated=zero, num_invalid=zero,
+        num_restarts=zero, status=jnp.int32(Status.MAX_STEPS),
+    )
+
+
+def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """One population: drawn, evaluated, ranked, and the distribution moved."""
+    _check(problem, hparams)
+    draw_key, evaluate_key = jax.random.split(jax.random.fold_in(state.key, state.step))
+    draw = families.sample_antithetic if hparams.antithetic else families.sample
+    samples = draw(state.family, draw_key, hparams.population)
+    objective, cost = _evaluate(problem, hparams, samples, evaluate_key)
+    num_samples, count = _sizes(hparams, state.step)
+    fresh = Pool(samples, objective, cost, jnp.arange(hparams.population) < num_samples)
+    pool = fresh
+    if hparams.elite_reuse:
+        pool = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), fresh, state.elites)
+    limit = problem.limit - hparams.margin
+    chosen = select(
+        pool.objective, pool.cost, limit, num=num_elites(hparams.rho, hparams.population),
+        count=count, scale=problem.scale, active=pool.active,
+    )
+    elites = replace(_rows(pool, chosen.index), active=chosen.taken)
+    rate = jnp.asarray(at(hparams.rate, state.step), samples.dtype)
+    family = _moved(state, hparams, fresh, elites, chosen.enough_feasible, rate)
+    family, restarted = _restarted(family, problem, hparams)
+
+    feasible, usable, excess = (
+        x[: hparams.population] for x in (chosen.feasible, chosen.usable, chosen.excess)
+    )
+    invalid = num_samples - jnp.sum(usable)
+    fine = jnp.any(usable)
+    for x in jax.tree.leaves(family):
+        fine &= jnp.isfinite(x).all()
+    new = replace(
+        state, step=state.step + 1, family=family,
+        best=_better(state.best, fresh, excess, feasible, objective, state.best.objective),
+        least=_better(state.least, fresh, excess, usable, -excess, -state.least.excess),
+        elites=elites if hparams.elite_reuse else None,
+        num_evaluated=(state.num_evaluated + num_samples).astype(jnp.int32),
+        num_invalid=(state.num_invalid + invalid).astype(jnp.int32),
+        num_restarts=state.num_restarts + restarted.astype(jnp.int32),
+        status=jnp.where(fine, Status.MAX_STEPS, Status.NONFINITE).astype(jnp.int32),
+    )
+    num_usable = jnp.sum(usable)
+    return new, Metrics(
+        num_evaluated=new.num_evaluated, num_feasible=jnp.sum(feasible), num_invalid=invalid,
+        enough_feasible=chosen.enough_feasible,
+        objective=jnp.sum(jnp.where(usable, objective, 0)) / num_usable,
+        cost=jnp.sum(jnp.where(usable[:, None], cost, 0), axis=0) / num_usable,
+        best_objective=new.best.objective, least_excess=new.least.excess,
+        spread=jnp.max(families.standard_deviation(family)), rate=rate,
+        num_restarts=new.num_restarts, status=new.status,
+    )
+
+
+run = partial(learner.run, step)
+train = partial(learner.train, init, step)
+
+
+def _evaluate(
+    problem: Problem, hparams: Hparams, samples: jax.Array, key: chex.PRNGKey
+) -> tuple[jax.Array, jax.Array]:
+    """Objectives ``[n]`` and costs ``[n, C]`` of a population."""
+    keys = jax.random.split(key, len(samples))
+    sharding = hparams.sharding
+    if sharding is not None:
+        samples, keys = lax.with_sharding_constraint((samples, keys), sharding)
+    found = jax.vmap(partial(_scores, problem))(samples, keys)
+    if sharding is not None:  # every device ranks them all, in one order of operations
+        whole = jax.sharding.NamedSharding(sharding.mesh, jax.sharding.PartitionSpec())
+        found = lax.with_sharding_constraint(found, whole)
+    return found
+
+
+def _scores(
+    problem: Problem, parameters: jax.Array, key: chex.PRNGKey
+) -> tuple[jax.Array, jax.Array]:
+    objective, cost = _split(problem.evaluate(parameters, key))
+    require_shape("the cost that evaluate returned", cost, problem.limit.shape)
+    return objective.astype(parameters.dtype), cost.astype(parameters.dtype)
+
+
+def _sizes(hparams: Hparams, step: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """n_l and k_l."""
+    most, rho = hparams.population, hparams.rho
+    if hparams.num_samples is None:
+        return jnp.int32(most), jnp.int32(num_elites(rho, most))
+    asked = jnp.round(jnp.asarray(at(hparams.num_samples, step), float))
+    num_samples = jnp.clip(asked, math.ceil(1 / rho - _SLACK), most).astype(jnp.int32)
+    counts = jnp.asarray([num_elites(rho, n) for n in range(most + 1)], jnp.int32)
+    return num_samples, counts[num_samples]
+
+
+def _rows(pool: Pool, index: jax.Array) -> Pool:
+    """The policies of an index; read as columns, for populations are computed that way round."""
+    return jax.tree.map(lambda x: x.T.at[..., index].get(mode="promise_in_bounds").T, pool)
+
+
+def _moved(
+    state: State, hparams: Hparams, fresh: Pool, elites: Pool, enough: jax.Array, rate: jax.Array
+) -> Any:
+    """The distribution after (4.14), and after what is added to it."""
+    weights = elite_weights(
+        elites.objective, elites.active, enough, weighting=hparams.weighting,
+        temperature=hparams.temperature,
+    )
+    some = jnp.any(elites.active)
+    samples, total = elites.parameters, rate
+    if hparams.sample_share is not None:
+        share = (1 - rate) * at(hparams.sample_share, state.step)
+        total = jnp.asarray(rate + share, rate.dtype)
+        own = fresh.active / jnp.sum(fresh.active, dtype=rate.dtype)
+        samples = jnp.concatenate([samples, fresh.parameters])
+        weights = jnp.concatenate([rate * weights, share * own])
+    weights = jnp.where(some, weights, 1)
+    moved = families.project(state.family, samples, weights, total)
+    if hparams.noise is not None:
+        moved = families.widen(moved, at(hparams.noise, state.step))
+    if hparams.variance_floor is not None:
+        moved = families.at_least(moved, hparams.variance_floor)
+    return jax.tree.map(lambda x, y: jnp.where(some, x, y).astype(y.dtype), moved, state.family)
+
+
+def _restarted(family: Any, problem: Problem, hparams: Hparams) -> tuple[Any, jax.Array]:
+    if hparams.restart_below is None:
+        return family, jnp.bool_(False)
+    narrow = jnp.all(families.standard_deviation(family) < hparams.restart_below)
+    return jax.tree.map(lambda x, y: jnp.where(narrow, x, y), problem.family, family), narrow
+
+
+def _better(
+    old: Sample, fresh: Pool, excess: jax.Array, among: jax.Array, score: jax.Array,
+    record: jax.Array,
+) -> Sample:
+    """The old sample, or that of the highest score if it beats the record."""
+    i = jnp.argmax(jnp.where(among, score, -jnp.inf))
+    one = _rows(fresh, i)
+    new = Sample(one.parameters, one.objective, one.cost, excess[i], among[i])
+    beats = among[i] & (~old.found | (score[i] > record))
+    return jax.tree.map(lambda x, y: jnp.where(beats, x, y), new, old)
+
+
+# --- what was found -------------------------------------------------------------------------
+
+
+@struct.dataclass
+class Assessment:
+    """A policy evaluated anew.
+
+    Attributes:
+      parameters: ``float[D]``.
+      objective: the mean over the evaluations.
+      cost: ``float[C]``, likewise; the estimate of H.
+      lower, upper: ``float[C]``, a 95% confidence interval of each cost (Student's). A cost that
+        never varied has an interval of length zero.
+      excess: ``max_c (cost_c - limit_c) / scale_c``.
+      feasible: whether every cost is at most its limit.
+      confident: whether every `upper` is.
+    """
+
+    parameters: jax.Array
+    objective: jax.Array
+    cost: jax.Array
+    lower: jax.Array
+    upper: jax.Array
+    excess: jax.Array
+    feasible: jax.Array
+    confident: jax.Array
+
+
+class Result(NamedTuple):
+    """What a search found, by evaluations of its own.
+
+    Attributes:
+      solution: ``float[D]``, the feasible one of `mean` and `best` with the higher objective;
+        None if neither is feasible.
+      solution_name: ``"mean"`` or ``"best"``, or None.
+      mean: the mean policy of the last distribution.
+      best: the best feasible sample; if there was none, the sample of the least violation.
+      violation: the least `excess` of the two; of at most 0 where there is a solution.
+      num_evaluations: of each.
+      message: one sentence that tells it.
+    """
+
+    solution: jax.Array | None
+    solution_name: str | None
+    mean: Assessment
+    best: Assessment
+    violation: float
+    num_evaluations: int
+    message: str
+
+
+@partial(jax.jit, static_argnames="num_evaluations")
+def assess(
+    problem: Problem, parameters: jax.Array, key: chex.PRNGKey, *, num_evaluations: int = 1000
+) -> Assessment:
+    """A policy evaluated with `num_evaluations` keys of its own. Under ``jit`` and ``vmap``."""
+    from scipy.special import stdtrit
+
+    if num_evaluations < 2:
+        raise ValueError(
+            f"num_evaluations={num_evaluations}; a confidence interval needs at least 2.")
+    keys = jax.random.split(key, num_evaluations)
+    objective, cost = jax.vmap(partial(_scores, problem), (None, 0))(parameters, keys)
+    objective, (mean, deviation) = _moments(objective)[0], _moments(cost)
+    margin = float(stdtrit(num_evaluations - 1, 0.975)) / math.sqrt(num_evaluations) * deviation
+    known = jnp.isfinite(mean)
+    lower, upper = (jnp.where(known, mean + s * margin, s * jnp.inf) for s in (-1, 1))
+    real = objective < jnp.inf  # and no NaN
+    return Assessment(
+        parameters=parameters, objective=objective, cost=mean, lower=lower, upper=upper,
+        excess=jnp.max((mean - problem.limit) / problem.scale, axis=-1, initial=-jnp.inf),
+        feasible=real & (mean <= problem.limit).all(),
+        confident=real & (upper <= problem.limit).all(),
+    )
+
+
+def _moments(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean and standard deviation; a constant's are exact."""
+    offset = x - x[0]
+    mean = jnp.mean(offset, axis=0)
+    deviation = jnp.sqrt(jnp.sum(jnp.square(offset - mean), axis=0) / (len(x) - 1))
+    return jnp.where(jnp.isfinite(x[0]), x[0] + mean, jnp.mean(x, axis=0)), deviation
+
+
+def result(
+    state: State,
+    problem: Problem,
+    hparams: Hparams,
+    key: chex.PRNGKey,
+    *,
+    num_evaluations: int = 1000,
+) -> Result:
+    """The mean policy and the best sample on fresh randomness, and the solution; on the host.
+
+    Args:
+      state: of one run; take one lane of a batch.
+      problem, hparams: of the run.
+      key: fresh.
+      num_evaluations: calls of evaluate for each of the two.
+
+    Raises:
+      ValueError: no sample of the last step could be evaluated, or a batch of states.
+    """
+    if jnp.ndim(state.step):
+        raise ValueError(
+            f"state holds a batch of {np.shape(state.step)} runs; take one: "
+            "jax.tree.map(lambda x: x[i], state)."
+        )
+    if int(state.status) == Status.NONFINITE:
+        raise ValueError(
+            f"step {int(state.step) - 1}: evaluate returned NaN for all samples "
+            f"({int(state.num_invalid)} of {int(state.num_evaluated)} in the run). Look for NaN in "
+            "the rollout or in the parameters that are drawn."
+        )
+    keys = jax.random.split(key)
+    sampled = state.best if bool(state.best.found) else state.least
+    look = partial(assess, problem, num_evaluations=num_evaluations)
+    both = {
+        "mean": look(families.center(state.family), keys[0]),
+        "best": look(sampled.parameters, keys[1]),
+    }
+    if not bool(sampled.found):  # no step was made
+        both["best"] = both["mean"]
+    feasible = [name for name in both if bool(both[name].feasible)]
+    name = max(feasible, key=lambda n: float(both[n].objective), default=None)
+    violation = float(min((float(a.excess) for a in both.values()), key=_nan_last))
+    if name is None:
+        seen = "" if bool(state.best.found) else " and no sample was"
+        message = (
+            f"No feasible policy: neither the mean nor the best sample is feasible on "
+            f"{num_evaluations} fresh evaluations{seen}; the least violation is {violation:.4g}."
+        )
+    else:
+        sure = "" if bool(both[name].confident) else ", but the interval reaches beyond a limit"
+        message = (
+            f"The {name} policy is feasible on {num_evaluations} fresh evaluations{sure}; its "
+            f"objective is {float(both[name].objective):.6g}."
+        )
+    return Result(
+        None if name is None else both[name].parameters, name, both["mean"], both["best"],
+        violation, num_evaluations, message,
+    )
+
+
+def _nan_last(x: float) -> float:
+    return math.inf if math.isnan(x) else x
+
+
+# --- checks ---------------------------------------------------------------------------------
+
+
+def _check(problem: Problem, hparams: Hparams) -> None:
+    if hparams.weighting not in WEIGHTINGS:
+        raise ValueError(
+            f"weighting={hparams.weighting!r}; choose {', '.join(map(repr, WEIGHTINGS))}.")
+    if not 0 < hparams.rho < 1 or hparams.rho * hparams.population < 1 - _SLACK:
+        raise ValueError(
+            f"rho={hparams.rho} of population={hparams.population} leaves no elite, or all; give "
+            "rho in (0, 1) with rho * population at least 1."
+        )
+    if np.ndim(hparams.margin):
+        require_shape("margin", hparams.margin, problem.limit.shape)
+    sharding = hparams.sharding
+    if sharding is not None and not isinstance(sharding, jax.sharding.NamedSharding):
+        raise ValueError(
+            f"sharding is a {type(sharding).__name__}; give a jax.sharding.NamedSharding.")
+    temperature = _number(hparams.temperature)
+    if temperature is not None and not temperature > 0:
+        raise ValueError(f"temperature={temperature}; it must be positive.")
+    for name, low in (("rate", "(0"), ("sample_share", "[0")):
+        value = _number(getattr(hparams, name))
+        if value is not None and not (0 <= value <= 1 and (value > 0 or low == "[0")):
+            raise ValueError(f"{name}={value}; it must be in {low}, 1].")
+
+
+def _number(value: Any) -> float | None:
+    """A number known now; None for a schedule or a traced value."""
+    if value is None or callable(value) or isinstance(value, Polynomial | jax.core.Tracer):
+        return None
+    return float(value) if np.ndim(value) == 0 else None
