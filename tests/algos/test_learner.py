@@ -14,7 +14,7 @@ import pytest
 from flax import struct
 
 import jaxltl as jl
-from jaxltl.algos import cce, learner, maximin_q, mlirl, rmax
+from jaxltl.algos import cce, learner, maximin_q, mlirl, rmax, trust_region
 from jaxltl.core.exponential_family import diagonal_gaussian
 from jaxltl.core.game import make_game
 from tests.support import counted_traces
@@ -121,6 +121,34 @@ def cross_entropy():
     )
 
 
+def choice_reset(key):
+    return jax.random.normal(key, (2,))
+
+
+def choice_step(world, action, key):
+    """A point pushed about; the reward is for being near, the cost is the push."""
+    place = world + 0.3 * action
+    return place, -jnp.sum(place**2), jnp.sum(action**2), jnp.abs(place).max() > 4
+
+
+def choice_observe(world):
+    return world
+
+
+def trust(method):
+    setting = partial(
+        trust_region.Hparams, method=method, num_trajectories=6, hidden=(3,), value_hidden=(3,),
+        cg_steps=3, value_epochs=1, value_batches=2,
+    )
+    problem = trust_region.make_problem(
+        choice_reset, choice_step, choice_observe, num_actions=2, horizon=4, limit=6.0
+    )
+    return Case(
+        trust_region, problem, setting(discount=0.9),
+        setting(discount=0.8, delta=0.02, cost_discount=0.9, value_rate=0.1),
+    )
+
+
 LEARNERS = {
     "toy": lambda: Case(TOY, jnp.arange(3.0), 0.1, 0.2),
     "mlirl-world": mlirl_world,
@@ -128,6 +156,8 @@ LEARNERS = {
     "q-generalized": partial(q_learning, "generalized"),
     "q-maximin": partial(q_learning, "maximin"),
     "rmax": pac_learning,
+    "trpo": partial(trust, "trpo"),
+    "cpo": partial(trust, "cpo"),
     "cce": cross_entropy,
 }
 
@@ -167,7 +197,7 @@ def assert_bitwise(one, other):
         np.testing.assert_array_equal(x, y)
 
 
-SLOW = {"mlirl-product", "q-maximin"}  # to compile, which is done several times
+SLOW = {"mlirl-product", "q-maximin", "trpo", "cpo"}  # to compile, which is done several times
 by_learner = pytest.mark.parametrize(
     "name",
     [pytest.param(n, marks=[pytest.mark.exhaustive] if n in SLOW else []) for n in LEARNERS],
