@@ -404,6 +404,7 @@ _EXPERIMENTS = {
     "mlirl": "section 2.5, inverse reinforcement learning with a temporal-logic task",
     "synthesis": "chapter 5, permissive strategies and learning inside them",
     "pac": "section 6.7, learning with a guarantee while winning almost surely",
+    "cce": "section 4.5, search under constraints, beside TRPO and CPO",
 }
 
 
@@ -412,7 +413,8 @@ _EXPERIMENTS = {
 @click.option("--out", type=click.Path(path_type=Path),
               help="Directory for the pictures, if there are any.  [default: out/reproduce]")
 @click.option("--seeds", type=click.IntRange(1),
-              help="How often learning is repeated, in pac.  [default: 10]")
+              help="How often learning is repeated, in pac and cce.  [default: 10 in pac; in cce "
+                   "50 for the regulator, 5 for the robot]")
 @click.option("--json", "as_json", is_flag=True, help="End with the figures as one JSON line.")
 @_plain_errors
 def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> None:

@@ -48,7 +48,7 @@ def problem(evaluate=quadratic, **options):
 
 
 # Compiling is what costs here, so what is run a few times is hardly optimised.
-QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+QUICK = {"xla_backend_optimization_level": 0}
 quick_run = jax.jit(cce.run, static_argnames="num_steps", compiler_options=QUICK)
 quick_step = jax.jit(cce.step, compiler_options=QUICK)
 
@@ -521,7 +521,7 @@ from jaxltl.core import exponential_family as ef
 jax.config.update("jax_enable_x64", True)
 mesh = jax.make_mesh((2,), ("population",), axis_types=(jax.sharding.AxisType.Auto,))
 over = NamedSharding(mesh, PartitionSpec("population"))
-quick = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+quick = {"xla_backend_optimization_level": 0}
 seen = []
 
 def evaluate(x, key):
