@@ -1117,7 +1117,7 @@ def paths(
                     facecolor=PAPER)
     every = figure.subplots(count, columns, squeeze=False).ravel()
     low, high = np.asarray(bounds, float)
-    handles = []
+    handles: list[Any] = []
     for i, axes in enumerate(every):
         axes.set_axis_off()
         if i >= len(maps):

@@ -397,3 +397,54 @@ def test_a_policy_over_the_values_of_a_game():
 def test_game_misfits(draw, message):
     with pytest.raises(ValueError, match=message):
         draw()
+
+
+# --- search under constraints -----------------------------------------------------------------
+
+
+def test_bands_have_means_spreads_and_limits():
+    x, mean, spread = [1, 2, 3], [1.0, 2.0, 4.0], [0.5, 0.5, 1.0]
+    figure = plot.bands(
+        {"one": {"cost": {"a": (x, mean, spread), "b": (x, mean, spread)}},
+         "two": {"cost": {"b": (x, mean, spread)}}},
+        limits={"two": {"cost": 3.0}}, label="trajectories",
+    )
+    first, second = figure.axes
+    assert [len(axes.get_lines()) for axes in (first, second)] == [2, 2]
+    np.testing.assert_allclose(second.get_lines()[1].get_ydata(), 3.0)
+    # A method has its colour in every panel.
+    assert first.get_lines()[1].get_color() == second.get_lines()[0].get_color()
+    band = first.collections[0].get_paths()[0].vertices
+    assert (band[:, 1].min(), band[:, 1].max()) == (0.5, 5.0)
+    assert [t.get_text() for t in figure.legends[0].texts] == ["a", "b"]
+    assert (first.get_xlabel(), second.get_xlabel()) == ("", "trajectories")
+
+
+def test_lines_beside_a_reference():
+    figure = plot.lines(
+        {"net": {"state": (np.zeros((5, 4)), np.ones(4)), "gap": ([[1.0, 2.0]], None)}},
+        labels=("time", "seed"))
+    assert [len(axes.get_lines()) for axes in figure.axes] == [6, 1]
+    assert [axes.get_xlabel() for axes in figure.axes] == ["time", "seed"]
+
+
+def test_paths_on_a_map():
+    place = np.array([[0.0, 1.0, 2.0], [0.0, 0.0, -1.0]])
+    figure = plot.paths(
+        {"first": (place, place), "second": (place, -place), "third": (place, place)},
+        {"goal": ((1, 1), (2, 2))}, bounds=((-3, -3), (3, 3)), columns=2)
+    assert len(figure.axes) == 4 and figure.axes[1].get_title(loc="left") == "second"
+    drawn = figure.axes[1].get_lines()
+    np.testing.assert_allclose(drawn[0].get_ydata(), -place[0])
+    np.testing.assert_allclose(drawn[-1].get_xdata(), [2.0, -1.0])  # where they end
+    goal = figure.axes[0].patches[0]
+    assert (goal.get_xy(), goal.get_width()) == ((1.0, 1.0), 1.0)
+
+
+@pytest.mark.parametrize("draw", [
+    lambda: plot.bands({}), lambda: plot.lines({"net": {}}),
+    lambda: plot.paths({}, {}, bounds=((0, 0), (1, 1))),
+])
+def test_nothing_to_show_of_a_search(draw):
+    with pytest.raises(ValueError, match="nothing to show"):
+        draw()

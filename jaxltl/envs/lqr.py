@@ -1,0 +1,366 @@
+"""The linear-quadratic regulator with bounded controls (dissertation, section 4.5.1).
+
+``x_(t+1) = A x_t + B u_t`` from a given state; the cost ``J = sum_t x_(t+1)' Q x_(t+1) + u_t' R
+u_t`` is to be small while ``low <= u_t <= high``. The policy is a network that reads the state.
+
+Two readings. The dissertation minimises J in a method that maximises a positive number G: here
+``G = exp(-J / scale)``, of which the logarithm is returned. And its constraint, written ``1 -
+max_t max(low - u_t, u_t - high, 0) >= 1``, is here that the largest violation is at most 0.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+from numpy.typing import ArrayLike
+
+from jaxltl.envs.networks import Network, apply_lanes, make_network, weighted
+
+
+@struct.dataclass
+class LQR:
+    """A regulator problem; made by :func:`lqr`.
+
+    Attributes:
+      dynamics, control: A ``float[n, n]`` and B ``float[n, m]``.
+      state_cost, control_cost: Q ``float[n, n]`` and R ``float[m, m]``.
+      low, high: ``float[m]``, bounds of the controls.
+      start: ``float[n]``.
+      scale: what J is divided by in the objective.
+      horizon: N, the number of controls; static.
+    """
+
+    dynamics: chex.Array
+    control: chex.Array
+    state_cost: chex.Array
+    control_cost: chex.Array
+    low: chex.Array
+    high: chex.Array
+    start: chex.Array
+    scale: chex.Array
+    horizon: int = struct.field(pytree_node=False)
+
+
+class Run(NamedTuple):
+    """One run of a policy, with the lanes of its parameters as last axes.
+
+    Attributes:
+      state: ``float[N + 1, n]``.
+      control: ``float[N, m]``.
+      total: J.
+      violation: ``max_t max(low - u_t, u_t - high, 0)``.
+    """
+
+    state: jax.Array
+    control: jax.Array
+    total: jax.Array
+    violation: jax.Array
+
+
+class Optimum(NamedTuple):
+    """The best controls, on the host in float64.
+
+    Attributes:
+      total: J.
+      control: ``float[N, m]``.
+      state: ``float[N + 1, n]``.
+      residual: the largest violation of the optimality conditions (Karush, Kuhn and Tucker).
+    """
+
+    total: float
+    control: np.ndarray
+    state: np.ndarray
+    residual: float
+
+
+def lqr(
+    dynamics: ArrayLike = ((1, 1), (0, 1)),
+    control: ArrayLike = ((1,), (1,)),
+    *,
+    state_cost: ArrayLike = ((1, 0), (0, 0)),
+    control_cost: ArrayLike = ((0.3,),),
+    low: ArrayLike = -0.2,
+    high: ArrayLike = 0.2,
+    start: ArrayLike = (1, -1),
+    horizon: int = 20,
+    scale: float | None = None,
+) -> LQR:
+    """A regulator problem (4.17); by default the dissertation's.
+
+    Args:
+      dynamics, control: A ``[n, n]`` and B ``[n, m]``.
+      state_cost, control_cost: Q, positive semidefinite, and R, positive definite.
+      low, high: ``[m]``, or one bound for all controls.
+      start: ``[n]``.
+      horizon: N.
+      scale: what J is divided by in the objective; default J without any control, if that is
+        positive, else 1.
+
+    Raises:
+      ValueError: shapes that do not fit, costs that are not definite, or bounds the wrong way.
+
+    Example:
+      >>> world = lqr()
+      >>> world.horizon, round(float(world.scale))
+      (20, 2470)
+    """
+    a, b, q, r = (np.asarray(x, float) for x in (dynamics, control, state_cost, control_cost))
+    x = np.asarray(start, float)
+    n, m = len(a), b.shape[-1]
+    for name, found, shape in (
+        ("dynamics", a, (n, n)), ("control", b, (n, m)), ("state_cost", q, (n, n)),
+        ("control_cost", r, (m, m)), ("start", x, (n,)),
+    ):
+        if found.shape != shape:
+            raise ValueError(f"{name} has shape {list(found.shape)}; expected {list(shape)}.")
+    _check_definite(q, r)
+    bounds = np.broadcast_to(np.asarray(low, float), m), np.broadcast_to(np.asarray(high, float), m)
+    if not (bounds[0] <= bounds[1]).all():
+        raise ValueError(f"low={low!r}, high={high!r}; low must be at most high.")
+    if horizon < 1:
+        raise ValueError(f"horizon={horizon}; it must be at least 1.")
+    if scale is None:
+        _, offset = _least_squares(a, b, q, r, x, horizon)
+        scale = float(offset @ offset) or 1.0
+    if not scale > 0:
+        raise ValueError(f"scale={scale}; it must be positive.")
+    # NumPy's, so that the optimum is that of these numbers and not of their nearest in float32.
+    return LQR(a, b, q, r, *bounds, x, np.asarray(scale), horizon=int(horizon))
+
+
+def _check_definite(q: np.ndarray, r: np.ndarray) -> None:
+    for name, matrix, strict in (("state_cost", q, False), ("control_cost", r, True)):
+        least = np.linalg.eigvalsh(matrix).min()
+        if not np.array_equal(matrix, matrix.T) or least < 0 or (strict and least == 0):
+            kind = "definite" if strict else "semidefinite"
+            raise ValueError(
+                f"{name} must be symmetric and positive {kind}; its least eigenvalue is {least:g}."
+            )
+
+
+def evaluator(world: LQR, network: Network | str = "2-2-1") -> jax.tree_util.Partial:
+    """``evaluate(parameters, key) -> (objective, cost)`` of a policy.
+
+    The objective is ``log G = -J / scale``, and the cost the largest violation of the bounds:
+    feasible is a cost of at most 0. Nothing is random; the key is not read. A run that leaves
+    the range of its numbers has the objective ``-inf`` and the cost ``inf``.
+
+    Args:
+      world: from :func:`lqr`, which travels as an argument.
+      network: from the n states to the m controls; or its sizes, then with biases.
+
+    Returns:
+      A pytree. ``evaluate(float[D], key)`` gives two scalars; under any number of ``vmap`` over
+      parameters, all of them become one last axis of every array.
+
+    Raises:
+      ValueError: a network with other inputs or outputs.
+
+    Example:
+      >>> evaluate = evaluator(lqr(), "2-2-1")
+      >>> [float(x) for x in evaluate(jnp.zeros(9), None)]
+      [-1.0, 0.0]
+    """
+    return jax.tree_util.Partial(_evaluate, _fitting(world, network), world)
+
+
+def _fitting(world: LQR, network: Network | str) -> Network:
+    network = make_network(network) if isinstance(network, str) else network
+    n, m = world.control.shape[-2:]
+    if (network.sizes[0], network.sizes[-1]) != (n, m):
+        raise ValueError(
+            f"the network has the sizes {network.sizes}; the world has {n} states, its inputs, "
+            f"and {m} controls, its outputs."
+        )
+    return network
+
+
+@jax.jit  # so that calls outside of jit share one compilation
+def _evaluate(
+    network: Network, world: LQR, parameters: jax.Array, key: Any
+) -> tuple[jax.Array, jax.Array]:
+    del key
+    total, violation = _scores(network, world, parameters)
+    return -total / jnp.asarray(world.scale, total.dtype), violation
+
+
+def simulate(world: LQR, network: Network | str, parameters: jax.Array) -> Run:
+    """The run of a policy, or of many.
+
+    Args:
+      parameters: ``float[D]``, or ``float[D, lanes]`` with any number of axes of lanes.
+
+    Returns:
+      :class:`Run`, with the lanes as last axes. Under ``jit`` and ``vmap``; differentiable.
+
+    Example:
+      >>> run = simulate(lqr(), "2-2-1", jnp.zeros(9))
+      >>> run.state[:3].tolist(), float(run.total)
+      ([[1.0, -1.0], [0.0, -1.0], [-1.0, -1.0]], 2470.0)
+    """
+    return _simulate(_fitting(world, network), world, jnp.asarray(parameters))
+
+
+@jax.jit
+def _simulate(network: Network, world: LQR, parameters: jax.Array) -> Run:
+    world = _as(world, parameters)
+    start = _start(world, parameters)
+
+    def step(carry: Any, _: None) -> Any:
+        carry, control = _step(network, world, parameters, carry)
+        return carry, (carry[0], control)
+
+    (_, total, violation), (states, controls) = lax.scan(step, start, None, length=world.horizon)
+    return Run(jnp.concatenate([start[0][None], states]), controls, *_finished(total, violation))
+
+
+def _plain(network: Network, world: LQR, parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Only J and the violation. The loop is not unrolled: that was up to a hundred times slower,
+    since whole chains of steps were then computed again for every number that they lead to."""
+    world = _as(world, parameters)
+    _, total, violation = lax.fori_loop(
+        0, world.horizon, lambda _, carry: _step(network, world, parameters, carry)[0],
+        _start(world, parameters),
+    )
+    return _finished(total, violation)
+
+
+def _as(world: LQR, parameters: jax.Array) -> LQR:
+    """The world in the precision of the parameters."""
+    dtype = jnp.promote_types(parameters.dtype, jnp.float32)
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), world)
+
+
+def _start(world: LQR, parameters: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    lanes = parameters.shape[1:]
+    state = world.start.reshape(-1, *(1,) * len(lanes))
+    zero = jnp.zeros(lanes, state.dtype)
+    return jnp.broadcast_to(state, (len(state), *lanes)), zero, zero
+
+
+def _step(
+    network: Network, world: LQR, parameters: jax.Array, carry: tuple[jax.Array, ...]
+) -> tuple[tuple[jax.Array, ...], jax.Array]:
+    state, total, violation = carry
+    beside = (1,) * (parameters.ndim - 1)
+    control = apply_lanes(network, parameters, state)
+    state = _times(world.dynamics, state) + _times(world.control, control)
+    total = total + _square(world.state_cost, state) + _square(world.control_cost, control)
+    low, high = world.low.reshape(-1, *beside), world.high.reshape(-1, *beside)
+    over = jnp.maximum(low - control, control - high).max(axis=0)
+    return (state, total, jnp.maximum(violation, over)), control
+
+
+def _times(matrix: jax.Array, x: jax.Array) -> jax.Array:
+    """``matrix @ x`` for ``x [n, lanes]``."""
+    return weighted(matrix.T.reshape(*matrix.T.shape, *(1,) * (x.ndim - 1)), x)
+
+
+def _square(matrix: jax.Array, x: jax.Array) -> jax.Array:
+    return jnp.sum(x * _times(matrix, x), axis=0)
+
+
+def _finished(total: jax.Array, violation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Infinite where an overflow has left no number."""
+    lost = ~jnp.isfinite(total) | ~jnp.isfinite(violation)
+    return jnp.where(lost, jnp.inf, total), jnp.where(lost, jnp.inf, violation)
+
+
+_scores = jax.custom_batching.custom_vmap(_plain)
+
+
+@_scores.def_vmap
+def _lanes_last(
+    size: int, batched: Any, network: Network, world: LQR, parameters: jax.Array
+) -> Any:
+    _, varied, many = batched
+    if any(jax.tree.leaves(varied)):
+        axes = (None, jax.tree.map(lambda b: 0 if b else None, varied), 0 if many else None)
+        return jax.vmap(_plain, axes)(network, world, parameters), (True, True)
+    # Earlier lanes are already last; all are merged into one axis.
+    lanes = parameters.shape[2:]
+    parameters = jnp.moveaxis(parameters, 0, -1).reshape(parameters.shape[1], -1)
+    found = _scores(network, world, parameters)
+    return tuple(jnp.moveaxis(x.reshape(*lanes, size), -1, 0) for x in found), (True, True)
+
+
+# --- the best controls, on the host -----------------------------------------------------------
+
+
+def optimum(world: LQR) -> Optimum:
+    """The best controls, of any policy with or without memory, and their cost.
+
+    With the states written in terms of the controls, J is a sum of squares ``|M u + c|^2`` under
+    bounds: a strictly convex problem, solved by an active-set method (Stark and Parker 1995)
+    that ends exactly up to rounding. On the host, in float64.
+
+    Raises:
+      ValueError: the method did not finish.
+
+    Example:
+      >>> f"{optimum(lqr()).total:.10f}"
+      '3.7510604123'
+    """
+    from scipy.optimize import lsq_linear
+
+    a, b, q, r, low, high, start = (
+        np.asarray(x, float) for x in (
+            world.dynamics, world.control, world.state_cost, world.control_cost, world.low,
+            world.high, world.start,
+        )
+    )
+    matrix, offset = _least_squares(a, b, q, r, start, world.horizon)
+    bounds = np.tile(low, world.horizon), np.tile(high, world.horizon)
+    pinned = bounds[0] == bounds[1]  # what cannot vary is taken out
+    u = bounds[0].copy()
+    if not pinned.all():
+        free = ~pinned
+        found = lsq_linear(
+            matrix[:, free], -offset - matrix[:, pinned] @ u[pinned],
+            (bounds[0][free], bounds[1][free]), method="bvls", tol=1e-15,
+            max_iter=100 * len(u),
+        )
+        if not found.success:
+            raise ValueError(f"the best controls were not found: {found.message}")
+        u[free] = found.x
+    gradient = 2 * matrix.T @ (matrix @ u + offset)
+    # At an optimum a step down the gradient is undone by the bounds.
+    residual = np.abs(u - np.clip(u - gradient, *bounds)).max()
+    controls = u.reshape(world.horizon, -1)
+    states = [start]
+    for control in controls:
+        states.append(a @ states[-1] + b @ control)
+    total = float(np.sum((matrix @ u + offset) ** 2))
+    return Optimum(total, controls, np.array(states), float(residual))
+
+
+def _least_squares(
+    a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, start: np.ndarray, horizon: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """M and c with ``J = |M u + c|^2`` for all controls in one vector u."""
+    n, m = b.shape
+    root_q, root_r = _root(q), _root(r)
+    effect, state = np.zeros((n, horizon * m)), start
+    rows, offsets = [], []
+    for t in range(horizon):
+        now = slice(t * m, (t + 1) * m)
+        effect = a @ effect
+        effect[:, now] += b
+        state = a @ state
+        own = np.zeros((m, horizon * m))
+        own[:, now] = root_r
+        rows += [root_q @ effect, own]
+        offsets += [root_q @ state, np.zeros(m)]
+    return np.concatenate(rows), np.concatenate(offsets)
+
+
+def _root(matrix: np.ndarray) -> np.ndarray:
+    """A matrix X with ``X' X = matrix``."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.sqrt(np.maximum(values, 0))[:, None] * vectors.T

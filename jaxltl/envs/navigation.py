@@ -1,0 +1,465 @@
+"""A robot that steers to a goal with local sensors alone (dissertation, section 4.5.2).
+
+The robot has a position and a heading ``(x, y, heading)``; an action is a speed and a turn.
+In a step it goes ``speed * time_step`` along its heading, stopped by the bounds of the map, and
+then turns. Obstacles do not stop it: to stay clear of them is a matter of the task. What the
+robot reads are the labels of points on circles around it (1 in the goal, -1 in the obstacle, 0
+elsewhere), seen from its heading, and the direction of the goal's centre.
+
+A trajectory has N states, of which the first is the start, and N actions, of which the last
+has no effect. The four tasks of table 4 are functions of its states; objectives J are to be
+large on average, costs Z at most the task's limit:
+
+====  =========================================  ==================================  =====
+task  J                                          Z                                   limit
+====  =========================================  ==================================  =====
+1     1 for each state in the goal, and 2 |y|    -1 if the goal is reached, where    -0.5
+      for each in the strip -2 <= y <= -0.2      the robot then stays
+2     30 times the least signed distance         -1 if the goal is visited           -0.5
+      from the obstacle
+3     as 2                                       -1 for each state in the goal       -5
+4     as 1, without staying in the goal          -1 if the goal is visited and the   -0.5
+                                                 obstacle is not
+====  =========================================  ==================================  =====
+
+The dissertation tells no geometry but by its figure 9; the numbers here are read off it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+from numpy.typing import ArrayLike
+
+from jaxltl.envs.networks import Network, apply_layers, layers, make_network
+
+TASKS = (1, 2, 3, 4)
+LIMITS = {1: -0.5, 2: -0.5, 3: -5.0, 4: -0.5}
+PROPOSITIONS = ("goal", "obstacle")
+
+Scores = Callable[..., tuple[jax.Array, jax.Array]]
+
+
+@struct.dataclass
+class Navigation:
+    """A map, a robot and its sensors; made by :func:`navigation`.
+
+    Boxes are ``float[2, 2]``: the lower left corner ``(x, y)``, then the upper right one.
+
+    Attributes:
+      goal, obstacle, bounds: boxes.
+      start: the box of the first positions; headings are anything.
+      speed, turn: the largest speed, and the largest turn in one step, in radians.
+      time_step: of a step.
+      offset: ``float[M, 2]``, the sensor's points, ahead being (1, 0).
+      strip: ``float[2]``, the least and largest y that earn ``2 |y|``.
+      weight: of the distance in tasks 2 and 3.
+      horizon: N, the states of a trajectory; static.
+    """
+
+    goal: chex.Array
+    obstacle: chex.Array
+    bounds: chex.Array
+    start: chex.Array
+    speed: chex.Array
+    turn: chex.Array
+    time_step: chex.Array
+    offset: chex.Array
+    strip: chex.Array
+    weight: chex.Array
+    horizon: int = struct.field(pytree_node=False)
+
+    @property
+    def num_observations(self) -> int:
+        """M + 2."""
+        return self.offset.shape[-2] + 2
+
+
+class State(NamedTuple):
+    """Positions and headings, in arrays of one shape ``float[...]``; headings in [-pi, pi)."""
+
+    x: jax.Array
+    y: jax.Array
+    heading: jax.Array
+
+
+class Run(NamedTuple):
+    """Trajectories.
+
+    Attributes:
+      state: arrays ``float[M, N]``.
+      action: ``float[M, N, 2]``, speed and turn as shares of the largest, in [-1, 1].
+    """
+
+    state: State
+    action: jax.Array
+
+
+@struct.dataclass
+class _Static:
+    """What is not traced among arguments that are."""
+
+    value: Any = struct.field(pytree_node=False)
+
+
+def navigation(
+    *,
+    goal: ArrayLike = ((1.5, 1.0), (2.5, 2.0)),
+    obstacle: ArrayLike = ((-1.0, 0.2), (1.0, 2.0)),
+    bounds: ArrayLike = ((-4.0, -4.0), (4.0, 4.0)),
+    start: ArrayLike = ((-3.0, -2.5), (-1.5, -0.5)),
+    speed: float = 1.0,
+    turn: float = np.pi / 6,
+    time_step: float = 0.5,
+    radii: Sequence[float] = (0.5, 1.0, 1.5, 2.0, 2.5),
+    num_directions: int = 12,
+    strip: ArrayLike = (-2.0, -0.2),
+    weight: float = 30.0,
+    horizon: int = 30,
+) -> Navigation:
+    """A map with a goal and an obstacle, and a robot.
+
+    Args:
+      goal, obstacle, bounds, start: boxes, each the lower left and the upper right corner.
+      speed, turn, time_step: see :class:`Navigation`.
+      radii: of the sensor's circles.
+      num_directions: points on each circle, evenly spaced, the first ahead.
+      strip, weight: of the tasks, see :class:`Navigation`.
+      horizon: N.
+
+    Raises:
+      ValueError: a box or range the wrong way round, or a size that is not positive.
+
+    Example:
+      >>> world = navigation()
+      >>> world.num_observations, policy_network(world).num_parameters
+      (62, 2882)
+    """
+    boxes = {"goal": goal, "obstacle": obstacle, "bounds": bounds, "start": start}
+    corners = {name: _box(name, box) for name, box in boxes.items()}
+    sizes = {"speed": speed, "turn": turn, "time_step": time_step, "num_directions": num_directions,
+             "horizon": horizon, "the least of radii": min(radii, default=0)}
+    for name, size in sizes.items():
+        if not size > 0:
+            raise ValueError(f"{name} is {size}; it must be positive.")
+    low_high = np.asarray(strip, float)
+    if low_high.shape != (2,) or low_high[0] > low_high[1]:
+        raise ValueError(f"strip={strip!r}; give the least and the largest y.")
+    angle = 2 * np.pi * np.arange(num_directions) / num_directions
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    offset = (np.asarray(radii, float)[:, None, None] * circle).reshape(-1, 2)
+    # NumPy's, so that a computation in either precision starts from the exact numbers.
+    numbers = {"speed": speed, "turn": turn, "time_step": time_step, "weight": weight}
+    arrays = {name: np.asarray(x, float) for name, x in numbers.items()}
+    return Navigation(
+        **corners, **arrays, offset=offset, strip=low_high, horizon=int(horizon))
+
+
+def _box(name: str, corners: ArrayLike) -> np.ndarray:
+    box = np.asarray(corners, float)
+    if box.shape != (2, 2) or not (box[0] <= box[1]).all():
+        raise ValueError(
+            f"{name}={corners!r}; give the corners ((x, y), (x, y)), the lower left one first."
+        )
+    return box
+
+
+def policy_network(world: Navigation, hidden: Sequence[int] = (30, 30)) -> Network:
+    """The dissertation's: ReLU layers with biases, and tanh to a speed and a turn."""
+    return make_network((world.num_observations, *hidden, 2), output="tanh")
+
+
+# --- the robot --------------------------------------------------------------------------------
+
+
+def start_states(
+    world: Navigation, key: chex.PRNGKey, shape: tuple[int, ...] = (), dtype: Any = None
+) -> State:
+    """First states, uniform in the box of starts and in their heading."""
+    dtype = dtype or jnp.result_type(float)
+    low, high = jnp.asarray(world.start, dtype)
+    u = jax.random.uniform(key, (3, *shape), dtype)
+    x, y = (low[i] + (high[i] - low[i]) * u[i] for i in range(2))
+    return State(x, y, (2 * u[2] - 1) * jnp.asarray(np.pi, dtype))
+
+
+def move(world: Navigation, state: State, action: jax.Array) -> State:
+    """The next state: forward along the heading, then the turn.
+
+    Args:
+      action: ``float[..., 2]``, speed and turn as shares of the largest; limited to [-1, 1].
+
+    Example:
+      >>> state = move(navigation(), State(*jnp.array([3.75, 0.0, 0.0])), jnp.array([1.0, -3.0]))
+      >>> [round(float(v), 4) for v in state]
+      [4.0, 0.0, -0.5236]
+    """
+    world = _as(world, state.x)
+    share = jnp.clip(action, -1, 1)
+    way = world.speed * world.time_step * share[..., 0]
+    x = state.x + way * jnp.cos(state.heading)
+    y = state.y + way * jnp.sin(state.heading)
+    (left, bottom), (right, top) = world.bounds
+    return State(
+        jnp.clip(x, left, right), jnp.clip(y, bottom, top),
+        _wrapped(state.heading + world.turn * share[..., 1]),
+    )
+
+
+def _wrapped(angle: jax.Array) -> jax.Array:
+    """Into [-pi, pi), for angles of less than two turns; ``%`` would be slow."""
+    angle = jnp.where(angle >= np.pi, angle - 2 * np.pi, angle)
+    return jnp.where(angle < -np.pi, angle + 2 * np.pi, angle)
+
+
+def observe(world: Navigation, state: State) -> jax.Array:
+    """What the robot reads: ``float[..., M + 2]``.
+
+    The labels of the M points, circle by circle, and then the direction of the goal's centre as
+    ahead and to the left, a vector of length 1 (of zeros in the centre itself).
+
+    Example:
+      >>> seen = observe(navigation(), State(*jnp.array([1.0, 1.5, 0.0])))
+      >>> seen[:12].astype(int).tolist(), seen[-2:].tolist()
+      ([1, 0, 0, -1, -1, -1, -1, -1, -1, -1, 0, 0], [1.0, 0.0])
+    """
+    world = _as(world, state.x)
+    x, y = state.x[..., None], state.y[..., None]
+    cos, sin = jnp.cos(state.heading)[..., None], jnp.sin(state.heading)[..., None]
+    # Two more points, so that all columns are made in one pass.
+    ahead, left = jnp.pad(world.offset, ((0, 2), (0, 0))).T
+    px, py = x + (cos * ahead - sin * left), y + (sin * ahead + cos * left)
+    label = _inside(world.goal, px, py).astype(x.dtype) - _inside(world.obstacle, px, py)
+    dx, dy = (world.goal[0, i] + world.goal[1, i] - 2 * p for i, p in enumerate((x, y)))
+    square = dx * dx + dy * dy
+    # The inner choice keeps a division by 0 out of the derivatives.
+    scale = jnp.where(square > 0, 1 / jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+    column, count = np.arange(len(ahead)), len(ahead) - 2
+    toward = jnp.where(column == count, cos * dx + sin * dy, cos * dy - sin * dx) * scale
+    return jnp.where(column < count, label, toward)
+
+
+def _inside(box: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+    (left, bottom), (right, top) = box
+    return (x >= left) & (x <= right) & (y >= bottom) & (y <= top)
+
+
+def _as(world: Navigation, like: jax.Array) -> Navigation:
+    """The world in the precision of an array."""
+    dtype = jnp.promote_types(jnp.asarray(like).dtype, jnp.float32)
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), world)
+
+
+# --- tasks ------------------------------------------------------------------------------------
+
+
+def labels(world: Navigation, state: State) -> jax.Array:
+    """Which of :data:`PROPOSITIONS` hold: ``bool[..., 2]``; boxes contain their edges.
+
+    Example:
+      >>> labels(navigation(), State(*jnp.array([2.0, 1.5, 0.0]))).tolist()
+      [True, False]
+    """
+    world = _as(world, state.x)
+    return jnp.stack(
+        [_inside(box, state.x, state.y) for box in (world.goal, world.obstacle)], axis=-1)
+
+
+def obstacle_distance(world: Navigation, state: State) -> jax.Array:
+    """The signed distance ``float[...]`` from the obstacle, negative inside of it.
+
+    Example:
+      >>> x, y = jnp.array([4.0, -3.0, 0.5]), jnp.array([6.0, 1.0, 1.0])
+      >>> obstacle_distance(navigation(), State(x, y, x)).tolist()
+      [5.0, 2.0, -0.5]
+    """
+    world = _as(world, state.x)
+    (left, bottom), (right, top) = world.obstacle
+    dx = jnp.maximum(left - state.x, state.x - right)
+    dy = jnp.maximum(bottom - state.y, state.y - top)
+    square = jnp.maximum(dx, 0) ** 2 + jnp.maximum(dy, 0) ** 2
+    # The inner choice keeps the slope of the root at 0 out of the derivatives.
+    outside = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+    return outside + jnp.minimum(jnp.maximum(dx, dy), 0)
+
+
+def reward(world: Navigation, state: State) -> jax.Array:
+    """What one state adds to the J of tasks 1 and 4: ``float[...]``.
+
+    Example:
+      >>> x = jnp.array([2.0, 0.0, 0.0])
+      >>> reward(navigation(), State(x, jnp.array([1.5, -1.5, 0.0]), x)).tolist()
+      [1.0, 3.0, 0.0]
+    """
+    low, high = jnp.asarray(world.strip, state.y.dtype)
+    strip = jnp.where((state.y >= low) & (state.y <= high), 2 * jnp.abs(state.y), 0)
+    return jnp.where(labels(world, state)[..., 0], 1, strip)
+
+
+def scores(world: Navigation, state: State, task: int) -> tuple[jax.Array, jax.Array]:
+    """J and Z of trajectories in one of the four tasks.
+
+    Args:
+      state: arrays ``float[..., N]``.
+      task: static; what differs in task 1, that the goal is not left, is up to the states.
+
+    Returns:
+      Two arrays ``float[...]``.
+
+    Raises:
+      ValueError: an unknown task.
+    """
+    if task not in TASKS:
+        raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4, or give a function.")
+    goal, obstacle = jnp.moveaxis(labels(world, state), -1, 0)
+    visited = goal.any(-1)
+    if task in (1, 4):
+        objective = reward(world, state).sum(-1)
+    else:
+        weight = jnp.asarray(world.weight, state.x.dtype)
+        objective = weight * obstacle_distance(world, state).min(-1)
+    cost = {1: visited, 2: visited, 3: goal.sum(-1), 4: visited & ~obstacle.any(-1)}[task]
+    return objective, 0 - cost.astype(objective.dtype)
+
+
+# --- trajectories and their evaluation --------------------------------------------------------
+
+
+def simulate(
+    world: Navigation,
+    network: Network,
+    parameters: jax.Array,
+    key: chex.PRNGKey,
+    *,
+    num_trajectories: int = 10,
+    absorbing: bool = False,
+) -> Run:
+    """Trajectories of a policy.
+
+    Args:
+      network: from the observations to two shares, see :func:`policy_network`.
+      parameters: ``float[D]``; they decide the precision.
+      key: decides the first states, the only chance there is.
+      num_trajectories: M, static.
+      absorbing: whether the robot stays for ever where it enters the goal; static.
+
+    Returns:
+      :class:`Run`. Under ``jit`` and ``vmap``; differentiable in the parameters.
+
+    Raises:
+      ValueError: a network that does not fit.
+
+    Example:
+      >>> world = navigation()
+      >>> network = policy_network(world)
+      >>> run = simulate(world, network, jnp.zeros(network.num_parameters), jax.random.key(0))
+      >>> run.state.x.shape, run.action.shape
+      ((10, 30), (10, 30, 2))
+    """
+    _check_fits(world, network)
+    settings = _Static((num_trajectories, absorbing))
+    return _simulate(network, settings, world, jnp.asarray(parameters), key)
+
+
+@jax.jit  # so that calls outside of jit share one compilation
+def _simulate(
+    network: Network, settings: _Static, world: Navigation, parameters: jax.Array,
+    key: chex.PRNGKey,
+) -> Run:
+    num_trajectories, absorbing = settings.value
+    dtype = jnp.promote_types(parameters.dtype, jnp.float32)
+    world, parameters = jax.tree.map(lambda x: jnp.asarray(x, dtype), (world, parameters))
+    parts = layers(network, parameters)
+
+    def step(state: State, _: None) -> tuple[State, tuple[State, jax.Array]]:
+        action = apply_layers(network, parts, observe(world, state))
+        following = move(world, state, action)
+        if absorbing:
+            stays = _inside(world.goal, state.x, state.y)
+            following = jax.tree.map(lambda x, y: jnp.where(stays, x, y), state, following)
+        return following, (state, action)
+
+    first = start_states(world, key, (num_trajectories,), dtype)
+    _, (states, actions) = lax.scan(step, first, None, length=world.horizon)
+    return Run(jax.tree.map(lambda x: x.T, states), jnp.moveaxis(actions, 0, 1))
+
+
+def evaluator(
+    world: Navigation,
+    task: int | Scores = 1,
+    network: Network | None = None,
+    *,
+    num_trajectories: int = 10,
+    absorbing: bool | None = None,
+) -> jax.tree_util.Partial:
+    """``evaluate(parameters, key) -> (objective, cost)`` of a policy, means over trajectories.
+
+    The objective is the mean of J, as a logarithm of G to be divided by a temperature (such as
+    the horizon): J reaches 120, where ``exp(J)`` overflows in float32.
+
+    Args:
+      world: from :func:`navigation`, which travels as an argument.
+      task: 1 to 4; or a function ``(world, run) -> (J float[M], Z float[M] or [M, C])`` of the M
+        trajectories, which may be a ``jax.tree_util.Partial`` with arrays.
+      network: default :func:`policy_network`.
+      num_trajectories: M.
+      absorbing: whether the goal is never left; default only in task 1.
+
+    Returns:
+      A pytree. ``evaluate(float[D], key)`` gives a scalar and a scalar or ``float[C]``. Under
+      ``vmap`` over policies, a step is one product of matrices for each policy and layer.
+
+    Raises:
+      ValueError: an unknown task, a network that does not fit, or no trajectories.
+
+    Example:
+      >>> world = navigation()
+      >>> evaluate = evaluator(world, 2)
+      >>> objective, cost = evaluate(jnp.zeros(2882), jax.random.key(0))
+      >>> 30 * 0.7 < objective < 30 * 4, float(cost)
+      (Array(True, dtype=bool), 0.0)
+    """
+    network = policy_network(world) if network is None else network
+    _check_fits(world, network)
+    if num_trajectories < 1:
+        raise ValueError(f"num_trajectories={num_trajectories}; give at least 1.")
+    if not callable(task):
+        if task not in TASKS:
+            raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4, or give a function.")
+        absorbing = task == 1 if absorbing is None else absorbing
+        score = jax.tree_util.Partial(_table_4, _Static(int(task)))
+    else:
+        score = task if isinstance(task, jax.tree_util.Partial) else jax.tree_util.Partial(task)
+    settings = _Static((int(num_trajectories), bool(absorbing)))
+    return jax.tree_util.Partial(_evaluate, network, settings, world, score)
+
+
+def _check_fits(world: Navigation, network: Network) -> None:
+    if (network.sizes[0], network.sizes[-1]) != (world.num_observations, 2):
+        raise ValueError(
+            f"the network has the sizes {network.sizes}; the world has {world.num_observations} "
+            "observations, its inputs, and speed and turn, its 2 outputs."
+        )
+
+
+def _table_4(task: _Static, world: Navigation, run: Run) -> tuple[jax.Array, jax.Array]:
+    return scores(world, run.state, task.value)
+
+
+@jax.jit
+def _evaluate(
+    network: Network, settings: _Static, world: Navigation, score: Scores, parameters: jax.Array,
+    key: chex.PRNGKey,
+) -> tuple[jax.Array, jax.Array]:
+    num_trajectories, absorbing = settings.value
+    run = simulate(
+        world, network, parameters, key, num_trajectories=num_trajectories, absorbing=absorbing)
+    objective, cost = score(world, run)
+    return objective.mean(axis=0), cost.mean(axis=0)

@@ -1,0 +1,131 @@
+"""The navigation tasks one step at a time, for learners that are paid by the step.
+
+:mod:`~jaxltl.envs.navigation` scores whole trajectories. Here each step pays what its state adds:
+rewards and costs are the increments of J and Z along the trajectory, so that their sums are J and
+Z exactly, for all four tasks. Where J or Z is not Markovian, what the increment depends on (the
+least distance so far, what was visited) is carried along, but the robot does not read it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.envs import navigation as nav
+from jaxltl.envs.navigation import Navigation, State
+
+
+class Place(NamedTuple):
+    """A robot on its way, in arrays without axes.
+
+    Attributes:
+      state: where the robot is; it has not been paid for this yet.
+      first: whether it is the first state.
+      nearest: the least distance from the obstacle before it.
+      goal, obstacle: whether they were visited before it.
+    """
+
+    state: State
+    first: jax.Array
+    nearest: jax.Array
+    goal: jax.Array
+    obstacle: jax.Array
+
+
+class Steps(NamedTuple):
+    """A world of steps: three pytrees that are called.
+
+    Attributes:
+      reset: ``key -> place``.
+      step: ``(place, action float[2], key) -> (place, reward, cost, done)``; the key is not read.
+      observe: ``place -> float[M + 2]``.
+    """
+
+    reset: Any
+    step: Any
+    observe: Any
+
+
+@struct.dataclass
+class _Settings:
+    """The task is traced, so that one compiled learner does for all four."""
+
+    task: jax.Array
+    absorbing: jax.Array
+    dtype: Any = struct.field(pytree_node=False)
+
+
+def stepwise(
+    world: Navigation, task: int, *, absorbing: bool | None = None, dtype: Any = None
+) -> Steps:
+    """One of the four tasks by steps; a trajectory takes ``world.horizon`` of them.
+
+    A step pays for the state that it leaves, so that N steps pay for the N states that
+    :func:`~jaxltl.envs.navigation.scores` counts, the first included; the last action has no
+    effect. A trajectory is never done before.
+
+    Args:
+      world: from :func:`~jaxltl.envs.navigation.navigation`, which travels as an argument.
+      task: 1 to 4; another one does not recompile.
+      absorbing: whether the robot stays for ever where it enters the goal; default only in task 1.
+      dtype: of all numbers; default JAX's.
+
+    Raises:
+      ValueError: an unknown task.
+
+    Example:
+      >>> steps = stepwise(nav.navigation(start=((2, 1.5), (2, 1.5))), 2)
+      >>> place = steps.reset(jax.random.key(0))
+      >>> total = []
+      >>> for _ in range(3):
+      ...     place, reward, cost, _ = steps.step(place, jnp.zeros(2), None)
+      ...     total.append((float(reward), float(cost)))
+      >>> total
+      [(30.0, -1.0), (0.0, 0.0), (0.0, 0.0)]
+    """
+    if task not in nav.TASKS:
+        raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4.")
+    stays = task == 1 if absorbing is None else absorbing
+    settings = _Settings(
+        jnp.int32(task), jnp.bool_(stays), np.dtype(dtype or jnp.result_type(float)))
+    return Steps(*(
+        jax.tree_util.Partial(f, settings, world) for f in (_reset, _step, _observe)))
+
+
+def _reset(settings: _Settings, world: Navigation, key: chex.PRNGKey) -> Place:
+    state = nav.start_states(world, key, dtype=settings.dtype)
+    no = jnp.bool_(False)
+    return Place(state, jnp.bool_(True), jnp.zeros((), settings.dtype), no, no)
+
+
+def _observe(settings: _Settings, world: Navigation, place: Place) -> jax.Array:
+    return nav.observe(world, place.state)
+
+
+def _step(
+    settings: _Settings, world: Navigation, place: Place, action: jax.Array, key: Any
+) -> tuple[Place, jax.Array, jax.Array, jax.Array]:
+    del key
+    task, dtype = settings.task, settings.dtype
+    in_goal, in_obstacle = nav.labels(world, place.state)
+    goal, obstacle = place.goal | in_goal, place.obstacle | in_obstacle
+    distance = nav.obstacle_distance(world, place.state)
+    nearest = jnp.where(place.first, distance, jnp.minimum(place.nearest, distance))
+    closer = nearest - place.nearest  # which is zero before the first state
+    reward = jnp.where(
+        (task == 1) | (task == 4), nav.reward(world, place.state),
+        jnp.asarray(world.weight, dtype) * closer,
+    )
+    visit = goal.astype(dtype) - place.goal
+    clean = (goal & ~obstacle).astype(dtype) - (place.goal & ~place.obstacle)
+    cost = jnp.select([task == 3, task == 4], [in_goal.astype(dtype), clean], visit)
+    following = nav.move(world, place.state, action.astype(dtype))
+    stays = settings.absorbing & in_goal
+    following = jax.tree.map(lambda x, y: jnp.where(stays, x, y), place.state, following)
+    place = Place(following, jnp.bool_(False), nearest, goal, obstacle)
+    return place, reward.astype(dtype), 0 - cost.astype(dtype), jnp.bool_(False)  # no -0

@@ -1,0 +1,240 @@
+"""Small fully connected networks on flat parameter vectors, for populations of policies.
+
+A policy is a vector ``float[D]``, as a search that samples policies needs it. Two ways to apply
+it: :func:`apply` for one policy and many inputs, as products of matrices, to be mapped over
+policies by ``vmap``; and :func:`apply_lanes`, whose arrays all have the policies, the *lanes*,
+last, for networks of a few nodes, where whole rows of lanes are far faster than tiny products.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
+    "relu": lambda x: jnp.maximum(x, 0),
+    "tanh": jnp.tanh,
+    "identity": lambda x: x,
+}
+
+
+@struct.dataclass
+class Network:
+    """The shape of a network; it holds no numbers. Made by :func:`make_network`.
+
+    Attributes:
+      sizes: the inputs, the nodes of each hidden layer, and the outputs.
+      hidden, output: names of activations, see :data:`ACTIVATIONS`.
+      biases: whether the layers have biases.
+    """
+
+    sizes: tuple[int, ...] = struct.field(pytree_node=False)
+    hidden: str = struct.field(pytree_node=False, default="relu")
+    output: str = struct.field(pytree_node=False, default="identity")
+    biases: bool = struct.field(pytree_node=False, default=True)
+
+    @property
+    def num_parameters(self) -> int:
+        """D, the length of a parameter vector."""
+        return num_parameters(self.sizes, self.biases)
+
+
+def make_network(
+    sizes: str | Sequence[int],
+    *,
+    hidden: str = "relu",
+    output: str = "identity",
+    biases: bool = True,
+) -> Network:
+    """A checked network.
+
+    Args:
+      sizes: such as ``"2-10-10-1"`` or ``(2, 10, 10, 1)``: inputs, hidden layers, outputs.
+      hidden: the activation of the hidden layers, ``"relu"``, ``"tanh"`` or ``"identity"``.
+      output: that of the last layer.
+      biases: whether each layer adds a bias to each of its nodes.
+
+    Raises:
+      ValueError: fewer than two sizes, a size below 1, or an unknown activation.
+
+    Example:
+      >>> make_network("2-2-1").num_parameters, make_network("2-2-1", biases=False).num_parameters
+      (9, 6)
+    """
+    try:
+        numbers = tuple(int(n) for n in (sizes.split("-") if isinstance(sizes, str) else sizes))
+    except ValueError:
+        numbers = ()
+    if len(numbers) < 2 or min(numbers) < 1:
+        raise ValueError(
+            f"sizes={sizes!r}; give the inputs, the hidden layers and the outputs, at least 1 "
+            "each, such as '2-10-1'."
+        )
+    for place, name in (("hidden", hidden), ("output", output)):
+        if name not in ACTIVATIONS:
+            raise ValueError(f"{place}={name!r}; choose among {', '.join(ACTIVATIONS)}.")
+    return Network(numbers, hidden, output, bool(biases))
+
+
+def num_parameters(sizes: Sequence[int], biases: bool = True) -> int:
+    """``sum_l (n_l + [biases]) * n_(l+1)``, how many numbers a network of these sizes has.
+
+    Example:
+      >>> num_parameters((62, 30, 30, 2))
+      2882
+    """
+    return sum((n + bool(biases)) * m for n, m in pairwise(sizes))
+
+
+Layers = list[tuple[jax.Array, jax.Array | None]]
+
+
+def layers(network: Network, parameters: jax.Array) -> Layers:
+    """The weights ``[inputs, outputs, lanes]`` and biases ``[outputs, lanes]`` of each layer.
+
+    A parameter vector is, layer by layer, the weights row by row (a row for each input) and
+    then the biases.
+
+    Args:
+      parameters: ``float[D, lanes]``, with any number of axes of lanes.
+
+    Raises:
+      ValueError: another number of parameters than the network has.
+
+    Example:
+      >>> (weight, bias), = layers(make_network("2-1"), jnp.array([3.0, 4.0, 5.0]))
+      >>> weight.tolist(), bias.tolist()
+      ([[3.0], [4.0]], [5.0])
+    """
+    if parameters.ndim == 0 or len(parameters) != network.num_parameters:
+        raise ValueError(
+            f"parameters have shape {parameters.shape}; the network "
+            f"{'-'.join(map(str, network.sizes))} with{'' if network.biases else 'out'} biases has "
+            f"{network.num_parameters} parameters, on the first axis."
+        )
+    found, place, lanes = [], 0, parameters.shape[1:]
+    for n, m in pairwise(network.sizes):
+        weight = parameters[place : place + n * m].reshape(n, m, *lanes)
+        place += n * m
+        bias = parameters[place : place + m] if network.biases else None
+        place += m if network.biases else 0
+        found.append((weight, bias))
+    return found
+
+
+def apply(network: Network, parameters: jax.Array, inputs: jax.Array) -> jax.Array:
+    """What one network answers, ``a(h(x W_1 + b_1) ... W_n + b_n)``.
+
+    Args:
+      network: from :func:`make_network`.
+      parameters: ``float[D]``, see :func:`layers`.
+      inputs: ``float[..., I]``.
+
+    Returns:
+      ``float[..., O]``. Under ``jit`` and ``vmap``; differentiable in the arrays.
+
+    Raises:
+      ValueError: shapes that do not fit the network.
+
+    Example:
+      >>> clip = make_network("1-2-1")  # relu(x + 1) - relu(x - 1) - 1
+      >>> parameters = jnp.array([1.0, 1.0, 1.0, -1.0, 1.0, -1.0, -1.0])
+      >>> apply(clip, parameters, jnp.array([[-3.0], [-0.5], [0.5], [3.0]])).ravel().tolist()
+      [-1.0, -0.5, 0.5, 1.0]
+    """
+    return apply_layers(network, layers(network, parameters), inputs)
+
+
+def apply_layers(network: Network, parts: Layers, inputs: jax.Array) -> jax.Array:
+    """:func:`apply` with parameters that :func:`layers` has taken apart.
+
+    For loops: inside of one the parameters of many policies would be copied in every pass.
+
+    Args:
+      parts: without lanes.
+      inputs: ``float[..., I]``.
+
+    Returns:
+      ``float[..., O]``.
+
+    Raises:
+      ValueError: inputs or parts that do not fit the network.
+    """
+    if inputs.shape[-1:] != network.sizes[:1] or parts[0][0].ndim != 2:
+        raise ValueError(
+            f"inputs have shape {list(inputs.shape)} and the first weights "
+            f"{list(parts[0][0].shape)}; give [..., {network.sizes[0]}] and "
+            f"{list(network.sizes[:2])}."
+        )
+    for (weight, bias), activation in zip(parts, _activations(network), strict=True):
+        inputs = inputs @ weight
+        inputs = activation(inputs if bias is None else inputs + bias)
+    return inputs
+
+
+def apply_lanes(network: Network, parameters: jax.Array, inputs: jax.Array) -> jax.Array:
+    """:func:`apply` with the axis of inputs first, and any axes of lanes last.
+
+    Args:
+      network: from :func:`make_network`.
+      parameters: ``float[D, lanes]``, see :func:`layers`.
+      inputs: ``float[I, ..., lanes]``: each lane's policy reads all inputs of its lane.
+
+    Returns:
+      ``float[O, ..., lanes]``. Under ``jit`` and ``vmap``; differentiable in the arrays.
+
+    Raises:
+      ValueError: shapes that do not fit the network or one another.
+
+    Example:
+      >>> doubles_and_negates = jnp.array([[2.0, -1.0], [0.0, 0.0]])
+      >>> apply_lanes(make_network("1-1"), doubles_and_negates, jnp.array([[3.0, 4.0]])).tolist()
+      [[6.0, -4.0]]
+    """
+    lanes = parameters.shape[1:]
+    outer = inputs.ndim - len(lanes)
+    if outer < 1 or len(inputs) != network.sizes[0] or inputs.shape[outer:] != lanes:
+        raise ValueError(
+            f"inputs have shape {list(inputs.shape)}; give [{network.sizes[0]}, ...] that ends in "
+            f"the lanes {list(lanes)} of the parameters {list(parameters.shape)}."
+        )
+    middle = (1,) * (outer - 1)
+    for (weight, bias), activation in zip(
+        layers(network, parameters), _activations(network), strict=True
+    ):
+        inputs = weighted(weight.reshape(*weight.shape[:2], *middle, *lanes), inputs)
+        inputs = activation(
+            inputs if bias is None else inputs + bias.reshape(len(bias), *middle, *lanes))
+    return inputs
+
+
+def _activations(network: Network) -> list[Callable[[jax.Array], jax.Array]]:
+    hidden = [ACTIVATIONS[network.hidden]] * (len(network.sizes) - 2)
+    return [*hidden, ACTIVATIONS[network.output]]
+
+
+def weighted(weight: jax.Array, inputs: jax.Array) -> jax.Array:
+    """``sum_i w(i, o) x(i)`` in each lane, by a written-out sum over i.
+
+    A reduction over a leading axis would be compiled to a loop that jumps through memory; a sum
+    of rows is read in the order of memory, several lanes at once.
+
+    Args:
+      weight: ``float[I, O, lanes]``, its lanes as those of the inputs or 1.
+      inputs: ``float[I, lanes]``.
+
+    Returns:
+      ``float[O, lanes]``.
+
+    Example:
+      >>> weighted(jnp.array([[1.0, 2.0], [3.0, 4.0]]), jnp.array([1.0, 10.0])).tolist()
+      [31.0, 42.0]
+    """
+    terms = [weight[i] * inputs[i] for i in range(len(inputs))]
+    while len(terms) > 1:  # pairwise, which is also more exact
+        terms = [sum(terms[i + 1 : i + 2], start=terms[i]) for i in range(0, len(terms), 2)]
+    return terms[0]

@@ -1,0 +1,540 @@
+"""Section 4.5: search under constraints, for a regulator and a robot, beside TRPO and CPO."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from jaxltl.algos import cce
+from jaxltl.algos import trust_region as tr
+from jaxltl.core import exponential_family as families
+from jaxltl.envs import lqr
+from jaxltl.envs import navigation as nav
+from jaxltl.envs.navigation_steps import Steps, stepwise
+from jaxltl.envs.networks import apply, make_network
+from jaxltl.learn import plain
+
+NETWORKS = ("2-2-1", "2-10-1", "2-10-10-1", "2-50-1")
+METHODS = ("CCE", "TRPO", "CPO", "penalised TRPO")
+FEASIBLE_STARTS = ((1, ("CCE", "TRPO", "CPO")), (4, ("CCE", "CPO", "penalised TRPO")))
+PENALTY = 100.0
+LQR_SEEDS, SEEDS = 50, 5
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is done; the default is what the command does.
+
+    Attributes:
+      networks: of the regulator.
+      tasks, methods: of the robot.
+      feasible_starts: methods by task that are also begun from feasible policies.
+      lqr_steps: of the search for the regulator.
+      steps: of the search for the robot, of 1,000 trajectories each.
+      trust_steps: of TRPO and CPO, of 200 trajectories each.
+      feasible_steps: of both kinds, in trajectories as the first: 200 and 1,000 to a step.
+      fresh: trajectories on which returned policies are judged.
+    """
+
+    networks: tuple[str, ...] = NETWORKS
+    tasks: tuple[int, ...] = nav.TASKS
+    methods: tuple[str, ...] = METHODS
+    feasible_starts: tuple[tuple[int, tuple[str, ...]], ...] = FEASIBLE_STARTS
+    lqr_steps: int = 400
+    steps: int = 60
+    trust_steps: int = 150
+    feasible_steps: tuple[int, int] = (20, 50)
+    fresh: int = 1000
+
+
+def figures(
+    progress: Callable[[str], None] = lambda text: None,
+    *,
+    seeds: int | None = None,
+    plan: Plan | None = None,
+) -> dict[str, Any]:
+    """Figures 8, 10 and 11.
+
+    Args:
+      progress: called with a line before each part.
+      seeds: how often each search is repeated; default 50 for the regulator, 5 for the robot.
+      plan: how much is done.
+
+    Returns:
+      ``lqr_optimum``. ``lqr``, for each network: ``network``, ``seeds``, ``feasible`` (how many
+      returned policies are), ``gap_median`` and ``gap_max``, how much they cost beyond the
+      optimum. ``navigation``, for each task and method: ``task``, ``method``, ``seeds``;
+      ``trajectories_to_feasible``, for each seed until the policies that were tried first
+      satisfied the constraint on average, or None; on fresh trajectories of the returned policies
+      ``seeds_feasible``, ``seeds_confident`` (the 95% interval of the cost too), the means
+      ``objective_mean`` and ``cost_mean``, and for each seed ``objective``, ``cost`` and
+      ``cost_interval``; ``seeds_feasible_at_end`` and ``final_objective``, of the policies tried
+      last. ``navigation_feasible_start``, the same from policies that are feasible.
+      ``seconds``. ``figure8``, ``figure10``, ``figure11`` and ``maps``, what the pictures show.
+    """
+    begin = time.perf_counter()
+    plan = plan or Plan()
+    optimum = lqr.optimum(lqr.lqr())
+    rows, drawn = [], []
+    for network in plan.networks:
+        progress(f"the regulator, network {network}")
+        row, shown = _regulator(network, seeds or LQR_SEEDS, plan, optimum)
+        rows.append(row)
+        drawn.append(shown)
+    # All searches of the robot are dispatched before the first is waited for: JAX runs several
+    # side by side, while the next is compiled.
+    usual, taught = [], []
+    for task in plan.tasks:
+        robot = _robot(task)
+        for method in plan.methods:
+            progress(f"the robot, task {task}: {method}")
+            usual.append((robot, _search(robot, method, seeds or SEEDS, plan)))
+    for task, methods in plan.feasible_starts:
+        progress(f"the robot, task {task}, from feasible policies: {', '.join(methods)}")
+        robot = _robot(task)
+        feasible = _feasible_policies(robot, seeds or SEEDS, plan)
+        taught += [(robot, _search(robot, m, seeds or SEEDS, plan, feasible)) for m in methods]
+    rows_of = []
+    for runs in (usual, taught):
+        progress("the robot: trajectories of what was found")
+        rows_of.append([_judged(robot, run, plan) for robot, run in runs])
+    found, curves, maps = zip(*rows_of[0], strict=True) if usual else ((), (), ())
+    anew, curves_anew, _ = zip(*rows_of[1], strict=True) if taught else ((), (), ())
+    return plain({
+        "lqr_optimum": optimum.total,
+        "lqr": rows,
+        "navigation": found,
+        "navigation_feasible_start": anew,
+        "seconds": round(time.perf_counter() - begin, 2),
+        "figure8": {
+            "optimum": {"state": optimum.state, "control": optimum.control[:, 0]},
+            "learned": drawn,
+        },
+        "figure10": curves,
+        "figure11": curves_anew,
+        "maps": maps,
+    })
+
+
+# --- the regulator ------------------------------------------------------------------------------
+
+_train = jax.jit(
+    lambda keys, problem, hparams, num_steps: jax.vmap(
+        lambda key: cce.train(key, problem, hparams, num_steps=num_steps))(keys),
+    static_argnums=3,
+)
+
+
+def _keys(seeds: int, part: int) -> jax.Array:
+    return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(i), part))(jnp.arange(seeds))
+
+
+def _regulator(
+    name: str, seeds: int, plan: Plan, optimum: lqr.Optimum
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A network's row, and its part of figure 8."""
+    world, network = lqr.lqr(), make_network(name)
+    size = network.num_parameters
+    problem = cce.make_problem(
+        lqr.evaluator(world, network), families.diagonal_gaussian(jnp.zeros(size), 1.0), limit=0.0)
+    state, _ = _train(
+        _keys(seeds, 0), problem, cce.Hparams(rate=0.1, population=100, rho=0.2), plan.lqr_steps)
+    # Nothing is random, so that one evaluation tells all.
+    sampled = jnp.where(
+        state.best.found[:, None], state.best.parameters, state.least.parameters)
+    both = jnp.stack([families.center(state.family), sampled], 1)
+    objective, cost = jax.vmap(jax.vmap(lambda p: problem.evaluate(p, None)))(both)
+    allowed = cost <= 0
+    rank = jnp.where(allowed.any(1)[:, None], jnp.where(allowed, objective, -jnp.inf), -cost)
+    chosen = jnp.argmax(rank, 1)
+    policy = both[jnp.arange(seeds), chosen]
+    run = lqr.simulate(world, network, policy.T)
+    feasible = np.asarray(allowed.any(1))
+    gap = np.asarray(run.total) - optimum.total
+    good = gap[feasible]
+    row = {
+        "network": name, "parameters": size, "seeds": seeds, "feasible": feasible.sum(),
+        "gap_median": np.median(good) if good.size else None,
+        "gap_max": good.max() if good.size else None,
+        "mean_policy_feasible": (cost[:, 0] <= 0).sum(),
+        "gap_within_tenth": (good < 0.1).sum(),
+    }
+    shown = {
+        "network": name, "state": _rounded(jnp.moveaxis(run.state, -1, 0)),
+        "control": _rounded(run.control[:, 0].T), "gap": np.sort(gap),
+        "violation": np.sort(run.violation),
+    }
+    return row, shown
+
+
+def _rounded(x: Any, digits: int = 4) -> np.ndarray:
+    return np.round(np.asarray(x, float), digits)
+
+
+# --- the robot ----------------------------------------------------------------------------------
+
+
+class Robot(NamedTuple):
+    """A task of the robot, for both kinds of learners, in single precision."""
+
+    task: int
+    world: nav.Navigation
+    problem: cce.Problem
+    hparams: cce.Hparams
+    steps: Steps
+    stepwise: tr.Problem
+
+
+class Search(NamedTuple):
+    """What a method did with all seeds, perhaps still under way.
+
+    Attributes:
+      method: its name.
+      keys: of the seeds.
+      trajectories, objective, cost: of its steps, ``[seeds, T]``.
+      state: of its learner, a lane for each seed.
+      hparams: of the learner.
+    """
+
+    method: str
+    keys: jax.Array
+    trajectories: jax.Array
+    objective: jax.Array
+    cost: jax.Array
+    state: Any
+    hparams: Any
+
+
+_NUM_TRAJECTORIES = 10  # of each policy that is tried
+_TRUST = tr.Hparams(
+    discount=0.999, delta=0.01, num_trajectories=200, hidden=(30, 30), value_hidden=(30, 30),
+    fisher_stride=10, value_epochs=3,
+)
+
+
+def _robot(task: int) -> Robot:
+    world = nav.navigation()
+    evaluate = nav.evaluator(
+        world, jax.tree_util.Partial(_scores, jnp.int32(task)),
+        num_trajectories=_NUM_TRAJECTORIES, absorbing=task == 1,
+    )
+    size = nav.policy_network(world).num_parameters
+    family = families.diagonal_gaussian(jnp.zeros(size, jnp.float32), 0.6)
+    problem = cce.make_problem(evaluate, family, limit=nav.LIMITS[task])
+    hparams = cce.Hparams(
+        rate=0.8, temperature=30.0, margin=0.5 if task == 3 else 0.1, population=100, rho=0.2)
+    steps = stepwise(world, task, dtype=jnp.float32)
+    by_steps = tr.make_problem(
+        *steps, num_actions=2, horizon=world.horizon, limit=nav.LIMITS[task])
+    return Robot(task, world, problem, hparams, steps, by_steps)
+
+
+def _scores(task: jax.Array, world: nav.Navigation, run: nav.Run) -> tuple[jax.Array, jax.Array]:
+    """J and Z of a task that is traced, so that one compiled search does for several."""
+    every = [nav.scores(world, run.state, number) for number in nav.TASKS]
+    return tuple(jnp.stack(part)[task - 1] for part in zip(*every, strict=True))  # type: ignore
+
+
+def _search(
+    robot: Robot, method: str, seeds: int, plan: Plan, taught: Any = None
+) -> Search:
+    """A method from its usual start, or from the policies that were taught."""
+    keys = _keys(seeds, robot.task)
+    if method == "CCE":
+        return _by_samples(robot, keys, plan, taught)
+    return _by_steps(robot, method, keys, plan, taught)
+
+
+def _by_samples(robot: Robot, keys: jax.Array, plan: Plan, taught: Any) -> Search:
+    if taught is None:
+        state, metrics = _train(keys, robot.problem, robot.hparams, plan.steps)
+    else:
+        state, metrics = _train_from(
+            keys, taught, robot.problem, robot.hparams, plan.feasible_steps[0])
+    return Search(
+        "CCE", keys, metrics.num_evaluated * _NUM_TRAJECTORIES, metrics.objective,
+        metrics.cost[..., 0], state, robot.hparams,
+    )
+
+
+@partial(jax.jit, static_argnums=4)
+def _train_from(
+    keys: jax.Array, family: Any, problem: cce.Problem, hparams: cce.Hparams, num_steps: int
+) -> Any:
+    """The search from a distribution for each seed."""
+    def one(key: jax.Array, family: Any) -> Any:
+        return cce.train(key, replace(problem, family=family), hparams, num_steps=num_steps)
+
+    return jax.vmap(one)(keys, family)
+
+
+def _feasible_policies(robot: Robot, seeds: int, plan: Plan) -> Any:
+    """For each seed a distribution of policies that are found for the constraint's sake alone.
+
+    With a margin that nothing can keep, the elites are always those of the least cost.
+    """
+    hparams = replace(robot.hparams, margin=1e3)
+    state, _ = _train(_keys(seeds, 100 + robot.task), robot.problem, hparams, plan.steps // 2)
+    return state.family
+
+
+def _by_steps(robot: Robot, method: str, keys: jax.Array, plan: Plan, taught: Any) -> Search:
+    hparams = replace(
+        _TRUST, method="cpo" if method == "CPO" else "trpo",
+        # A penalty of zero is none, and does not recompile.
+        penalty=None if method == "CPO" else PENALTY * (method == "penalised TRPO"),
+    )
+    num_steps = plan.trust_steps if taught is None else plan.feasible_steps[1]
+    state = jax.vmap(lambda key: tr.init(key, robot.stepwise, hparams))(keys)
+    if taught is not None:
+        state = _taught(state, robot, hparams, taught)
+    state, metrics = _run(state, robot.stepwise, hparams, num_steps)
+    return Search(
+        method, keys, metrics.trajectories, metrics.reward, metrics.cost, state, hparams)
+
+
+@partial(jax.jit, static_argnums=3)
+def _run(state: tr.State, problem: tr.Problem, hparams: tr.Hparams, num_steps: int) -> Any:
+    """Seeds one after the other: side by side their products of matrices are slower."""
+    return jax.lax.map(lambda s: tr.run(s, problem, hparams, num_steps=num_steps), state)
+
+
+def _taught(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: Any) -> tr.State:
+    """Networks that do what the policies do, by least squares on these policies' trajectories."""
+    network = nav.policy_network(robot.world)
+    descent = optax.adam(3e-3)
+
+    def teach(state: tr.State, family: Any) -> tr.State:
+        policy = families.center(family)
+        seen, _, _ = _drive(robot.steps, partial(_by_network, network, policy),
+                            state.key, 200, robot.world.horizon)
+        seen = seen.reshape(-1, seen.shape[-1])
+        wanted = apply(network, policy, seen)
+
+        def loss(parameters: Any, chosen: jax.Array) -> jax.Array:
+            mean, _ = tr.policy(
+                replace(state, parameters=parameters), hparams, seen[chosen])
+            return jnp.mean((mean - wanted[chosen]) ** 2)
+
+        def descend(carry: Any, key: jax.Array) -> Any:
+            parameters, memory = carry
+            chosen = jax.random.randint(key, (256,), 0, len(seen))
+            updates, memory = descent.update(jax.grad(loss)(parameters, chosen), memory)
+            return (optax.apply_updates(parameters, updates), memory), None
+
+        first = {**state.parameters, "log_deviation": jnp.full(2, jnp.log(0.2), jnp.float32)}
+        keys = jax.random.split(jax.random.fold_in(state.key, 2), 3000)
+        (parameters, _), _ = jax.lax.scan(descend, (first, descent.init(first)), keys)
+        return replace(
+            state, parameters={**parameters, "log_deviation": first["log_deviation"]})
+
+    return jax.jit(lambda s, f: jax.lax.map(lambda x: teach(*x), (s, f)))(state, families_)
+
+
+# --- trajectories of what was found -------------------------------------------------------------
+
+
+def _by_network(network: Any, policy: jax.Array, seen: jax.Array, key: jax.Array) -> jax.Array:
+    del key
+    return apply(network, policy, seen)
+
+
+def _by_chance(
+    state: tr.State, hparams: tr.Hparams, seen: jax.Array, key: jax.Array
+) -> jax.Array:
+    mean, deviation = tr.policy(state, hparams, seen)
+    return mean + deviation * jax.random.normal(key, mean.shape, mean.dtype)
+
+
+def _drive(
+    steps: Steps, act: Callable[..., jax.Array], key: jax.Array, number: int, horizon: int
+) -> tuple[jax.Array, Any, tuple[jax.Array, jax.Array]]:
+    """Observations ``[T, M, O]``, places ``[T, M]``, and J and Z ``[M]`` of trajectories."""
+    starts, noise = jax.random.split(key)
+    places = jax.vmap(steps.reset)(jax.random.split(starts, number))
+
+    def move(places: Any, key: jax.Array) -> Any:
+        seen = jax.vmap(steps.observe)(places)
+        action = act(seen, key)
+        following, reward, cost, _ = jax.vmap(lambda p, a: steps.step(p, a, None))(places, action)
+        return following, (seen, places, reward, cost)
+
+    _, (seen, path, reward, cost) = jax.lax.scan(
+        move, places, jax.random.split(noise, horizon))
+    return seen, path, (reward.sum(0), cost.sum(0))
+
+
+@partial(jax.jit, static_argnums=(2, 3))
+def _driven(steps: Steps, policy: Any, number: int, horizon: int, key: jax.Array) -> Any:
+    if isinstance(policy, tuple):
+        act = partial(_by_chance, *policy)
+    else:
+        act = partial(_by_network, nav.policy_network(nav.navigation()), policy)
+    _, path, scores = _drive(steps, act, key, number, horizon)
+    return path.state, scores
+
+
+def _policies(robot: Robot, run: Search, plan: Plan) -> list[Any]:
+    """What a search returns, for each seed; without a solution what violates the limit least."""
+    found: list[Any] = []
+    for i, key in enumerate(run.keys):
+        state = jax.tree.map(lambda x, i=i: x[i], run.state)
+        if run.method != "CCE":
+            found.append((state, run.hparams))
+            continue
+        result = cce.result(
+            state, robot.problem, run.hparams, jax.random.fold_in(key, 1),
+            num_evaluations=max(plan.fresh // _NUM_TRAJECTORIES, 2),
+        )
+        least = min((result.mean, result.best), key=lambda a: float(a.excess))
+        found.append(least.parameters if result.solution is None else result.solution)
+    return found
+
+
+def _judged(
+    robot: Robot, run: Search, plan: Plan
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """A row, the learning curves, and some trajectories of the first seed's policy."""
+    limit = nav.LIMITS[robot.task]
+    trajectories, objectives, costs = (
+        np.asarray(x) for x in (run.trajectories, run.objective, run.cost))
+    policies = _policies(robot, run, plan)
+    path: Any = None
+    objective, cost, interval = [], [], []
+    for policy in policies:
+        state, (j, z) = _driven(
+            robot.steps, policy, plan.fresh, robot.world.horizon, jax.random.key(10**6))
+        path = state if path is None else path
+        objective.append(float(j.mean()))
+        cost.append(float(z.mean()))
+        margin = 1.96 * float(z.std(ddof=1)) / np.sqrt(plan.fresh)
+        interval.append((cost[-1] - margin, cost[-1] + margin))
+    reached = costs <= limit
+    first = [int(t[c.argmax()]) if c.any() else None
+             for t, c in zip(trajectories, reached, strict=True)]
+    row = {
+        "task": robot.task, "method": run.method, "limit": limit, "seeds": len(policies),
+        "seeds_feasible": sum(z <= limit for z in cost),
+        "seeds_confident": sum(high <= limit for _, high in interval),
+        "seeds_feasible_at_end": int(reached[:, -1].sum()),
+        "trajectories": int(trajectories[0, -1]),
+        "trajectories_to_feasible": first,
+        "objective_mean": np.mean(objective), "cost_mean": np.mean(cost),
+        "objective": _rounded(objective), "cost": _rounded(cost),
+        "cost_interval": _rounded(interval),
+        "final_objective": _rounded(objectives[:, -1]),
+        "final_cost": _rounded(costs[:, -1]),
+    }
+    curve = {
+        "task": robot.task, "method": run.method, "limit": limit,
+        "trajectories": trajectories[0],
+        **{f"{name}_{of}": _rounded(getattr(np, of)(x, axis=0), 3)
+           for name, x in (("objective", objectives), ("cost", costs))
+           for of in ("mean", "std")},
+    }
+    paths = {"task": robot.task, "method": run.method,
+             "x": _rounded(path.x[:, :10].T, 3), "y": _rounded(path.y[:, :10].T, 3)}
+    return row, curve, paths
+
+
+# --- the table ----------------------------------------------------------------------------------
+
+
+def table(result: dict[str, Any]) -> str:
+    """Section 4.5: what was published in words and pictures, and what was measured."""
+    lines = [
+        f"Section 4.5.1: a regulator with bounded controls, optimal cost "
+        f"{result['lqr_optimum']:.10f}",
+        "",
+        f"{'network':12}{'parameters':>12}{'feasible':>12}{'median gap':>12}{'largest gap':>13}",
+        *(
+            f"{x['network']:12}{x['parameters']:>12}{x['feasible']:>8} / {x['seeds']:<3}"
+            f"{_number(x['gap_median'], '10.4g'):>10}{_number(x['gap_max'], '11.4g'):>13}"
+            for x in result["lqr"]
+        ),
+        "",
+        "Section 4.5.2: a robot; objectives J are to be large, costs H at most the limit",
+    ]
+    for title, rows in (
+        ("", result["navigation"]),
+        ("from policies that are feasible", result["navigation_feasible_start"]),
+    ):
+        lines += [
+            "", *([title] if title else []),
+            f"{'':28}{'feasible':>10}{'':>4}{'returned policies':>20}"
+            f"{'':>4}thousand trajectories",
+            f"{'task':6}{'limit':>6}  {'method':16}{'seeds':>8}{'sure':>6}{'J':>8}{'H':>8}"
+            f"    until first feasible, of how many",
+        ]
+        for x in rows:
+            first = ", ".join(
+                "-" if t is None else f"{t / 1000:.1f}" for t in x["trajectories_to_feasible"])
+            lines.append(
+                f"{x['task']:<6}{x['limit']:>6}  {x['method']:16}"
+                f"{x['seeds_feasible']:>4} / {x['seeds']:<2}{x['seeds_confident']:>5}"
+                f"{x['objective_mean']:>8.1f}{x['cost_mean']:>8.2f}    {first} of "
+                f"{x['trajectories'] / 1000:g}"
+            )
+    return "\n".join([*lines, "", *_DIFFERENCES, "", f"{result['seconds']:.1f} s in all"])
+
+
+def _number(x: float | None, form: str) -> str:
+    return "-" if x is None else format(x, form)
+
+
+_DIFFERENCES = (
+    "Published: pictures without digits. Gaps are of the returned policies that are feasible.",
+    "J and H of the robot are means over the seeds on 1,000 fresh trajectories of each returned",
+    "policy: of CCE the mean of the last distribution or the best sample, whichever is feasible",
+    "and better; of the others the last policy, with its noise. Sure: the 95% interval of H is",
+    "below the limit too. First feasible: the policies that were tried, on average. The map is",
+    "ours, read off a picture. TRPO and CPO are paid the increments of J and Z, step by step.",
+)
+
+
+# --- pictures -----------------------------------------------------------------------------------
+
+
+def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
+    """Figures 8, 10 and 11, and where the returned policies of the first seed go."""
+    from jaxltl import plot
+
+    best = result["figure8"]["optimum"]
+    drawn = {"figure_8_regulator": plot.lines({
+        x["network"]: {
+            "first state": (np.asarray(x["state"])[..., 0], np.asarray(best["state"])[:, 0]),
+            "second state": (np.asarray(x["state"])[..., 1], np.asarray(best["state"])[:, 1]),
+            "control": (x["control"], best["control"]),
+            "cost beyond the optimum": ([x["gap"]], None),
+            "violation": ([x["violation"]], None),
+        } for x in result["figure8"]["learned"]
+    }, labels=("time", "time", "time", "seeds, sorted", "seeds, sorted"), names=(
+        "learned", "optimal"))}
+    for name, curves in (("figure_10_robot", result["figure10"]),
+                         ("figure_11_feasible_start", result["figure11"])):
+        if not curves:
+            continue
+        rows: dict[str, Any] = {}
+        limits = {}
+        for x in curves:
+            row = rows.setdefault(f"task {x['task']}", {"objective": {}, "cost": {}})
+            limits[f"task {x['task']}"] = {"cost": x["limit"]}
+            for part in row:
+                row[part][x["method"]] = tuple(
+                    np.asarray(x[k]) for k in ("trajectories", f"{part}_mean", f"{part}_std"))
+        drawn[name] = plot.bands(rows, limits=limits, label="trajectories")
+    world = nav.navigation()
+    drawn["maps"] = plot.paths(
+        {f"task {x['task']}: {x['method']}": (x["x"], x["y"]) for x in result["maps"]},
+        {"goal": world.goal, "obstacle": world.obstacle, "start": world.start},
+        bounds=world.bounds, columns=len({x["method"] for x in result["maps"]}),
+    )
+    return [(f"{name}.svg", plot.to_bytes(figure)) for name, figure in drawn.items()]

@@ -1,0 +1,91 @@
+"""Section 4.5 in little: what ``reproduce cce`` returns, prints and draws."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxltl.algos import trust_region as tr
+from jaxltl.envs import navigation as nav
+from jaxltl.envs.navigation_steps import stepwise
+from jaxltl.reproduce import cce
+
+
+@pytest.fixture(scope="module")
+def result():
+    plan = cce.Plan(
+        networks=("2-2-1",), tasks=(4,), methods=("CCE", "TRPO", "penalised TRPO"),
+        feasible_starts=(), lqr_steps=30, steps=4, trust_steps=2, fresh=100,
+    )
+    return cce.figures(seeds=2, plan=plan)
+
+
+def test_the_keys_of_section_4_5(result):
+    found = json.loads(json.dumps(result, allow_nan=False))
+    assert found["lqr_optimum"] == pytest.approx(3.751060412278, abs=1e-9)
+    (row,) = found["lqr"]
+    assert (row["network"], row["seeds"], row["feasible"]) == ("2-2-1", 2, 2)
+    assert 0 < row["gap_median"] <= row["gap_max"] < 2470
+    assert [(x["task"], x["method"]) for x in found["navigation"]] == [
+        (4, "CCE"), (4, "TRPO"), (4, "penalised TRPO")]
+    for x in found["navigation"]:
+        assert x["seeds"] == 2 == len(x["trajectories_to_feasible"])
+        assert x["seeds_feasible"] == sum(z <= -0.5 for z in x["cost"])
+        assert x["seeds_confident"] <= x["seeds_feasible"]
+        assert -1 <= x["cost_mean"] <= 0 <= x["objective_mean"] <= 120
+        np.testing.assert_allclose(np.mean(x["cost"]), x["cost_mean"], atol=1e-4)
+        low, high = np.transpose(x["cost_interval"])
+        assert (low <= x["cost"]).all() and (x["cost"] <= high).all()
+    assert [x["trajectories"] for x in found["navigation"]] == [4000, 600, 600]
+    assert found["seconds"] > 0
+
+
+def test_a_penalty_changes_what_is_learned(result):
+    _, plain, penalised = result["navigation"]
+    assert plain["objective"] != penalised["objective"]
+
+
+def test_the_table_and_the_pictures_of_section_4_5(result):
+    text = cce.table(result)
+    assert "3.7510604123" in text and "penalised TRPO" in text
+    assert [name for name, _ in cce.pictures(result)] == [
+        "figure_8_regulator.svg", "figure_10_robot.svg", "maps.svg"]
+
+
+@pytest.mark.parametrize("task", nav.TASKS)
+def test_steps_add_up_to_the_scores(task):
+    """The rewards and costs of steps are those of whole trajectories, from the same robot."""
+    world = nav.navigation(start=((-1.5, 0.0), (2.0, 1.5)))
+    steps = stepwise(world, task)
+    key, noise = jax.random.split(jax.random.key(task))
+    places = jax.vmap(steps.reset)(jax.random.split(key, 50))
+    actions = jax.random.uniform(noise, (world.horizon, 50, 2), minval=-1, maxval=1)
+
+    def move(places, action):
+        following, *paid = jax.vmap(lambda p, a: steps.step(p, a, None))(places, action)
+        return following, (places.state, *paid)
+
+    _, (state, reward, cost, done) = jax.lax.scan(move, places, actions)
+    objective, total = nav.scores(world, jax.tree.map(jnp.transpose, state), task)
+    np.testing.assert_allclose(reward.sum(0), objective, atol=1e-9)
+    np.testing.assert_allclose(cost.sum(0), total, atol=1e-12)
+    assert len(np.unique(total)) > 1 and not done.any()
+    if task == 1:  # once in the goal, never out of it
+        inside = nav.labels(world, state)[..., 0]
+        assert (inside[:-1] <= inside[1:]).all() and inside.any()
+    with pytest.raises(ValueError, match="task=5"):
+        stepwise(world, 5)
+
+
+def test_steps_fit_the_trust_region_learner_and_its_precision():
+    steps = stepwise(nav.navigation(), 3, dtype=jnp.float32)
+    problem = tr.make_problem(*steps, num_actions=2, horizon=30, limit=-5.0)
+    batch = jax.eval_shape(
+        lambda key: tr.rollout(
+            key, tr.init(key, problem, tr.Hparams(discount=0.9)), problem,
+            tr.Hparams(discount=0.9), num_trajectories=3),
+        jax.random.key(0))
+    assert batch.observation.shape == (30, 3, 62)
+    assert batch.reward.dtype == batch.observation.dtype == jnp.float32
