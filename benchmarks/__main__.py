@@ -1,4 +1,4 @@
-"""``python -m benchmarks [a b c d e f g] [--states N] [--json]``: a table, and JSON."""
+"""``python -m benchmarks [a b c d e f g h] [--states N] [--json]``: a table, and JSON."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _row_text(row: dict[str, Any]) -> str:
 def main() -> None:
     """Measures the chosen parts, prints a row each and at the end all as one JSON line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("parts", nargs="*", default=list("abcdefg"), help="a to g")
+    parser.add_argument("parts", nargs="*", default=list("abcdefgh"), help="a to h")
     parser.add_argument("--states", type=int, default=1_000_000)
     parser.add_argument("--json", action="store_true", help="only the JSON line")
     chosen = parser.parse_args()
@@ -51,9 +51,11 @@ def main() -> None:
             from benchmarks.games import run as measure
         elif part == "g":
             from benchmarks.pac import run as measure
+        elif part == "h":
+            from benchmarks.navigation import run as measure
         else:
-            parser.error(f"unknown part {part!r}; choose among a, b, c, d, e, f, g")
-        found = measure() if part in "ceg" else measure(chosen.states)
+            parser.error(f"unknown part {part!r}; choose among a, b, c, d, e, f, g, h")
+        found = measure() if part in "cegh" else measure(chosen.states)
         rows += found
         if not chosen.json:
             print(*map(_row_text, found), sep="\n", flush=True)

@@ -50,7 +50,7 @@ class Plan:
     feasible_starts: tuple[tuple[int, tuple[str, ...]], ...] = FEASIBLE_STARTS
     lqr_steps: int = 400
     steps: int = 60
-    trust_steps: int = 150
+    trust_steps: int = 120
     feasible_steps: tuple[int, int] = (20, 50)
     fresh: int = 1000
 
