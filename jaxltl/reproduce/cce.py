@@ -216,7 +216,9 @@ class Search(NamedTuple):
 _NUM_TRAJECTORIES = 10  # of each policy that is tried
 _TRUST = tr.Hparams(
     discount=0.999, delta=0.01, num_trajectories=200, hidden=(30, 30), value_hidden=(30, 30),
-    fisher_stride=10, value_epochs=3,
+    # With little damping the steps follow the noise of the sample: CPO then believes that one step
+    # meets the limit, and rests above it.
+    damping=0.1, fisher_stride=4, value_epochs=3,
 )
 
 

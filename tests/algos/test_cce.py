@@ -489,7 +489,7 @@ def test_compliant_settings_meet_the_theorem():
     ({"elite_reuse": True}, {"no elite_reuse"}), ({"antithetic": True}, {"no antithetic"}),
     ({"variance_floor": 0.1}, {"no variance_floor"}), ({"noise": 0.1}, {"no noise"}),
     ({"restart_below": 0.1}, {"no restart_below"}),
-], ids=str)
+])
 def test_settings_outside_the_theorem_are_named(change, failing):
     report = cce.theorem_conditions(COMPLIANT.replace(**change), num_steps=10_000)
     assert report.holds is False
