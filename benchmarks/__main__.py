@@ -24,6 +24,12 @@ def _row_text(row: dict[str, Any]) -> str:
     )
 
 
+def _search() -> list[dict[str, Any]]:
+    from benchmarks import navigation, seeds
+
+    return navigation.run() + seeds.run()
+
+
 def main() -> None:
     """Measures the chosen parts, prints a row each and at the end all as one JSON line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
@@ -52,7 +58,7 @@ def main() -> None:
         elif part == "g":
             from benchmarks.pac import run as measure
         elif part == "h":
-            from benchmarks.navigation import run as measure
+            measure = _search
         else:
             parser.error(f"unknown part {part!r}; choose among a, b, c, d, e, f, g, h")
         found = measure() if part in "cegh" else measure(chosen.states)

@@ -38,7 +38,7 @@ from flax import struct
 from jax import lax
 from numpy.typing import ArrayLike
 
-from jaxltl.envs.networks import Network, apply_layers, layers, make_network
+from jaxltl.envs.networks import Network, apply_layers, layers, make_network, padded
 
 TASKS = (1, 2, 3, 4)
 LIMITS = {1: -0.5, 2: -0.5, 3: -5.0, 4: -0.5}
@@ -376,7 +376,7 @@ def _simulate(
     num_trajectories, absorbing = settings.value
     dtype = jnp.promote_types(parameters.dtype, jnp.float32)
     world, parameters = jax.tree.map(lambda x: jnp.asarray(x, dtype), (world, parameters))
-    parts = layers(network, parameters)
+    parts = padded(layers(network, parameters))
 
     def step(state: State, _: None) -> tuple[State, tuple[State, jax.Array]]:
         action = apply_layers(network, parts, observe(world, state))

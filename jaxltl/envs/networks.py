@@ -176,6 +176,31 @@ def apply_layers(network: Network, parts: Layers, inputs: jax.Array) -> jax.Arra
     return inputs
 
 
+def padded(parts: Layers, multiple: int = 16) -> Layers:
+    """The same network with hidden layers as wide as the processor likes; outputs are the same.
+
+    The new nodes are zero, and so is what the next layer makes of them, with any activation that
+    is 0 at 0. For loops over small products of matrices.
+
+    Args:
+      parts: from :func:`layers`, without lanes.
+      multiple: of which the hidden layers' widths become multiples.
+
+    Example:
+      >>> parts = layers(make_network("3-5-1"), jnp.ones(26))
+      >>> [weight.shape for weight, _ in padded(parts)]
+      [(3, 16), (16, 1)]
+    """
+    found, inputs = [], parts[0][0].shape[0]
+    for i, (weight, bias) in enumerate(parts):
+        last = i == len(parts) - 1
+        more = 0 if last else -weight.shape[1] % multiple
+        weight = jnp.pad(weight, ((0, inputs - weight.shape[0]), (0, more)))
+        found.append((weight, None if bias is None else jnp.pad(bias, (0, more))))
+        inputs = weight.shape[1]
+    return found
+
+
 def apply_lanes(network: Network, parameters: jax.Array, inputs: jax.Array) -> jax.Array:
     """:func:`apply` with the axis of inputs first, and any axes of lanes last.
 
