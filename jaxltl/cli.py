@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from jaxltl.core.automaton import Automaton
-    from jaxltl.learn import Outcome
 
 
 class _Failure(click.ClickException):
@@ -92,26 +91,38 @@ def main() -> None:
 def learn(task_file: Path, out: Path | None, seed: int, seeds: int, as_json: bool) -> None:
     """Learn a policy for a task, and say how well it does it.
 
-    Writes policy.npz, result.json, report.html and pictures. An interrupted run goes on where
-    it stopped when it is started again with the same task and options.
+    Writes policy.npz, result.json, report.html and pictures; by method = "todirl", the learned
+    network.npz and the policies of the training worlds. An interrupted run goes on where it
+    stopped when it is started again with the same task and options.
     """
-    from jaxltl.task import read_task
-
-    task = read_task(task_file)
+    job = _job(task_file)
+    task = job.read_task(task_file)
     out = _directory(out, task.name)
     with _float64():
-        outcome = _learn(task, out, seed, seeds)
-        result = _write(outcome, out, task_file)
+        outcome = _learn(job, task, out, seed, seeds)
+        result = _write(job, outcome, out, task_file)
     click.echo(_table(result))
     click.echo(f"\nwrote {out}/report.html and the files beside it")
     if as_json:
         _print_json(result)
 
 
-def _learn(task: Any, out: Path, seed: int, seeds: int) -> Outcome:
+def _job(task_file: Path) -> Any:
+    """The module that does what a task file asks for."""
+    from jaxltl.task import method_of
+
+    if method_of(task_file) == "todirl":
+        from jaxltl import learn_todirl
+
+        return learn_todirl
+    from jaxltl import learn
+
+    return learn
+
+
+def _learn(job: Any, task: Any, out: Path, seed: int, seeds: int) -> Any:
     from tqdm import tqdm
 
-    from jaxltl import learn as job
     from jaxltl.algos.learner import atomic_write
 
     begin = time.perf_counter()
@@ -141,18 +152,16 @@ def _learn(task: Any, out: Path, seed: int, seeds: int) -> Outcome:
     return job.Outcome(setup, *parts, seed=seed, seconds=time.perf_counter() - begin)
 
 
-def _write(outcome: Outcome, out: Path, task_file: Path) -> dict[str, Any]:
-    from jaxltl import learn as job
-    from jaxltl import report
+def _write(job: Any, outcome: Any, out: Path, task_file: Path) -> dict[str, Any]:
     from jaxltl.algos.learner import atomic_write
 
     result = job.summary(outcome)
-    job.save_policy(out / "policy.npz", outcome)
+    job.save(out, outcome)
     pictures = job.pictures(outcome)
     for name, _, svg, _ in pictures:
         with atomic_write(out / name) as file:
             file.write(svg)
-    page = report.page(result, [p[1:] for p in pictures], task_file.read_text())
+    page = _report(result).page(result, [p[1:] for p in pictures], task_file.read_text())
     with atomic_write(out / "report.html") as file:
         file.write(page.encode())
     # Last, so that its presence says that all the rest is there.
@@ -161,7 +170,16 @@ def _write(outcome: Outcome, out: Path, task_file: Path) -> dict[str, Any]:
     return result
 
 
+def _report(result: Mapping[str, Any]) -> Any:
+    """The module that shows a result."""
+    from jaxltl import report, report_todirl
+
+    return report_todirl if result["method"] == "todirl" else report
+
+
 def _table(result: Mapping[str, Any]) -> str:
+    if result["method"] == "todirl":
+        return str(_report(result).table(result))
     from jaxltl.report import certified, number, place, probability, spread, warnings
 
     shown, training, seeds = result["demonstrations"], result["training"], result["seeds"]
@@ -211,16 +229,10 @@ def _table(result: Mapping[str, Any]) -> str:
 @_plain_errors
 def check(task_file: Path) -> None:
     """Check a task file and all that it names, without learning."""
-    from jaxltl import learn as job
-    from jaxltl.task import read_task
-
+    job = _job(task_file)
     with _float64():
-        setup = job.prepare(read_task(task_file), seed=0)
-    lengths = setup.demonstrations.length
-    click.echo(
-        f"ok: {setup.world.mdp.num_states} states, {setup.model.num_memory} memory states, "
-        f"{len(lengths)} demonstrations of {int(lengths.sum())} pairs"
-    )
+        setup = job.prepare(job.read_task(task_file), seed=0)
+    click.echo(f"ok: {job.describe(setup)}")
 
 
 # --- synthesize -----------------------------------------------------------------------------
@@ -402,6 +414,7 @@ def _render(result: Automaton, form: str, formula: str) -> str:
 
 _EXPERIMENTS = {
     "mlirl": "section 2.5, inverse reinforcement learning with a temporal-logic task",
+    "todirl": "section 3.5, reward networks that plan in worlds never seen",
     "synthesis": "chapter 5, permissive strategies and learning inside them",
     "pac": "section 6.7, learning with a guarantee while winning almost surely",
     "cce": "section 4.5, search under constraints, beside TRPO and CPO",
@@ -413,7 +426,7 @@ _EXPERIMENTS = {
 @click.option("--out", type=click.Path(path_type=Path),
               help="Directory for the pictures, if there are any.  [default: out/reproduce]")
 @click.option("--seeds", type=click.IntRange(1),
-              help="How often learning is repeated, in pac and cce.  [default: 10 in pac; in cce "
+              help="How often learning is repeated, in todirl, pac and cce.  [default: 10; in cce "
                    "50 for the regulator, 5 for the robot]")
 @click.option("--json", "as_json", is_flag=True, help="End with the figures as one JSON line.")
 @_plain_errors

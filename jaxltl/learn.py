@@ -26,8 +26,14 @@ from jaxltl.task import (
     World,
     load_demonstrations,
     load_world,
+    read_task,
     synthetic_demonstrations,
 )
+
+__all__ = [
+    "STEPS", "Learned", "Outcome", "Setup", "describe", "fingerprint", "learn", "optimize",
+    "pictures", "prepare", "read_task", "save", "summary",
+]
 
 Report = Callable[[int, Mapping[str, np.ndarray]], None]
 
@@ -87,6 +93,7 @@ def optimize(
     chunk: int | None = None,
     report: Report | None = None,
     checkpoint: Path | None = None,
+    finished: Callable[[Any], bool] | None = None,
 ) -> tuple[Any, dict[str, np.ndarray]]:
     """Several runs of a learner side by side, until every gradient vanishes.
 
@@ -105,6 +112,8 @@ def optimize(
       report: called after each chunk with the steps made and the newest metrics ``[N]``.
       checkpoint: a file that holds states and history after each chunk; the run goes on
         from it if it exists, and ends with the same bits.
+      finished: whether the states after a chunk have nothing left to learn, for learners that
+        end otherwise than by their gradient.
 
     Returns:
       The states, and the history: metrics ``[T, N]`` of at most 10 steps per chunk; figures
@@ -128,6 +137,8 @@ def optimize(
     history = {name: np.array(column) for name, column in saved["history"].items()}
     while (done := int(np.max(states.step))) < num_steps:
         if rows and bool(np.all(history["gradient_norm"][rows - 1] <= tolerance)):
+            break
+        if finished is not None and finished(states):
             break
         states, figures = learner.run(
             batched, states, problem, settings,
@@ -294,7 +305,16 @@ def prepare(task: Task, seed: int) -> Setup:
     return Setup(task, world, model, *synthetic_demonstrations(task, model, key))
 
 
-def fingerprint(task: Task, seed: int, num_seeds: int) -> str:
+def describe(setup: Setup) -> str:
+    """What a task comes to, in one line."""
+    lengths = setup.demonstrations.length
+    return (
+        f"{setup.world.mdp.num_states} states, {setup.model.num_memory} memory states, "
+        f"{len(lengths)} demonstrations of {int(lengths.sum())} pairs"
+    )
+
+
+def fingerprint(task: Any, seed: int, num_seeds: int) -> str:
     """What a checkpoint must agree on to be gone on from."""
     parts = [task.digest, seed, num_seeds, jaxltl.__version__, jax.__version__,
              str(jnp.result_type(float))]
@@ -428,6 +448,11 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
+def save(out: Path, outcome: Outcome) -> None:
+    """Writes ``policy.npz`` into a directory; see :func:`save_policy`."""
+    save_policy(out / "policy.npz", outcome)
+
+
 def save_policy(path: Path, outcome: Outcome) -> None:
     """Writes the kept policy with all that it takes to run it, as an ``.npz``, atomically.
 
@@ -507,7 +532,7 @@ def _maps(outcome: Outcome, cells: np.ndarray) -> list[tuple[str, str, bytes, st
     if shown.size:
         panels = np.where(met, value, np.nan).T[shown]
         arrows = np.where(met[..., None], policy, np.nan).transpose(1, 0, 2)[shown]
-        titles = [_short(f"memory {q}: {names[q]}") for q in shown]
+        titles = [short_name(f"memory {q}: {names[q]}") for q in shown]
         picture = plot.grid(
             cells, panels, arrows, titles=titles, label="probability of doing the task",
             actions=actions,
@@ -521,7 +546,8 @@ def _maps(outcome: Outcome, cells: np.ndarray) -> list[tuple[str, str, bytes, st
     return maps
 
 
-def _short(text: str, width: int = 44) -> str:
+def short_name(text: str, width: int = 44) -> str:
+    """The text, or its beginning where it is longer than that."""
     return text if len(text) <= width else text[: width - 1] + "…"
 
 

@@ -55,12 +55,8 @@ def page(
       pictures: title, SVG and caption of each.
       task_text: the task file, shown at the end.
     """
-    name = html.escape(result["task"])
     parts = [
-        f"<h1>{name}</h1>",
-        f"<p class=muted>{_sentence(result)}</p>",
-        f"<p><code>{html.escape(result['formula'])}</code></p>",
-        _warnings(result),
+        *head(result, _sentence(result), warnings(result)),
         _tiles(result),
         "<h2>Probability of doing the task</h2>",
         _evidence_table(result),
@@ -68,6 +64,31 @@ def page(
         _weights_table(result),
         _seeds(result),
     ]
+    return frame(result, parts, pictures, task_text)
+
+
+def head(result: Mapping[str, Any], sentence: str, warned: Iterable[str]) -> list[str]:
+    """What a page begins with: the task, what was done, and what a reader must know."""
+    return [
+        f"<h1>{html.escape(result['task'])}</h1>",
+        f"<p class=muted>{sentence}</p>",
+        f"<p><code>{html.escape(result['formula'])}</code></p>",
+        "".join(f"<p class=bad>{html.escape(w)}</p>" for w in warned),
+    ]
+
+
+def frame(
+    result: Mapping[str, Any], parts: Iterable[str], pictures: Iterable[tuple[str, bytes, str]],
+    task_text: str,
+) -> str:
+    """A whole page of its parts, the pictures and the task file.
+
+    Args:
+      result: what ``result.json`` holds; read are its task, versions and seconds.
+      parts: HTML.
+      pictures, task_text: as for :func:`page`.
+    """
+    name, parts = html.escape(result["task"]), list(parts)
     for title, svg, caption in pictures:
         image = base64.b64encode(svg).decode()
         parts.append(
@@ -132,8 +153,11 @@ def warnings(result: Mapping[str, Any]) -> list[str]:
     return found
 
 
-def _warnings(result: Mapping[str, Any]) -> str:
-    return "".join(f"<p class=bad>{html.escape(w)}</p>" for w in warnings(result))
+def tiles(figures: Iterable[tuple[str, str]]) -> str:
+    """Figures to see first, each with its text, which is HTML."""
+    return "<div class=tiles>" + "".join(
+        f"<div class=tile><b>{value}</b><small>{text}</small></div>" for value, text in figures
+    ) + "</div>"
 
 
 def _tiles(result: Mapping[str, Any]) -> str:
@@ -141,7 +165,7 @@ def _tiles(result: Mapping[str, Any]) -> str:
     training = result["training"]
     how = ("<span class=good>converged</span>" if training["converged"]
            else "<span class=bad>not converged</span>")
-    tiles = [
+    return tiles([
         (probability(learned["mean"]["value"]),
          f"mean probability over {learned['num_starts']} initial states"),
         (probability(learned["minimum"]["value"]),
@@ -149,10 +173,7 @@ def _tiles(result: Mapping[str, Any]) -> str:
         (probability(best["mean"]["value"]), "best achievable mean"),
         (number(result["neg_log_likelihood"]),
          f"negative log-likelihood; {how} in {training['steps']} steps"),
-    ]
-    return "<div class=tiles>" + "".join(
-        f"<div class=tile><b>{value}</b><small>{text}</small></div>" for value, text in tiles
-    ) + "</div>"
+    ])
 
 
 def _evidence_table(result: Mapping[str, Any]) -> str:

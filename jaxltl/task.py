@@ -110,7 +110,8 @@ _KEYS: dict[str, dict[str, Rule]] = {
         "length": COUNT,
     },
     "learner": {
-        "method": choice("mlirl"),
+        # Files of other methods are read by modules of their own; see method_of.
+        "method": Rule(lambda v: v == "mlirl", '"mlirl" or "todirl"'),
         "in": choice("product", "world"),
         "discount": number_in(0, 1, below=True),
         "mu": number_in(0),
@@ -137,6 +138,16 @@ _REQUIRED = {
     "task": ("formula",),
     "learner": ("method", "discount"),
 }
+
+
+def method_of(path: str | Path) -> Any:
+    """What a task file says of ``[learner] method``, unchecked; None if it says nothing.
+
+    Raises:
+      ValueError: the file cannot be read or is no TOML.
+    """
+    learner = read_toml(Path(path), "the task file")[0].get("learner")
+    return learner.get("method") if isinstance(learner, dict) else None
 
 
 def read_task(path: str | Path) -> Task:
@@ -335,7 +346,15 @@ def load_demonstrations(task: Task, world: World) -> Trajectories:
       ValueError: not such a file, or a demonstration that the world cannot have made. The
         message names the demonstration and the step, both counted from 1.
     """
-    path = task.path.parent / task.demonstrations["file"]
+    return read_demonstrations(task.path.parent / task.demonstrations["file"], world)
+
+
+def read_demonstrations(path: Path, world: World) -> Trajectories:
+    """The demonstrations of a file, as :func:`load_demonstrations` says.
+
+    Raises:
+      ValueError: likewise.
+    """
     try:
         data = json.loads(read_bytes(path, "the demonstrations"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:

@@ -289,6 +289,23 @@ def soft_maximum(q: np.ndarray, available: np.ndarray, operator: str) -> np.ndar
     return (weight * q).sum(axis=-1) / total
 
 
+def likelihood_gradient(
+    transition: np.ndarray, policy: np.ndarray, slope: np.ndarray, counts: np.ndarray,
+    discount: float,
+) -> np.ndarray:
+    """(3.6) and (3.7): every parameter's sensitivity of Q by a dense solve, then of log pi.
+
+    `transition` is ``[S, A, S]``, `slope` the derivative of the reward ``[S, A, F]``.
+    """
+    num_states, num_actions, num_parameters = slope.shape
+    chain = np.einsum("sat,tb->satb", transition, policy)
+    chain = chain.reshape(num_states * num_actions, num_states * num_actions)
+    system = np.eye(len(chain)) - discount * chain
+    q = np.linalg.solve(system, slope.reshape(-1, num_parameters)).reshape(slope.shape)
+    mean = np.einsum("sa,saf->sf", policy, q)
+    return np.einsum("sa,saf->f", counts, q - mean[:, None])
+
+
 # --- supports by brute force -------------------------------------------------------------------
 
 

@@ -6,12 +6,15 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_hex
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.patches import Circle, FancyArrowPatch, Rectangle
 
 from jaxltl import drawing, plot
 from jaxltl.core.automaton import Automaton, complement, make_automaton
+from jaxltl.core.rollout import Trajectories, make_trajectories
 from jaxltl.core.translate import to_automaton
+from jaxltl.envs.temporal_gridworld import random_world, training_world
 
 MAP = "b . r\n. # y"
 GOOD = [
@@ -448,3 +451,54 @@ def test_paths_on_a_map():
 def test_nothing_to_show_of_a_search(draw):
     with pytest.raises(ValueError, match="nothing to show"):
         draw()
+
+
+# --- coloured worlds --------------------------------------------------------------------------
+
+
+def test_a_coloured_world_is_drawn_with_all_that_is_in_it():
+    world = training_world(margin=2)
+    policy, value = np.full((100, 2, 4), 0.25), np.tile(np.arange(100.0)[:, None], (1, 2))
+    policy[:, 1] = [0, 0, 0, 1]
+    runs = make_trajectories(world.mdp, [[(0, 3), (1, 3), (2, 1)], [(99, 0)]])
+    figure = plot.temporal_gridworld(
+        world, policy, [0, 1], runs, value, title=["first", "second"], label="worth")
+    first, second, low, _, bar = figure.axes
+    assert [a.get_title(loc="left") for a in (first, second)] == ["first", "second"]
+    assert first.get_xlim() == (-2, 12) and bar.get_ylabel() == "worth"
+    names = Counter(text.get_text() for text in first.texts)
+    assert names == {"o1": 1, "o2": 1, "o3": 1, "ob": 5}
+    shown = first.images[0].get_array()
+    assert shown.shape == (14, 14, 3)
+    np.testing.assert_allclose(shown[5, 5], to_rgb(plot._TINTS[4]))  # cell (4, 4) is black
+    np.testing.assert_allclose(low.images[0].get_array().ravel(), np.arange(100))
+    triangles = next(a for a in second.collections if isinstance(a, PolyCollection))
+    assert len(triangles.get_paths()) == 100
+    # What is drawn on black cells is light, and dark on all others.
+    light = [to_hex(c) == plot.PAPER for c in triangles.get_facecolor()]
+    np.testing.assert_array_equal(light, np.asarray(world.colors)[2:-2, 2:-2].ravel() == 4)
+    walk = first.get_lines()[0].get_xydata()
+    np.testing.assert_allclose(np.diff(walk, axis=0), [[1, 0], [1, 0]])
+    np.testing.assert_allclose(walk[0], 0.5, atol=0.25)
+    assert [t.get_text() for t in figure.legends[0].texts] == ["first cell", "last cell"]
+    ElementTree.fromstring(plot.to_bytes(figure))
+
+
+def test_a_large_coloured_world_names_only_what_is_rare():
+    world = random_world(0, "F o1", shape=(20, 30), num_obstacles=12)
+    figure = plot.temporal_gridworld(world)
+    assert sorted(text.get_text() for text in figure.axes[0].texts) == ["o1", "o2", "o3"]
+    assert not figure.legends
+
+
+@pytest.mark.parametrize("options, message", [
+    ({"policy": np.zeros((99, 4))}, r"policy has shape \(99, 4\); .* 100 cells, .*100, memory, 4"),
+    ({"policy": np.zeros((100, 2, 4)), "memory": 2}, r"memory 2 does not exist; .* 0 to 1"),
+    ({"value": np.zeros((100, 2, 4))}, r"value has shape \(100, 2, 4\)"),
+    ({"policy": np.zeros((100, 1)), "actions": ["hop"]}, "action 'hop' has no direction"),
+    ({"trajectories": Trajectories(np.array([[100]]), np.array([[0]]), np.array([1]))},
+     "trajectories have states 100 to 100; the world's cells are 0 to 99"),
+])
+def test_what_does_not_fit_a_coloured_world(options, message):
+    with pytest.raises(ValueError, match=message):
+        plot.temporal_gridworld(training_world(), **options)

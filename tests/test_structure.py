@@ -29,10 +29,11 @@ LAYERS = [
     {"game", "rollout", "language", "trackers"},
     {"translate", "graph", "fixed_point", "objective"},
     {"product", "monitor"},
+    {"flat", "stack"},
     {"acceptance", "stiff", "bellman", "occupancy", "gr1", "pac", "span_iteration",
      "finite_task"},
     {"reachability", "winning", "game_value", "mean_payoff"},
-    {"verify", "permissive"},
+    {"verify", "permissive", "task_performance"},
 ]
 
 PUBLIC = [

@@ -9,7 +9,7 @@ written for an MDP, and a product's values have ``[S, Q]`` for ``[S]``.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import chex
@@ -20,6 +20,7 @@ from jax import lax
 from jax.scipy.special import logsumexp
 
 from jaxltl.core.fixed_point import implicit, solve_linear
+from jaxltl.core.flat import Predecessors, successors
 from jaxltl.core.operators import (
     action_argmax,
     action_max,
@@ -30,6 +31,8 @@ from jaxltl.core.operators import (
     pushforward,
 )
 from jaxltl.core.types import Solution, Status, status_code
+
+_SWEEPS_BETWEEN = 4  # sweeps between two looks at what is left
 
 
 def action_value(
@@ -66,19 +69,22 @@ def expected_reward(model: Any, reward: jax.Array) -> jax.Array:
     raise ValueError(f"reward has shape {reward.shape}; expected {actions} or {transitions}.")
 
 
-def _rounding(model: Any, reward: jax.Array, value: jax.Array, gap: jax.Array) -> jax.Array:
+def _rounding(
+    model: Any, reward: jax.Array, value: jax.Array, gap: jax.Array, axis: int | None = None
+) -> jax.Array:
     """What rounding in one backup can add to an error, amplified by ``1 / gap``.
 
     A backup sums at most as many products as a state has successors, over which rows may
     also miss one by a rounding each, and takes a maximum or a mean over the actions.
     """
     terms = model.num_successors + model.num_actions + 4
-    magnitude = jnp.max(jnp.abs(reward)) + jnp.max(jnp.abs(value))
+    magnitude = jnp.max(jnp.abs(reward), axis) + jnp.max(jnp.abs(value), axis)
     return terms * jnp.finfo(value.dtype).eps * magnitude / gap
 
 
 def _macqueen(
-    model: Any, reward: jax.Array, discount: jax.Array, value: jax.Array, image: jax.Array
+    model: Any, reward: jax.Array, discount: jax.Array, value: jax.Array, image: jax.Array,
+    axis: int | None = None,
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Bounds on the fixed point of a monotone T with ``T(v + c) = T(v) + discount * c``.
 
@@ -90,9 +96,9 @@ def _macqueen(
     """
     change = image - value
     gap = jnp.where(discount < 1, 1 - discount, jnp.nan)
-    rounding = _rounding(model, reward, image, gap)
-    down = discount / gap * jnp.min(change) - rounding
-    up = discount / gap * jnp.max(change) + rounding
+    rounding = _rounding(model, reward, image, gap, axis)
+    down = discount / gap * jnp.min(change, axis) - rounding
+    up = discount / gap * jnp.max(change, axis) + rounding
     finite = jnp.isfinite(down) & jnp.isfinite(up)
     return down, up, rounding, finite
 
@@ -104,10 +110,11 @@ def _certified(
     tolerance: jax.Array | float | None,
     value: jax.Array,
     image: jax.Array,
+    axis: int | None = None,
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Midpoint shift of the enclosure, its half width, whether that meets the tolerance, and
     whether it is mostly rounding, so that further sweeps would not help."""
-    down, up, rounding, finite = _macqueen(model, reward, discount, value, image)
+    down, up, rounding, finite = _macqueen(model, reward, discount, value, image, axis)
     half = (up - down) / 2
     goal = 4 * rounding if tolerance is None else tolerance
     half = jnp.where(finite, half, jnp.inf)
@@ -230,8 +237,15 @@ class _Jacobian(NamedTuple):
         return solve_linear(vecmat, b)
 
     def newton(self, value: jax.Array, image: jax.Array) -> jax.Array:
-        """One inexact step of Newton's method from `value`, whose backup is `image`."""
-        return value + solve_linear(self.matvec, image - value, tolerance=1e-2, max_steps=48)
+        """One inexact step of Newton's method from `value`, whose backup is `image`.
+
+        A plain sweep where the linear solver gets nowhere, as it can in single precision.
+        """
+        change = image - value
+        found = solve_linear(self.matvec, change, tolerance=1e-2, max_steps=48)
+        left = self.matvec(found) - change
+        solved = jnp.sum(left * left) <= jnp.sum(change * change) / 4
+        return value + jnp.where(solved, found, change)
 
 
 @partial(jax.jit, static_argnames=("method",))
@@ -322,6 +336,7 @@ def soft_value(
     reward: jax.Array,
     discount: jax.Array | float,
     *,
+    initial: jax.Array | None = None,
     method: str = "newton",
     tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int = 100_000,
@@ -332,6 +347,7 @@ def soft_value(
       model: the model.
       reward: ``float[S, A]`` or ``float[S, A, K]``.
       discount: scalar in [0, 1).
+      initial: ``float[S]``, where to start; default zero. It changes the number of steps only.
       method: ``"newton"`` (soft policy iteration, few linear solves, for any discount)
         or ``"value_iteration"`` (cheap sweeps).
       tolerance: certified absolute error asked for; default: what the dtype allows.
@@ -376,12 +392,168 @@ def soft_value(
         *_, n, done = carry
         return ~done & (n < max_steps)
 
-    zero = jnp.zeros(model.state_shape, model.dtype)
-    start = (zero, backup(zero), jnp.int32(1), jnp.bool_(False))
-    value, image, n, _ = lax.stop_gradient(lax.while_loop(unfinished, body, start))
-    solution = _solution(model, reward, discount, tolerance, value, image, zero, n)
+    guess = jnp.zeros(model.state_shape, model.dtype) if initial is None else initial
+    table = successors(model) if method == "value_iteration" else None
+    if table is None:
+        start = (guess, backup(guess), jnp.int32(1), jnp.bool_(False))
+        value, image, n, _ = lax.stop_gradient(lax.while_loop(unfinished, body, start))
+    else:
+        value, image, n = _soft_iteration(
+            model, table, reward, discount, tolerance, max_steps, guess)
+    solution = _solution(model, reward, discount, tolerance, value, image, value, n)
     solution = _attach(solution, backup, jacobian(solution.value))
     return _with_softmax(model, reward, discount, solution)
+
+
+def _soft_iteration(model, table, reward, discount, tolerance, max_steps, guess):
+    """Sweeps of the soft backup on numbered states, action by action.
+
+    The maximum and the sum over actions are then elementwise; as reductions over a short
+    last axis they take several times as long. Certified every few sweeps.
+
+    Returns:
+      The last value but one, the last one, and the number of sweeps.
+    """
+    gains = _action_columns(
+        model.num_actions, jnp.where(model.available, reward, -jnp.inf))
+    size = jnp.max(jnp.abs(reward))[None]  # all that certifying reads of the reward
+
+    def loop(table, gains, size, discount, tolerance, max_steps, value):
+        def sweep(value):
+            q = [g + discount * x for g, x in zip(gains, table.expectation(value), strict=True)]
+            top = reduce(jnp.maximum, q)
+            return top + jnp.log(reduce(jnp.add, [jnp.exp(x - top) for x in q]))
+
+        def judged(carry):
+            value, image, n, active = carry
+            *_, done, exhausted = _certified(
+                model, size, discount, tolerance, value, image, axis=0)
+            ended = (done | exhausted | ~jnp.isfinite(image[0])) & (n > 0)
+            return value, image, n, active & ~ended & (n < max_steps)
+
+        def body(carry):
+            value, image, n, active = judged(carry)
+
+            def one(_, carry):
+                value, image, n = carry
+                goes = active & (n < jnp.maximum(max_steps, 1))
+                keep = partial(jnp.where, goes)
+                return keep(image, value), keep(sweep(image), image), n + goes
+
+            return *lax.fori_loop(0, _SWEEPS_BETWEEN, one, (value, image, n)), active
+
+        def unfinished(carry):
+            # Judged where XLA does not compute the sweep again for every reduction.
+            return jnp.any(judged(carry)[-1] | (carry[2] == 0))
+
+        n = jnp.zeros(jnp.shape(value)[1:], jnp.int32)
+        start = (value, value, n, jnp.ones(n.shape, bool))
+        return lax.while_loop(unfinished, body, start)[:3]
+
+    arguments = (gains, size, discount, tolerance, jnp.asarray(max_steps), guess.ravel())
+    value, image, n = _lanes_last(loop, table, lax.stop_gradient(arguments))
+    return value.reshape(guess.shape), image.reshape(guess.shape), n
+
+
+def _lanes_last(loop, table: Any, arguments: tuple[Any, ...]) -> Any:
+    """``loop(table, *arguments)``, whose lanes under ``vmap`` become a last axis.
+
+    With the states first and the lanes side by side a gather moves whole rows, and what is
+    computed of them is vectorised. `loop` takes arrays with or without that axis.
+    """
+    @jax.custom_batching.custom_vmap
+    def one(table: Any, arguments: tuple[Any, ...]) -> Any:
+        return loop(table, *arguments)
+
+    @one.def_vmap
+    def _(size: int, batched: Any, table: Any, arguments: tuple[Any, ...]) -> Any:
+        of_table, of_arguments = batched
+        if any(jax.tree.leaves(of_table)):
+            axes = jax.tree.map(lambda b: 0 if b else None, (of_table, of_arguments))
+            found = jax.vmap(lambda t, x: loop(t, *x), axes)(table, arguments)
+        else:
+            def last(x: jax.Array, b: bool) -> jax.Array:
+                if b:
+                    return jnp.moveaxis(x, 0, -1)
+                return jnp.broadcast_to(x[..., None], (*x.shape, size))
+
+            found = loop(table, *jax.tree.map(last, arguments, of_arguments))
+            found = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), found)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return one(lax.stop_gradient(table), jax.tree.map(jnp.asarray, arguments))
+
+
+def soft_policy_adjoint(
+    model: Any,
+    policy: jax.Array,
+    discount: jax.Array | float,
+    cotangent: jax.Array,
+    *,
+    predecessors: Predecessors | None = None,
+    max_steps: jax.Array | int = 100_000,
+) -> jax.Array:
+    """The derivative of ``sum c log pi`` in the reward, for the soft policy pi of that reward.
+
+    With ``g = c - pi sum_a c`` and x the solution of ``x = discount * P'(g + pi x)``, it is
+    ``g + pi x``: the transpose of the sensitivity (3.6), one linear system for any number of
+    parameters. Solved by sweeps, as the series ``sum_k (discount * P_pi')^k b``: what is left
+    is known exactly and shrinks at the rate of the discount or faster.
+
+    Args:
+      model: the model.
+      policy: ``float[S, A]``, of :func:`soft_value`.
+      discount: scalar in [0, 1).
+      cotangent: ``float[S, A]``, the weights c; zero at unavailable actions.
+      predecessors: of the model (without their leading axis), which make it faster.
+      max_steps: sweeps at most.
+
+    Returns:
+      ``float[S, A]``.
+    """
+    shape = policy.shape[:-1]
+    discount = jnp.asarray(discount, policy.dtype)
+    columns = partial(_action_columns, model.num_actions)
+    g = cotangent - policy * jnp.sum(cotangent, axis=-1, keepdims=True)
+
+    def loop(before, weights, g, discount, max_steps):
+        def push(mass):
+            """The discounted flow ``[N]`` of masses ``[N]`` of the actions."""
+            if before is not None:
+                return discount * before.pushforward(jnp.concatenate(mass))
+            return discount * pushforward(model, jnp.stack(mass, -1).reshape(policy.shape)).ravel()
+
+        def sweep(_, carry):
+            x, r, n, active = carry
+            x = x + jnp.where(active, r, 0)
+            return x, jnp.where(active, push([w * r for w in weights]), r), n + active, active
+
+        def judged(carry):
+            x, r, n, active = carry
+            return x, r, n, active & (jnp.sum(jnp.abs(r), 0) > target) & (n < max_steps)
+
+        b = push(g)
+        target = float(jnp.finfo(b.dtype).eps) ** 0.8 * jnp.sum(jnp.abs(b), 0)
+        n = jnp.zeros(b.shape[1:], jnp.int32)
+        x, r, *_ = lax.while_loop(
+            lambda carry: jnp.any(judged(carry)[-1]),
+            lambda carry: lax.fori_loop(0, _SWEEPS_BETWEEN, sweep, judged(carry)),
+            (jnp.zeros_like(b), b, n, jnp.ones(n.shape, bool)),
+        )
+        return x + r
+
+    arguments = lax.stop_gradient((columns(policy), columns(g), discount, jnp.asarray(max_steps)))
+    if predecessors is None:
+        x = loop(None, *arguments)
+    else:
+        x = _lanes_last(loop, predecessors, arguments)
+    return g + policy * x.reshape(shape)[..., None]
+
+
+def _action_columns(num_actions: int, table: jax.Array) -> list[jax.Array]:
+    """``[S, A]`` as arrays ``[S]``, which lie side by side in memory."""
+    rows = table.reshape(-1, num_actions)
+    return [rows[:, a] for a in range(num_actions)]
 
 
 def policy_logits(

@@ -14,7 +14,16 @@ import pytest
 from flax import struct
 
 import jaxltl as jl
-from jaxltl.algos import cce, learner, maximin_q, mlirl, rmax, trust_region
+from jaxltl.algos import (
+    behavioral_cloning,
+    cce,
+    learner,
+    maximin_q,
+    mlirl,
+    rmax,
+    todirl,
+    trust_region,
+)
 from jaxltl.core.exponential_family import diagonal_gaussian
 from jaxltl.core.game import make_game
 from tests.support import counted_traces
@@ -76,6 +85,18 @@ def mlirl_product():
     return Case(
         mlirl, mlirl.make_problem(lazy, features, demonstrations),
         mlirl.Hparams(discount=0.5, mu=0.1), mlirl.Hparams(discount=0.6, mu=1.0, l2=1e-2),
+    )
+
+
+def task_oriented():
+    world, demonstrations = grid()
+    problem = todirl.make_problem(
+        jl.product(world, "!r U g", label_on="exit"), np.eye(6), demonstrations,
+        network=todirl.RewardNetwork((3,)), held_out=0.5,
+    )
+    return Case(
+        todirl, problem, todirl.Hparams(discount=0.9, patience=3),
+        todirl.Hparams(discount=0.8, l2=0.1, learning_rate=0.05, patience=4),
     )
 
 
@@ -149,16 +170,28 @@ def trust(method):
     )
 
 
+def cloning():
+    world, demonstrations = grid()
+    network = behavioral_cloning.DensePolicy(hidden=(4,))
+    problem = behavioral_cloning.make_problem(
+        jl.product(world, "!r U g"), jnp.eye(6), demonstrations, held_out=0.5, network=network)
+    setting = partial(behavioral_cloning.Hparams, batch=5)
+    return Case(
+        behavioral_cloning, problem, setting(), setting(learning_rate=0.1, l2=0.1, patience=3))
+
+
 LEARNERS = {
     "toy": lambda: Case(TOY, jnp.arange(3.0), 0.1, 0.2),
     "mlirl-world": mlirl_world,
     "mlirl-product": mlirl_product,
+    "todirl": task_oriented,
     "q-generalized": partial(q_learning, "generalized"),
     "q-maximin": partial(q_learning, "maximin"),
     "rmax": pac_learning,
     "trpo": partial(trust, "trpo"),
     "cpo": partial(trust, "cpo"),
     "cce": cross_entropy,
+    "cloning": cloning,
 }
 
 # What a state has learned, by name; the first that it has.

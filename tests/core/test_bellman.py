@@ -7,7 +7,9 @@ import pytest
 
 import jaxltl as jl
 from jaxltl import Status
-from jaxltl.core.bellman import boltzmann_expansion, expected_reward
+from jaxltl.core.bellman import boltzmann_expansion, expected_reward, soft_value
+from jaxltl.core.stack import stack_products
+from jaxltl.envs import temporal_gridworld as grid
 from tests import reference
 from tests.support import as_mdp, assert_encloses, mass_preserving, stack
 
@@ -357,3 +359,13 @@ def test_sensitivities_equal_the_explicit_equations(adjoint):
                 assert np.abs(other - slope).max() > 1e-2
             else:
                 np.testing.assert_allclose(other, slope, atol=1e-12)
+
+
+def test_soft_newton_passes_linear_systems_that_single_precision_does_not_solve():
+    """In this world the linear solver gets nowhere in the second step; a sweep leads on."""
+    model = stack_products([grid.random_world(9).mdp], grid.COMPLETE)
+    model = jax.tree.map(
+        lambda x: x[0].astype(jnp.float32) if x.dtype == float else x[0], model)
+    found = soft_value(model, grid.expert_reward(model), 0.95, max_steps=50)
+    assert found.status == Status.CONVERGED
+    assert jnp.max(found.upper - found.lower) < 0.02

@@ -1,0 +1,361 @@
+"""Behavioral cloning with the task's memory (dissertation, section 3.5).
+
+A network that sees what is near and the memory of the task's automaton classifies which
+action was demonstrated there. There is no world model: nothing is planned, so what was
+learned holds where things look as they did in the demonstrations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import linen as nn
+from flax import struct
+
+from jaxltl.algos import learner
+from jaxltl.core.product import Product
+from jaxltl.core.rollout import Trajectories
+from jaxltl.core.stack import demonstrated_counts, split_trajectories, stack_models
+
+# --- policy networks -----------------------------------------------------------------------------
+
+
+class ConvolutionalPolicy(nn.Module):
+    """The network of section 3.5: two convolutions, two dense layers, ReLU between them.
+
+    The convolutions see the patch as an image. The memory, which has no place in it, joins
+    what they found at the first dense layer.
+
+    Attributes:
+      image: height, width and channels of an observation; section 3.5 has (3, 3, 5).
+      num_actions: how many scores to give.
+      kernels: of each convolution, 2 x 2 with stride 1 and no padding.
+      hidden: widths of the dense layers.
+    """
+
+    image: Sequence[int] = (3, 3, 5)
+    num_actions: int = 4
+    kernels: Sequence[int] = (12, 24)
+    hidden: Sequence[int] = (100, 100)
+
+    @nn.compact
+    def __call__(self, observation: jax.Array, memory: jax.Array) -> jax.Array:
+        rows = observation.shape[:-1]
+        x = observation.reshape(-1, *self.image)
+        for features in self.kernels:
+            x = nn.relu(nn.Conv(features, (2, 2), padding="VALID")(x))
+        return _dense_layers(self, x.reshape(*rows, -1), memory)
+
+
+class DensePolicy(nn.Module):
+    """A multilayer perceptron on (observation, memory), ReLU between its layers.
+
+    Attributes:
+      num_actions: how many scores to give.
+      hidden: widths of the hidden layers.
+    """
+
+    num_actions: int = 4
+    hidden: Sequence[int] = (100, 100)
+
+    @nn.compact
+    def __call__(self, observation: jax.Array, memory: jax.Array) -> jax.Array:
+        return _dense_layers(self, observation, memory)
+
+
+def _dense_layers(module: Any, seen: jax.Array, memory: jax.Array) -> jax.Array:
+    """Scores of (what is seen, memory) side by side; each part goes in only once."""
+    widths = (*module.hidden, module.num_actions)
+    inputs = seen.shape[-1] + memory.shape[-1]
+    kernel = module.param("kernel", nn.initializers.lecun_normal(), (inputs, widths[0]))
+    bias = module.param("bias", nn.initializers.zeros_init(), (widths[0],))
+    above, below = jnp.split(kernel, [seen.shape[-1]])
+    x = seen @ above + (memory @ below + bias)
+    for width in widths[1:]:
+        x = nn.Dense(width)(nn.relu(x))
+    return x
+
+
+# --- the learner's data --------------------------------------------------------------------------
+
+
+@struct.dataclass
+class Problem:
+    """What is given: what is seen in worlds, and which actions were demonstrated.
+
+    Attributes:
+      observation: ``float[W, S, O]``, what is seen in each world state.
+      available: ``bool[W, S, A]``.
+      counts: ``float[W, S, Q, A]``, how often each pair was demonstrated.
+      held_out: counts of the demonstrations by which learning is stopped; may be zero.
+      network: called as ``network(observation [..., O], memory [..., Q]) -> float[..., A]``,
+        memory one-hot, scores (logits) of the actions; static.
+    """
+
+    observation: jax.Array
+    available: jax.Array
+    counts: jax.Array
+    held_out: jax.Array
+    network: nn.Module = struct.field(pytree_node=False, default=ConvolutionalPolicy())
+
+
+@struct.dataclass
+class Hparams:
+    """How to learn. Numbers are traced, so new values do not recompile.
+
+    Attributes:
+      learning_rate: of Adam.
+      l2: precision of the Gaussian prior on the parameters, shared by all pairs.
+      patience: steps without a better held-out likelihood after which learning stops.
+      batch: pairs in a minibatch; static.
+    """
+
+    learning_rate: jax.Array | float = 3e-3
+    l2: jax.Array | float = 0.0
+    patience: jax.Array | int = 500
+    batch: int = struct.field(pytree_node=False, default=128)
+
+
+@struct.dataclass
+class Best:
+    """The parameters with the best held-out likelihood; without held-out data the newest.
+
+    Attributes:
+      parameters: of the network.
+      neg_log_likelihood: held out, per pair; NaN without held-out data.
+      step: the number of steps after which they were reached.
+    """
+
+    parameters: Any
+    neg_log_likelihood: jax.Array
+    step: jax.Array
+
+
+@struct.dataclass
+class State:
+    """Parameters on their way; once `stopped`, only the step counter goes on.
+
+    Attributes:
+      key, step: the root key and the number of steps made.
+      parameters: of the network.
+      optimizer: optax's state.
+      best: what was learned: ``state.best.parameters``.
+      stopped: whether patience has run out.
+    """
+
+    key: jax.Array
+    step: jax.Array
+    parameters: Any
+    optimizer: Any
+    best: Best
+    stopped: jax.Array
+
+
+@struct.dataclass
+class Metrics:
+    """Figures of the parameters before a step.
+
+    Attributes:
+      loss: of the minibatch, per pair, with the prior.
+      held_out: negative log-likelihood of the average held-out pair; NaN without any.
+      gradient_norm: Euclidean.
+    """
+
+    loss: jax.Array
+    held_out: jax.Array
+    gradient_norm: jax.Array
+
+
+def make_problem(
+    models: Product | Sequence[Product],
+    observation: Any,
+    demonstrations: Trajectories | Sequence[Trajectories],
+    *,
+    held_out: float | Trajectories | Sequence[Trajectories] | None = 0.2,
+    network: nn.Module | None = None,
+) -> Problem:
+    """A checked :class:`Problem`, on the host.
+
+    Args:
+      models: a product, several, or products stacked along a first axis of W worlds.
+      observation: ``float[S, O]`` or ``float[W, S, O]``, or one for each world.
+      demonstrations: in the world (not in the product), or one for each world.
+      held_out: the share of each world's trajectories, its last ones, by which learning is
+        stopped early; or such trajectories; None or 0: no early stopping.
+      network: the policy; default :class:`ConvolutionalPolicy` with the models' number of
+        actions.
+
+    Raises:
+      ValueError: worlds that differ, observations or scores of the wrong shape, or
+        demonstrations that do not fit their world, or of which none is left.
+    """
+    models = stack_models(models)
+    observation = jnp.asarray(np.stack([np.asarray(x) for x in observation]), models.dtype)
+    observation = observation[None] if observation.ndim == 2 else observation
+    rows = models.letter.shape
+    if observation.ndim != 3 or observation.shape[:2] != rows:
+        raise ValueError(f"observation has shape {observation.shape}; expected {(*rows, 'O')}.")
+    if not bool(jnp.all(jnp.isfinite(observation))):
+        w, s, _ = np.argwhere(~np.isfinite(np.asarray(observation)))[0].tolist()
+        raise ValueError(f"world {w}: the observation in state {s} is not finite.")
+    test: Any = held_out
+    if held_out is None or isinstance(held_out, int | float):
+        demonstrations, test = split_trajectories(demonstrations, held_out or 0.0)
+    counts = demonstrated_counts(models, demonstrations)
+    if not bool(jnp.any(counts > 0)):
+        raise ValueError(
+            "demonstrations: no pair is left to learn from; give more, or a smaller held_out."
+        )
+    problem = Problem(
+        observation=observation, available=jnp.asarray(models.mdp.available), counts=counts,
+        held_out=demonstrated_counts(models, test),
+        network=ConvolutionalPolicy(num_actions=models.num_actions) if network is None else network,
+    )
+    _require_scores(problem)
+    return problem
+
+
+def _require_scores(problem: Problem) -> None:
+    height_width_channels = getattr(problem.network, "image", None)
+    size = problem.observation.shape[-1]
+    if height_width_channels is not None and int(np.prod(height_width_channels)) != size:
+        raise ValueError(
+            f"an observation has {size} numbers, which are no image of shape "
+            f"{tuple(height_width_channels)}; set ConvolutionalPolicy(image=...)."
+        )
+    found = jax.eval_shape(
+        lambda *x: problem.network.init_with_output(jax.random.key(0), *x)[0], *_inputs(problem)
+    )
+    expected = problem.counts.shape[1:]
+    if getattr(found, "shape", None) != expected:
+        what = getattr(found, "shape", type(found).__name__)
+        raise ValueError(
+            f"the network's scores have shape {what}; expected {expected}, one number for each "
+            "state, memory and action."
+        )
+
+
+def _inputs(problem: Problem) -> tuple[jax.Array, jax.Array]:
+    """Observation ``[S, 1, O]`` of the first world and memory ``[1, Q, Q]``."""
+    memory = jnp.eye(problem.counts.shape[2], dtype=problem.observation.dtype)
+    return problem.observation[0, :, None], memory[None]
+
+
+def policy(
+    network: nn.Module, parameters: Any, model: Product, observation: jax.Array
+) -> jax.Array:
+    """The policy in a world, which may be a new one: ``float[S, Q, A]``.
+
+    Args:
+      network: as ``Problem.network``.
+      parameters: what was learned, ``state.best.parameters``.
+      model: the product of that world and the task; batches of worlds by ``vmap``.
+      observation: ``float[S, O]``.
+    """
+    memory = jnp.eye(model.num_memory, dtype=observation.dtype)[None]
+    scores: Any = network.apply(parameters, observation[:, None], memory)
+    return jax.nn.softmax(jnp.where(model.available, scores, -jnp.inf), axis=-1)
+
+
+# --- learning -------------------------------------------------------------------------------------
+
+
+def likelihood(parameters: Any, problem: Problem, counts: jax.Array) -> jax.Array:
+    """Negative log-likelihood (3.10) of the average counted pair; NaN if there is none.
+
+    Args:
+      parameters: of the network.
+      problem: the worlds.
+      counts: ``float[W, S, Q, A]``.
+    """
+    memory = jnp.eye(counts.shape[2], dtype=problem.observation.dtype)[None, None]
+    scores: Any = problem.network.apply(parameters, problem.observation[:, :, None], memory)
+    log_policy = _log_policy(scores, problem.available[:, :, None])
+    return -jnp.sum(counts * log_policy) / jnp.sum(counts)
+
+
+def _log_policy(scores: jax.Array, available: jax.Array) -> jax.Array:
+    log_policy = jax.nn.log_softmax(jnp.where(available, scores, -jnp.inf), axis=-1)
+    return jnp.where(available, log_policy, 0)
+
+
+def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """A state at the network's own random start; the key is kept."""
+    dtype = problem.observation.dtype
+    drawn = problem.network.init(jax.random.fold_in(key, 0), *_inputs(problem))
+    parameters = jax.tree.map(lambda x: jnp.asarray(x, dtype), drawn)
+    return State(
+        key=key, step=jnp.int32(0), parameters=parameters,
+        optimizer=jax.tree.map(
+            lambda x: jnp.asarray(x, jnp.result_type(x)), _optimizer(hparams).init(parameters)
+        ),
+        best=Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
+        stopped=jnp.bool_(False),
+    )
+
+
+def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """One step of Adam on a minibatch, drawn with replacement from the demonstrated pairs.
+
+    The loss is (3.10) with the network's outputs read as logits; softmax twice, as the
+    formula has it where they are probabilities, does not train.
+    """
+    pairs = _draw(jax.random.fold_in(state.key, state.step + 1), problem.counts, hparams.batch)
+
+    def loss_of(parameters: Any) -> jax.Array:
+        w, s, q, a = pairs
+        memory = jax.nn.one_hot(q, problem.counts.shape[2], dtype=problem.observation.dtype)
+        scores: Any = problem.network.apply(parameters, problem.observation[w, s], memory)
+        log_policy = _log_policy(scores, problem.available[w, s])
+        fit = -jnp.mean(jnp.take_along_axis(log_policy, a[:, None], axis=-1))
+        squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(parameters))
+        return fit + hparams.l2 / 2 * squares / jnp.sum(problem.counts)
+
+    loss, gradient = jax.value_and_grad(loss_of)(state.parameters)
+    updates, optimizer = _optimizer(hparams).update(gradient, state.optimizer, state.parameters)
+    parameters = optax.apply_updates(state.parameters, updates)
+    held_out = likelihood(state.parameters, problem, problem.held_out)
+    judged = jnp.any(problem.held_out > 0)
+    better = judged & (held_out < state.best.neg_log_likelihood) & ~state.stopped
+    best = _where(better, Best(state.parameters, held_out, state.step), state.best)
+    newest = Best(parameters, jnp.full_like(loss, jnp.nan), state.step + 1)
+    stopped = state.stopped | (judged & (state.step - best.step >= hparams.patience))
+    kept = (state.parameters, state.optimizer, best)
+    parameters, optimizer, best = _where(
+        stopped, kept, (parameters, optimizer, _where(judged, best, newest))
+    )
+    metrics = Metrics(loss=loss, held_out=held_out, gradient_norm=optax.tree.norm(gradient))
+    return State(
+        key=state.key, step=state.step + 1, parameters=parameters, optimizer=optimizer,
+        best=best, stopped=stopped,
+    ), metrics
+
+
+def _draw(key: chex.PRNGKey, counts: jax.Array, num: int) -> tuple[jax.Array, ...]:
+    """Indices ``int32[num]`` on each axis of `counts`, with probabilities proportional to them."""
+    total = jnp.cumsum(counts.ravel())
+    point = jax.random.uniform(key, (num,), total.dtype) * total[-1]
+    # Rounding must not lead beyond the last pair that counts.
+    last = jnp.searchsorted(total, total[-1])
+    index = jnp.minimum(jnp.searchsorted(total, point, side="right"), last)
+    return jnp.unravel_index(index, counts.shape)
+
+
+def _where(condition: jax.Array, one: Any, other: Any) -> Any:
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), one, other)
+
+
+def _optimizer(hparams: Hparams) -> optax.GradientTransformation:
+    rate = optax.scale_by_learning_rate(hparams.learning_rate)
+    return optax.chain(optax.scale_by_adam(), rate)
+
+
+run = partial(learner.run, step)
+train = partial(learner.train, init, step)

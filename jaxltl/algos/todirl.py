@@ -1,0 +1,565 @@
+"""Task-oriented deep inverse RL (dissertation, chapter 3).
+
+From demonstrations, learn a reward network that sees what is near, the memory of the
+task's automaton and the action, such that the soft (maximum-entropy) policy of the product
+makes the demonstrations likely (3.3). What was learned is local, so it plans in worlds that
+were never seen: :func:`plan`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import linen as nn
+from flax import struct
+from jax import lax
+
+from jaxltl.algos import learner
+from jaxltl.core.bellman import policy_logits, soft_policy_adjoint, soft_value
+from jaxltl.core.flat import Predecessors, predecessors
+from jaxltl.core.product import Product
+from jaxltl.core.rollout import Trajectories
+from jaxltl.core.stack import demonstrated_counts, split_trajectories, stack_models
+from jaxltl.core.stack import world as lane
+from jaxltl.core.types import Solution, Status, status_code
+
+# --- reward networks ---------------------------------------------------------------------------
+
+
+class RewardNetwork(nn.Module):
+    """A multilayer perceptron on (observation, memory, action), ReLU between its layers.
+
+    The first layer is a dense layer on the three inputs side by side, computed as the sum
+    of its three parts: each part sees its own input only once, not once per combination.
+
+    Attributes:
+      hidden: widths of the hidden layers; section 3.5 has two of 80. Empty: a linear reward.
+    """
+
+    hidden: Sequence[int] = (80, 80)
+
+    @nn.compact
+    def __call__(self, observation: jax.Array, memory: jax.Array, action: jax.Array) -> jax.Array:
+        widths = (*self.hidden, 1)
+        inputs = (observation, memory, action)
+        sizes = [x.shape[-1] for x in inputs]
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), (sum(sizes), widths[0]))
+        bias = self.param("bias", nn.initializers.zeros_init(), (widths[0],))
+        parts = jnp.split(kernel, np.cumsum(sizes)[:-1])
+        terms = [x @ part for x, part in zip(inputs, parts, strict=True)]
+        x = terms[0] + (terms[1] + terms[2] + bias)
+        rows = x.shape[:-1]
+        x = x.reshape(-1, widths[0])  # as a matrix the products are a little faster
+        for width in widths[1:]:
+            x = nn.Dense(width)(nn.relu(x))
+        return x.reshape(rows)
+
+
+class Concatenated(nn.Module):
+    """A network that reads one vector, ``[..., O + Q + A] -> [...]`` or ``[..., 1]``, as a reward.
+
+    Attributes:
+      network: the flax module.
+    """
+
+    network: nn.Module
+
+    @nn.compact
+    def __call__(self, observation: jax.Array, memory: jax.Array, action: jax.Array) -> jax.Array:
+        inputs = (observation, memory, action)
+        rows = jnp.broadcast_shapes(*(x.shape[:-1] for x in inputs))
+        wide = [jnp.broadcast_to(x, (*rows, x.shape[-1])) for x in inputs]
+        result = self.network(jnp.concatenate(wide, axis=-1))
+        return result[..., 0] if result.shape == (*rows, 1) else result
+
+
+# --- the learner's data --------------------------------------------------------------------------
+
+
+@struct.dataclass
+class Problem:
+    """What is given: worlds beside the task, what is seen in them, and demonstrations.
+
+    Attributes:
+      model: products stacked along a first axis of W worlds.
+      observation: ``float[W, S, O]``, what is seen in each world state.
+      counts: ``float[W, S, Q, A]``, how often each pair was demonstrated; with a horizon
+        ``float[W, T, S, Q, A]``.
+      held_out: counts of the demonstrations by which learning is stopped; may be zero.
+      weight: ``float[W]``, factors of the worlds' likelihoods.
+      predecessors: of the product states, with a first axis of W, or None; they make the
+        gradient faster.
+      network: called as ``network(observation [S, 1, 1, O], memory [1, Q, 1, Q],
+        action [1, 1, A, A]) -> float[S, Q, A]``, memory and action one-hot; static.
+    """
+
+    model: Product
+    observation: jax.Array
+    counts: jax.Array
+    held_out: jax.Array
+    weight: jax.Array
+    predecessors: Predecessors | None = None
+    network: nn.Module = struct.field(pytree_node=False, default=RewardNetwork())
+
+    @property
+    def horizon(self) -> int | None:
+        """Steps that the counts tell apart, or None."""
+        return self.counts.shape[1] if self.counts.ndim == 5 else None
+
+
+@struct.dataclass
+class Hparams:
+    """How to learn. Numbers are traced, so new values do not recompile.
+
+    Attributes:
+      discount: in [0, 1); with a horizon 1 is allowed.
+      l2: precision of the Gaussian prior on the parameters.
+      learning_rate: for every optimiser but ``lbfgs``.
+      patience: steps without a better held-out likelihood after which learning stops.
+      tolerance: certified error asked of the soft values; None: what the dtype allows.
+      optimizer: ``"adam"``, ``"sgd"``, ``"rmsprop"`` or ``"lbfgs"``, all optax's; static.
+      method: of the soft solver, see :func:`~jaxltl.core.bellman.soft_value`; static.
+      horizon: None, or the number of steps of a run, for a policy of the time left; static.
+    """
+
+    discount: jax.Array | float
+    l2: jax.Array | float = 1e-3
+    learning_rate: jax.Array | float = 3e-3
+    patience: jax.Array | int = 50
+    tolerance: jax.Array | float | None = None
+    optimizer: str = struct.field(pytree_node=False, default="adam")
+    method: str = struct.field(pytree_node=False, default="value_iteration")
+    horizon: int | None = struct.field(pytree_node=False, default=None)
+
+
+@struct.dataclass
+class Best:
+    """The parameters with the best held-out likelihood; without held-out data the newest.
+
+    Attributes:
+      parameters: of the network.
+      neg_log_likelihood: held out, per pair; NaN without held-out data.
+      step: the number of steps after which they were reached.
+    """
+
+    parameters: Any
+    neg_log_likelihood: jax.Array
+    step: jax.Array
+
+
+@struct.dataclass
+class State:
+    """Parameters on their way; once `stopped`, only the step counter goes on.
+
+    Attributes:
+      key, step: the root key and the number of steps made.
+      parameters: of the network.
+      value: ``float[W, S, Q]``, the soft value that the next solve starts from.
+      optimizer: optax's state.
+      best: what was learned: ``state.best.parameters``.
+      stopped: whether patience has run out.
+    """
+
+    key: jax.Array
+    step: jax.Array
+    parameters: Any
+    value: jax.Array
+    optimizer: Any
+    best: Best
+    stopped: jax.Array
+
+
+@struct.dataclass
+class Metrics:
+    """Figures of the parameters before a step.
+
+    Attributes:
+      loss: the negative log-likelihood and minus the logarithm of the prior.
+      neg_log_likelihood: minus (3.3), over all pairs, weighted by world.
+      per_pair: the same for the average pair.
+      held_out: negative log-likelihood of the average held-out pair; NaN without any.
+      gradient_norm: Euclidean.
+      error: certified error of the soft values, the largest over the worlds.
+      status: of the soft solver, the worst over the worlds.
+    """
+
+    loss: jax.Array
+    neg_log_likelihood: jax.Array
+    per_pair: jax.Array
+    held_out: jax.Array
+    gradient_norm: jax.Array
+    error: jax.Array
+    status: jax.Array
+
+
+def make_problem(
+    worlds: Product | Sequence[Product],
+    observation: Any,
+    demonstrations: Trajectories | Sequence[Trajectories],
+    *,
+    held_out: float | Trajectories | Sequence[Trajectories] | None = 0.2,
+    network: nn.Module | None = None,
+    weight: Any = None,
+    horizon: int | None = None,
+) -> Problem:
+    """A checked :class:`Problem`, on the host.
+
+    Args:
+      worlds: a product, several, or products stacked along a first axis of W worlds.
+      observation: ``float[S, O]``, or one for each world.
+      demonstrations: in the world (not in the product), or one for each world; empty
+        trajectories are left out.
+      held_out: the share of each world's trajectories, its last ones, by which learning is
+        stopped early; or such trajectories; None or 0: no early stopping.
+      network: the reward; default :class:`RewardNetwork`.
+      weight: ``float[W]``, factors of the worlds' likelihoods; default 1.
+      horizon: count pairs by time, for ``Hparams.horizon``.
+
+    Raises:
+      ValueError: worlds of different shapes or propositions, observations, weights or
+        rewards of the wrong shape, demonstrations that do not fit their world or exceed the
+        horizon, or no pair left to learn from.
+    """
+    model = stack_models(worlds)
+    num_worlds, num_states = model.letter.shape
+    dtype = model.dtype
+    if isinstance(observation, list | tuple):
+        observation = np.stack([np.asarray(x) for x in observation])
+    observation = jnp.asarray(observation, dtype)
+    if observation.ndim == 2:
+        observation = observation[None]
+    if observation.ndim != 3 or observation.shape[:2] != (num_worlds, num_states):
+        raise ValueError(
+            f"observation has shape {observation.shape}; expected {(num_worlds, num_states, 'O')}."
+        )
+    if not bool(jnp.all(jnp.isfinite(observation))):
+        w, s, _ = np.argwhere(~np.isfinite(np.asarray(observation)))[0].tolist()
+        raise ValueError(f"world {w}: the observation in state {s} is not finite.")
+    test: Any = held_out
+    if held_out is None or isinstance(held_out, int | float):
+        demonstrations, test = split_trajectories(demonstrations, held_out or 0.0)
+    counts, other = (
+        demonstrated_counts(model, x, horizon=horizon) for x in (demonstrations, test))
+    if not bool(jnp.any(counts > 0)):
+        raise ValueError(
+            "demonstrations: no pair is left to learn from; give more, or a smaller held_out."
+        )
+    weight = jnp.ones(num_worlds, dtype) if weight is None else jnp.asarray(weight, dtype)
+    if weight.shape != (num_worlds,):
+        raise ValueError(f"weight has shape {weight.shape}; expected {(num_worlds,)}.")
+    network = RewardNetwork() if network is None else network
+    _require_reward(network, model, observation)
+    return Problem(
+        model=model, observation=observation, counts=counts, held_out=other, weight=weight,
+        predecessors=predecessors([lane(model, w) for w in range(num_worlds)]), network=network,
+    )
+
+
+def _require_reward(network: nn.Module, model: Product, observation: jax.Array) -> None:
+    inputs = _inputs(model, observation[0])
+    found = jax.eval_shape(
+        lambda *x: network.init_with_output(jax.random.key(0), *x)[0], *inputs
+    )
+    expected = (*observation.shape[1:2], *(x.shape[-1] for x in inputs[1:]))
+    if getattr(found, "shape", None) != expected:
+        what = getattr(found, "shape", type(found).__name__)
+        raise ValueError(
+            f"the network's reward has shape {what}; expected {expected}, one number for each "
+            "state, memory and action. A module on one vector is wrapped as Concatenated(module)."
+        )
+
+
+def _inputs(model: Product, observation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The network's inputs: observation, memory and action on their own axes."""
+    num_memory, num_actions = model.num_memory, model.mdp.available.shape[-1]
+    memory = jnp.eye(num_memory, dtype=observation.dtype)[None, :, None]
+    action = jnp.eye(num_actions, dtype=observation.dtype)[None, None]
+    return observation[:, None, None], memory, action
+
+
+# --- planning -------------------------------------------------------------------------------------
+
+
+def reward(network: nn.Module, parameters: Any, model: Product, observation: jax.Array):
+    """The network's reward in a product: ``float[S, Q, A]``."""
+    return network.apply(parameters, *_inputs(model, observation))
+
+
+def plan(
+    network: nn.Module,
+    parameters: Any,
+    model: Product,
+    observation: jax.Array,
+    hparams: Hparams,
+    *,
+    initial: jax.Array | None = None,
+) -> Solution:
+    """Soft value and policy (3.4), (3.5) of a learned reward in any world.
+
+    Args:
+      network, parameters: what was learned.
+      model: the product; its automaton has as many states as the one learned with.
+      observation: ``float[S, O]``.
+      hparams: discount, tolerance, method and horizon are read.
+      initial: ``float[S, Q]``, a value to start from.
+
+    Returns:
+      :class:`~jaxltl.core.types.Solution`, differentiable in the parameters; with a
+      horizon, value and policy have a first axis of time. Batches of worlds by ``vmap``.
+
+    Raises:
+      ValueError: unknown method.
+    """
+    return _plan(reward(network, parameters, model, observation), model, hparams, initial)
+
+
+def _plan(
+    rewards: jax.Array, model: Product, hparams: Hparams, initial: jax.Array | None
+) -> Solution:
+    if hparams.horizon is not None:
+        return _backward_induction(rewards, model, hparams)
+    return soft_value(
+        model, rewards, hparams.discount, initial=initial, method=hparams.method,
+        tolerance=hparams.tolerance,
+    )
+
+
+def _backward_induction(rewards: jax.Array, model: Product, hparams: Hparams) -> Solution:
+    """Soft values with 0, ..., T - 1 steps behind, ``V_T = 0``; exact but for rounding."""
+    rewards = jnp.asarray(rewards, model.dtype)
+    discount = jnp.asarray(hparams.discount, model.dtype)
+
+    def backup(value: jax.Array, _: None) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        logits = policy_logits(model, rewards, discount, value)
+        value = jax.nn.logsumexp(logits, axis=-1)
+        return value, (value, jax.nn.softmax(logits, axis=-1))
+
+    horizon = int(hparams.horizon or 0)
+    last = jnp.zeros(model.state_shape, model.dtype)
+    _, (value, policy) = lax.scan(backup, last, None, length=horizon, reverse=True)
+    exact = lax.stop_gradient(value)
+    terms = model.num_successors + model.num_actions + 4
+    size = jnp.max(jnp.abs(rewards)) + jnp.max(jnp.abs(exact))
+    half = lax.stop_gradient(horizon * terms * jnp.finfo(model.dtype).eps * size)
+    finite = jnp.all(jnp.isfinite(exact))
+    return Solution(
+        value=value, policy=policy, lower=exact - half, upper=exact + half,
+        residual=jnp.zeros((), model.dtype), num_steps=jnp.int32(horizon),
+        status=status_code(finite, finite),
+    )
+
+
+def solve(
+    parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
+) -> Solution:
+    """Soft values and policies of a reward in the problem's worlds, with a first axis of W.
+
+    Args:
+      parameters: of the network.
+      problem, hparams: what and how.
+      initial: ``float[W, S, Q]``, values to start from.
+    """
+    def world(model, observation, initial):
+        return plan(problem.network, parameters, model, observation, hparams, initial=initial)
+
+    return _each_world(world, problem.model, problem.observation, _initial(problem, initial))
+
+
+def _each_world(function, *arguments):
+    """``vmap`` over worlds; one world is not batched, which would keep seeds from being so."""
+    if jax.tree.leaves(arguments)[0].shape[0] == 1:
+        one = function(*(jax.tree.map(lambda x: x[0], y) for y in arguments))
+        return jax.tree.map(lambda x: x[None], one)
+    return jax.vmap(function)(*arguments)
+
+
+def _initial(problem: Problem, initial: jax.Array | None) -> jax.Array:
+    if initial is not None:
+        return initial
+    return jnp.zeros((*problem.model.letter.shape, problem.model.num_memory), problem.model.dtype)
+
+
+# --- learning -------------------------------------------------------------------------------------
+
+
+@struct.dataclass
+class Objective:
+    """What the loss was made of, and the soft values with their evidence."""
+
+    neg_log_likelihood: jax.Array
+    per_pair: jax.Array
+    held_out: jax.Array
+    value: jax.Array
+    error: jax.Array
+    status: jax.Array
+
+
+def objective(
+    parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
+) -> tuple[jax.Array, Objective]:
+    """``-sum log pi(a | s, q) + l2 / 2 |theta|^2``: minus (3.2), over all pairs of all worlds.
+
+    Its gradient costs one linear solve with the transposed transition matrix of the policy
+    (implicit function theorem), instead of one system (3.6) for each parameter.
+
+    Args:
+      parameters, problem, hparams, initial: as in :func:`solve`.
+
+    Returns:
+      The loss, and :class:`Objective`.
+
+    Raises:
+      ValueError: the problem does not count pairs by time up to ``hparams.horizon``.
+    """
+    if hparams.horizon is not None and hparams.horizon != problem.horizon:
+        raise ValueError(
+            f"hparams.horizon={hparams.horizon}, but the problem has horizon={problem.horizon}; "
+            f"make_problem(..., horizon={hparams.horizon}) counts pairs by time."
+        )
+    counts, held_out = problem.counts, problem.held_out
+    if hparams.horizon is None and problem.horizon is not None:
+        counts, held_out = counts.sum(axis=1), held_out.sum(axis=1)
+
+    def world(model, observation, counts, held_out, initial, before):
+        rewards = jnp.asarray(reward(problem.network, parameters, model, observation), model.dtype)
+        find = _by_time if hparams.horizon is not None else partial(_stationary, before=before)
+        return find(rewards, model, hparams, counts, held_out, initial)
+
+    seen, other, value, error, status = _each_world(
+        world, problem.model, problem.observation, counts, held_out, _initial(problem, initial),
+        problem.predecessors,
+    )
+    weight = problem.weight
+    pairs, other_pairs = (weight @ jnp.sum(x, axis=(1, 2, 3)) for x in _flat(counts, held_out))
+    neg = -weight @ seen
+    squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(parameters))
+    return neg + hparams.l2 / 2 * squares, Objective(
+        neg_log_likelihood=neg, per_pair=neg / pairs,
+        held_out=lax.stop_gradient(-(weight @ other) / other_pairs),
+        value=value, error=jnp.max(error), status=jnp.max(status),
+    )
+
+
+def _stationary(rewards, model, hparams, counts, held_out, initial, *, before):
+    """Log-likelihoods of the stationary soft policy, with the gradient of the first."""
+    constant = lax.stop_gradient(rewards)
+    solution = lax.stop_gradient(_plan(constant, model, hparams, initial))
+    log_policy = _log_policy(model, constant, hparams.discount, solution.value)
+    policy = jnp.where(model.available, jnp.exp(log_policy), 0)
+    slope = lax.stop_gradient(
+        soft_policy_adjoint(model, policy, hparams.discount, counts, predecessors=before)
+    )
+    # The likelihood, and as its derivative the adjoint's, which differentiating the solver's
+    # own equations would find by scatters, slow on a CPU.
+    seen = jnp.sum(counts * log_policy) + jnp.sum(slope * (rewards - constant))
+    error = jnp.max(solution.upper - solution.lower) / 2
+    return seen, jnp.sum(held_out * log_policy), solution.value, error, solution.status
+
+
+def _by_time(rewards, model, hparams, counts, held_out, initial):
+    """Log-likelihoods of the policy of the time left, differentiable as they stand."""
+    solution = _backward_induction(rewards, model, hparams)
+    after = jnp.concatenate([solution.value[1:], jnp.zeros_like(solution.value[:1])])
+    log_policy = jax.vmap(lambda v: _log_policy(model, rewards, hparams.discount, v))(after)
+    seen, other = (jnp.sum(x * log_policy) for x in (counts, held_out))
+    error = lax.stop_gradient(jnp.max(solution.upper - solution.lower) / 2)
+    return seen, other, initial, error, solution.status
+
+
+def _log_policy(model, rewards, discount, value) -> jax.Array:
+    """Zero at unavailable actions, which have no counts."""
+    logits = policy_logits(model, rewards, discount, value)
+    return jnp.where(model.available, jax.nn.log_softmax(logits, axis=-1), 0)
+
+
+def _flat(*counts: jax.Array) -> list[jax.Array]:
+    return [x.reshape(x.shape[0], -1, *x.shape[-2:]) for x in counts]
+
+
+def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """A state at the network's own random start; the key is kept."""
+    dtype = problem.model.dtype
+    inputs = _inputs(problem.model, problem.observation[0])
+    drawn = _draw(problem.network, jax.random.fold_in(key, 0), inputs)
+    parameters = jax.tree.map(lambda x: jnp.asarray(x, dtype), drawn)
+    return State(
+        key=key, step=jnp.int32(0), parameters=parameters, value=_initial(problem, None),
+        # optax starts from weakly typed zeros, which a second run would compile anew for.
+        optimizer=jax.tree.map(
+            lambda x: jnp.asarray(x, jnp.result_type(x)), _optimizer(hparams).init(parameters)
+        ),
+        best=Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
+        stopped=jnp.bool_(False),
+    )
+
+
+@partial(jax.jit, static_argnums=0)
+def _draw(network: nn.Module, key: chex.PRNGKey, inputs: tuple[jax.Array, ...]) -> Any:
+    return network.init(key, *inputs)
+
+
+def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """One full-batch step of the optimiser on :func:`objective`; deterministic given the state."""
+
+    def loss_of(parameters: Any) -> jax.Array:
+        return objective(parameters, problem, hparams, state.value)[0]
+
+    (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
+        state.parameters, problem, hparams, state.value
+    )
+    updates, optimizer = _optimizer(hparams).update(
+        gradient, state.optimizer, state.parameters, value=loss, grad=gradient, value_fn=loss_of
+    )
+    metrics = Metrics(
+        loss=loss, neg_log_likelihood=parts.neg_log_likelihood, per_pair=parts.per_pair,
+        held_out=parts.held_out, gradient_norm=optax.tree.norm(gradient), error=parts.error,
+        status=parts.status,
+    )
+    parameters = optax.apply_updates(state.parameters, updates)
+    judged = jnp.any(problem.held_out > 0)
+    better = judged & (parts.held_out < state.best.neg_log_likelihood) & ~state.stopped
+    best = _where(better, Best(state.parameters, parts.held_out, state.step), state.best)
+    newest = Best(parameters, jnp.full_like(loss, jnp.nan), state.step + 1)
+    stopped = state.stopped | (judged & (state.step - best.step >= hparams.patience))
+    # A solve that failed would poison the next one's start.
+    value = jnp.where(parts.status != Status.NONFINITE, parts.value, 0)
+    after = State(
+        key=state.key, step=state.step, parameters=parameters, value=value, optimizer=optimizer,
+        best=_where(judged, best, newest), stopped=stopped,
+    )
+    after = _where(stopped, replace(state, best=best, stopped=stopped), after)
+    return replace(after, step=state.step + 1), metrics
+
+
+def _where(condition: jax.Array, one: Any, other: Any) -> Any:
+    def choose(x: jax.Array, y: jax.Array) -> jax.Array:
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            return x
+        return jnp.where(condition, x, y)
+
+    return jax.tree.map(choose, one, other)
+
+
+def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
+    if hparams.optimizer == "lbfgs":
+        return optax.lbfgs()
+    kinds = {
+        "adam": optax.scale_by_adam, "rmsprop": optax.scale_by_rms, "sgd": optax.identity,
+    }
+    if hparams.optimizer not in kinds:
+        known = ", ".join(("lbfgs", *kinds))
+        raise ValueError(f"optimizer={hparams.optimizer!r}; choose one of {known}.")
+    rate = optax.scale_by_learning_rate(hparams.learning_rate)
+    return optax.with_extra_args_support(optax.chain(kinds[hparams.optimizer](), rate))
+
+
+run = partial(learner.run, step)
+train = partial(learner.train, init, step)

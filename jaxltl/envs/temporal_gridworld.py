@@ -1,0 +1,880 @@
+"""Coloured grid worlds whose objects are to be visited in an order.
+
+The temporal grid-world of the dissertation, section 3.5. Each cell has one of five colours, and
+what a cell *is* follows from the colours of the 3 x 3 patch around it: an object, an obstacle, or
+a distractor. A reward that reads patches therefore carries over to worlds never seen.
+
+Cells are given as ``(row, column)`` from 1 at the top left, as in the dissertation and in
+pictures; the state of a cell is ``(row - 1) * columns + column - 1``, as in
+:func:`jaxltl.envs.gridworld.gridworld`, whose actions these worlds have.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from numpy.typing import ArrayLike, NDArray
+
+from jaxltl.core import operators
+from jaxltl.core.automaton import Automaton, letter_index
+from jaxltl.core.bellman import soft_value
+from jaxltl.core.labels import require_known
+from jaxltl.core.ltl import Formula, parse_ltl
+from jaxltl.core.mdp import MDP
+from jaxltl.core.product import Product
+from jaxltl.core.rollout import Trajectories, rollout
+from jaxltl.core.translate import to_automaton
+from jaxltl.envs.gridworld import gridworld
+
+COLORS = ("red", "yellow", "white", "purple", "black")
+LETTERS = "rywpb"  # of the colours, in text files
+OBJECTS: Mapping[str, Mapping[str, int]] = {
+    "o1": {"red": 5, "black": 4},
+    "o2": {"yellow": 5, "black": 4},
+    "o3": {"white": 5, "black": 4},
+}
+OBSTACLES: Mapping[str, Mapping[str, int]] = {"ob": {"black": 9}}
+COMPLETE = "(!o2 & !o3 & !ob) U (o1 & ((!o3 & !ob) U (o2 & (!ob U o3))))"
+INCOMPLETE = "(!o2 & !o3) U (o1 & ((!o3) U (o2 & F o3)))"
+
+Counts = Mapping[str, Mapping[str, int]]
+Task = Automaton | Formula | str
+Kinds = tuple[tuple[str, tuple[int, ...]], ...]
+
+_FREE = -1  # a cell whose colour is still to be drawn
+_ROUNDS = 10_000
+
+
+@struct.dataclass
+class World:
+    """A coloured grid world; made by :func:`make_world` and its relatives.
+
+    Attributes:
+      mdp: the world as an MDP, its labels the kinds of cells, and starting uniformly in cells
+        that are of no kind.
+      colors: ``int32[rows + 2 * margin, columns + 2 * margin]``, indices into ``COLORS``.
+      margin: rings of coloured cells around the grid, which the patches at the border show.
+      shape: ``(rows, columns)``.
+      kinds: the name of each kind of cell, and how many of each colour its 3 x 3 patch has.
+    """
+
+    mdp: MDP
+    colors: jax.Array
+    margin: int = struct.field(pytree_node=False, default=1)
+    shape: tuple[int, int] = struct.field(pytree_node=False, default=(10, 10))
+    kinds: Kinds = struct.field(pytree_node=False, default=())
+
+
+# --- kinds of cells ---------------------------------------------------------------------------
+
+
+def many_objects(num: int) -> dict[str, dict[str, int]]:
+    """Counts of colours for objects ``o1``, ``o2``, ..., no two alike.
+
+    The first three are those of the dissertation. Each has an X of one colour on another.
+
+    Args:
+      num: how many, at most 16.
+
+    Example:
+      >>> many_objects(4)["o4"]
+      {'purple': 5, 'black': 4}
+    """
+    pairs = [
+        (inside, around) for around in reversed(COLORS) for inside in COLORS
+        if inside not in (around, "black")
+    ]
+    if not 0 <= num <= len(pairs):
+        raise ValueError(f"num={num}; there are colours for 0 to {len(pairs)} objects.")
+    return {f"o{i + 1}": {a: 5, b: 4} for i, (a, b) in enumerate(pairs[:num])}
+
+
+def _make_kinds(objects: Counts, obstacles: Counts) -> Kinds:
+    kinds: dict[str, tuple[int, ...]] = {}
+    for name, counts in [*objects.items(), *obstacles.items()]:
+        if name in kinds:
+            raise ValueError(f"{name!r} is both an object and an obstacle; rename one of them.")
+        for color, count in counts.items():
+            if color not in COLORS:
+                raise ValueError(f"{name}: {color!r} is no colour; use {', '.join(COLORS)}.")
+            if count < 0:
+                raise ValueError(f"{name}: {count} cells of {color}; give 0 or more.")
+        row = tuple(int(counts.get(color, 0)) for color in COLORS)
+        if sum(row) != 9:
+            raise ValueError(f"{name}: {dict(counts)} are {sum(row)} cells; a patch has 9.")
+        for other, same in kinds.items():
+            if same == row:
+                raise ValueError(f"{other} and {name} have the same colours; change one of them.")
+        kinds[name] = row
+    return tuple(kinds.items())
+
+
+def _code(counts: ArrayLike) -> NDArray[np.int64]:
+    """Counts of colours up to 9 as the digits of one number."""
+    return np.asarray(counts, np.int64) @ 10 ** np.arange(len(COLORS))
+
+
+_DIGIT = np.append(10 ** np.arange(len(COLORS)), 10 ** len(COLORS))  # the last: a free cell
+
+
+def _find(colors: NDArray[Any], codes: NDArray[np.int64]) -> NDArray[np.int32]:
+    """The kind of each cell that has a patch, -1 for none; free cells are of no colour."""
+    digit = _DIGIT[colors]
+    across = digit[:, :-2] + digit[:, 1:-1] + digit[:, 2:]
+    total = across[:-2] + across[1:-1] + across[2:]
+    kind = np.full(total.shape, -1, np.int32)
+    for i, code in enumerate(codes):
+        kind[total == code] = i
+    return kind
+
+
+def categories(
+    colors: ArrayLike,
+    *,
+    objects: Counts = OBJECTS,
+    obstacles: Counts = OBSTACLES,
+    margin: int = 1,
+) -> NDArray[np.int32]:
+    """What each cell is, by the colours of the 3 x 3 patch around it; on the host.
+
+    Args:
+      colors: ``int[rows + 2 * margin, columns + 2 * margin]``, indices into ``COLORS``.
+      objects, obstacles: the number of cells of each colour in the patch of each kind.
+      margin: rings of cells around the grid, at least one.
+
+    Returns:
+      ``int32[rows, columns]``: the place among the objects and then the obstacles, -1 for a
+      distractor.
+
+    Raises:
+      ValueError: no whole grid, a colour that does not exist, or ambiguous kinds.
+
+    Example:
+      >>> x = [[0, 4, 0], [4, 0, 4], [0, 4, 0]]  # red where an X is, black elsewhere
+      >>> categories(x).tolist(), categories(np.full((3, 3), 4)).tolist()
+      ([[0]], [[3]])
+    """
+    kinds = _make_kinds(objects, obstacles)
+    colors = _check_colors(colors, margin)
+    return _find(_crop(colors, margin - 1), _codes(kinds))
+
+
+def _codes(kinds: Kinds) -> NDArray[np.int64]:
+    return _code(np.array([row for _, row in kinds]).reshape(-1, len(COLORS)))
+
+
+def _crop(colors: NDArray[Any], width: int) -> NDArray[Any]:
+    return colors[width : colors.shape[0] - width, width : colors.shape[1] - width]
+
+
+def _check_margin(margin: int) -> None:
+    if margin < 1:
+        raise ValueError(f"margin={margin}; cells at the border need a ring of at least 1.")
+
+
+def _check_colors(colors: ArrayLike, margin: int) -> NDArray[np.int32]:
+    array = np.asarray(colors)
+    _check_margin(margin)
+    if array.ndim != 2 or min(array.shape) < 2 * margin + 1 or array.dtype.kind not in "iu":
+        raise ValueError(
+            f"colors have shape {array.shape} and type {array.dtype}; pass integers [rows, "
+            f"columns] with a margin of {margin} on each side and a cell inside."
+        )
+    for row, column in np.argwhere((array < 0) | (array >= len(COLORS)))[:1]:
+        raise ValueError(
+            f"colors[{row}, {column}] = {array[row, column]}; colours are 0 to {len(COLORS) - 1}."
+        )
+    return array.astype(np.int32)
+
+
+# --- worlds -----------------------------------------------------------------------------------
+
+
+def colored_world(
+    colors: ArrayLike,
+    *,
+    objects: Counts = OBJECTS,
+    obstacles: Counts = OBSTACLES,
+    margin: int = 1,
+    slip: float = 0.0,
+) -> World:
+    """The world of given colours.
+
+    Args:
+      colors, objects, obstacles, margin: see :func:`categories`.
+      slip: probability of moving sideways, see :func:`jaxltl.envs.gridworld.gridworld`.
+
+    Raises:
+      ValueError: see :func:`categories`; or no cell is a distractor, so that no run can start.
+    """
+    kind = categories(colors, objects=objects, obstacles=obstacles, margin=margin)
+    kinds = _make_kinds(objects, obstacles)
+    return _assemble(_blank(kind.shape, slip), np.asarray(colors), kind, kinds, margin)
+
+
+def _blank(shape: Sequence[int], slip: float) -> MDP:
+    rows, columns = shape
+    return gridworld("\n".join(["." * columns] * rows), slip=slip)
+
+
+def _assemble(
+    blank: MDP, colors: NDArray[Any], kind: NDArray[np.int32], kinds: Kinds, margin: int
+) -> World:
+    start = (kind < 0).ravel()
+    if not start.any():
+        raise ValueError("no cell is a distractor, so that no run can start; use a larger grid.")
+    mdp = replace(
+        blank,
+        label=jnp.asarray(kind.reshape(-1, 1) == np.arange(len(kinds))),
+        initial=jnp.asarray(start / start.sum(), blank.dtype),
+        propositions=tuple(name for name, _ in kinds),
+    )
+    rows, columns = kind.shape
+    return World(mdp, jnp.asarray(colors, jnp.int32), margin, (rows, columns), kinds)
+
+
+def make_world(
+    plan: Mapping[str, Sequence[tuple[int, int]]],
+    seed: int | np.random.Generator,
+    *,
+    shape: tuple[int, int] = (10, 10),
+    objects: Counts = OBJECTS,
+    obstacles: Counts = OBSTACLES,
+    margin: int = 1,
+    slip: float = 0.0,
+) -> World:
+    """A world with objects and obstacles in given cells, and random colours elsewhere.
+
+    The most frequent colours of a kind come first on the cross of its patch, centre and corners,
+    so that 5 and 4 cells make the pattern X. Other cells are drawn uniformly, and again where they
+    happen to make an object or an obstacle, until exactly the planned cells are of their kind.
+
+    Args:
+      plan: cells ``(row, column)``, from 1, of each kind by its name.
+      seed: of the random colours. The inner rings do not depend on the margin.
+      shape: rows and columns.
+      objects, obstacles, margin, slip: see :func:`colored_world`.
+
+    Raises:
+      ValueError: an unknown name, a cell outside the grid or used twice, patches that overlap
+        with different colours, or obstacles between which another one would arise.
+
+    Example:
+      >>> world = make_world({"o1": [(1, 2)], "ob": [(4, 3)]}, seed=0, shape=(4, 4))
+      >>> world.mdp.label[1].tolist(), int(world.mdp.label.sum())
+      ([True, False, False, False], 2)
+    """
+    kinds = _make_kinds(objects, obstacles)
+    _check_margin(margin)
+    _check_shape(shape)
+    kind = _plan_map(plan, kinds, shape)
+    stamps, codes = _stamps(kinds), _codes(kinds)
+    colors = np.full((shape[0] + 2, shape[1] + 2), _FREE)
+    for row, column in np.argwhere(kind >= 0).tolist():
+        if not _stamp(colors, stamps[kind[row, column]], row, column):
+            raise ValueError(
+                f"the patch of {kinds[kind[row, column]][0]} in cell {(row + 1, column + 1)} "
+                "overlaps with another that wants other colours; plan them 3 cells apart."
+            )
+    found = _find(colors, codes)
+    for row, column in np.argwhere(found != kind)[:1]:
+        raise ValueError(
+            f"cell {(int(row) + 1, int(column) + 1)} would be {kinds[found[row, column]][0]}, "
+            "which the plan does not say: the patches around it leave no choice. Add it, or "
+            "move them."
+        )
+    colors = _fill(np.random.default_rng(seed), colors, kind, codes, margin)
+    return _assemble(_blank(shape, slip), colors, kind, kinds, margin)
+
+
+def training_world(seed: int = 0, *, margin: int = 1, slip: float = 0.0) -> World:
+    """The training world of the dissertation, Figure 5a; its free cells have random colours.
+
+    Example:
+      >>> training_world().mdp.label.sum(0).tolist()
+      [1, 1, 1, 5]
+    """
+    plan = {
+        "o1": [(1, 7)], "o2": [(7, 1)], "o3": [(10, 10)],
+        "ob": [(4, 4), (4, 5), (4, 6), (4, 7), (10, 7)],
+    }
+    return make_world(plan, seed, margin=margin, slip=slip)
+
+
+def _check_shape(shape: Sequence[int]) -> None:
+    if len(shape) != 2 or min(shape) < 1:
+        raise ValueError(f"shape={tuple(shape)}; give (rows, columns), both at least 1.")
+
+
+def _plan_map(
+    plan: Mapping[str, Sequence[tuple[int, int]]], kinds: Kinds, shape: tuple[int, int]
+) -> NDArray[np.int32]:
+    names = [name for name, _ in kinds]
+    kind = np.full(shape, -1, np.int32)
+    for name, cells in plan.items():
+        if name not in names:
+            raise ValueError(f"plan: {name!r} is no kind of cell; there are {', '.join(names)}.")
+        for row, column in cells:
+            if not (1 <= row <= shape[0] and 1 <= column <= shape[1]):
+                raise ValueError(
+                    f"plan: {name} in cell {(row, column)} is outside the grid; rows are 1 to "
+                    f"{shape[0]}, columns 1 to {shape[1]}."
+                )
+            if kind[row - 1, column - 1] >= 0:
+                raise ValueError(f"plan: cell {(row, column)} is used twice.")
+            kind[row - 1, column - 1] = names.index(name)
+    return kind
+
+
+def _stamps(kinds: Kinds) -> list[NDArray[np.int64]]:
+    """A 3 x 3 patch for each kind."""
+    order = np.array([4, 0, 2, 6, 8, 1, 3, 5, 7])  # centre, corners, and the rest
+    stamps = []
+    for _, counts in kinds:
+        frequent = sorted(range(len(counts)), key=lambda c: -counts[c])
+        patch = np.empty(9, np.int64)
+        patch[order] = np.repeat(frequent, [counts[c] for c in frequent])
+        stamps.append(patch.reshape(3, 3))
+    return stamps
+
+
+def _stamp(colors: NDArray[Any], stamp: NDArray[np.int64], row: int, column: int) -> bool:
+    """Writes a patch around a cell, unless a cell there has another colour already."""
+    patch = colors[row : row + 3, column : column + 3]
+    if ((patch != _FREE) & (patch != stamp)).any():
+        return False
+    patch[:] = stamp
+    return True
+
+
+def _fill(
+    random: np.random.Generator, colors: NDArray[Any], kind: NDArray[np.int32],
+    codes: NDArray[np.int64], margin: int,
+) -> NDArray[Any]:
+    """Random colours for free cells that make nothing that is not planned, and outer rings."""
+    free = colors == _FREE
+    again = free
+    for _ in range(_ROUNDS):
+        colors[again] = random.integers(len(COLORS), size=int(again.sum()))
+        wrong = np.argwhere(_find(colors, codes) != kind)
+        if not len(wrong):
+            break
+        again = np.zeros_like(free)
+        for row, column in wrong:
+            again[row : row + 3, column : column + 3] = True
+        again &= free
+    else:
+        raise ValueError(
+            f"no colours were found in {_ROUNDS} rounds that make only what is planned; plan "
+            "fewer objects and obstacles, or give them rarer colours."
+        )
+    for _ in range(margin - 1):
+        ring = random.integers(len(COLORS), size=(colors.shape[0] + 2, colors.shape[1] + 2))
+        ring[1:-1, 1:-1] = colors
+        colors = ring
+    return colors
+
+
+# --- random worlds ----------------------------------------------------------------------------
+
+
+class _Generator(NamedTuple):
+    """What all random worlds of a family share."""
+
+    blank: MDP
+    successor: NDArray[Any]  # [S, A, K]
+    kinds: Kinds
+    num_objects: int  # which are the first kinds
+    counts: tuple[int, ...]  # how many cells of each kind
+    distance: tuple[int, ...]  # from objects, for each kind
+    step: NDArray[np.int32]  # [P + 1, Q], the memory after leaving a cell; the last row: of no kind
+    final: NDArray[np.bool_]
+    initial: int
+
+
+def random_worlds(
+    seeds: Iterable[int],
+    task: Task = COMPLETE,
+    *,
+    shape: tuple[int, int] = (10, 10),
+    objects: Counts = OBJECTS,
+    obstacles: Counts = OBSTACLES,
+    num_obstacles: int = 5,
+    min_distance: int = 3,
+    obstacle_distance: int = 3,
+    margin: int = 1,
+    slip: float = 0.0,
+    max_tries: int = 1000,
+) -> list[World]:
+    """Worlds with one of each object and some obstacles in random cells, in each of which the
+    task can be done from every distractor cell.
+
+    Args:
+      seeds: one for each world. A world depends on its own seed alone.
+      task: an automaton, a formula, or a formula's text over the kinds of cells. A cell's label
+        is read when it is left.
+      shape, objects, obstacles, margin, slip: see :func:`make_world`.
+      num_obstacles: cells of each kind of obstacle. Obstacles may touch.
+      min_distance: of objects from one another, the larger of the differences of their rows and
+        columns.
+      obstacle_distance: of obstacles from objects, likewise.
+      max_tries: placements to try for each world.
+
+    Raises:
+      ValueError: an unknown proposition, a task that no finite run fulfils, or no placement found
+        in which the objects have room and the task can be done from everywhere.
+    """
+    kinds = _make_kinds(objects, obstacles)
+    _check_margin(margin)
+    _check_shape(shape)
+    if num_obstacles < 0:
+        raise ValueError(f"num_obstacles={num_obstacles}; give 0 or more.")
+    step, final, initial = _on_kinds(task, kinds)
+    blank = _blank(shape, slip)
+    family = _Generator(
+        blank, np.asarray(blank.successor), kinds, len(objects),
+        (1,) * len(objects) + (num_obstacles,) * len(obstacles),
+        (min_distance,) * len(objects) + (obstacle_distance,) * len(obstacles),
+        step, final, initial,
+    )
+    codes, stamps = _codes(kinds), _stamps(kinds)
+    worlds = []
+    for seed in seeds:
+        random = np.random.default_rng(seed)
+        for _ in range(max_tries):
+            placed = _place(random, family, shape, stamps, codes)
+            if placed is not None and _is_feasible(family, placed[1]):
+                break
+        else:
+            raise ValueError(
+                f"seed {seed}: in {max_tries} placements on {shape[0]} x {shape[1]} cells the "
+                "objects had no room, or the task could not be done from every distractor cell. "
+                "Use a larger grid or fewer obstacles, or check the task."
+            )
+        colors = _fill(random, *placed, codes, margin)
+        worlds.append(_assemble(blank, colors, placed[1], kinds, margin))
+    return worlds
+
+
+def random_world(seed: int, task: Task = COMPLETE, **options: Any) -> World:
+    """One world of :func:`random_worlds`, which takes the same options.
+
+    Example:
+      >>> world = random_world(3, shape=(6, 8), num_obstacles=2)
+      >>> world.mdp.label.sum(0).tolist()
+      [1, 1, 1, 2]
+    """
+    return random_worlds([seed], task, **options)[0]
+
+
+def _on_kinds(task: Task, kinds: Kinds) -> tuple[NDArray[np.int32], NDArray[np.bool_], int]:
+    """The memory after each kind of cell ``[P + 1, Q]``, the final memory, and the first."""
+    names = [name for name, _ in kinds]
+    if isinstance(task, str | Formula):
+        formula = parse_ltl(task) if isinstance(task, str) else task
+        require_known(formula.propositions, names, "the task")
+        shown = [frozenset({n} & set(formula.propositions)) for n in [*names, ""]]
+        task = to_automaton(formula, letters=list(dict.fromkeys(shown)))
+    require_known(task.propositions, names, "the task")
+    if task.acceptance != "cosafe":
+        raise ValueError(
+            f"the task has {task.acceptance} acceptance; a task that finite runs fulfil is needed, "
+            "such as F o1."
+        )
+    read = [letter_index(task, {n} & set(task.propositions)) for n in [*names, ""]]
+    delta = np.asarray(task.delta)
+    return delta[:, read].T, np.asarray(task.final), int(task.initial)
+
+
+def _place(
+    random: np.random.Generator, family: _Generator, shape: tuple[int, int],
+    stamps: list[NDArray[np.int64]], codes: NDArray[np.int64],
+) -> tuple[NDArray[Any], NDArray[np.int32]] | None:
+    """Patches in random cells and the kinds of cells, or None if there is no room."""
+    rows, columns = shape
+    colors = np.full((rows + 2, columns + 2), _FREE)
+    kind = np.full(shape, -1, np.int32)
+    objects: list[tuple[int, int]] = []
+    for i, (count, distance) in enumerate(zip(family.counts, family.distance, strict=True)):
+        open_ = kind < 0
+        for row, column in objects:
+            near = slice(max(row - distance + 1, 0), row + distance)
+            open_[near, max(column - distance + 1, 0) : column + distance] = False
+        for cell in random.permutation(np.flatnonzero(open_)):
+            if not count:
+                break
+            row, column = divmod(int(cell), columns)
+            if _adds(colors, kind, i, stamps[i], codes, row, column):
+                count -= 1
+                if i < family.num_objects:
+                    objects.append((row, column))
+        if count:
+            return None
+    return colors, kind
+
+
+def _adds(colors, kind, number, stamp, codes, row: int, column: int) -> bool:
+    """Stamps a kind around a cell, unless that is impossible or makes something else too."""
+    patch = colors[row : row + 3, column : column + 3]
+    before = patch.copy()
+    if not _stamp(colors, stamp, row, column):
+        return False
+    kind[row, column] = number
+    # Only cells up to two away see the patch.
+    top, left = max(row - 2, 0), max(column - 2, 0)
+    planned = kind[top : row + 3, left : column + 3]
+    if np.array_equal(_find(colors[top : row + 5, left : column + 5], codes), planned):
+        return True
+    patch[:], kind[row, column] = before, -1
+    return False
+
+
+def _is_feasible(family: _Generator, kind: NDArray[np.int32]) -> bool:
+    flat = kind.ravel()
+    # The last row of the table is of cells of no kind, whose number is -1.
+    can = _can_finish(family.successor, family.step[flat], family.final, "exit")
+    return bool(can[flat < 0, family.initial].all())
+
+
+def _can_finish(
+    successor: NDArray[Any], step: NDArray[Any], final: NDArray[np.bool_], label_on: str,
+    used: NDArray[np.bool_] | None = None,
+) -> NDArray[np.bool_]:
+    """From which world and memory states some run reaches final memory: ``bool[S, Q]``.
+
+    Args:
+      successor: ``[S, A, K]``.
+      step: ``[S, Q]``, the memory after reading a cell.
+      final: ``[Q]``.
+      label_on: which cell a step reads.
+      used: ``bool[S, A, K]``, which successors are real; default all.
+    """
+    count = len(successor)
+    flat = successor.reshape(count, -1)
+    if used is not None:
+        # A successor that is not real is replaced by the state itself, which changes nothing.
+        flat = np.where(used.reshape(count, -1), flat, np.arange(count)[:, None])
+    columns = [np.ascontiguousarray(c) for c in flat.T]
+    can = np.broadcast_to(final, step.shape)
+    while True:
+        read = np.take_along_axis(can, step, 1) if label_on == "entry" else can
+        after = read[columns[0]]
+        for c in columns[1:]:
+            after |= read[c]
+        if label_on == "exit":
+            after = np.take_along_axis(after, step, 1)
+        after |= can
+        if np.array_equal(after, can):
+            return after
+        can = after
+
+
+def infeasible_starts(model: Product) -> NDArray[np.bool_]:
+    """The starting states from which no run fulfils the task, by the graph alone; on the host.
+
+    Args:
+      model: the product of a world and a co-safe task.
+
+    Returns:
+      ``bool[S]``, of world states with a positive initial probability.
+
+    Raises:
+      ValueError: the task is not co-safe, or the world has no successor lists.
+    """
+    if not isinstance(model.mdp, MDP):
+        raise ValueError("infeasible_starts needs successor lists; use make_mdp.")
+    if model.automaton.acceptance != "cosafe":
+        raise ValueError(
+            f"the task has {model.automaton.acceptance} acceptance; it must be co-safe."
+        )
+    can = _can_finish(
+        np.asarray(model.mdp.successor), np.asarray(model.next_memory),
+        np.asarray(model.automaton.final), model.label_on, np.asarray(model.mdp.probability) > 0,
+    )
+    begin = np.asarray(model.initial_memory)
+    return np.asarray(~can[np.arange(len(can)), begin] & (np.asarray(model.mdp.initial) > 0))
+
+
+# --- what is seen -----------------------------------------------------------------------------
+
+
+def patches(world: World, radius: int = 1) -> jax.Array:
+    """The colours around each cell.
+
+    Args:
+      world: the world.
+      radius: how far around; 1 sees 3 x 3 cells. At most the world's margin. Static.
+
+    Returns:
+      ``int32[S, 2 * radius + 1, 2 * radius + 1]``, indices into ``COLORS``.
+
+    Raises:
+      ValueError: the radius is negative or larger than the margin.
+
+    Example:
+      >>> patches(training_world())[6].tolist()  # o1 in cell (1, 7)
+      [[0, 4, 0], [4, 0, 4], [0, 4, 0]]
+    """
+    if not 0 <= radius <= world.margin:
+        raise ValueError(
+            f"radius={radius}; this world shows 0 to {world.margin} cells around each. Make it "
+            f"with margin={radius}."
+        )
+    rows, columns = world.shape
+    around = np.arange(2 * radius + 1) + world.margin - radius
+    down = (np.arange(rows)[:, None, None, None]) + around[:, None]
+    across = np.arange(columns)[:, None, None] + around
+    return world.colors[down, across].reshape(rows * columns, around.size, around.size)
+
+
+def observations(world: World, radius: int = 1) -> jax.Array:
+    """The colours around each cell, one-hot: ``float[S, O]``.
+
+    ``O = (2 * radius + 1)**2 * 5``: row by row, for each cell one number for each colour. Reshaped
+    to ``[S, 2 * radius + 1, 2 * radius + 1, 5]`` it is an image.
+
+    Raises:
+      ValueError: see :func:`patches`.
+    """
+    hot = jax.nn.one_hot(patches(world, radius), len(COLORS), dtype=world.mdp.dtype)
+    return hot.reshape(hot.shape[0], -1)
+
+
+# --- the expert -------------------------------------------------------------------------------
+
+
+def _distance(automaton: Any) -> jax.Array:
+    """Letters to read to a final state, at least: ``float[Q]``, infinite where the task failed."""
+    delta, final = jnp.asarray(automaton.delta), jnp.asarray(automaton.final)
+
+    def sweep(_: int, distance: jax.Array) -> jax.Array:
+        return jnp.where(final, 0.0, jnp.minimum(distance, 1 + distance[delta].min(-1)))
+
+    start = jnp.where(final, 0.0, jnp.inf)
+    return jax.lax.fori_loop(0, delta.shape[0], sweep, start)
+
+
+def is_over(model: Product) -> jax.Array:
+    """``bool[S, Q]``: the task is done or cannot be done any more, by the automaton alone."""
+    distance = _distance(model.automaton)
+    over = (distance == 0) | jnp.isinf(distance)
+    return jnp.broadcast_to(over, model.state_shape)
+
+
+def expert_reward(
+    model: Product,
+    *,
+    progress: jax.Array | float = 10.0,
+    failure: jax.Array | float = -10.0,
+    step: jax.Array | float = -1.0,
+    won: jax.Array | float = 3.0,
+    lost: jax.Array | float = -3.0,
+) -> jax.Array:
+    """The reward of one who knows the task: ``float[S, Q, A]``.
+
+    Each step has one of five rewards. While the task is open: `progress` if the automaton moves
+    to a state from which fewer letters lead to a final one, `failure` if it moves to one from
+    which none do, else `step`. After that, `won` in a final state and `lost` in a failed one.
+
+    Args:
+      model: the product of a world and a co-safe task; expected over successors where it reads
+        the label of the state that is entered.
+      progress, failure, step, won, lost: scalars.
+
+    Raises:
+      ValueError: the task has no final states.
+    """
+    dtype = model.dtype
+    distance = _distance(model.automaton)
+    following = distance[model.next_memory]  # [S, Q]
+    reward = jnp.where(following < distance, progress, step)
+    reward = jnp.where(jnp.isinf(following), failure, reward)
+    reward = jnp.where(distance == 0, won, jnp.where(jnp.isinf(distance), lost, reward))
+    reward = reward.astype(dtype)
+    if model.label_on == "exit":
+        return jnp.broadcast_to(reward[:, :, None], (*reward.shape, model.num_actions))
+    expect = partial(operators.expectation, model.mdp)
+    return jax.vmap(expect, in_axes=1, out_axes=1)(reward)
+
+
+def expert_policy(
+    model: Product,
+    discount: jax.Array | float = 0.95,
+    *,
+    reward: jax.Array | None = None,
+    method: str = "value_iteration",
+    tolerance: jax.Array | float | None = None,
+) -> jax.Array:
+    """The soft-optimal policy (3.4), (3.5) for a reward: ``float[S, Q, A]``.
+
+    Args:
+      model: the product.
+      discount: scalar in [0, 1).
+      reward: ``float[S, Q, A]``; default :func:`expert_reward`.
+      method, tolerance: see :func:`jaxltl.core.bellman.soft_value`. Sweeps suit the discount of
+        the dissertation, and many worlds at once under ``vmap``; nearer to 1, use ``"newton"``.
+    """
+    reward = expert_reward(model) if reward is None else reward
+    return soft_value(model, reward, discount, method=method, tolerance=tolerance).policy
+
+
+@partial(jax.jit, static_argnames=("num", "horizon"))
+def demonstrations(
+    key: chex.PRNGKey, model: Product, policy: jax.Array, num: int, horizon: int = 100
+) -> Trajectories:
+    """Runs of a policy in the world, cut where the task is done or has failed.
+
+    Args:
+      key: a PRNG key, consumed.
+      model: the product.
+      policy: ``float[S, Q, A]``.
+      num: how many runs; static.
+      horizon: T, the longest; static.
+
+    Returns:
+      Trajectories of the world, states ``int32[num, horizon]``. The last pair of a run is the one
+      that enters a final or failed state of the automaton.
+    """
+    runs = rollout(
+        model, policy, key, num_trajectories=num, num_steps=horizon, stop=is_over(model)
+    )
+    return replace(runs, state=runs.state // model.num_memory)
+
+
+# --- text files -------------------------------------------------------------------------------
+
+
+def write_world(world: World) -> str:
+    """A world as text: its margin, slip and kinds of cells, then a letter for each colour."""
+    slip = 0.0
+    if world.mdp.num_successors > 1:
+        slip = 1 - float(world.mdp.probability[0, 0, 0])
+    head = [f"margin: {world.margin}", f"slip: {slip:.6g}"]
+    for name, counts in world.kinds:
+        shown = [f"{n} {c}" for c, n in zip(COLORS, counts, strict=True) if n]
+        head.append(f"{name}: {', '.join(shown)}")
+    letters = np.array(list(LETTERS))[np.asarray(world.colors)]
+    return "\n".join([*head, "", *("".join(row) for row in letters), ""])
+
+
+def read_world(text: str) -> World:
+    """The world of a text, such as :func:`write_world` makes.
+
+    Lines with a colon are settings: ``margin`` (default 1), ``slip`` (default 0), and the colours
+    of a kind of cell, such as ``o1: 5 red, 4 black``; if there are none of the latter, kinds are
+    those of the dissertation. All other lines are rows of the map with its margin, with a letter
+    for each cell: r, y, w, p or b.
+
+    Raises:
+      ValueError: naming the line, or the row and column of the map, and what is wrong.
+
+    Example:
+      >>> world = read_world('''
+      ... rbrp
+      ... brbp
+      ... rbry
+      ... ''')
+      >>> world.shape, world.mdp.label[:, 0].tolist()
+      ((1, 2), [True, False])
+    """
+    margin, slip = 1, 0.0
+    kinds: dict[str, dict[str, int]] = {}
+    rows = []
+    for i, line in enumerate(text.splitlines()):
+        name, colon, value = (part.strip() for part in line.partition(":"))
+        if not colon:
+            rows += [name] if name else []
+        elif name == "margin":
+            margin = int(_number(value, int, i, name))
+        elif name == "slip":
+            slip = _number(value, float, i, name)
+        elif name in kinds:
+            raise ValueError(f"line {i + 1}: {name} is given twice; remove one of the lines.")
+        else:
+            kinds[name] = _read_counts(value, i, name)
+    objects, obstacles = (kinds, {}) if kinds else (OBJECTS, OBSTACLES)
+    return colored_world(
+        _read_rows(rows), objects=objects, obstacles=obstacles, margin=margin, slip=slip
+    )
+
+
+def _number(text: str, kind: type, line: int, name: str) -> float:
+    try:
+        return kind(text)
+    except ValueError:
+        raise ValueError(f"line {line + 1}: {name} is {text!r}, which is no number.") from None
+
+
+def _read_counts(text: str, line: int, name: str) -> dict[str, int]:
+    counts = {}
+    for part in text.split(","):
+        words = part.split()
+        if len(words) != 2:
+            raise ValueError(
+                f"line {line + 1}: {name}: {part.strip()!r}; write it as: o1: 5 red, 4 black."
+            )
+        counts[words[1]] = int(_number(words[0], int, line, name))
+    return counts
+
+
+def _read_rows(rows: Sequence[str]) -> NDArray[np.int32]:
+    if not rows:
+        raise ValueError(f"the map is empty; write rows of the letters {', '.join(LETTERS)}.")
+    for i, row in enumerate(rows):
+        for j, letter in enumerate(row):
+            if letter not in LETTERS:
+                raise ValueError(
+                    f"map row {i + 1}, column {j + 1}: {letter!r} is no colour; use "
+                    f"{', '.join(f'{a} ({b})' for a, b in zip(LETTERS, COLORS, strict=True))}."
+                )
+        if len(row) != len(rows[0]):
+            raise ValueError(
+                f"map row {i + 1} has {len(row)} cells, row 1 has {len(rows[0])}; all rows must "
+                "have the same length."
+            )
+    return np.array([[LETTERS.index(letter) for letter in row] for row in rows], np.int32)
+
+
+def save_world(path: str | os.PathLike[str], world: World) -> None:
+    """Writes a world as text to a file, which appears only when complete.
+
+    Raises:
+      ValueError: the place cannot be written to.
+    """
+    path = Path(path)
+    try:
+        # A directory of its own, so that the file gets the usual permissions.
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as place:
+            draft = Path(place) / path.name
+            draft.write_text(write_world(world), encoding="utf-8")
+            os.replace(draft, path)
+    except OSError as error:
+        raise ValueError(
+            f"cannot write {str(path)!r}: {error.strerror}; choose a directory that exists and "
+            "is writable."
+        ) from error
+
+
+def load_world(path: str | os.PathLike[str]) -> World:
+    """The world of a text file, see :func:`read_world`.
+
+    Raises:
+      ValueError: the file cannot be read, or :func:`read_world` refuses it; naming the file.
+    """
+    try:
+        return read_world(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"cannot read {str(path)!r}: {error.strerror}.") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
