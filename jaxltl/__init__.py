@@ -62,6 +62,8 @@ from jaxltl.core.reachability import (
     satisfaction_probability,
 )
 from jaxltl.core.rollout import Trajectories, make_trajectories, rollout
+from jaxltl.core.stack import stack_products, synchronize
+from jaxltl.core.task_performance import task_performance
 from jaxltl.core.translate import to_automaton
 from jaxltl.core.types import NotConverged, Solution, Status, check
 from jaxltl.core.verify import Verification, verify
@@ -146,8 +148,11 @@ __all__ = [
     "satisfaction_probability",
     "shield",
     "soft_value",
+    "stack_products",
     "states_where",
     "strategy_value",
+    "synchronize",
+    "task_performance",
     "to_automaton",
     "to_dense",
     "verdict",

@@ -49,8 +49,9 @@ PUBLIC = [
     "occupancy_measure", "optimal_satisfaction", "optimal_value", "parity", "parse_ltl",
     "permissive_strategy", "policy_value", "product", "project_policy", "pushforward", "reach",
     "reachability_probability", "read_hoa", "restrict", "rollout", "safety", "sample_successor",
-    "satisfaction_probability", "shield", "soft_value", "states_where", "strategy_value",
-    "to_automaton", "to_dense", "verdict", "verify", "winning_region", "write_hoa",
+    "satisfaction_probability", "shield", "soft_value", "stack_products", "states_where",
+    "strategy_value", "synchronize", "task_performance", "to_automaton", "to_dense", "verdict",
+    "verify", "winning_region", "write_hoa",
 ]
 
 

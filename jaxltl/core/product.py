@@ -330,6 +330,7 @@ def _successor(world: MDP | DenseMDP) -> jax.Array:
 # --- lifting and projecting -----------------------------------------------------------------
 
 
+@jax.jit  # so that a call outside of jit compiles once, not operation by operation
 def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectories:
     """World trajectories with the memory that the automaton had along them.
 

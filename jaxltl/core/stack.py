@@ -19,7 +19,7 @@ import numpy as np
 from jaxltl.core.automaton import Automaton, make_automaton
 from jaxltl.core.ltl import Formula, Letter, parse_ltl
 from jaxltl.core.mdp import MDP
-from jaxltl.core.product import Product, letters, lift_trajectories, product
+from jaxltl.core.product import Product, letters, product
 from jaxltl.core.rollout import Trajectories, make_trajectories
 from jaxltl.core.translate import to_automaton
 
@@ -408,12 +408,26 @@ def demonstrated_counts(
         counts = np.zeros(size, int)
         if rows:
             try:
-                lifted = lift_trajectories(model, make_trajectories(model.mdp, rows))
+                checked = make_trajectories(model.mdp, rows)
             except ValueError as error:
                 raise ValueError(f"demonstrations in world {w}: {error}") from error
-            pair = np.asarray(lifted.state * model.num_actions + lifted.action)
+            state, action, inside = (
+                np.asarray(x) for x in (checked.state, checked.action, checked.mask))
+            lifted = state * model.num_memory + _memory_along(model, state)
+            pair = lifted * model.num_actions + action
             if horizon is not None:
                 pair = pair + np.arange(pair.shape[1]) * (model.num_states * model.num_actions)
-            counts = np.bincount(pair[np.asarray(lifted.mask)], minlength=size)
-        found.append(jnp.asarray(counts.reshape(shape), models.dtype))
-    return jnp.stack(found)
+            counts = np.bincount(pair[inside], minlength=size)
+        found.append(counts.reshape(shape))
+    return jnp.asarray(np.stack(found), models.dtype)
+
+
+def _memory_along(model: Product, state: np.ndarray) -> np.ndarray:
+    """The memory along trajectories ``int[N, T]``; on the host, where no length compiles anew."""
+    delta, letter = np.asarray(model.automaton.delta), np.asarray(model.letter)[state]
+    read = letter[:, 1:] if model.label_on == "entry" else letter[:, :-1]
+    memory = np.empty_like(state)
+    memory[:, 0] = np.asarray(model.initial_memory)[state[:, 0]]
+    for t in range(read.shape[1]):
+        memory[:, t + 1] = delta[memory[:, t], read[:, t]]
+    return memory

@@ -203,6 +203,20 @@ def test_pairs_are_counted_in_each_world():
         stack.demonstrated_counts(models, [first, wrong])
 
 
+@pytest.mark.parametrize("label_on", ["exit", "entry"])
+def test_pairs_are_those_of_lifted_trajectories(label_on):
+    model = jl.product(small_world(), TASK, label_on=label_on)
+    runs = jl.rollout(
+        small_world(), jnp.full((6, 4), 0.25), jax.random.key(0), num_trajectories=20, num_steps=15)
+    lifted = jl.lift_trajectories(model, runs)
+    expected = np.zeros((15, model.num_states, 4))
+    np.add.at(expected, (np.arange(15), np.asarray(lifted.state), np.asarray(lifted.action)), 1)
+    found = stack.demonstrated_counts(stack.as_stacked(model), runs, horizon=15)
+    np.testing.assert_array_equal(found[0].reshape(expected.shape), expected)
+    found = stack.demonstrated_counts(stack.as_stacked(model), runs)
+    np.testing.assert_array_equal(found[0].reshape(expected.shape[1:]), expected.sum(0))
+
+
 def test_the_last_trajectories_are_held_out():
     runs = demonstrations(*[[(s, 0)] for s in range(5)])
     (train,), (test,) = stack.split_trajectories(runs, 0.4)
