@@ -157,13 +157,16 @@ _HPARAMS = todirl.Hparams(discount=_DISCOUNT, l2=1e-3, learning_rate=3e-3, patie
 _CLONING = cloning.Hparams(learning_rate=3e-3, patience=500)
 
 
+@partial(jax.jit, static_argnums=0)
+def _begin(learner: Any, keys: jax.Array, problems: Any, hparams: Any) -> Any:
+    return jax.vmap(lambda k, p: learner.init(k, p, hparams))(keys, problems)
+
+
+@partial(jax.jit, static_argnums=(0, 4))
 def _run(learner: Any, states: Any, problems: Any, hparams: Any, num_steps: int) -> Any:
     return jax.vmap(
         lambda s, p: learner.run(s, p, hparams, num_steps=num_steps, max_rows=1)[0]
     )(states, problems)
-
-
-_run = jax.jit(_run, static_argnums=(0, 4))
 
 
 def _learned(
@@ -180,7 +183,7 @@ def _learned(
     # Each seed learns in its own world alone.
     problems = jax.tree.map(lambda x: x[:, None], learner.make_problem(models, seen, shown))
     keys = jax.vmap(jax.random.key)(1000 + jnp.arange(len(setting.train)))
-    states = jax.vmap(lambda k, p: learner.init(k, p, hparams))(keys, problems)
+    states = _begin(learner, keys, problems, hparams)
     judge = partial(_judged, setting, memory, method, radius)
     chunk = max((plan.cloning_steps if method == "cloning" else plan.steps) // plan.points, 1)
     curve: list[Any] = []
@@ -211,8 +214,7 @@ def _judged(setting: Setting, memory: Automaton, method: str, radius: int, param
     own = _policies(method, parameters, _stacked(setting.train, memory),
                     _observed(setting.train, radius))
     new_models, new_seen = _stacked(setting.test, memory), _observed(setting.test, radius)
-    new = jax.lax.map(
-        lambda p: _everywhere(method, p, new_models, new_seen), parameters)
+    new = _everywhere(method, parameters, new_models, new_seen)
     return Judged(
         _performance(setting, memory, setting.train, own),
         jax.tree.map(
@@ -235,10 +237,12 @@ def _policies(method: str, parameters: Any, models: Product, seen: jax.Array) ->
 
 @partial(jax.jit, static_argnums=0)
 def _everywhere(method: str, parameters: Any, models: Product, seen: jax.Array) -> jax.Array:
-    """Of one seed in all worlds: ``float[M, S, Q, A]``."""
-    copies = jax.tree.map(
-        lambda x: jnp.broadcast_to(x, (len(seen), *x.shape)), parameters)
-    return _policies(method, copies, models, seen)
+    """Of each seed in all worlds: ``float[N, M, S, Q, A]``."""
+    def one(parameters: Any) -> jax.Array:
+        copies = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(seen), *x.shape)), parameters)
+        return _policies(method, copies, models, seen)
+
+    return jax.lax.map(one, parameters)
 
 
 def _performance(
@@ -291,12 +295,12 @@ def _curve(judged: list[Judged]) -> dict[str, Any]:
 
 def _walks(setting: Setting, states: Any) -> list[dict[str, Any]]:
     """Runs of the first seed's policy in its own world and in two new ones."""
-    parameters, found = _lane(states.best.parameters, 0), []
+    parameters, found = jax.tree.map(lambda x: x[:1], states.best.parameters), []
     worlds = {"training world": setting.train[0], "test world": setting.test[0],
               "another test world": setting.test[1]}
     for title, world in worlds.items():
         models = _stacked([world], setting.task)
-        (policy,) = _everywhere("todirl", parameters, models, _observed([world], 1))
+        ((policy,),) = _everywhere("todirl", parameters, models, _observed([world], 1))
         runs = grid.demonstrations(jax.random.key(0), _lane(models, 0), policy, 6, horizon=60)
         pairs = np.stack([runs.state, runs.action], -1).tolist()
         cut = [row[:n] for row, n in zip(pairs, np.asarray(runs.length), strict=True)]
