@@ -73,7 +73,8 @@ def task_performance(
     """Probability that a policy does the product's task: mean and least over the starts (3.9).
 
     Args:
-      model: one product; ``vmap`` over stacked ones, or :func:`task_performances`.
+      model: one product; ``vmap`` over stacked ones, or :func:`task_performances`. (Not
+        ``lax.map`` with a batch size that leaves a remainder: on a CPU that can lock up.)
       policy: ``float[S, Q, A]`` or ``int32[S, Q]``.
       method: ``"blocks"`` (one factorisation for each memory state, of co-safe and safety
         tasks), ``"general"`` (:func:`~jaxltl.core.reachability.satisfaction_probability`,
