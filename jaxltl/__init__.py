@@ -62,8 +62,8 @@ from jaxltl.core.reachability import (
     satisfaction_probability,
 )
 from jaxltl.core.rollout import Trajectories, make_trajectories, rollout
-from jaxltl.core.stack import stack_products, synchronize
-from jaxltl.core.task_performance import task_performance
+from jaxltl.core.stack import lift_memory, stack_products, synchronize
+from jaxltl.core.task_performance import task_performance, task_performances
 from jaxltl.core.translate import to_automaton
 from jaxltl.core.types import NotConverged, Solution, Status, check
 from jaxltl.core.verify import Verification, verify
@@ -118,6 +118,7 @@ __all__ = [
     "holds_on_lasso",
     "is_equivalent",
     "letters",
+    "lift_memory",
     "lift_policy",
     "lift_trajectories",
     "make_automaton",
@@ -153,6 +154,7 @@ __all__ = [
     "strategy_value",
     "synchronize",
     "task_performance",
+    "task_performances",
     "to_automaton",
     "to_dense",
     "verdict",

@@ -124,21 +124,6 @@ class Hparams:
 
 
 @struct.dataclass
-class Best:
-    """The parameters with the best held-out likelihood; without held-out data the newest.
-
-    Attributes:
-      parameters: of the network.
-      neg_log_likelihood: held out, per pair; NaN without held-out data.
-      step: the number of steps after which they were reached.
-    """
-
-    parameters: Any
-    neg_log_likelihood: jax.Array
-    step: jax.Array
-
-
-@struct.dataclass
 class State:
     """Parameters on their way; once `stopped`, only the step counter goes on.
 
@@ -154,7 +139,7 @@ class State:
     step: jax.Array
     parameters: Any
     optimizer: Any
-    best: Best
+    best: learner.Best
     stopped: jax.Array
 
 
@@ -296,7 +281,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         optimizer=jax.tree.map(
             lambda x: jnp.asarray(x, jnp.result_type(x)), _optimizer(hparams).init(parameters)
         ),
-        best=Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
+        best=learner.Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
         stopped=jnp.bool_(False),
     )
 
@@ -322,15 +307,10 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     updates, optimizer = _optimizer(hparams).update(gradient, state.optimizer, state.parameters)
     parameters = optax.apply_updates(state.parameters, updates)
     held_out = likelihood(state.parameters, problem, problem.held_out)
-    judged = jnp.any(problem.held_out > 0)
-    better = judged & (held_out < state.best.neg_log_likelihood) & ~state.stopped
-    best = _where(better, Best(state.parameters, held_out, state.step), state.best)
-    newest = Best(parameters, jnp.full_like(loss, jnp.nan), state.step + 1)
-    stopped = state.stopped | (judged & (state.step - best.step >= hparams.patience))
-    kept = (state.parameters, state.optimizer, best)
-    parameters, optimizer, best = _where(
-        stopped, kept, (parameters, optimizer, _where(judged, best, newest))
-    )
+    best, stopped = learner.stop_early(
+        state, parameters, held_out, jnp.any(problem.held_out > 0), hparams.patience)
+    parameters, optimizer = learner.choose(
+        stopped, (state.parameters, state.optimizer), (parameters, optimizer))
     metrics = Metrics(loss=loss, held_out=held_out, gradient_norm=optax.tree.norm(gradient))
     return State(
         key=state.key, step=state.step + 1, parameters=parameters, optimizer=optimizer,
@@ -346,10 +326,6 @@ def _draw(key: chex.PRNGKey, counts: jax.Array, num: int) -> tuple[jax.Array, ..
     last = jnp.searchsorted(total, total[-1])
     index = jnp.minimum(jnp.searchsorted(total, point, side="right"), last)
     return jnp.unravel_index(index, counts.shape)
-
-
-def _where(condition: jax.Array, one: Any, other: Any) -> Any:
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), one, other)
 
 
 def _optimizer(hparams: Hparams) -> optax.GradientTransformation:

@@ -141,21 +141,6 @@ class Hparams:
 
 
 @struct.dataclass
-class Best:
-    """The parameters with the best held-out likelihood; without held-out data the newest.
-
-    Attributes:
-      parameters: of the network.
-      neg_log_likelihood: held out, per pair; NaN without held-out data.
-      step: the number of steps after which they were reached.
-    """
-
-    parameters: Any
-    neg_log_likelihood: jax.Array
-    step: jax.Array
-
-
-@struct.dataclass
 class State:
     """Parameters on their way; once `stopped`, only the step counter goes on.
 
@@ -173,7 +158,7 @@ class State:
     parameters: Any
     value: jax.Array
     optimizer: Any
-    best: Best
+    best: learner.Best
     stopped: jax.Array
 
 
@@ -496,7 +481,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         optimizer=jax.tree.map(
             lambda x: jnp.asarray(x, jnp.result_type(x)), _optimizer(hparams).init(parameters)
         ),
-        best=Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
+        best=learner.Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
         stopped=jnp.bool_(False),
     )
 
@@ -524,28 +509,14 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
         status=parts.status,
     )
     parameters = optax.apply_updates(state.parameters, updates)
-    judged = jnp.any(problem.held_out > 0)
-    better = judged & (parts.held_out < state.best.neg_log_likelihood) & ~state.stopped
-    best = _where(better, Best(state.parameters, parts.held_out, state.step), state.best)
-    newest = Best(parameters, jnp.full_like(loss, jnp.nan), state.step + 1)
-    stopped = state.stopped | (judged & (state.step - best.step >= hparams.patience))
+    best, stopped = learner.stop_early(
+        state, parameters, parts.held_out, jnp.any(problem.held_out > 0), hparams.patience)
     # A solve that failed would poison the next one's start.
     value = jnp.where(parts.status != Status.NONFINITE, parts.value, 0)
-    after = State(
-        key=state.key, step=state.step, parameters=parameters, value=value, optimizer=optimizer,
-        best=_where(judged, best, newest), stopped=stopped,
-    )
-    after = _where(stopped, replace(state, best=best, stopped=stopped), after)
+    after = replace(
+        state, parameters=parameters, value=value, optimizer=optimizer, best=best, stopped=stopped)
+    after = learner.choose(stopped, replace(state, best=best, stopped=stopped), after)
     return replace(after, step=state.step + 1), metrics
-
-
-def _where(condition: jax.Array, one: Any, other: Any) -> Any:
-    def choose(x: jax.Array, y: jax.Array) -> jax.Array:
-        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
-            return x
-        return jnp.where(condition, x, y)
-
-    return jax.tree.map(choose, one, other)
 
 
 def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
