@@ -36,6 +36,7 @@ def check(methods):
     return {x["method"]: x for x in found["by_demonstrations"]}
 
 
+@pytest.mark.exhaustive
 def test_section_3_5_in_little():
     rows = check(("todirl",))
     assert rows["todirl"]["test_mean"] > 0.3  # by chance .003

@@ -276,6 +276,7 @@ def test_options_solve_it_too(options):
     assert solved.solution is not None
 
 
+@pytest.mark.exhaustive
 def test_variance_floors_noise_and_restarts_do_what_they_say():
     floored, _ = searched(problem(), Hparams(rate=0.9, variance_floor=1e-2))
     assert (floored.family.variance >= 1e-2).all()

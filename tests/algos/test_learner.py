@@ -230,7 +230,8 @@ def assert_bitwise(one, other):
         np.testing.assert_array_equal(x, y)
 
 
-SLOW = {"mlirl-product", "q-maximin", "trpo", "cpo"}  # to compile, which is done several times
+# To compile, which is done several times.
+SLOW = {"mlirl-product", "q-maximin", "trpo", "cpo", "todirl"}
 by_learner = pytest.mark.parametrize(
     "name",
     [pytest.param(n, marks=[pytest.mark.exhaustive] if n in SLOW else []) for n in LEARNERS],

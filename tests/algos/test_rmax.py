@@ -285,6 +285,7 @@ def test_a_seldom_successor_seen_late_still_counts():
     assert found.epsilon_optimal.all(), "there is nothing to choose"
 
 
+@pytest.mark.exhaustive
 def test_a_formula_on_a_markov_decision_process():
     """One player, a slippery walk, a task with memory and a pit that must be left alone."""
     world = jl.gridworld("s . a\n. # .\nb . p", slip=0.1)
@@ -362,6 +363,7 @@ def test_new_numbers_do_not_retrace():
     assert not traced
 
 
+@pytest.mark.exhaustive
 def test_single_precision():
     with jax.enable_x64(False):
         found = patrol()

@@ -128,6 +128,7 @@ def test_example_2():
     assert all_runs_win(strategy, task)
 
 
+@pytest.mark.exhaustive
 def test_no_strategy_attains_the_supremum_of_figure_12():
     """The reward wants to stay and the task wants to leave: only longer and longer delays help."""
     game, reward = reward_against_task()
@@ -192,6 +193,7 @@ def test_every_run_of_a_buchi_strategy_wins(method):
     assert seen > 5
 
 
+@pytest.mark.exhaustive
 def test_every_run_of_a_parity_or_reactive_strategy_wins():
     rng = np.random.default_rng(2)
     seen, maximal = 0, 0

@@ -51,6 +51,7 @@ def test_the_error_holds_what_it_says(shape, enough):
         np.testing.assert_allclose(quantity, gain[i] + 0.8 * reached, atol=1e-12)
 
 
+@pytest.mark.exhaustive
 def test_lanes_are_as_if_alone_however_they_are_nested():
     game, allowed, probability, gain, guess = models(1, 6)
     discount, enough = jnp.linspace(0.3, 0.9, 6), jnp.logspace(-1, -8, 6)
