@@ -221,7 +221,7 @@ def run() -> list[dict[str, Any]]:
     now, _ = todirl.run(before, given, hparams, num_steps=1)
     learned, _ = todirl.run(now, given, hparams, num_steps=300)
     return [
-        *gradient_rows(given, hparams, now.parameters, now.guess),
+        *gradient_rows(given, hparams, now.parameters, now.value),
         seeds_row(given, hparams),
         worlds_row(given, hparams, learned.best.parameters),
     ]
