@@ -552,6 +552,7 @@ print("equal on", len(jax.devices()))
 """
 
 
+@pytest.mark.exhaustive
 def test_a_population_over_two_devices_is_the_population():
     done = subprocess.run(
         [sys.executable, "-c", SHARDED], capture_output=True, text=True, check=False,

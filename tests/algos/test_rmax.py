@@ -258,6 +258,7 @@ def test_without_restarts_what_recurs_becomes_optimal():
     assert 15 <= np.asarray(found.epsilon_optimal)[mine].sum() <= 35
 
 
+@pytest.mark.exhaustive
 def test_the_printed_update_fails_where_the_corrected_one_does_not():
     mdp, reward = gamble()
     problem = rmax.make_problem(mdp, np.array([True, False]), reward)

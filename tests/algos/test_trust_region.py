@@ -492,6 +492,7 @@ def test_trajectories_end_where_they_are_done():
     np.testing.assert_allclose(mean.action[0], expected)
 
 
+@pytest.mark.exhaustive
 def test_figures_are_those_of_the_trajectories():
     problem = counted(last=4.0, limit=5.0)
     hparams = SMALL.replace(cost_discount=0.5)

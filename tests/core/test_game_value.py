@@ -387,7 +387,9 @@ def test_a_strategy_without_a_move_is_worth_minus_infinity_where_play_can_get_th
 
 
 @pytest.mark.parametrize(("label_on", "method"), [
-    ("entry", "modified_policy_iteration"), ("exit", "strategy_iteration")])
+    pytest.param("entry", "modified_policy_iteration", marks=pytest.mark.exhaustive),
+    ("exit", "strategy_iteration"),
+])
 def test_products_and_dense_games_agree_with_explicit_ones(label_on, method):
     rng = np.random.default_rng(7)
     lazy, model = random_product(rng, label_on=label_on)

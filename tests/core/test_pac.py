@@ -328,6 +328,7 @@ def wins(game, accepting):
     return np.asarray(jl.almost_sure_buchi(game, jnp.asarray(accepting)).region)
 
 
+@pytest.mark.exhaustive
 def test_a_strategy_wins_in_both_games_or_in_neither():  # lemma 9
     rng = np.random.default_rng(9)
     seen = set()

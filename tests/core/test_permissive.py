@@ -173,7 +173,8 @@ def test_safe_strategies_allow_exactly_what_some_winning_strategy_does():
         assert strategy.maximal
 
 
-@pytest.mark.parametrize("method", ["auto", "rank", "counter", "parity"])
+@pytest.mark.parametrize("method", [
+    "auto", "rank", "counter", pytest.param("parity", marks=pytest.mark.exhaustive)])
 def test_every_run_of_a_buchi_strategy_wins(method):
     rng = np.random.default_rng(1)
     seen = 0
@@ -213,6 +214,7 @@ def test_every_run_of_a_parity_or_reactive_strategy_wins():
     assert seen > 10 and 0 < maximal < seen
 
 
+@pytest.mark.exhaustive
 def test_the_parity_construction_includes_every_memoryless_winning_strategy():
     rng = np.random.default_rng(3)
     included = 0
