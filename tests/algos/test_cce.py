@@ -269,7 +269,7 @@ ONE_BY_ONE = [
 
 
 @pytest.mark.parametrize("options", [
-    *OPTIONS, *(pytest.param(o, marks=pytest.mark.exhaustive) for o in ONE_BY_ONE)], ids=str)
+    *OPTIONS, *(pytest.param(o, marks=pytest.mark.exhaustive) for o in ONE_BY_ONE)], ids=", ".join)
 def test_options_solve_it_too(options):
     solved = found(problem(), Hparams(**{"rate": 0.3, **options}), 80, num_evaluations=2)
     np.testing.assert_allclose(solved.best.parameters, [1.0, 0.0], atol=5e-2)
