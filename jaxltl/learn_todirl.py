@@ -27,7 +27,12 @@ from jaxltl.core.monitor import Verdict, make_monitor
 from jaxltl.core.operators import action_mean, expectation
 from jaxltl.core.product import Product, product, project_policy
 from jaxltl.core.rollout import Trajectories
-from jaxltl.core.task_performance import Performance, summarize, task_performances
+from jaxltl.core.task_performance import (
+    Performance,
+    infeasible_starts,
+    summarize,
+    task_performances,
+)
 from jaxltl.core.types import Status, status_code
 from jaxltl.envs import temporal_gridworld
 from jaxltl.envs.gridworld import ACTIONS
@@ -404,10 +409,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     """The outcome as numbers, lists and texts, for ``result.json``; NaN becomes None."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, history, count = setup.task, learned.history, setup.num_training
-    infeasible = np.array([
-        temporal_gridworld.infeasible_starts(_part(setup.worlds.judged, w)).sum()
-        for w in range(len(setup.worlds.scenes))
-    ])
+    infeasible = np.asarray(jax.vmap(infeasible_starts)(setup.worlds.judged)).sum(axis=1)
     result = {
         "task": task.name,
         "formula": task.formula,

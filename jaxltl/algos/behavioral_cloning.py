@@ -22,7 +22,7 @@ from flax import struct
 from jaxltl.algos import learner
 from jaxltl.core.product import Product
 from jaxltl.core.rollout import Trajectories
-from jaxltl.core.stack import demonstrated_counts, split_trajectories, stack_models
+from jaxltl.core.stack import stack_models, stack_observations, training_counts
 
 # --- policy networks -----------------------------------------------------------------------------
 
@@ -182,25 +182,11 @@ def make_problem(
         demonstrations that do not fit their world, or of which none is left.
     """
     models = stack_models(models)
-    observation = jnp.asarray(np.stack([np.asarray(x) for x in observation]), models.dtype)
-    observation = observation[None] if observation.ndim == 2 else observation
-    rows = models.letter.shape
-    if observation.ndim != 3 or observation.shape[:2] != rows:
-        raise ValueError(f"observation has shape {observation.shape}; expected {(*rows, 'O')}.")
-    if not bool(jnp.all(jnp.isfinite(observation))):
-        w, s, _ = np.argwhere(~np.isfinite(np.asarray(observation)))[0].tolist()
-        raise ValueError(f"world {w}: the observation in state {s} is not finite.")
-    test: Any = held_out
-    if held_out is None or isinstance(held_out, int | float):
-        demonstrations, test = split_trajectories(demonstrations, held_out or 0.0)
-    counts = demonstrated_counts(models, demonstrations)
-    if not bool(jnp.any(counts > 0)):
-        raise ValueError(
-            "demonstrations: no pair is left to learn from; give more, or a smaller held_out."
-        )
+    observation = stack_observations(models, observation)
+    counts, other = training_counts(models, demonstrations, held_out)
     problem = Problem(
         observation=observation, available=jnp.asarray(models.mdp.available), counts=counts,
-        held_out=demonstrated_counts(models, test),
+        held_out=other,
         network=ConvolutionalPolicy(num_actions=models.num_actions) if network is None else network,
     )
     _require_scores(problem)

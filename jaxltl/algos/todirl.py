@@ -27,7 +27,7 @@ from jaxltl.core.bellman import policy_logits, soft_policy_adjoint, soft_value
 from jaxltl.core.flat import Predecessors, predecessors
 from jaxltl.core.product import Product
 from jaxltl.core.rollout import Trajectories
-from jaxltl.core.stack import demonstrated_counts, split_trajectories, stack_models
+from jaxltl.core.stack import stack_models, stack_observations, training_counts
 from jaxltl.core.stack import world as lane
 from jaxltl.core.types import Solution, Status, status_code
 
@@ -214,29 +214,9 @@ def make_problem(
         horizon, or no pair left to learn from.
     """
     model = stack_models(worlds)
-    num_worlds, num_states = model.letter.shape
-    dtype = model.dtype
-    if isinstance(observation, list | tuple):
-        observation = np.stack([np.asarray(x) for x in observation])
-    observation = jnp.asarray(observation, dtype)
-    if observation.ndim == 2:
-        observation = observation[None]
-    if observation.ndim != 3 or observation.shape[:2] != (num_worlds, num_states):
-        raise ValueError(
-            f"observation has shape {observation.shape}; expected {(num_worlds, num_states, 'O')}."
-        )
-    if not bool(jnp.all(jnp.isfinite(observation))):
-        w, s, _ = np.argwhere(~np.isfinite(np.asarray(observation)))[0].tolist()
-        raise ValueError(f"world {w}: the observation in state {s} is not finite.")
-    test: Any = held_out
-    if held_out is None or isinstance(held_out, int | float):
-        demonstrations, test = split_trajectories(demonstrations, held_out or 0.0)
-    counts, other = (
-        demonstrated_counts(model, x, horizon=horizon) for x in (demonstrations, test))
-    if not bool(jnp.any(counts > 0)):
-        raise ValueError(
-            "demonstrations: no pair is left to learn from; give more, or a smaller held_out."
-        )
+    num_worlds, dtype = model.letter.shape[0], model.dtype
+    observation = stack_observations(model, observation)
+    counts, other = training_counts(model, demonstrations, held_out, horizon=horizon)
     weight = jnp.ones(num_worlds, dtype) if weight is None else jnp.asarray(weight, dtype)
     if weight.shape != (num_worlds,):
         raise ValueError(f"weight has shape {weight.shape}; expected {(num_worlds,)}.")

@@ -431,3 +431,57 @@ def _memory_along(model: Product, state: np.ndarray) -> np.ndarray:
     for t in range(read.shape[1]):
         memory[:, t + 1] = delta[memory[:, t], read[:, t]]
     return memory
+
+
+def stack_observations(models: Product, observation: Any) -> jax.Array:
+    """What is seen in each state of each of the W worlds, checked: ``float[W, S, O]``.
+
+    Args:
+      models: stacked products.
+      observation: ``float[S, O]``, ``float[W, S, O]``, or a list with one for each world.
+
+    Raises:
+      ValueError: another shape, or a number that is not finite.
+    """
+    if isinstance(observation, list | tuple):
+        observation = np.stack([np.asarray(x) for x in observation])
+    observation = jnp.asarray(observation, models.dtype)
+    if observation.ndim == 2:
+        observation = observation[None]
+    rows = models.letter.shape
+    if observation.ndim != 3 or observation.shape[:2] != rows:
+        raise ValueError(f"observation has shape {observation.shape}; expected {(*rows, 'O')}.")
+    if not bool(jnp.all(jnp.isfinite(observation))):
+        w, s, _ = np.argwhere(~np.isfinite(np.asarray(observation)))[0].tolist()
+        raise ValueError(f"world {w}: the observation in state {s} is not finite.")
+    return observation
+
+
+def training_counts(
+    models: Product,
+    demonstrations: Demonstrations,
+    held_out: float | Demonstrations | None,
+    *,
+    horizon: int | None = None,
+) -> tuple[jax.Array, jax.Array]:
+    """:func:`demonstrated_counts` of what is learned from and of what is held out.
+
+    Args:
+      models: stacked products.
+      demonstrations: of the worlds.
+      held_out: the share of each world's trajectories, its last ones; or such trajectories;
+        None or 0: none.
+      horizon: count by time up to so many steps.
+
+    Raises:
+      ValueError: demonstrations that do not fit their world, or of which none is left.
+    """
+    test: Any = held_out
+    if held_out is None or isinstance(held_out, int | float):
+        demonstrations, test = split_trajectories(demonstrations, held_out or 0.0)
+    counts = demonstrated_counts(models, demonstrations, horizon=horizon)
+    if not bool(jnp.any(counts > 0)):
+        raise ValueError(
+            "demonstrations: no pair is left to learn from; give more, or a smaller held_out."
+        )
+    return counts, demonstrated_counts(models, test, horizon=horizon)

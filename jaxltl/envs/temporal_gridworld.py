@@ -543,67 +543,32 @@ def _adds(colors, kind, number, stamp, codes, row: int, column: int) -> bool:
 def _is_feasible(family: _Generator, kind: NDArray[np.int32]) -> bool:
     flat = kind.ravel()
     # The last row of the table is of cells of no kind, whose number is -1.
-    can = _can_finish(family.successor, family.step[flat], family.final, "exit")
+    can = _can_finish(family.successor, family.step[flat], family.final)
     return bool(can[flat < 0, family.initial].all())
 
 
 def _can_finish(
-    successor: NDArray[Any], step: NDArray[Any], final: NDArray[np.bool_], label_on: str,
-    used: NDArray[np.bool_] | None = None,
+    successor: NDArray[Any], step: NDArray[Any], final: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """From which world and memory states some run reaches final memory: ``bool[S, Q]``.
 
+    In NumPy, for thousands of tries; a step reads the cell that it leaves.
+
     Args:
-      successor: ``[S, A, K]``.
+      successor: ``[S, A, K]``, all of them possible.
       step: ``[S, Q]``, the memory after reading a cell.
       final: ``[Q]``.
-      label_on: which cell a step reads.
-      used: ``bool[S, A, K]``, which successors are real; default all.
     """
-    count = len(successor)
-    flat = successor.reshape(count, -1)
-    if used is not None:
-        # A successor that is not real is replaced by the state itself, which changes nothing.
-        flat = np.where(used.reshape(count, -1), flat, np.arange(count)[:, None])
-    columns = [np.ascontiguousarray(c) for c in flat.T]
+    columns = [np.ascontiguousarray(c) for c in successor.reshape(len(successor), -1).T]
     can = np.broadcast_to(final, step.shape)
     while True:
-        read = np.take_along_axis(can, step, 1) if label_on == "entry" else can
-        after = read[columns[0]]
+        after = can[columns[0]]
         for c in columns[1:]:
-            after |= read[c]
-        if label_on == "exit":
-            after = np.take_along_axis(after, step, 1)
-        after |= can
+            after |= can[c]
+        after = np.take_along_axis(after, step, 1) | can
         if np.array_equal(after, can):
             return after
         can = after
-
-
-def infeasible_starts(model: Product) -> NDArray[np.bool_]:
-    """The starting states from which no run fulfils the task, by the graph alone; on the host.
-
-    Args:
-      model: the product of a world and a co-safe task.
-
-    Returns:
-      ``bool[S]``, of world states with a positive initial probability.
-
-    Raises:
-      ValueError: the task is not co-safe, or the world has no successor lists.
-    """
-    if not isinstance(model.mdp, MDP):
-        raise ValueError("infeasible_starts needs successor lists; use make_mdp.")
-    if model.automaton.acceptance != "cosafe":
-        raise ValueError(
-            f"the task has {model.automaton.acceptance} acceptance; it must be co-safe."
-        )
-    can = _can_finish(
-        np.asarray(model.mdp.successor), np.asarray(model.next_memory),
-        np.asarray(model.automaton.final), model.label_on, np.asarray(model.mdp.probability) > 0,
-    )
-    begin = np.asarray(model.initial_memory)
-    return np.asarray(~can[np.arange(len(can)), begin] & (np.asarray(model.mdp.initial) > 0))
 
 
 # --- what is seen -----------------------------------------------------------------------------

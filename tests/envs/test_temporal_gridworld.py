@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
+from jaxltl.core.task_performance import infeasible_starts
 from jaxltl.envs import temporal_gridworld as tg
 
 PLAN = {
@@ -119,7 +120,7 @@ def test_random_worlds_are_what_they_say():
     worlds = tg.random_worlds(range(30))
     for world in worlds:
         check_random(world, KINDS, 5, 3)
-        assert not tg.infeasible_starts(exit_product(world)).any()
+        assert not infeasible_starts(exit_product(world)).any()
     np.testing.assert_array_equal(worlds[7].colors, tg.random_world(7).colors)
     assert len({labelled(world)["o1"][0] for world in worlds}) > 10
 
@@ -133,7 +134,7 @@ def test_random_worlds_of_other_sizes_objects_and_tasks():
     )
     check_random(world, {**objects, **tg.OBSTACLES}, 9, 5)
     assert world.colors.shape == (16, 21) and world.mdp.num_successors == 3
-    assert not tg.infeasible_starts(exit_product(world, task)).any()
+    assert not infeasible_starts(exit_product(world, task)).any()
     automaton = jl.to_automaton("F o1", letters=[set(), {"o1"}])
     assert tg.random_world(0, automaton).mdp.num_states == 100
     assert tg.random_world(0, "true", num_obstacles=0).mdp.label.sum() == 3
@@ -160,8 +161,8 @@ WALLED = {"o1": [(6, 2)], "o2": [(6, 5)], "ob": [(1, 3), (2, 3), (3, 3), (3, 2),
 def test_starts_without_a_way_are_found():
     world = tg.make_world(WALLED, 0, shape=(7, 6))
     model = exit_product(world, "!ob U (o1 & (!ob U o2))")
-    assert np.flatnonzero(tg.infeasible_starts(model)).tolist() == [0, 1, 6, 7]
-    assert not tg.infeasible_starts(exit_product(world, "F (o1 & F o2)")).any()
+    assert np.flatnonzero(infeasible_starts(model)).tolist() == [0, 1, 6, 7]
+    assert not infeasible_starts(exit_product(world, "F (o1 & F o2)")).any()
 
 
 @pytest.mark.parametrize("task, slip, label_on", [
@@ -174,9 +175,13 @@ def test_feasibility_agrees_with_the_attractor(task, slip, label_on):
     world = tg.make_world(WALLED, 0, shape=(7, 6), slip=slip)
     model = jl.product(world.mdp, task, label_on=label_on)
     can = np.asarray(jl.attractor(model, model.final, model.available).region)
+    if label_on == "exit":  # as the generator reads
+        found = tg._can_finish(*(
+            np.asarray(x) for x in (world.mdp.successor, model.next_memory, model.automaton.final)))
+        np.testing.assert_array_equal(found, can)
     expected = ~can[np.arange(42), np.asarray(model.initial_memory)]
     expected &= np.asarray(world.mdp.initial) > 0
-    np.testing.assert_array_equal(tg.infeasible_starts(model), expected)
+    np.testing.assert_array_equal(infeasible_starts(model), expected)
 
 
 @pytest.mark.parametrize("make, message", [
