@@ -23,6 +23,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from flax import struct
 from jax import lax
 
@@ -162,6 +163,28 @@ def run_in_chunks(
     if not rows:
         return state, None
     return state, jax.tree.map(lambda *x: np.concatenate(x), *rows)
+
+
+# --- optimisers --------------------------------------------------------------------------
+
+
+def optimizer(name: str, learning_rate: Any) -> optax.GradientTransformationExtraArgs:
+    """One of optax's: ``"lbfgs"``, ``"adam"``, ``"rmsprop"`` or ``"sgd"``.
+
+    Args:
+      name: which one.
+      learning_rate: of all but ``"lbfgs"``, which searches along its lines.
+
+    Raises:
+      ValueError: an unknown name.
+    """
+    if name == "lbfgs":
+        return optax.lbfgs()
+    kinds = {"adam": optax.scale_by_adam, "rmsprop": optax.scale_by_rms, "sgd": optax.identity}
+    if name not in kinds:
+        raise ValueError(f"optimizer={name!r}; choose one of {', '.join(('lbfgs', *kinds))}.")
+    rate = optax.scale_by_learning_rate(learning_rate)
+    return optax.with_extra_args_support(optax.chain(kinds[name](), rate))
 
 
 # --- early stopping ------------------------------------------------------------------------

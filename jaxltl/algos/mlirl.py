@@ -69,7 +69,7 @@ class Hparams:
       start_scale: standard deviation of the noise added to ``Problem.start``.
       policy: ``"boltzmann"`` (2.3) or ``"soft"``; static.
       adjoint: ``"exact"``, or ``"approximate"`` for (2.7); static.
-      optimizer: ``"lbfgs"``, ``"adam"`` or ``"sgd"``, all optax's; static.
+      optimizer: ``"lbfgs"``, ``"adam"``, ``"rmsprop"`` or ``"sgd"``, all optax's; static.
     """
 
     discount: jax.Array | float
@@ -293,14 +293,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
 
 
 def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
-    if hparams.optimizer == "lbfgs":
-        return optax.lbfgs()
-    rate = optax.scale_by_learning_rate(hparams.learning_rate)
-    if hparams.optimizer == "adam":
-        return optax.with_extra_args_support(optax.chain(optax.scale_by_adam(), rate))
-    if hparams.optimizer == "sgd":
-        return optax.with_extra_args_support(rate)
-    raise ValueError(f"optimizer={hparams.optimizer!r}; choose lbfgs, adam or sgd.")
+    return learner.optimizer(hparams.optimizer, hparams.learning_rate)
 
 
 run = partial(learner.run, step)

@@ -500,16 +500,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
 
 
 def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
-    if hparams.optimizer == "lbfgs":
-        return optax.lbfgs()
-    kinds = {
-        "adam": optax.scale_by_adam, "rmsprop": optax.scale_by_rms, "sgd": optax.identity,
-    }
-    if hparams.optimizer not in kinds:
-        known = ", ".join(("lbfgs", *kinds))
-        raise ValueError(f"optimizer={hparams.optimizer!r}; choose one of {known}.")
-    rate = optax.scale_by_learning_rate(hparams.learning_rate)
-    return optax.with_extra_args_support(optax.chain(kinds[hparams.optimizer](), rate))
+    return learner.optimizer(hparams.optimizer, hparams.learning_rate)
 
 
 run = partial(learner.run, step)

@@ -242,7 +242,7 @@ def test_bad_problems_are_refused(arguments, message):
         ({"policy": "soft", "adjoint": "approximate"}, "belongs to the Boltzmann policy"),
         ({"adjoint": "none"}, "adjoint='none'; choose exact or approximate"),
         ({"mu": 1.0}, "make the problem in a product"),
-        ({"optimizer": "newton"}, "optimizer='newton'; choose lbfgs, adam or sgd"),
+        ({"optimizer": "newton"}, "optimizer='newton'; choose one of lbfgs, adam, rmsprop, sgd"),
     ],
 )
 def test_bad_settings_are_refused(options, message):
