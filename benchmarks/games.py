@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.timing import once
-from jaxltl.core.game import Game
-from jaxltl.core.game_value import minimax_value
-from jaxltl.core.mdp import MDP
-from jaxltl.core.objective import buchi, safety
-from jaxltl.core.permissive import apply_strategy, permissive_strategy
+from jaxltl.core.games.objective import buchi, safety
+from jaxltl.core.games.permissive import apply_strategy, permissive_strategy
+from jaxltl.core.games.winning import winning_region
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.mdp import MDP
 from jaxltl.core.types import check
-from jaxltl.core.winning import winning_region
+from jaxltl.core.values.minimax import minimax_value
 from jaxltl.envs.robots import diagonal_reward, robots
 
 

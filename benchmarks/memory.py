@@ -17,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.models import random_mdp, risky_mdp
-from jaxltl.core.bellman import optimal_value
-from jaxltl.core.mdp import MDP
-from jaxltl.core.product import Product, letters, product
-from jaxltl.core.reachability import optimal_satisfaction, reachability_probability
-from jaxltl.core.translate import to_automaton
+from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.product import Product, letters, product
+from jaxltl.core.values.discounted import optimal_value
+from jaxltl.core.values.reachability import reachability_probability
+from jaxltl.core.values.satisfaction import optimal_satisfaction
 
 
 def _settled() -> int:

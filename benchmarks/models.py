@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.mdp import MDP
+from jaxltl.core.models.mdp import MDP
 from jaxltl.envs.gridworld import gridworld
 
 

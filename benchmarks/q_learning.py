@@ -14,10 +14,10 @@ import numpy as np
 
 from benchmarks.timing import compare
 from jaxltl.algos import maximin_q
-from jaxltl.core import graph
-from jaxltl.core.game import Game
-from jaxltl.core.operators import forall_successor
-from jaxltl.core.product import restrict
+from jaxltl.core.graphs.attractor import attractor
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.operators import forall_successor
+from jaxltl.core.models.restrict import restrict
 from jaxltl.envs.robots import diagonal_reward, robots
 
 _DISCOUNT = 0.9
@@ -28,7 +28,7 @@ def safe_robots(size: int) -> Game:
     """The game of section 5.5, example 1, under its most permissive strategy."""
     game = robots(size)
     collision = game.label[:, game.propositions.index("collision")]
-    region = ~graph.attractor(game, collision, rule=~game.system).region
+    region = ~attractor(game, collision, rule=~game.system).region
     start = np.where(region, game.initial, 0)
     mask = game.available & forall_successor(game, region)
     return restrict(game, start / start.sum(), allowed=mask).model

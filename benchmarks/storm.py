@@ -6,7 +6,7 @@ import numpy as np
 import stormpy
 from stormpy import datastructures, environments, models
 
-from jaxltl.core.mdp import MDP
+from jaxltl.core.models.mdp import MDP
 
 METHODS = {
     "value_iteration": environments.MinMaxMethod.VALUE_ITERATION,

@@ -16,13 +16,13 @@ from jax.flatten_util import ravel_pytree
 
 from benchmarks.timing import compare, once
 from jaxltl.algos import todirl
-from jaxltl.core.automaton import Automaton
-from jaxltl.core.bellman import policy_logits, soft_value
-from jaxltl.core.operators import expectation, transition_matrix
-from jaxltl.core.product import Product, product
-from jaxltl.core.stack import stack_products
-from jaxltl.core.task_performance import task_performances
-from jaxltl.core.translate import to_automaton
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.models.batch import stack_products
+from jaxltl.core.models.operators import expectation, transition_matrix
+from jaxltl.core.models.product import Product, product
+from jaxltl.core.values.performance import task_performances
+from jaxltl.core.values.soft import policy_logits, soft_value
 from jaxltl.envs import temporal_gridworld as grid
 
 _DISCOUNT = 0.95

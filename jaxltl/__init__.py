@@ -4,28 +4,11 @@ State a task by a temporal-logic formula, demonstrations, a reward, or a mix; le
 product of the world and the task's automaton; get every answer with its evidence.
 """
 
-from jaxltl.core.automaton import Automaton, complement, make_automaton
-from jaxltl.core.bellman import (
-    boltzmann_fixed_points,
-    boltzmann_value,
-    optimal_value,
-    policy_value,
-    soft_value,
-)
-from jaxltl.core.game import Game, make_game
-from jaxltl.core.game_value import minimax_value, strategy_value
-from jaxltl.core.graph import (
-    almost_surely_reaching,
-    attractor,
-    avoidable,
-    end_components,
-)
-from jaxltl.core.language import find_difference, is_equivalent
-from jaxltl.core.ltl import Formula, holds_on_lasso, parse_ltl
-from jaxltl.core.mdp import MDP, DenseMDP, from_dense, make_mdp, to_dense
-from jaxltl.core.mean_payoff import mean_payoff
-from jaxltl.core.monitor import Monitor, Verdict, make_monitor, monitor_step, verdict
-from jaxltl.core.objective import (
+from jaxltl.core.automata.automaton import Automaton, complement, make_automaton
+from jaxltl.core.automata.language import find_difference, is_equivalent
+from jaxltl.core.automata.synchronize import synchronize
+from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.games.objective import (
     GR1,
     Parity,
     buchi,
@@ -37,16 +20,24 @@ from jaxltl.core.objective import (
     safety,
     states_where,
 )
-from jaxltl.core.occupancy import feature_expectation, occupancy_measure
-from jaxltl.core.operators import (
+from jaxltl.core.games.permissive import Permissive, apply_strategy, permissive_strategy, shield
+from jaxltl.core.games.verify import Verification, verify
+from jaxltl.core.games.winning import Winning, almost_sure_buchi, winning_region
+from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor, avoidable
+from jaxltl.core.graphs.end_components import end_components
+from jaxltl.core.logic.ltl import Formula, holds_on_lasso, parse_ltl
+from jaxltl.core.models.batch import lift_memory, stack_products
+from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp, to_dense
+from jaxltl.core.models.monitor import Monitor, Verdict, make_monitor, monitor_step, verdict
+from jaxltl.core.models.operators import (
     exists_successor,
     expectation,
     forall_successor,
     pushforward,
     sample_successor,
 )
-from jaxltl.core.permissive import Permissive, apply_strategy, permissive_strategy, shield
-from jaxltl.core.product import (
+from jaxltl.core.models.product import (
     FiniteMemoryPolicy,
     Product,
     letters,
@@ -54,20 +45,19 @@ from jaxltl.core.product import (
     lift_trajectories,
     product,
     project_policy,
-    restrict,
 )
-from jaxltl.core.reachability import (
-    optimal_satisfaction,
-    reachability_probability,
-    satisfaction_probability,
-)
-from jaxltl.core.rollout import Trajectories, make_trajectories, rollout
-from jaxltl.core.stack import lift_memory, stack_products, synchronize
-from jaxltl.core.task_performance import task_performance, task_performances
-from jaxltl.core.translate import to_automaton
+from jaxltl.core.models.restrict import restrict
+from jaxltl.core.models.trajectories import Trajectories, make_trajectories, rollout
 from jaxltl.core.types import NotConverged, Solution, Status, check
-from jaxltl.core.verify import Verification, verify
-from jaxltl.core.winning import Winning, almost_sure_buchi, winning_region
+from jaxltl.core.values.boltzmann import boltzmann_fixed_points, boltzmann_value
+from jaxltl.core.values.discounted import optimal_value, policy_value
+from jaxltl.core.values.mean_payoff import mean_payoff
+from jaxltl.core.values.minimax import minimax_value, strategy_value
+from jaxltl.core.values.occupancy import feature_expectation, occupancy_measure
+from jaxltl.core.values.performance import task_performance, task_performances
+from jaxltl.core.values.reachability import reachability_probability
+from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
+from jaxltl.core.values.soft import soft_value
 from jaxltl.envs.gridworld import gridworld
 from jaxltl.envs.robots import grid_game
 from jaxltl.io.hoa import read_hoa, write_hoa

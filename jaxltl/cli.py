@@ -23,7 +23,7 @@ import jaxltl
 if TYPE_CHECKING:
     import numpy as np
 
-    from jaxltl.core.automaton import Automaton
+    from jaxltl.core.automata.automaton import Automaton
 
 
 class _Failure(click.ClickException):
@@ -109,13 +109,13 @@ def learn(task_file: Path, out: Path | None, seed: int, seeds: int, as_json: boo
 
 def _job(task_file: Path) -> Any:
     """The module that does what a task file asks for."""
-    from jaxltl.task import method_of
+    from jaxltl.app.files.task import method_of
 
     if method_of(task_file) == "todirl":
-        from jaxltl import learn_todirl
+        from jaxltl.app import learn_todirl
 
         return learn_todirl
-    from jaxltl import learn
+    from jaxltl.app import learn
 
     return learn
 
@@ -172,7 +172,8 @@ def _write(job: Any, outcome: Any, out: Path, task_file: Path) -> dict[str, Any]
 
 def _report(result: Mapping[str, Any]) -> Any:
     """The module that shows a result."""
-    from jaxltl import report, report_todirl
+    from jaxltl.app.reports import learn as report
+    from jaxltl.app.reports import learn_todirl as report_todirl
 
     return report_todirl if result["method"] == "todirl" else report
 
@@ -180,7 +181,7 @@ def _report(result: Mapping[str, Any]) -> Any:
 def _table(result: Mapping[str, Any]) -> str:
     if result["method"] == "todirl":
         return str(_report(result).table(result))
-    from jaxltl.report import certified, number, place, probability, spread, warnings
+    from jaxltl.app.reports.learn import certified, number, place, probability, spread, warnings
 
     shown, training, seeds = result["demonstrations"], result["training"], result["seeds"]
     dropped = f", {shown['dropped']} unfinished dropped" if shown["dropped"] else ""
@@ -260,10 +261,10 @@ def synthesize(
     The exit status is 0 whoever wins; 2 for mistakes, and for a task that is unrealizable from
     every initial state where the file demands a strategy by a table [strategy].
     """
-    from jaxltl import synthesis
-    from jaxltl import synthesis_report as report
     from jaxltl.algos.learner import atomic_write
-    from jaxltl.game_file import read_game
+    from jaxltl.app import synthesize as synthesis
+    from jaxltl.app.files.game import read_game
+    from jaxltl.app.reports import synthesize as report
 
     begin = time.perf_counter()
     file = read_game(game_file)
@@ -315,8 +316,8 @@ def _stages(names: tuple[str, ...]) -> Iterator[Callable[[str], None]]:
 
 
 def _write_synthesis(found: Any, out: Path, place: int | None, begin: float) -> dict[str, Any]:
-    from jaxltl import synthesis_report as report
     from jaxltl.algos.learner import atomic_write
+    from jaxltl.app.reports import synthesize as report
 
     for stale in ("result.json", *report.FILES):
         (out / stale).unlink(missing_ok=True)
@@ -356,7 +357,7 @@ def automaton(
     Acceptance is by final states where a finite prefix decides (dfa), else by accepting
     transitions met for ever (buchi) where that is possible, else by min-even parity.
     """
-    from jaxltl.core.translate import to_automaton
+    from jaxltl.core.automata.translate import to_automaton
 
     numbered = [("", f) for f in formulas] + _formula_lines(source)
     if not numbered:
@@ -385,7 +386,7 @@ def _formula_lines(source: str | None) -> list[tuple[str, str]]:
 
 
 def _render(result: Automaton, form: str, formula: str) -> str:
-    from jaxltl.core.automaton import to_dict, to_dot, to_text
+    from jaxltl.core.automata.text import to_dict, to_dot, to_text
 
     if form == "text":
         return to_text(result)

@@ -6,8 +6,8 @@ import random
 from collections.abc import Iterator, Sequence
 from itertools import chain, combinations, product
 
-from jaxltl.core.automaton import Automaton
-from jaxltl.core.ltl import Formula
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.logic.ltl import Formula
 
 Word = Sequence[frozenset[str]]
 

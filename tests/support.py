@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.automaton import make_automaton
-from jaxltl.core.mdp import MDP, DenseMDP, make_mdp, to_dense
-from jaxltl.core.product import Product, product
+from jaxltl.core.automata.automaton import make_automaton
+from jaxltl.core.models.mdp import MDP, DenseMDP, make_mdp, to_dense
+from jaxltl.core.models.product import Product, product
 from tests import reference
 
 REPRESENTATIONS = ("sparse", "dense", "product")

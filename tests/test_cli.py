@@ -13,8 +13,8 @@ import pytest
 from click.testing import CliRunner
 
 from jaxltl.cli import main
-from jaxltl.core.language import is_equivalent
-from jaxltl.core.translate import to_automaton
+from jaxltl.core.automata.language import is_equivalent
+from jaxltl.core.automata.translate import to_automaton
 from jaxltl.io.hoa import read_hoa_stream
 from tests.test_task import SHOWN, TASK, write  # noqa: F401
 
@@ -278,7 +278,7 @@ def test_help_does_not_load_the_pictures():
     code = (
         "import sys; from click.testing import CliRunner; from jaxltl.cli import main; "
         "r = CliRunner().invoke(main, ['--help']); assert r.exit_code == 0; "
-        "print([m for m in ('matplotlib', 'tqdm', 'jaxltl.learn', 'jaxltl.plot') "
+        "print([m for m in ('matplotlib', 'tqdm', 'jaxltl.app.learn', 'jaxltl.plot') "
         "if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

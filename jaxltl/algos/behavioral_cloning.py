@@ -20,9 +20,9 @@ from flax import linen as nn
 from flax import struct
 
 from jaxltl.algos import learner
-from jaxltl.core.product import Product
-from jaxltl.core.rollout import Trajectories
-from jaxltl.core.stack import stack_models, stack_observations, training_counts
+from jaxltl.core.models.batch import stack_models, stack_observations, training_counts
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.trajectories import Trajectories
 
 # --- policy networks -----------------------------------------------------------------------------
 

@@ -32,8 +32,8 @@ import numpy as np
 from flax import struct
 from jax import lax
 
+from jaxltl.algos import exponential_family as families
 from jaxltl.algos import learner
-from jaxltl.core import exponential_family as families
 from jaxltl.core.types import Status, require_shape
 
 WEIGHTINGS = ("until_feasible", "literal", "uniform")

@@ -46,11 +46,11 @@ from jaxltl.algos.play import (
     take,
     uniform,
 )
-from jaxltl.core.game import Game, as_game
-from jaxltl.core.graph import bottom_components
-from jaxltl.core.mdp import MDP
-from jaxltl.core.operators import action_argmax, sample_successor
-from jaxltl.core.product import restrict
+from jaxltl.core.graphs.end_components import bottom_components
+from jaxltl.core.models.game import Game, as_game
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.operators import action_argmax, sample_successor
+from jaxltl.core.models.restrict import restrict
 from jaxltl.core.types import require_shape, status_code
 
 
@@ -226,7 +226,7 @@ def make_problem(
         are no distributions, or a game that does not fit the method.
 
     Example:
-      >>> from jaxltl.core.mdp import from_dense
+      >>> from jaxltl.core.models.mdp import from_dense
       >>> mdp = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]])
       >>> problem = make_problem(mdp, [[0.0, 0.0], [1.0, 1.0]])
       >>> hparams = Hparams(discount=0.5, restart=0.5, num_chains=4, moves_per_step=8)

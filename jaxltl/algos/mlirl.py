@@ -20,13 +20,14 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 
 from jaxltl.algos import learner
-from jaxltl.core.bellman import boltzmann_value, policy_logits, soft_value
-from jaxltl.core.mdp import MDP, DenseMDP
-from jaxltl.core.operators import expectation
-from jaxltl.core.product import Product, lift_trajectories
-from jaxltl.core.reachability import satisfaction_probability
-from jaxltl.core.rollout import Trajectories
+from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.operators import expectation
+from jaxltl.core.models.product import Product, lift_trajectories
+from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status
+from jaxltl.core.values.boltzmann import boltzmann_value
+from jaxltl.core.values.satisfaction import satisfaction_probability
+from jaxltl.core.values.soft import policy_logits, soft_value
 
 Reward = Callable[[Any, jax.Array], jax.Array]
 

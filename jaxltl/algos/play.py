@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.game import Game
+from jaxltl.core.models.game import Game
 from jaxltl.core.types import require_shape
 
 # --- on the host ----------------------------------------------------------------------------

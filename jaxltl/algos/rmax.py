@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxltl.algos import learner
+from jaxltl.algos import learner, pac
 from jaxltl.algos.play import (
     check_distributions,
     check_reward,
@@ -36,19 +36,18 @@ from jaxltl.algos.play import (
     take,
     uniform,
 )
-from jaxltl.core import pac
-from jaxltl.core.automaton import Automaton
-from jaxltl.core.game import Game, as_game
-from jaxltl.core.game_value import minimax_value, strategy_value
-from jaxltl.core.graph import attractor
-from jaxltl.core.ltl import Formula
-from jaxltl.core.mdp import MDP
-from jaxltl.core.objective import Parity, buchi
-from jaxltl.core.operators import forall_successor, sample_successor
-from jaxltl.core.product import restrict
-from jaxltl.core.span_iteration import span_iteration
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.games.objective import Parity, buchi
+from jaxltl.core.games.winning import objective_at, solve, task_game
+from jaxltl.core.graphs.attractor import attractor
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models.game import Game, as_game
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.operators import forall_successor, sample_successor
+from jaxltl.core.models.restrict import restrict
 from jaxltl.core.types import Solution, require_shape, status_code
-from jaxltl.core.winning import objective_at, solve, task_game
+from jaxltl.core.values.minimax import minimax_value, strategy_value
+from jaxltl.core.values.warm_start import span_iteration
 
 UPDATES = ("every", "printed")
 
@@ -251,7 +250,7 @@ def make_problem(
         that is not finite; a task that is no Buchi condition; or a start outside the region.
 
     Example:
-      >>> from jaxltl.core.mdp import from_dense
+      >>> from jaxltl.core.models.mdp import from_dense
       >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[1.0, 0], [1.0, 0]]],
       ...                    label=[[0], [1]], propositions=["home"], initial=[1, 0])
       >>> problem = make_problem(world, "G F home", [[1.0, 0.0], [0.0, 0.0]])

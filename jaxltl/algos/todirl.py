@@ -23,13 +23,13 @@ from flax import struct
 from jax import lax
 
 from jaxltl.algos import learner
-from jaxltl.core.bellman import policy_logits, soft_policy_adjoint, soft_value
-from jaxltl.core.flat import Predecessors, predecessors
-from jaxltl.core.product import Product
-from jaxltl.core.rollout import Trajectories
-from jaxltl.core.stack import stack_models, stack_observations, training_counts
-from jaxltl.core.stack import world as lane
+from jaxltl.core.models.batch import stack_models, stack_observations, training_counts
+from jaxltl.core.models.batch import world as lane
+from jaxltl.core.models.kernels import Predecessors, predecessors
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status, status_code
+from jaxltl.core.values.soft import policy_logits, soft_policy_adjoint, soft_value
 
 # --- reward networks ---------------------------------------------------------------------------
 
@@ -126,7 +126,7 @@ class Hparams:
       patience: steps without a better held-out likelihood after which learning stops.
       tolerance: certified error asked of the soft values; None: what the dtype allows.
       optimizer: ``"adam"``, ``"sgd"``, ``"rmsprop"`` or ``"lbfgs"``, all optax's; static.
-      method: of the soft solver, see :func:`~jaxltl.core.bellman.soft_value`; static.
+      method: of the soft solver, see :func:`~jaxltl.core.values.soft.soft_value`; static.
       horizon: None, or the number of steps of a run, for a policy of the time left; static.
     """
 

@@ -7,8 +7,8 @@ from collections.abc import Collection, Mapping
 import chex
 import numpy as np
 
-from jaxltl.core.labels import satisfying
-from jaxltl.core.mdp import MDP, make_mdp
+from jaxltl.core.logic.labels import satisfying
+from jaxltl.core.models.mdp import MDP, make_mdp
 
 ACTIONS = ("up", "down", "left", "right")
 _MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))

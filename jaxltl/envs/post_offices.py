@@ -14,10 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.automaton import Automaton, make_automaton
-from jaxltl.core.game import Game, make_game
-from jaxltl.core.mdp import make_mdp
-from jaxltl.core.product import product, restrict
+from jaxltl.core.automata.automaton import Automaton, make_automaton
+from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models.mdp import make_mdp
+from jaxltl.core.models.product import product
+from jaxltl.core.models.restrict import restrict
 from jaxltl.envs import gridworld as grid
 
 ACTIONS = (*grid.ACTIONS, "off", "on")

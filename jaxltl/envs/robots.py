@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core import operators
-from jaxltl.core.game import Game, make_game
-from jaxltl.core.labels import satisfying
-from jaxltl.core.mdp import MDP, make_mdp
-from jaxltl.core.objective import States, states_where
+from jaxltl.core.games.objective import States, states_where
+from jaxltl.core.logic.labels import satisfying
+from jaxltl.core.models import operators
+from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models.mdp import MDP, make_mdp
 from jaxltl.envs import gridworld as grid
 
 ACTIONS = (*grid.ACTIONS, "stay")

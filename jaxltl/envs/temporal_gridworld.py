@@ -26,15 +26,15 @@ import numpy as np
 from flax import struct
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.core import operators
-from jaxltl.core.automaton import Automaton, letter_index
-from jaxltl.core.bellman import soft_value
-from jaxltl.core.labels import require_known
-from jaxltl.core.ltl import Formula, parse_ltl
-from jaxltl.core.mdp import MDP
-from jaxltl.core.product import Product
-from jaxltl.core.rollout import Trajectories, rollout
-from jaxltl.core.translate import to_automaton
+from jaxltl.core.automata.automaton import Automaton, letter_index
+from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.logic.labels import require_known
+from jaxltl.core.logic.ltl import Formula, parse_ltl
+from jaxltl.core.models import operators
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.trajectories import Trajectories, rollout
+from jaxltl.core.values.soft import soft_value
 from jaxltl.envs.gridworld import gridworld
 
 COLORS = ("red", "yellow", "white", "purple", "black")
@@ -687,7 +687,7 @@ def expert_policy(
       model: the product.
       discount: scalar in [0, 1).
       reward: ``float[S, Q, A]``; default :func:`expert_reward`.
-      method, tolerance: see :func:`jaxltl.core.bellman.soft_value`. Sweeps suit the discount of
+      method, tolerance: see :func:`jaxltl.core.values.soft.soft_value`. Sweeps suit the discount of
         the dissertation, and many worlds at once under ``vmap``; nearer to 1, use ``"newton"``.
     """
     reward = expert_reward(model) if reward is None else reward

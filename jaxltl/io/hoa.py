@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.automaton import Automaton, Cube, _letter_text, make_automaton, prime_cover
-from jaxltl.core.ltl import Letter, as_letters
+from jaxltl.core.automata.automaton import Automaton, Cube, _letter_text, make_automaton
+from jaxltl.core.automata.text import prime_cover
+from jaxltl.core.logic.ltl import Letter, as_letters
 
 if TYPE_CHECKING:
     from lark import Lark, Token
@@ -111,7 +112,7 @@ def write_hoa(automaton: Automaton, name: str = "") -> str:
     Raises:
         ValueError: For priorities above 255, whose acceptance formula no reader would bear.
 
-    >>> from jaxltl.core.translate import to_automaton
+    >>> from jaxltl.core.automata.translate import to_automaton
     >>> print(write_hoa(to_automaton("F a")))
     HOA: v1
     tool: "jaxltl"
@@ -822,7 +823,7 @@ def _automaton(
         edge_priority = [_edge_priority(marks, header.sets, *order) for marks in table.marks]
         priority = np.array(edge_priority, np.int64)[table.edge_of]
     else:
-        from jaxltl.core.emerson_lei import to_parity
+        from jaxltl.core.automata.emerson_lei import to_parity
 
         colors, compact = _colors(condition, table.marks, header)
         colors = colors[table.edge_of]

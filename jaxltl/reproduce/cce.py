@@ -14,13 +14,13 @@ import numpy as np
 import optax
 
 from jaxltl.algos import cce
+from jaxltl.algos import exponential_family as families
 from jaxltl.algos import trust_region as tr
-from jaxltl.core import exponential_family as families
+from jaxltl.app.learn import plain
 from jaxltl.envs import lqr
 from jaxltl.envs import navigation as nav
 from jaxltl.envs.navigation_steps import Steps, stepwise
 from jaxltl.envs.networks import apply, make_network
-from jaxltl.learn import plain
 
 NETWORKS = ("2-2-1", "2-10-1", "2-10-10-1", "2-50-1")
 METHODS = ("CCE", "TRPO", "CPO", "penalised TRPO")

@@ -13,13 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.algos import mlirl as irl
-from jaxltl.core.mdp import MDP
-from jaxltl.core.product import Product, lift_policy, product, restrict
-from jaxltl.core.reachability import satisfaction_probability
-from jaxltl.core.rollout import Trajectories, make_trajectories
+from jaxltl.app.learn import from_starts, optimize, plain
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.product import Product, lift_policy, product
+from jaxltl.core.models.restrict import restrict
+from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.types import NotConverged, Status, check
+from jaxltl.core.values.satisfaction import satisfaction_probability
 from jaxltl.envs.gridworld import ACTIONS, gridworld
-from jaxltl.learn import from_starts, optimize, plain
 
 MAP = """
 w  w  w  w  w  w  r  w  w  w

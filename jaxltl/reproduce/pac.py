@@ -12,17 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.algos import rmax
-from jaxltl.core import pac
-from jaxltl.core.automaton import Automaton
-from jaxltl.core.game_value import minimax_value, strategy_value
-from jaxltl.core.operators import expectation
-from jaxltl.core.product import restrict
+from jaxltl.algos import pac, rmax
+from jaxltl.app.learn import plain
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.games.winning import almost_sure_buchi
+from jaxltl.core.models.operators import expectation
+from jaxltl.core.models.restrict import restrict
 from jaxltl.core.types import check
-from jaxltl.core.winning import almost_sure_buchi
+from jaxltl.core.values.minimax import minimax_value, strategy_value
 from jaxltl.envs import gridworld as grid
 from jaxltl.envs.post_offices import Patrol, patrol, surveillance
-from jaxltl.learn import plain
 
 DISCOUNT, EPSILON, REWARD_BOUND, FAILURE = 0.6, 1e-4, 1.0, 0.1
 RESTART = 1 / 50  # before a move, with this probability, a run starts anew

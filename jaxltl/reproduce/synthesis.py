@@ -12,15 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.algos import maximin_q
-from jaxltl.core.bellman import optimal_value
-from jaxltl.core.game import Game
-from jaxltl.core.game_value import minimax_value
-from jaxltl.core.objective import buchi, gr1, safety
-from jaxltl.core.permissive import apply_strategy, permissive_strategy
+from jaxltl.app.learn import plain
+from jaxltl.core.games.objective import buchi, gr1, safety
+from jaxltl.core.games.permissive import apply_strategy, permissive_strategy
+from jaxltl.core.games.winning import solve, task_game
+from jaxltl.core.models.game import Game
 from jaxltl.core.types import NotConverged, check
-from jaxltl.core.winning import solve, task_game
+from jaxltl.core.values.discounted import optimal_value
+from jaxltl.core.values.minimax import minimax_value
 from jaxltl.envs.robots import diagonal_reward, reward_against_task, robots
-from jaxltl.learn import plain
 
 SIZES = (3, 4, 5, 6, 8, 10)
 BOUNDS = (4, 6, 8, 10, 14, 20)

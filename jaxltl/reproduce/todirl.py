@@ -14,14 +14,15 @@ import numpy as np
 
 from jaxltl.algos import behavioral_cloning as cloning
 from jaxltl.algos import todirl
-from jaxltl.core.automaton import Automaton
-from jaxltl.core.product import Product
-from jaxltl.core.rollout import Trajectories, make_trajectories
-from jaxltl.core.stack import lift_memory, stack_products, synchronize
-from jaxltl.core.task_performance import task_performances
-from jaxltl.core.translate import to_automaton
+from jaxltl.app.learn import plain
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.synchronize import synchronize
+from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.models.batch import lift_memory, stack_products
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.trajectories import Trajectories, make_trajectories
+from jaxltl.core.values.performance import task_performances
 from jaxltl.envs import temporal_gridworld as grid
-from jaxltl.learn import plain
 
 METHODS = ("todirl", "incomplete", "patch5", "memoryless", "cloning")
 _MEMORY = {"incomplete": grid.INCOMPLETE, "memoryless": "true"}  # of the others, the task's

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from jaxltl.algos import cce
+from jaxltl.algos import exponential_family as ef
 from jaxltl.algos.cce import Hparams, Polynomial
-from jaxltl.core import exponential_family as ef
 from jaxltl.core.types import Status
 from tests.support import counted_traces, lane
 

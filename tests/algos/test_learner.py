@@ -24,8 +24,8 @@ from jaxltl.algos import (
     todirl,
     trust_region,
 )
-from jaxltl.core.exponential_family import diagonal_gaussian
-from jaxltl.core.game import make_game
+from jaxltl.algos.exponential_family import diagonal_gaussian
+from jaxltl.core.models.game import make_game
 from tests.support import counted_traces
 
 

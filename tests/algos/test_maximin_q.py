@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from jaxltl.algos import maximin_q
-from jaxltl.core import graph
-from jaxltl.core.game import Game, make_game
-from jaxltl.core.mdp import make_mdp, to_dense
-from jaxltl.core.operators import forall_successor
-from jaxltl.core.product import restrict
+from jaxltl.core.graphs.attractor import attractor
+from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models.mdp import make_mdp, to_dense
+from jaxltl.core.models.operators import forall_successor
+from jaxltl.core.models.restrict import restrict
 from jaxltl.core.types import NotConverged, Status, check
 from jaxltl.envs.robots import diagonal_reward, robots
 from tests.support import counted_traces
@@ -36,7 +36,7 @@ class Safe(NamedTuple):
 def safe_robots(size: int) -> Safe:
     game = robots(size)
     collision = game.label[:, game.propositions.index("collision")]
-    region = ~graph.attractor(game, collision, rule=~game.system).region
+    region = ~attractor(game, collision, rule=~game.system).region
     mask = game.available & forall_successor(game, region)
     start = np.where(region, game.initial, 0)
     part = restrict(game, start / start.sum(), allowed=mask).model

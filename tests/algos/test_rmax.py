@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.algos import rmax
-from jaxltl.core import pac
-from jaxltl.core.game import Game, make_game
-from jaxltl.core.game_value import minimax_value
+from jaxltl.algos import pac, rmax
+from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.types import Status
+from jaxltl.core.values.minimax import minimax_value
 from jaxltl.envs.post_offices import patrol, post_offices
 from tests import reference_games
 from tests.support import as_mdp, counted_traces, lane, stack

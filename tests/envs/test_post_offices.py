@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.core import pac
-from jaxltl.core.game import is_deterministic
-from jaxltl.core.objective import buchi
-from jaxltl.core.operators import expectation
-from jaxltl.core.winning import solve
+from jaxltl.algos import pac
+from jaxltl.core.games.objective import buchi
+from jaxltl.core.games.winning import solve
+from jaxltl.core.models.game import is_deterministic
+from jaxltl.core.models.operators import expectation
 from jaxltl.envs.post_offices import ACTIONS, patrol, patrol_reward, post_offices, surveillance
 
 DISCOUNT = 0.6

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.core import graph, operators
-from jaxltl.core.game import is_deterministic
-from jaxltl.core.product import restrict
+from jaxltl.core.graphs.attractor import attractor
+from jaxltl.core.models import operators
+from jaxltl.core.models.game import is_deterministic
+from jaxltl.core.models.restrict import restrict
 from jaxltl.envs.gridworld import parse_map
 from jaxltl.envs.robots import (
     ACTIONS,
@@ -30,7 +31,7 @@ UNAVAILABLE = {}
 def safe_part(game):
     """What is reachable where the system keeps from colliding for ever, all its safe moves free."""
     collision = game.label[:, game.propositions.index("collision")]
-    region = ~graph.attractor(game, collision, rule=~game.system).region
+    region = ~attractor(game, collision, rule=~game.system).region
     allowed = game.available & operators.forall_successor(game, region) & region[:, None]
     return restrict(game, allowed=allowed).model
 
@@ -358,7 +359,7 @@ def test_a_system_that_slips_may_be_driven_into_the_other():
     lost = []
     for slip in (0.0, 0.2):
         game = grid_game(text, slip=slip, system_stays=False)
-        found = graph.attractor(game, game.label[:, 0], rule=~game.system).region
+        found = attractor(game, game.label[:, 0], rule=~game.system).region
         lost.append(np.asarray(found & (game.initial > 0)))
     assert lost[1][lost[0]].all()
     assert lost[1].sum() > lost[0].sum()

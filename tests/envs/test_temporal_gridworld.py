@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.core.task_performance import infeasible_starts
+from jaxltl.core.values.performance import infeasible_starts
 from jaxltl.envs import temporal_gridworld as tg
 
 PLAN = {

@@ -1,0 +1,1 @@
+"""Files that people write: tasks, games and their tables."""

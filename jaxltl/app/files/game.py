@@ -1,0 +1,283 @@
+"""Game files: a game and what the system is to achieve in it. Reading and checking them.
+
+A game file is TOML with the tables ``[game]`` and ``[task]``, and ``[strategy]`` where one is
+demanded; ``examples/robots.toml`` and ``examples/patrol.toml`` show the keys. Files that it names
+are looked up beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxltl.app.files.tables import (
+    COUNT,
+    LEGEND,
+    MAP,
+    TABLE,
+    TEXT,
+    TRUTH,
+    Rule,
+    check_table,
+    choice,
+    is_list,
+    number_in,
+    read_bytes,
+    read_toml,
+)
+from jaxltl.app.files.task import load_model
+from jaxltl.core.games.objective import GR1, Parity, gr1, safety
+from jaxltl.core.games.permissive import METHODS
+from jaxltl.core.games.winning import task_game
+from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models.product import Product
+from jaxltl.envs.gridworld import parse_map
+from jaxltl.envs.robots import ACTIONS, grid_game, places
+
+
+@dataclass(frozen=True)
+class GameFile:
+    """A checked game file.
+
+    Attributes:
+      path: the file; `name` is its stem, unless the file gives one.
+      game, task, strategy: the tables' keys and values, all known and of the right kind;
+        keys that were left out are absent.
+      demanded: whether the file has a table ``[strategy]``.
+    """
+
+    path: Path
+    name: str
+    game: Mapping[str, Any]
+    task: Mapping[str, Any]
+    strategy: Mapping[str, Any]
+    demanded: bool
+
+
+@dataclass(frozen=True)
+class World:
+    """A game, with its map if it has one.
+
+    Attributes:
+      game: the game, with successor lists.
+      actions: A names.
+      text: the map; None for a game from arrays.
+      wall: the kind of cell that is not a place.
+      places: ``int[C, 2]``, row and column of each place from 0; None without a map.
+    """
+
+    game: Game
+    actions: tuple[str, ...]
+    text: str | None = None
+    wall: str = "#"
+    places: np.ndarray | None = None
+
+    def where(self, state: int) -> dict[str, Any]:
+        """A state for people: both robots' rows and columns from 1, else its number from 0."""
+        if self.places is None:
+            return {"state": int(state)}
+        count = len(self.places)
+        environment, system, _ = np.unravel_index(int(state), (count, count, 2))
+        return {
+            name: {"row": int(row) + 1, "column": int(column) + 1}
+            for name, (row, column) in (
+                ("system", self.places[system]), ("environment", self.places[environment])
+            )
+        }
+
+    def describe(self, state: int) -> str:
+        """:meth:`where` as a text."""
+        where = self.where(state)
+        if self.places is None:
+            return f"state {where['state']}"
+        return ", ".join(
+            f"{name} in row {cell['row']}, column {cell['column']}" for name, cell in where.items()
+        )
+
+
+_START = Rule(
+    lambda v: (isinstance(v, str) and bool(v.strip())) or (is_list(v, int) and len(v) == 2),
+    "a Boolean formula over the map's propositions, or a cell as [row, column], from 1",
+)
+_FORMULAS = Rule(
+    lambda v: is_list(v, str) and bool(v), 'a list of Boolean formulas, such as ["a", "b & !c"]'
+)
+_KEYS: dict[str, dict[str, Rule]] = {
+    "": {"name": TEXT, "game": TABLE, "task": TABLE, "strategy": TABLE},
+    "game": {
+        "map": MAP,
+        "legend": LEGEND,
+        "wall": TEXT,
+        "slip": number_in(0, 1),
+        "system_start": _START,
+        "environment_start": _START,
+        "system_stays": TRUTH,
+        "environment_stays": TRUTH,
+        "model": TEXT,
+        "initial": TEXT,
+    },
+    "task": {
+        "formula": TEXT,
+        "assumptions": _FORMULAS,
+        "guarantees": _FORMULAS,
+        "safe": TEXT,
+        "chance": choice("random", "adversarial"),
+    },
+    "strategy": {"method": choice(*METHODS), "bound": COUNT},
+}
+
+
+def read_game(path: str | Path) -> GameFile:
+    """Reads a game file.
+
+    Raises:
+      ValueError: the file is missing or malformed, or a key is unknown, missing or wrong.
+        The message names the file, the place and the fix.
+    """
+    path = Path(path)
+    data, _ = read_toml(path, "the game file")
+    check_table(path, "", data, _KEYS[""], ("game", "task"))
+    for table in ("game", "task", "strategy"):
+        check_table(path, table, data.get(table, {}), _KEYS[table])
+    _check_game(path, data["game"])
+    _check_task(path, data["task"])
+    return GameFile(
+        path=path, name=data.get("name", path.stem), game=data["game"], task=data["task"],
+        strategy=data.get("strategy", {}), demanded="strategy" in data,
+    )
+
+
+def _check_game(path: Path, game: Mapping[str, Any]) -> None:
+    if ("map" in game) == ("model" in game):
+        raise ValueError(f"{path}: [game] must have either a map or a model (an .npz file).")
+    for key in game:
+        if "model" in game and key not in ("model", "initial"):
+            raise ValueError(
+                f"{path}: [game] {key} belongs to a map; a model has it in its arrays."
+            )
+    if "map" in game and "initial" in game:
+        raise ValueError(
+            f"{path}: [game] initial belongs to a model; on a map give system_start and "
+            "environment_start."
+        )
+
+
+def _check_task(path: Path, task: Mapping[str, Any]) -> None:
+    lists = [k for k in ("assumptions", "guarantees", "safe") if k in task]
+    if "formula" in task and lists:
+        raise ValueError(
+            f"{path}: [task] has both formula and {lists[0]}; give either a formula, or "
+            "guarantees with assumptions and safe where needed."
+        )
+    if "formula" not in task and not {"guarantees", "safe"} & set(lists):
+        raise ValueError(
+            f'{path}: [task] lacks what the system is to achieve: formula = "...", or '
+            'guarantees = ["..."], each to be met again and again, or safe = "...", to hold '
+            "for ever."
+        )
+    if "assumptions" in task and "guarantees" not in task:
+        raise ValueError(
+            f"{path}: [task] has assumptions but no guarantees, so that they assume in vain; add "
+            "guarantees or leave them out."
+        )
+
+
+def load_game(file: GameFile) -> World:
+    """The game that a game file describes.
+
+    Raises:
+      ValueError: a malformed map or model. The message names the file and the place.
+    """
+    spec = dict(file.game)
+    try:
+        if "model" in spec:
+            return _from_arrays(file.path.parent / spec["model"], spec.get("initial"))
+        text = spec.pop("map")
+        if isinstance(text, dict):
+            text = read_bytes(file.path.parent / text["file"], "the map").decode()
+        wall = spec.get("wall", "#")
+        for key in ("system_start", "environment_start"):
+            if isinstance(spec.get(key), list):
+                spec[key] = _cell(spec[key], key, parse_map(text), wall)
+        game = grid_game(text, **spec)
+    except ValueError as error:
+        raise ValueError(f"{file.path}: [game] {error}") from None
+    return World(game, ACTIONS, text, wall, places(text, wall=wall))
+
+
+def _from_arrays(path: Path, initial: str | None) -> World:
+    world, more = load_model(path, initial, ("system",))
+    if "system" not in more:
+        raise ValueError(
+            f"{str(path)!r} lacks the array system: for each state True where the system moves "
+            "and False where the environment does."
+        )
+    try:
+        return World(make_game(world.mdp, more["system"]), world.actions)
+    except ValueError as error:
+        raise ValueError(f"{str(path)!r}: {error}") from None
+
+
+def _cell(given: list[int], key: str, cells: np.ndarray, wall: str) -> tuple[int, int]:
+    (row, column), (rows, columns) = given, cells.shape
+    if not (1 <= row <= rows and 1 <= column <= columns):
+        raise ValueError(
+            f"{key} = {given} is off the map, which has rows 1 to {rows} and columns 1 to "
+            f"{columns}."
+        )
+    if cells[row - 1, column - 1] == wall:
+        raise ValueError(f"{key} = {given} is a wall of the map; start in another cell.")
+    return row - 1, column - 1
+
+
+def load_objective(file: GameFile, world: World) -> tuple[Game, Parity | GR1]:
+    """What the system is to achieve, and the game on whose states that is written.
+
+    Returns:
+      Of a formula, the product with its automaton; else the world's own game.
+
+    Raises:
+      ValueError: a formula is malformed or mentions an unknown proposition, or one that
+        must be Boolean is not.
+    """
+    task, game = file.task, world.game
+    try:
+        if "formula" in task:
+            return task_game(game, task["formula"])
+        safe = task.get("safe", "true")
+        if "guarantees" not in task:
+            return game, safety(game, safe)
+        return game, gr1(game, task.get("assumptions", ()), task["guarantees"], safe=safe)
+    except ValueError as error:
+        raise ValueError(f"{file.path}: [task] {error}") from None
+
+
+def task_text(task: Mapping[str, Any]) -> str:
+    """What the system is to achieve, as one formula.
+
+    Example:
+      >>> task_text({"assumptions": ["a"], "guarantees": ["b", "c | d"], "safe": "!e"})
+      'G (!e) & (G F (a) -> G F (b) & G F (c | d))'
+    """
+    if "formula" in task:
+        return str(task["formula"])
+
+    def all_of(sets: list[str]) -> str:
+        return " & ".join(f"G F ({x})" for x in sets)
+
+    parts = [f"G ({task['safe']})"] if "safe" in task else []
+    if "guarantees" in task:
+        goals = all_of(task["guarantees"])
+        if "assumptions" in task:
+            goals = f"({all_of(task['assumptions'])} -> {goals})"
+        parts.append(goals)
+    return " & ".join(parts)
+
+
+def automaton_of(game: Game) -> Any:
+    """The task's automaton, if the game is a product with one."""
+    return game.mdp.automaton if isinstance(game.mdp, Product) else None

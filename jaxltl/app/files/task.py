@@ -1,0 +1,503 @@
+"""Task files: what to do, where, shown how, learned by what. Reading and checking them.
+
+A task file is TOML with the tables ``[world]``, ``[task]``, ``[demonstrations]`` and
+``[learner]``; ``examples/two_goals.toml`` shows every key. Files that it names are looked up
+beside it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxltl.app.files.tables import (
+    COUNT,
+    LEGEND,
+    MAP,
+    NAMES,
+    TABLE,
+    TEXT,
+    Rule,
+    check_table,
+    choice,
+    is_list,
+    number_in,
+    read_bytes,
+    read_toml,
+)
+from jaxltl.core.logic.labels import satisfying
+from jaxltl.core.models.mdp import MDP, from_dense, make_mdp
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.trajectories import Trajectories, make_trajectories
+from jaxltl.envs.gridworld import ACTIONS, gridworld, parse_map
+
+
+@dataclass(frozen=True)
+class Task:
+    """A checked task file.
+
+    Attributes:
+      path: the file; `name` is its stem, unless the file gives one.
+      world, demonstrations, learner: the tables' keys and values, all known and of the right
+        kind; keys that were left out are absent.
+      formula: the task.
+      label_on: which label a step of the product reads, ``"entry"`` or ``"exit"``.
+      digest: a fingerprint of the file and of every file that it names.
+    """
+
+    path: Path
+    name: str
+    world: Mapping[str, Any]
+    formula: str
+    label_on: str
+    demonstrations: Mapping[str, Any]
+    learner: Mapping[str, Any]
+    digest: str
+
+
+class World(NamedTuple):
+    """A model, with its map if it has one.
+
+    Attributes:
+      mdp: the model.
+      cells: ``str[rows, columns]``, or None for a model from arrays.
+      actions: A names.
+    """
+
+    mdp: MDP
+    cells: np.ndarray | None
+    actions: tuple[str, ...]
+
+    def place(self, state: int) -> str:
+        """A state for people: its row and column from 1 on a map, else its number from 0."""
+        if self.cells is None:
+            return f"state {state}"
+        row, column = divmod(int(state), self.cells.shape[1])
+        return f"row {row + 1}, column {column + 1}"
+
+
+# --- the keys of each table -----------------------------------------------------------------
+
+
+_KEYS: dict[str, dict[str, Rule]] = {
+    "": {
+        "name": TEXT,
+        **dict.fromkeys(("world", "task", "demonstrations", "learner"), TABLE),
+    },
+    "world": {
+        "map": MAP,
+        "legend": LEGEND,
+        "wall": TEXT,
+        "slip": number_in(0, 1),
+        "absorbing": NAMES,
+        "initial": TEXT,
+        "model": TEXT,
+    },
+    "task": {"formula": TEXT, "label_on": choice("entry", "exit")},
+    "demonstrations": {
+        "file": TEXT,
+        "synthetic": COUNT,
+        "discount": number_in(0, 1, below=True),
+        "length": COUNT,
+    },
+    "learner": {
+        # Files of other methods are read by modules of their own; see method_of.
+        "method": Rule(lambda v: v == "mlirl", '"mlirl" or "todirl"'),
+        "in": choice("product", "world"),
+        "discount": number_in(0, 1, below=True),
+        "mu": number_in(0),
+        "l2": number_in(0),
+        "policy": choice("boltzmann", "soft"),
+        "adjoint": choice("exact", "approximate"),
+        "optimizer": choice("lbfgs", "adam", "sgd"),
+        "learning_rate": number_in(0),
+        "steps": COUNT,
+        "tolerance": number_in(0),
+        "start": Rule(lambda v: is_list(v, int | float), "a list of numbers, one per feature"),  # type: ignore[arg-type]
+        "start_scale": number_in(0),
+        "watched": choice("initial", "all"),
+        "avoid": NAMES,
+        "goal": NAMES,
+        "progress": Rule(
+            lambda v: is_list(v, str) or is_list(v, int),
+            "a list of propositions (in the world) or of automaton states (in the product)",
+        ),
+    },
+}
+_REQUIRED = {
+    "": ("world", "task", "demonstrations", "learner"),
+    "task": ("formula",),
+    "learner": ("method", "discount"),
+}
+
+
+def method_of(path: str | Path) -> Any:
+    """What a task file says of ``[learner] method``, unchecked; None if it says nothing.
+
+    Raises:
+      ValueError: the file cannot be read or is no TOML.
+    """
+    learner = read_toml(Path(path), "the task file")[0].get("learner")
+    return learner.get("method") if isinstance(learner, dict) else None
+
+
+def read_task(path: str | Path) -> Task:
+    """Reads a task file.
+
+    Raises:
+      ValueError: the file, or one that it names, is missing or malformed, or a key is
+        unknown, missing or wrong. The message names the file, the place and the fix.
+    """
+    path = Path(path)
+    data, raw = read_toml(path, "the task file")
+    check_table(path, "", data, _KEYS[""], _REQUIRED[""])
+    for table in _REQUIRED[""]:
+        check_table(path, table, data[table], _KEYS[table], _REQUIRED.get(table, ()))
+    world, shown, learner = data["world"], data["demonstrations"], data["learner"]
+    _check_world(path, world)
+    _check_demonstrations(path, shown)
+    _check_learner(path, learner)
+    digest = hashlib.sha256(raw)
+    for name in _named_files(data):
+        digest.update(read_bytes(path.parent / name, f"{path} names a file that"))
+    return Task(
+        path=path, name=data.get("name", path.stem), world=world,
+        formula=data["task"]["formula"], label_on=data["task"].get("label_on", "entry"),
+        demonstrations=shown, learner=learner, digest=digest.hexdigest(),
+    )
+
+
+def _check_world(path: Path, world: Mapping[str, Any]) -> None:
+    if ("map" in world) == ("model" in world):
+        raise ValueError(f"{path}: [world] must have either a map or a model (an .npz file).")
+    for key in ("legend", "wall", "slip", "absorbing"):
+        if "model" in world and key in world:
+            raise ValueError(
+                f"{path}: [world] {key} belongs to a map; a model has it in its arrays."
+            )
+
+
+def _check_demonstrations(path: Path, shown: Mapping[str, Any]) -> None:
+    if ("file" in shown) == ("synthetic" in shown):
+        raise ValueError(
+            f"{path}: [demonstrations] must have either file = \"...\" or synthetic = N."
+        )
+    if "synthetic" in shown and "discount" not in shown:
+        raise ValueError(
+            f"{path}: [demonstrations] lacks discount, that of the reward for doing the task which "
+            "the synthetic demonstrator maximises; for example 0.95."
+        )
+    for key in ("discount", "length"):
+        if "file" in shown and key in shown:
+            raise ValueError(f"{path}: [demonstrations] {key} belongs to synthetic = N.")
+
+
+def _check_learner(path: Path, learner: Mapping[str, Any]) -> None:
+    in_world = learner.get("in", "product") == "world"
+    if in_world and "goal" not in learner:
+        raise ValueError(
+            f'{path}: [learner] lacks goal, the propositions of the goal cells, which in = "world" '
+            "needs since the learner does not see the formula."
+        )
+    if in_world and "mu" in learner:
+        raise ValueError(
+            f'{path}: [learner] mu weighs the probability of doing the task; it needs '
+            'in = "product".'
+        )
+    if not in_world and "goal" in learner:
+        raise ValueError(f'{path}: [learner] goal belongs to in = "world".')
+    kind = str if in_world else int
+    if any(not isinstance(x, kind) for x in learner.get("progress", ())):
+        raise ValueError(
+            f"{path}: [learner] progress = {learner['progress']!r}; it must be a list of "
+            + ("propositions." if in_world else "automaton states (or left out).")
+        )
+
+
+def _named_files(data: Mapping[str, Any]) -> list[str]:
+    text = data["world"].get("map")
+    names = [text["file"]] if isinstance(text, dict) else []
+    names += [data["world"]["model"]] if "model" in data["world"] else []
+    return names + ([data["demonstrations"]["file"]] if "file" in data["demonstrations"] else [])
+
+
+# --- the world ------------------------------------------------------------------------------
+
+
+def load_world(task: Task) -> World:
+    """The model that a task file describes.
+
+    Raises:
+      ValueError: a malformed map or model. The message names the file and the place.
+    """
+    spec = dict(task.world)
+    try:
+        if "model" in spec:
+            path = task.path.parent / spec["model"]
+            return load_model(path, spec.get("initial"))[0]
+        text = spec.pop("map")
+        if isinstance(text, dict):
+            text = read_bytes(task.path.parent / text["file"], "the map").decode()
+        return World(gridworld(text, **spec), parse_map(text), ACTIONS)
+    except ValueError as error:
+        raise ValueError(f"{task.path}: [world] {error}") from None
+
+
+_ARRAYS = (
+    "successor", "probability", "transition", "available", "initial", "label", "propositions",
+    "actions",
+)
+
+
+def load_model(
+    path: Path, initial: str | None, more: Sequence[str] = ()
+) -> tuple[World, dict[str, np.ndarray]]:
+    """A model from an ``.npz`` of arrays, and those of `more` arrays that it holds.
+
+    Args:
+      path: the file.
+      initial: a Boolean formula, uniformly where it holds; default the file's own.
+      more: names of arrays that it may hold beside a model's.
+
+    Raises:
+      ValueError: the file is no ``.npz``, or an array is unknown, missing or wrong.
+    """
+    arrays = _read_arrays(path)
+    known = (*_ARRAYS, *more)
+    for name in arrays:
+        if name not in known:
+            raise ValueError(
+                f"{str(path)!r} holds an array {name!r}; it may hold {', '.join(known)}."
+            )
+    options: dict[str, Any] = {k: arrays[k] for k in ("available", "initial", "label")
+                               if k in arrays}
+    names = arrays.get("propositions", np.zeros(0, str))
+    options["propositions"] = [str(x) for x in names.ravel()]
+    try:
+        if "transition" in arrays:
+            mdp = from_dense(arrays["transition"], **options)
+        elif {"successor", "probability"} <= set(arrays):
+            mdp = make_mdp(arrays["successor"], arrays["probability"], **options)
+        else:
+            raise ValueError("it needs the array transition, or successor and probability.")
+        if initial is not None:
+            mdp = replace(mdp, initial=_where_holds(initial, mdp))
+    except ValueError as error:
+        raise ValueError(f"{str(path)!r}: {error}") from None
+    default = [f"action {a}" for a in range(mdp.num_actions)]
+    actions = tuple(str(a) for a in arrays.get("actions", np.array(default)).ravel())
+    if len(set(actions)) != mdp.num_actions:
+        raise ValueError(
+            f"{str(path)!r}: actions has {len(set(actions))} distinct names; the model has "
+            f"{mdp.num_actions} actions."
+        )
+    return World(mdp, None, actions), {k: arrays[k] for k in more if k in arrays}
+
+
+def _read_arrays(path: Path) -> dict[str, np.ndarray]:
+    raw = read_bytes(path, "the model")
+    arrays, what = {}, f"{str(path)!r} is not an .npz of plain arrays"
+    try:
+        file = np.load(io.BytesIO(raw), allow_pickle=False)
+        if not isinstance(file, np.lib.npyio.NpzFile):
+            raise ValueError("it holds a single array; write it by numpy.savez(path, name=...).")
+        for name in file.files:
+            what = f"{str(path)!r}: the array {name!r} is malformed"
+            arrays[name] = file[name]
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        if "Object arrays" in str(error):
+            raise ValueError(
+                f"{what}: it holds Python objects, such as None; save numbers, truth values or "
+                "texts."
+            ) from None
+        raise ValueError(f"{what}: {error}") from None
+    return arrays
+
+
+def _where_holds(formula: str, mdp: MDP) -> jax.Array:
+    """The uniform distribution over the states whose labels satisfy a propositional formula."""
+    holds = satisfying(np.asarray(mdp.label), mdp.propositions, formula, "initial")
+    if not holds.any():
+        raise ValueError(f"initial={formula!r} holds in no state.")
+    return jax.numpy.asarray(holds / holds.sum(), mdp.dtype)
+
+
+# --- demonstrations -------------------------------------------------------------------------
+
+
+def load_demonstrations(task: Task, world: World) -> Trajectories:
+    """The demonstrations of a task's file.
+
+    The file is JSON, ``{"demonstrations": [...]}``. Each demonstration is an object with
+    ``"cells"``, ``[row, column]`` counted from 1 at the top left (or ``"states"``, numbers
+    counted from 0), and ``"actions"``, names or numbers from 0, one per cell. A cell more than
+    actions is where the demonstration ended.
+
+    Raises:
+      ValueError: not such a file, or a demonstration that the world cannot have made. The
+        message names the demonstration and the step, both counted from 1.
+    """
+    return read_demonstrations(task.path.parent / task.demonstrations["file"], world)
+
+
+def read_demonstrations(path: Path, world: World) -> Trajectories:
+    """The demonstrations of a file, as :func:`load_demonstrations` says.
+
+    Raises:
+      ValueError: likewise.
+    """
+    try:
+        data = json.loads(read_bytes(path, "the demonstrations"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: this is not JSON: {error}") from None
+    shown = data.get("demonstrations") if isinstance(data, dict) else None
+    if not isinstance(shown, list) or not shown:
+        raise ValueError(
+            f'{path}: expected {{"demonstrations": [...]}} with at least one demonstration.'
+        )
+    sequences = []
+    for number, one in enumerate(shown, start=1):
+        try:
+            sequences.append(_read_demonstration(one, world))
+        except ValueError as error:
+            raise ValueError(f"{path}: demonstration {number}{error}") from None
+    return make_trajectories(world.mdp, sequences)
+
+
+def _read_demonstration(one: Any, world: World) -> list[tuple[int, int]]:
+    keys = set(one) if isinstance(one, dict) else set()
+    if keys not in ({"cells", "actions"}, {"states", "actions"}):
+        found = f"it has {', '.join(map(repr, sorted(keys)))}" if keys else f"got {one!r:.60}"
+        raise ValueError(
+            f': expected {{"cells": [[row, column], ...], "actions": [...]}}, or "states" in place '
+            f"of \"cells\"; {found}."
+        )
+    kind = "cells" if "cells" in keys else "states"
+    places, names = one[kind], one["actions"]
+    if not isinstance(places, list) or not isinstance(names, list) or not names:
+        raise ValueError(f': {kind} and actions must be lists, with at least one action.')
+    if len(places) - len(names) not in (0, 1):
+        raise ValueError(
+            f": {len(places)} {kind} and {len(names)} actions; give one action for each of the "
+            f"{kind}, except perhaps the last."
+        )
+    read = _read_cell if kind == "cells" else _read_state
+    states = [_at_step(t, read, place, world) for t, place in enumerate(places, start=1)]
+    actions = [_at_step(t, _read_action, name, world) for t, name in enumerate(names, start=1)]
+    available = np.asarray(world.mdp.available)
+    successor, probability = np.asarray(world.mdp.successor), np.asarray(world.mdp.probability)
+    for t, (s, a) in enumerate(zip(states, actions, strict=False)):
+        doing = f", step {t + 1}: {world.actions[a]!r} in {world.place(s)}"
+        if not available[s, a]:
+            can = ", ".join(np.array(world.actions)[available[s]])
+            raise ValueError(f"{doing} is not available there; available are {can}.")
+        reached = np.unique(successor[s, a][probability[s, a] > 0])
+        if t + 1 < len(states) and states[t + 1] not in reached:
+            can = " or ".join(world.place(r) for r in reached)
+            raise ValueError(
+                f"{doing} cannot lead to {world.place(states[t + 1])}, which comes next; it "
+                f"leads to {can}."
+            )
+    return list(zip(states, actions, strict=False))
+
+
+def _at_step(step: int, read: Callable[[Any, World], int], value: Any, world: World) -> int:
+    try:
+        return read(value, world)
+    except ValueError as error:
+        raise ValueError(f", step {step}: {error}") from None
+
+
+def _read_cell(value: Any, world: World) -> int:
+    if world.cells is None:
+        raise ValueError('the model has no map, so give "states" instead of "cells".')
+    if not (is_list(value, int) and len(value) == 2):
+        raise ValueError(f"the cell is {value!r}; it must be [row, column].")
+    row, column = value
+    rows, columns = world.cells.shape
+    if not (1 <= row <= rows and 1 <= column <= columns):
+        raise ValueError(
+            f"the cell [{row}, {column}] is off the map, which has rows 1 to {rows} and "
+            f"columns 1 to {columns}."
+        )
+    return (row - 1) * columns + column - 1
+
+
+def _read_state(value: Any, world: World) -> int:
+    last = world.mdp.num_states - 1
+    if not is_list([value], int) or not 0 <= value <= last:
+        raise ValueError(f"the state is {value!r}; states are 0 to {last}.")
+    return int(value)
+
+
+def _read_action(value: Any, world: World) -> int:
+    if value in world.actions:
+        return world.actions.index(value)
+    if is_list([value], int) and 0 <= value < len(world.actions):
+        return int(value)
+    raise ValueError(
+        f"the action {value!r} is unknown; the actions are {', '.join(world.actions)}."
+    )
+
+
+def synthetic_demonstrations(
+    task: Task, model: Product, key: jax.Array
+) -> tuple[Trajectories, int]:
+    """Runs of a policy that maximises the discounted reward of doing the task, in the world.
+
+    Each run ends where the task is done. A run that has not done it within the asked length,
+    and one that starts where it is done, show nothing and are dropped.
+
+    Args:
+      task: its ``[demonstrations]`` gives the number, discount and length (default 200).
+      model: the product of the world and a co-safe task.
+      key: a PRNG key, consumed.
+
+    Returns:
+      :class:`~jaxltl.core.models.trajectories.Trajectories` of the world, and how many were
+      dropped.
+
+    Raises:
+      ValueError: the task is not co-safe, or no run did it.
+    """
+    # Deferred: a task with a file of demonstrations has no need of these solvers.
+    from jaxltl.core.models.operators import expectation
+    from jaxltl.core.models.trajectories import rollout
+    from jaxltl.core.values.discounted import optimal_value
+
+    if model.automaton.acceptance != "cosafe":
+        raise ValueError(
+            "synthetic demonstrations end when the task is done, which takes a co-safe formula."
+        )
+    spec = task.demonstrations
+    asked, length = spec["synthetic"], spec.get("length", 200)
+    final = model.final
+    arriving = expectation(model, final.astype(model.dtype))
+    reward = jax.numpy.where(final[..., None], 0, arriving)
+    best = optimal_value(model, reward, spec["discount"])
+    # One step more than asked tells a run that has just arrived from one that has not.
+    runs = rollout(
+        model, best.policy, key, num_trajectories=asked, num_steps=length + 1, stop=final
+    )
+    states, actions = np.asarray(runs.state), np.asarray(runs.action)
+    lengths = np.asarray(runs.length)
+    kept = [
+        [(int(s) // model.num_memory, int(a)) for s, a in zip(x[:n], u[:n], strict=True)]
+        for x, u, n in zip(states, actions, lengths, strict=True)
+        if 0 < n <= length
+    ]
+    if not kept:
+        raise ValueError(
+            f"{task.path}: [demonstrations] none of {asked} synthetic runs did the task within "
+            f"{length} steps; raise length or discount, or check that the task can be done."
+        )
+    return make_trajectories(model.mdp, kept), asked - len(kept)

@@ -1,0 +1,560 @@
+"""From a task to a policy with its evidence: what `jaxltl learn` computes."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxltl
+from jaxltl.algos import learner, mlirl
+from jaxltl.app.files.task import (
+    Task,
+    World,
+    load_demonstrations,
+    load_world,
+    read_task,
+    synthetic_demonstrations,
+)
+from jaxltl.core.models.monitor import Verdict, make_monitor
+from jaxltl.core.models.product import Product, lift_policy, product, project_policy
+from jaxltl.core.models.restrict import restrict
+from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.types import Solution, Status
+from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
+
+__all__ = [
+    "STEPS", "Learned", "Outcome", "Setup", "describe", "fingerprint", "learn", "optimize",
+    "pictures", "prepare", "read_task", "save", "summary",
+]
+
+Report = Callable[[int, Mapping[str, np.ndarray]], None]
+
+STEPS = 500  # at most, unless the task says otherwise
+_TOLERANCE = 1e-6  # of the gradient's norm
+_ROWS = 10  # of the history, per chunk
+
+
+# --- the loop -------------------------------------------------------------------------------
+
+
+def _step_until_flat(
+    step: learner.Step, state: Any, problem: Any, settings: tuple[Any, jax.Array]
+) -> tuple[Any, dict[str, jax.Array]]:
+    """A learner's step that stays put where the gradient is no longer than the tolerance."""
+    hparams, tolerance = settings
+    after, metrics = step(state, problem, hparams)
+    flat = metrics.gradient_norm <= tolerance
+    kept = jax.tree.map(lambda new, old: jnp.where(flat, old, new), after, state)
+    figures = {name: getattr(metrics, name) for name in metrics.__dataclass_fields__}
+    return kept.replace(step=after.step), {"step": after.step, **figures}
+
+
+@functools.cache  # the loop is compiled once for each step function, so it must stay the same one
+def _lanes(step: learner.Step, num_lanes: int) -> learner.Step:
+    one = functools.partial(_step_until_flat, step)
+    if num_lanes > 1:
+        return jax.vmap(one, in_axes=(0, None, 0))
+
+    def alone(states: Any, problem: Any, settings: Any) -> tuple[Any, dict[str, jax.Array]]:
+        # Without vmap, whose loops and branches take several times as long to compile.
+        state, setting = jax.tree.map(lambda x: x[0], (states, settings))
+        return jax.tree.map(lambda x: x[None], one(state, problem, setting))
+
+    return alone
+
+
+def _strong(tree: Any) -> Any:
+    """Arrays whose type is not weak, so that the first chunk's program serves the others too."""
+
+    def one(x: jax.Array) -> jax.Array:
+        is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        return x if is_key else jax.lax.convert_element_type(x, x.dtype)
+
+    return jax.tree.map(one, tree)
+
+
+def optimize(
+    step: learner.Step,
+    metrics: type[Any],
+    states: Any,
+    problem: Any,
+    hparams: Any,
+    *,
+    num_steps: int,
+    tolerance: float = _TOLERANCE,
+    chunk: int | None = None,
+    report: Report | None = None,
+    checkpoint: Path | None = None,
+    finished: Callable[[Any], bool] | None = None,
+) -> tuple[Any, dict[str, np.ndarray]]:
+    """Several runs of a learner side by side, until every gradient vanishes.
+
+    A run whose gradient is within the tolerance stays where it is, so no run depends on how
+    long the others take.
+
+    Args:
+      step: the learner's step.
+      metrics: the dataclass of its metrics, among them ``gradient_norm``.
+      states: N states, leading axis.
+      problem: shared by the runs.
+      hparams: numbers, shared, or arrays ``[N]``, one for each run.
+      num_steps: steps at most.
+      tolerance: of the gradient's Euclidean norm.
+      chunk: steps between reports; default 10, or a hundredth of `num_steps`.
+      report: called after each chunk with the steps made and the newest metrics ``[N]``.
+      checkpoint: a file that holds states and history after each chunk; the run goes on
+        from it if it exists, and ends with the same bits.
+      finished: whether the states after a chunk have nothing left to learn, for learners that
+        end otherwise than by their gradient.
+
+    Returns:
+      The states, and the history: metrics ``[T, N]`` of at most 10 steps per chunk; figures
+      of the parameters before the step.
+
+    Raises:
+      ValueError: the checkpoint is damaged or cannot be written.
+    """
+    chunk = chunk or max(_ROWS, -(-num_steps // 100))
+    num_lanes = len(states.step)
+    shape, spread = (num_lanes,), functools.partial(jnp.broadcast_to, shape=(num_lanes,))
+    dtype = states.value.dtype
+    settings = jax.tree.map(lambda x: spread(jnp.asarray(x, dtype)), (hparams, tolerance))
+    batched = _lanes(step, num_lanes)
+    names = ("step", *(field.name for field in fields(metrics)))
+    empty = np.zeros((-(-num_steps // chunk) * _ROWS, *shape))
+    saved = {"states": states, "rows": jnp.int32(0), "history": dict.fromkeys(names, empty)}
+    if checkpoint is not None and checkpoint.exists():
+        saved = learner.load(checkpoint, saved)
+    states, rows = _strong(saved["states"]), int(saved["rows"])
+    history = {name: np.array(column) for name, column in saved["history"].items()}
+    while (done := int(np.max(states.step))) < num_steps:
+        if rows and bool(np.all(history["gradient_norm"][rows - 1] <= tolerance)):
+            break
+        if finished is not None and finished(states):
+            break
+        states, figures = learner.run(
+            batched, states, problem, settings,
+            num_steps=min(chunk, num_steps - done), max_rows=_ROWS,
+        )
+        added = len(figures["step"])
+        for name, column in figures.items():
+            history[name][rows : rows + added] = column
+        rows += added
+        if checkpoint is not None:
+            learner.save(
+                checkpoint, {"states": states, "rows": jnp.int32(rows), "history": history}
+            )
+        if report is not None:
+            report(int(np.max(states.step)), {k: v[rows - 1] for k, v in history.items()})
+    return states, {name: column[:rows] for name, column in history.items()}
+
+
+# --- the learners ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What a method learned, with N seeds side by side.
+
+    Attributes:
+      policy: ``float[N, S, Q, A]``, policies of the product.
+      weights: ``float[N, F]``, and the features' names.
+      loss, neg_log_likelihood, gradient_norm: ``float[N]``.
+      status: ``int32[N]``, of the solver that yielded the policies.
+      num_steps: ``int[N]``, until the gradient vanished, or all.
+      converged: ``bool[N]``: the gradient vanished and the policy's solver converged.
+      history: metrics ``[T, N]``.
+    """
+
+    policy: jax.Array
+    weights: np.ndarray
+    names: tuple[str, ...]
+    loss: np.ndarray
+    neg_log_likelihood: np.ndarray
+    gradient_norm: np.ndarray
+    status: np.ndarray
+    num_steps: np.ndarray
+    converged: np.ndarray
+    history: Mapping[str, np.ndarray]
+
+
+def _mlirl(
+    spec: Mapping[str, Any],
+    model: Product,
+    shown: Trajectories,
+    keys: jax.Array,
+    report: Report | None,
+    checkpoint: Path | None,
+) -> Learned:
+    """Inverse RL by maximum likelihood, in the world or in the product (chapter 2)."""
+    in_world = spec.get("in", "product") == "world"
+    avoid, progress = spec.get("avoid", ()), spec.get("progress")
+    if in_world:
+        features = mlirl.world_features(
+            model.mdp, shown, goal=spec["goal"], progress=progress or (), avoid=avoid
+        )
+    else:
+        features = mlirl.task_features(model, shown, avoid=avoid, progress=progress)
+    start = spec.get("start")
+    if start is not None and len(start) != len(features.names):
+        raise ValueError(
+            f"[learner] start has {len(start)} numbers; there are {len(features.names)} "
+            f"features: {', '.join(features.names)}."
+        )
+    problem = mlirl.make_problem(
+        model.mdp if in_world else model, features.values, shown,
+        start=start, watched=spec.get("watched", "initial"),
+    )
+    options = ("discount", "mu", "l2", "learning_rate", "start_scale", "policy", "adjoint",
+               "optimizer")
+    hparams = mlirl.Hparams(**{k: spec[k] for k in options if k in spec})
+    num_steps, tolerance = spec.get("steps", STEPS), spec.get("tolerance", _TOLERANCE)
+    states = jax.jit(jax.vmap(mlirl.init, (0, None, None)))(keys, problem, hparams)
+    states, history = optimize(
+        mlirl.step, mlirl.Metrics, states, problem, hparams, num_steps=num_steps,
+        tolerance=tolerance, report=report, checkpoint=checkpoint,
+    )
+    evaluate = jax.jit(_policy_and_likelihood)
+    found = [evaluate(parameters, problem, hparams) for parameters in states.parameters]
+    policy, nll, codes = (jnp.stack(column) for column in zip(*found, strict=True))
+    gradient_norm, status = history["gradient_norm"][-1], np.asarray(codes)
+    flat = history["gradient_norm"] <= tolerance
+    first = np.where(flat.any(axis=0), np.argmax(flat, axis=0), len(flat) - 1)
+    steps = np.take_along_axis(history["step"], first[None], axis=0)[0]
+    return Learned(
+        policy=jax.vmap(lift_policy, (None, 0))(model, policy) if in_world else policy,
+        weights=np.asarray(states.parameters), names=features.names, loss=history["loss"][-1],
+        neg_log_likelihood=np.asarray(nll), gradient_norm=gradient_norm, status=status,
+        num_steps=steps.astype(int),
+        converged=flat[-1] & (status == Status.CONVERGED), history=history,
+    )
+
+
+def _policy_and_likelihood(
+    parameters: Any, problem: mlirl.Problem, hparams: mlirl.Hparams
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    solution = mlirl.solve(parameters, problem, hparams)
+    seen = problem.counts > 0
+    log_policy = jnp.log(jnp.where(seen, solution.policy, 1))
+    return solution.policy, -jnp.sum(problem.counts * log_policy), solution.status
+
+
+METHODS = {"mlirl": _mlirl}
+
+
+# --- the whole job --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A task file's contents as the library's objects; see :func:`prepare`."""
+
+    task: Task
+    world: World
+    model: Product
+    demonstrations: Trajectories
+    dropped: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A finished job: what was asked, learned and found out about it.
+
+    Attributes:
+      setup, learned: the parts.
+      chosen: the seed's position whose loss is least; the policy that is kept.
+      solution: the kept policy's probability of doing the task, with bounds.
+      best: the largest probability that any policy has, with bounds.
+      satisfaction: ``float[N, S]``, of every seed's policy from every start.
+      seed: the first of the seeds.
+      seconds: spent.
+    """
+
+    setup: Setup
+    learned: Learned
+    chosen: int
+    solution: Solution
+    best: Solution
+    satisfaction: np.ndarray
+    seed: int
+    seconds: float
+
+
+def prepare(task: Task, seed: int) -> Setup:
+    """The world, product and demonstrations of a task; all of its files checked.
+
+    Raises:
+      ValueError: something in the task or its files is wrong.
+    """
+    world = load_world(task)
+    try:
+        model = product(world.mdp, task.formula, label_on=task.label_on)
+    except ValueError as error:
+        raise ValueError(f"{task.path}: [task] {error}") from None
+    if "file" in task.demonstrations:
+        return Setup(task, world, model, load_demonstrations(task, world), 0)
+    key = jax.random.fold_in(jax.random.key(seed), 0)
+    return Setup(task, world, model, *synthetic_demonstrations(task, model, key))
+
+
+def describe(setup: Setup) -> str:
+    """What a task comes to, in one line."""
+    lengths = setup.demonstrations.length
+    return (
+        f"{setup.world.mdp.num_states} states, {setup.model.num_memory} memory states, "
+        f"{len(lengths)} demonstrations of {int(lengths.sum())} pairs"
+    )
+
+
+def fingerprint(task: Any, seed: int, num_seeds: int) -> str:
+    """What a checkpoint must agree on to be gone on from."""
+    parts = [task.digest, seed, num_seeds, jaxltl.__version__, jax.__version__,
+             str(jnp.result_type(float))]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
+
+
+def learn(
+    setup: Setup,
+    seed: int,
+    num_seeds: int,
+    *,
+    report: Report | None = None,
+    checkpoint: Path | None = None,
+) -> tuple[Learned, int, Solution, Solution, np.ndarray]:
+    """Learns with N seeds, keeps the best, and evaluates it; see :class:`Outcome`.
+
+    Raises:
+      ValueError: the learner cannot work on this task.
+    """
+    model, spec = setup.model, setup.task.learner
+    root = jax.random.fold_in(jax.random.key(seed), 1)
+    keys = jax.vmap(functools.partial(jax.random.fold_in, root))(jnp.arange(num_seeds))
+    learned = METHODS[spec["method"]](
+        spec, model, setup.demonstrations, keys, report, checkpoint
+    )
+    loss = np.where(np.isfinite(learned.loss), learned.loss, np.inf)
+    chosen = int(np.argmin(np.where(learned.converged, loss, loss + 1e12)))
+    solution = satisfaction_probability(model, learned.policy[chosen])
+    best = optimal_satisfaction(model)
+    at_start = functools.partial(from_starts, model)
+    each = [
+        solution if i == chosen else satisfaction_probability(model, learned.policy[i])
+        for i in range(num_seeds)
+    ]
+    return learned, chosen, solution, best, np.stack([at_start(s.value) for s in each])
+
+
+def from_starts(model: Product, value: jax.Array | np.ndarray) -> np.ndarray:
+    """A product's value at the memory in which a run starts: ``[S]`` from ``[S, Q]``."""
+    memory = np.asarray(model.initial_memory)
+    return np.asarray(value)[np.arange(len(memory)), memory]
+
+
+def summary(outcome: Outcome) -> dict[str, Any]:
+    """The outcome as numbers, lists and texts, for ``result.json``; NaN becomes None."""
+    setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
+    task, world, model = setup.task, setup.world, setup.model
+    starts = np.flatnonzero(np.asarray(model.mdp.initial) > 0)
+    impossible = [int(s) for s in starts if from_starts(model, outcome.best.upper)[s] <= 0]
+    mean = outcome.satisfaction @ np.asarray(model.mdp.initial)
+    least = outcome.satisfaction[:, starts].min(axis=1)
+    pairs = int(np.sum(np.asarray(setup.demonstrations.length)))
+    result = {
+        "task": task.name,
+        "formula": task.formula,
+        "method": task.learner["method"],
+        "in": task.learner.get("in", "product"),
+        "num_states": world.mdp.num_states,
+        "num_memory": model.num_memory,
+        "demonstrations": {
+            "number": len(np.asarray(setup.demonstrations.length)),
+            "pairs": pairs,
+            "synthetic": "synthetic" in task.demonstrations,
+            "dropped": setup.dropped,
+        },
+        "satisfaction": _evidence(outcome.solution, model, world, starts),
+        "best_achievable": _evidence(outcome.best, model, world, starts),
+        "impossible_starts": [_place(world, s) for s in impossible],
+        "neg_log_likelihood": learned.neg_log_likelihood[i],
+        "weights": dict(zip(learned.names, learned.weights[i].tolist(), strict=True)),
+        "training": {
+            "loss": learned.loss[i],
+            "gradient_norm": learned.gradient_norm[i],
+            "steps": int(learned.num_steps[i]),
+            "converged": bool(learned.converged[i]),
+            "solver": Status(int(learned.status[i])).name,
+            "hyperparameters": {k: v for k, v in task.learner.items() if k != "method"},
+        },
+        "seeds": {
+            "first": outcome.seed,
+            "number": len(learned.loss),
+            "kept": i,
+            "converged": int(learned.converged.sum()),
+            "mean": mean,
+            "minimum": least,
+            "loss": learned.loss,
+            "neg_log_likelihood": learned.neg_log_likelihood,
+        },
+        "seconds": round(outcome.seconds, 2),
+        "versions": {"jaxltl": jaxltl.__version__, "jax": jax.__version__},
+    }
+    return plain(result)
+
+
+def _evidence(
+    solution: Solution, model: Product, world: World, starts: np.ndarray
+) -> dict[str, Any]:
+    value, lower, upper = (
+        from_starts(model, x) for x in (solution.value, solution.lower, solution.upper)
+    )
+    weight = np.where(np.isin(np.arange(len(value)), starts), np.asarray(model.mdp.initial), 0)
+    weight = weight / weight.sum()
+    worst = int(starts[np.argmin(value[starts])])
+    return {
+        "mean": {"value": weight @ value, "lower": weight @ lower, "upper": weight @ upper},
+        "minimum": {
+            "value": value[worst], "lower": lower[starts].min(), "upper": upper[worst],
+            **_place(world, worst),
+        },
+        "num_starts": len(starts),
+        "status": Status(int(solution.status)).name,
+        "residual": solution.residual,
+    }
+
+
+def _place(world: World, state: int) -> dict[str, int]:
+    if world.cells is None:
+        return {"state": state}
+    row, column = divmod(state, world.cells.shape[1])
+    return {"state": state, "row": row + 1, "column": column + 1}
+
+
+def plain(value: Any) -> Any:
+    """Arrays and NumPy numbers as lists and numbers that JSON has; NaN and infinity as None."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return plain(np.asarray(value).tolist())
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def save(out: Path, outcome: Outcome) -> None:
+    """Writes ``policy.npz`` into a directory; see :func:`save_policy`."""
+    save_policy(out / "policy.npz", outcome)
+
+
+def save_policy(path: Path, outcome: Outcome) -> None:
+    """Writes the kept policy with all that it takes to run it, as an ``.npz``, atomically.
+
+    Its arrays: ``policy [S, Q, A]``; ``initial_memory [S]`` and ``next_memory [S, Q]``, the memory
+    at the start in s and after reading the label of s; ``label_on``; ``actions [A]``; ``weights
+    [F]`` and ``features [F]``; ``satisfaction``, ``lower`` and ``upper`` ``[S, Q]``.
+
+    Raises:
+      ValueError: the place cannot be written to.
+    """
+    model, learned, i = outcome.setup.model, outcome.learned, outcome.chosen
+    policy = project_policy(model, learned.policy[i])
+    arrays = {
+        "policy": policy.action,
+        "initial_memory": policy.initial_memory,
+        "next_memory": policy.next_memory,
+        "label_on": policy.label_on,
+        "actions": np.array(outcome.setup.world.actions),
+        "weights": learned.weights[i],
+        "features": np.array(learned.names),
+        "all_weights": learned.weights,
+        "satisfaction": outcome.solution.value,
+        "lower": outcome.solution.lower,
+        "upper": outcome.solution.upper,
+    }
+    with learner.atomic_write(path) as file:
+        np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
+
+
+def pictures(outcome: Outcome) -> list[tuple[str, str, bytes, str]]:
+    """The report's pictures: file name, title, SVG and caption of each."""
+    # Deferred: learning alone does not need matplotlib.
+    from jaxltl import plot
+
+    setup, model = outcome.setup, outcome.setup.model
+    task_graph = plot.automaton(model.automaton)
+    found = [(
+        "automaton.svg", "The task as an automaton", plot.to_bytes(task_graph),
+        "States with a double circle: the task is done, whatever follows. Grey: it has failed. "
+        "Each state is named by the formula that is left to satisfy.",
+    )]
+    if setup.world.cells is not None:
+        found += _maps(outcome, setup.world.cells)
+    history = outcome.learned.history
+    curves = plot.curves(
+        {k: v.T for k, v in history.items()}, steps=history["step"][:, 0],
+        show=("loss", "neg_log_likelihood", "satisfaction", "gradient_norm"),
+    )
+    found.append((
+        "learning.svg", "Learning", plot.to_bytes(curves),
+        "Figures of the weights before each step"
+        + ("; the line is the median over seeds, the band holds all of them."
+           if len(outcome.learned.loss) > 1 else "."),
+    ))
+    return found
+
+
+def _maps(outcome: Outcome, cells: np.ndarray) -> list[tuple[str, str, bytes, str]]:
+    from jaxltl import plot
+
+    model, actions = outcome.setup.model, outcome.setup.world.actions
+    policy = np.asarray(outcome.learned.policy[outcome.chosen])
+    value = np.array(outcome.solution.value)
+    starts = np.asarray(model.mdp.initial) > 0
+    at_start = np.where(starts, from_starts(model, value), np.nan)
+    values = plot.grid(cells, at_start, label="probability of doing the task")
+    # Memory states where the policy still matters: not done, not failed, and reachable.
+    open_ = np.asarray(make_monitor(model.automaton).verdict) == Verdict.UNDECIDED
+    undecided = open_ & (value > 0).any(axis=0)
+    met = _reached(model)
+    shown = np.flatnonzero(undecided & met.any(axis=0))
+    names = model.automaton.state_names or ("",) * model.num_memory
+    maps = [(
+        "values.svg", "From where it works", plot.to_bytes(values),
+        "Probability that the learned policy does the task, from each initial state.",
+    )]
+    if shown.size:
+        panels = np.where(met, value, np.nan).T[shown]
+        arrows = np.where(met[..., None], policy, np.nan).transpose(1, 0, 2)[shown]
+        titles = [short_name(f"memory {q}: {names[q]}") for q in shown]
+        picture = plot.grid(
+            cells, panels, arrows, titles=titles, label="probability of doing the task",
+            actions=actions,
+        )
+        maps.append((
+            "policy.svg", "What it does", plot.to_bytes(picture),
+            "One map for each state of the automaton, which is the policy's memory. An arrow is as "
+            "long as its action is likely; colours are the probability of doing the task from "
+            "there. Cells that cannot be met with that memory are blank.",
+        ))
+    return maps
+
+
+def short_name(text: str, width: int = 44) -> str:
+    """The text, or its beginning where it is longer than that."""
+    return text if len(text) <= width else text[: width - 1] + "…"
+
+
+def _reached(model: Product) -> np.ndarray:
+    """``bool[S, Q]``: product states that some policy can reach from an initial one."""
+    found = restrict(model)
+    met = np.zeros(model.state_shape, bool)
+    met[np.asarray(found.base_state), np.asarray(found.memory)] = True
+    return met

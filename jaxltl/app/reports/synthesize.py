@@ -1,0 +1,364 @@
+"""What a synthesis found, for people and for files: summary, tables, arrays and pictures."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxltl
+from jaxltl.algos.learner import atomic_write
+from jaxltl.app.files.game import World, task_text
+from jaxltl.app.learn import plain
+from jaxltl.app.synthesize import Play, Synthesis
+from jaxltl.core.games.objective import GR1
+from jaxltl.core.models.game import Game, is_deterministic
+
+# --- results --------------------------------------------------------------------------------
+
+
+def summary(found: Synthesis, seconds: float) -> dict[str, Any]:
+    """The findings as numbers, lists and texts, for ``result.json``."""
+    file, world = found.file, found.world
+    wins, starts = found.wins, found.starts
+    won = int(wins[starts].sum())
+    outcome = ("realizable" if won == starts.size else
+               "partly realizable" if won else "unrealizable")
+    automaton = found.nodes.automaton
+    result = {
+        "game": file.name,
+        "task": task_text(file.task),
+        "chance": file.task.get("chance", "random"),
+        "deterministic": is_deterministic(world.game),
+        "num_states": world.game.num_states,
+        "num_memory": 1 if automaton is None else len(automaton.delta),
+        "outcome": outcome,
+        "region": {
+            "states": int(wins.sum()),
+            "initial_states": won,
+            "num_initial_states": int(starts.size),
+            "lost_initial_states": [world.where(s) for s in starts[~wins[starts]][:100]],
+        },
+        "verdict": found.verdict._asdict(),
+        "strategy": _about_strategy(found),
+        "play": _about_play(found),
+        "seconds": round(seconds, 2),
+        "versions": {"jaxltl": jaxltl.__version__, "jax": jax.__version__},
+    }
+    return dict(plain(result))
+
+
+def _about_strategy(found: Synthesis) -> dict[str, Any] | None:
+    if found.strategy is None or found.restricted is None or found.strategy_verdict is None:
+        return None
+    game = found.restricted.model
+    system, available = np.asarray(game.system), np.asarray(game.available)
+    memory = found.strategy.game.state_shape
+    return {
+        "maximal": found.strategy.maximal,
+        "reason": found.strategy.reason,
+        "num_memory": memory[1] if len(memory) > 1 else 1,
+        "num_states": game.num_states,
+        "num_system_states": int(system.sum()),
+        "num_moves": int(available.sum()),
+        "num_system_moves": int(available[system].sum()),
+        "confirmed": found.strategy_verdict.system,
+        "refuted_by": found.strategy_verdict.reason,
+    }
+
+
+def _about_play(found: Synthesis) -> dict[str, Any] | None:
+    if found.play is None:
+        return None
+    return {
+        "steps": [
+            {"mover": step.mover, "move": step.action,
+             **found.world.where(int(found.nodes.world_state[step.node]))}
+            for step in found.play.steps
+        ],
+        "repeats_from": found.play.repeats_from,
+        "failed": found.play.failed,
+        "by_chance": found.play.by_chance,
+    }
+
+
+def is_confirmed(result: Mapping[str, Any]) -> bool:
+    """Whether the independent check found nothing against a :func:`summary`."""
+    strategy = result["strategy"]
+    claims = result["verdict"]
+    sound = strategy is None or strategy["confirmed"]
+    return bool(claims["system"] and claims["environment"] and sound)
+
+
+def table(result: Mapping[str, Any], found: Synthesis) -> str:
+    """A summary for people."""
+    region, strategy = result["region"], result["strategy"]
+    sure = result["deterministic"] or result["chance"] == "adversarial"
+    surely = "surely" if sure else "almost surely"
+    lines = [
+        f"{result['game']}: {result['num_states']} states"
+        + (f" x {result['num_memory']} automaton states" if found.nodes.automaton else ""),
+        f"  {result['task']}",
+        "",
+        f"{result['outcome']}: the system wins {surely} from {region['initial_states']} of "
+        f"{region['num_initial_states']} initial states",
+        f"  (and from {region['states']} of all {result['num_states']} states, were they initial)",
+    ]
+    lost = region["num_initial_states"] - region["initial_states"]
+    if lost:
+        kind = "" if sure else " with positive probability"
+        lines.append(
+            f"the environment wins{kind} from {lost}, for example: "
+            + found.world.describe(int(found.starts[~found.wins[found.starts]][0]))
+        )
+    if strategy:
+        lines += [
+            "",
+            *textwrap.wrap(f"permissive strategy, {strategy['reason']}", 96,
+                           subsequent_indent="  "),
+            f"  restricted game   {strategy['num_states']} states "
+            f"({strategy['num_system_states']} of the system), {strategy['num_moves']} moves "
+            f"({strategy['num_system_moves']} of the system)",
+        ]
+        if strategy["num_memory"] > 1:
+            lines.append(f"  memory            {strategy['num_memory']} states")
+    lines += ["", _verdict(result)]
+    if found.play is not None:
+        note = "" if found.world.places is None else " (cells as row, column)"
+        lines += ["", f"a play that the environment wins{note}", *describe_play(found)]
+    return "\n".join(lines)
+
+
+def _verdict(result: Mapping[str, Any]) -> str:
+    if is_confirmed(result):
+        what = "both players' strategies" + (
+            " and the permissive strategy" if result["strategy"] else "")
+        return f"independent check: confirmed, {what}"
+    reasons = [result["verdict"]["reason"], (result["strategy"] or {}).get("refuted_by", "")]
+    return f"independent check: REFUTED: {' '.join(r for r in reasons if r)}"
+
+
+# --- a play, for people ----------------------------------------------------------------------
+
+
+def describe_play(found: Synthesis) -> list[str]:
+    """A play that the environment wins, as the lines of a table."""
+    play, nodes, world = found.play, found.nodes, found.world
+    if play is None:
+        return []
+    rows = [["step", "mover", "move", *_columns(world)]]
+    for i, step in enumerate(play.steps):
+        state = int(nodes.world_state[step.node])
+        rows.append([str(i), step.mover, step.action, *_cells(world, state)])
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = [
+        "  " + "  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+    return [*lines, "  " + _ending(play, found)]
+
+
+def _columns(world: World) -> list[str]:
+    return ["state"] if world.places is None else ["system", "environment"]
+
+
+def _cells(world: World, state: int) -> list[str]:
+    where = world.where(state)
+    if world.places is None:
+        return [str(where["state"])]
+    return [f"{where[k]['row']}, {where[k]['column']}" for k in _columns(world)]
+
+
+def _ending(play: Play, found: Synthesis) -> str:
+    last = len(play.steps) - 1
+    if play.failed:
+        chance = ", after chance went against the system" if play.by_chance else ""
+        return f"the task has failed in step {last}{chance}"
+    round_ = f"steps {play.repeats_from} to {last} repeat"
+    if play.by_chance:
+        return f"{round_} as long as chance goes against the system"
+    return f"{round_} for ever, and {_missed(play, found) or 'the task is not done'}"
+
+
+def _missed(play: Play, found: Synthesis) -> str:
+    """Which guarantee a loop never meets."""
+    objective = found.winning.objective
+    guarantees = found.file.task.get("guarantees", ())
+    if not isinstance(objective, GR1):
+        return ""
+    loop = [step.node for step in play.steps[play.repeats_from:]]
+    met = [bool(np.asarray(row)[loop].any()) for row in objective.guarantees]
+    never = [g for g, m in zip(guarantees, met, strict=True) if not m]
+    return f"never meet {' nor '.join(never)}" if never else ""
+
+
+# --- files ----------------------------------------------------------------------------------
+
+
+def save(out: Path, found: Synthesis) -> list[str]:
+    """Writes the strategies into a directory, atomically: the names of the files.
+
+    ``strategy.npz``, if the system wins from some initial state, is its permissive strategy as
+    the restricted game of N states: ``successor``, ``probability``, ``initial``, ``system``,
+    ``label``, ``propositions`` and ``actions`` as in a game file's model; ``mask [N, A]``, the
+    moves that are allowed; and ``world_state``, ``automaton_state`` and ``memory [N]``, what each
+    state stands for; ``region [S]``, the states of the world from which the system wins. To
+    follow the strategy keep a state of the restricted game, make an allowed move, and go on to
+    the successor whose ``world_state`` was observed.
+
+    ``counter_strategy.npz``, if the environment wins from some: ``counter_action [N]``, or for
+    GR(1) ``[N, M]`` with ``assumptions [M, N]``, which move its memory on; and the game of N
+    nodes that it is played on, as above.
+    """
+    written = []
+    region = {"region": found.wins}
+    nodes = found.nodes
+    if found.strategy is not None and found.restricted is not None:
+        state = found.restricted.base_state
+        base = np.asarray(found.strategy.base_state[state])
+        arrays = _arrays(found, found.restricted.model, base) | region
+        arrays["mask"] = found.restricted.model.available
+        arrays["memory"] = found.restricted.memory
+        written.append(_savez(out / "strategy.npz", arrays))
+    if found.play is not None:
+        game = nodes.game
+        lost = jnp.where(found.winning.region, 0, game.initial)
+        game = replace(game, mdp=game.mdp.replace(initial=lost / lost.sum()))
+        arrays = _arrays(found, game, np.arange(game.num_states)) | region
+        arrays |= {"counter_action": found.winning.counter_action, "available": game.available}
+        if isinstance(found.winning.objective, GR1):
+            arrays["assumptions"] = found.winning.objective.assumptions
+        written.append(_savez(out / "counter_strategy.npz", arrays))
+    return written
+
+
+def _arrays(found: Synthesis, game: Game, node: np.ndarray) -> dict[str, Any]:
+    return {
+        "successor": game.mdp.successor,
+        "probability": game.mdp.probability,
+        "initial": game.initial,
+        "system": game.system,
+        "label": game.label,
+        "propositions": np.array(game.propositions, str),
+        "actions": np.array(found.world.actions),
+        "world_state": found.nodes.world_state[node],
+        "automaton_state": found.nodes.automaton_state[node],
+    }
+
+
+def _savez(path: Path, arrays: Mapping[str, Any]) -> str:
+    with atomic_write(path) as file:
+        np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
+    return path.name
+
+
+FILES = ("strategy.npz", "counter_strategy.npz", "automaton.svg", "region.svg", "moves.svg")
+MOST_MAPS = 36  # of the environment's places
+MOST_PANELS = 6  # of a strategy's memory
+
+
+def pictures(found: Synthesis, environment: int | None = None) -> list[tuple[str, bytes]]:
+    """Pictures as SVG, by file name: the task's automaton, and maps if the game has one.
+
+    Args:
+      found: the findings.
+      environment: the number of the environment's place in ``moves.svg``; default the one
+        in which the strategy forbids the most.
+    """
+    # Deferred: solving alone does not need matplotlib.
+    from jaxltl import plot
+
+    made = []
+    if found.nodes.automaton is not None and len(found.nodes.automaton.delta) <= 40:
+        made.append(("automaton.svg", plot.automaton(found.nodes.automaton)))
+    world = found.world
+    if world.text is not None and world.places is not None:
+        count = len(world.places)
+        few = None if count <= MOST_MAPS else _most_lost(found, count)
+        made.append(("region.svg", plot.game_region(
+            found.wins, world.text, environment=few, wall=world.wall)))
+        if found.strategy is not None:
+            made.append(("moves.svg", _moves_picture(found, environment)))
+    return [(name, plot.to_bytes(figure)) for name, figure in made]
+
+
+def place_of(found: Synthesis, cell: tuple[int, int] | None) -> int | None:
+    """The number of the place in a cell, given by its row and column from 1.
+
+    Raises:
+      ValueError: the game has no map, or no place there.
+    """
+    if cell is None:
+        return None
+    places = found.world.places
+    if places is None:
+        raise ValueError(f"--environment {cell[0]} {cell[1]}: the game has no map.")
+    here = np.flatnonzero((places == np.array(cell) - 1).all(axis=1))
+    if not here.size:
+        rows, columns = places.max(axis=0) + 1
+        raise ValueError(
+            f"--environment {cell[0]} {cell[1]} is a wall or off the map, which has rows 1 to "
+            f"{rows} and columns 1 to {columns}."
+        )
+    return int(here[0])
+
+
+def _most_lost(found: Synthesis, count: int) -> list[int]:
+    """The environment's places with most cells that the system loses, in order."""
+    lost = ~found.wins.reshape(count, count, 2)[:, :, 1]
+    return sorted(np.argsort(-lost.sum(axis=1), kind="stable")[:12].tolist())
+
+
+def _moves_picture(found: Synthesis, environment: int | None) -> Any:
+    from jaxltl import plot
+
+    world, nodes, strategy, restricted = (
+        found.world, found.nodes, found.strategy, found.restricted
+    )
+    assert strategy is not None and restricted is not None and world.places is not None
+    count = len(world.places)
+    base = np.asarray(strategy.base_state)[np.asarray(restricted.base_state)]
+    memory = np.asarray(restricted.memory)
+    state, automaton = nodes.world_state[base], nodes.automaton_state[base]
+    mine = np.asarray(restricted.model.system)
+    can = np.asarray(world.game.available)
+    place = state // (2 * count)
+    if environment is None:
+        forbids = can[state].sum(-1) - np.asarray(restricted.model.available).sum(-1)
+        total = np.bincount(place[mine], forbids[mine], minlength=count)
+        environment = int(np.argmax(total))
+    here = mine & (place == environment)
+    pairs, size = np.unique(
+        np.stack([automaton[here], memory[here]], 1), axis=0, return_counts=True
+    )
+    shown = np.sort(np.argsort(-size, kind="stable")[:MOST_PANELS])
+    size_a = world.game.num_actions
+    mask = np.asarray(strategy.mask).reshape(nodes.game.num_states, -1, strategy.mask.shape[-1])
+    region = np.asarray(strategy.region).reshape(nodes.game.num_states, -1)
+    allowed = np.zeros((len(shown), world.game.num_states, size_a), bool)
+    wins = np.zeros((len(shown), world.game.num_states), bool)
+    for panel, (q, m) in enumerate(pairs[shown]):
+        node = np.flatnonzero((nodes.automaton_state == q) & np.asarray(nodes.game.system))
+        allowed[panel, nodes.world_state[node]] = mask[node, m, :size_a]
+        wins[panel, nodes.world_state[node]] = region[node, m]
+    return plot.game_moves(
+        allowed, world.text or "", environment, region=wins, available=can, actions=world.actions,
+        titles=[_title(found, int(q), int(m), pairs) for q, m in pairs[shown]], wall=world.wall,
+    )
+
+
+def _title(found: Synthesis, q: int, m: int, pairs: np.ndarray) -> str:
+    """What the memory of a panel stands for."""
+    parts = []
+    if len(set(pairs[:, 0])) > 1:
+        parts.append(f"automaton in {q}")
+    if len(set(pairs[:, 1])) > 1:
+        goals = found.file.task.get("guarantees", ())
+        parts.append(f"towards {goals[m]}" if m < len(goals) else f"memory {m}")
+    return ", ".join(parts)

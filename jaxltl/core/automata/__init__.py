@@ -1,0 +1,1 @@
+"""Deterministic automata of formulas, and questions about their languages. No JAX here."""

@@ -1,0 +1,363 @@
+"""Deterministic automata over infinite words, as integer tables.
+
+An automaton reads one letter per step; a letter is the set of the propositions true then.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxltl.core.logic.ltl import Letter, as_letters
+
+ACCEPTANCES = ("cosafe", "safety", "buchi", "parity")
+
+
+DRAWN_STATES, DRAWN_ARROWS = 40, 120  # up to which a notebook shows a picture
+
+
+@dataclass(frozen=True, eq=False)
+class Automaton:
+    """A complete deterministic automaton; see `make_automaton` for checked construction.
+
+    A word is accepted iff the least priority that its run reads infinitely often is even
+    (min-even parity, on transitions). The acceptance tells which priorities there are:
+
+    - `"cosafe"`: state q has priority 0 if it is final, else 1, and final states are absorbing:
+      the run must reach one.
+    - `"safety"`: the same, and non-final states are absorbing: the run must avoid them.
+    - `"buchi"`: 0 on accepting transitions, else 1.
+    - `"parity"`: any.
+
+    Args:
+        delta: int32 `[Q, L]`, the state after reading letter l in state q.
+        initial: int32 scalar, the state before anything is read.
+        priority: int32 `[Q, L]`, of reading letter l in state q.
+        letters: bool `[L, P]`, whether proposition p holds in letter l.
+        propositions: `[P]` names.
+        acceptance: `"cosafe"`, `"safety"`, `"buchi"` or `"parity"`.
+        state_names: `[Q]` readable names, one formula per state, or empty.
+    """
+
+    delta: NDArray[np.int32]
+    initial: int | NDArray[np.int32]
+    priority: NDArray[np.int32]
+    letters: NDArray[np.bool_]
+    propositions: tuple[str, ...]
+    acceptance: str
+    state_names: tuple[str, ...] = ()
+
+    @property
+    def final(self) -> NDArray[np.bool_]:
+        """bool `[Q]`, the final states of a co-safe or safety automaton.
+
+        Raises:
+            ValueError: For Buchi and parity acceptance, which is on transitions.
+        """
+        if self.acceptance not in ("cosafe", "safety"):
+            raise ValueError(
+                f"final: an automaton with {self.acceptance} acceptance has no final states. "
+                "Read its priority[Q, L], or accepting[Q, L]."
+            )
+        return self.priority[..., 0] == 0
+
+    @property
+    def accepting(self) -> NDArray[np.bool_]:
+        """bool `[Q, L]`, the transitions of even priority."""
+        return self.priority % 2 == 0
+
+    def __repr__(self) -> str:
+        return f"Automaton({self.acceptance}, {_extent(self)})"
+
+    def _repr_svg_(self) -> str | None:
+        """The picture that notebooks show; None, so that they show text, where it would crowd."""
+        arrows = sum(len(set(row)) for row in np.asarray(self.delta).tolist())
+        if len(self.delta) > DRAWN_STATES or arrows > DRAWN_ARROWS:
+            return None
+        # By name, since the core does not depend on drawing and only a notebook gets here.
+        plot = importlib.import_module("jaxltl.plot")
+        return plot.to_bytes(plot.automaton(self), "svg").decode()
+
+
+def make_automaton(
+    delta: ArrayLike,
+    initial: int,
+    letters: ArrayLike,
+    propositions: Iterable[str],
+    *,
+    final: ArrayLike | None = None,
+    accepting: ArrayLike | None = None,
+    priority: ArrayLike | None = None,
+    acceptance: str | None = None,
+    state_names: Iterable[str] = (),
+) -> Automaton:
+    """An `Automaton` from checked tables.
+
+    Args:
+        delta: `[Q, L]` integers in 0..Q-1.
+        initial: In 0..Q-1.
+        letters: `[L, P]` booleans, no two rows equal.
+        propositions: `[P]` distinct names.
+        final: `[Q]` booleans, absorbing as `acceptance` asks.
+        accepting: `[Q]` or `[Q, L]` booleans, visited infinitely often (Buchi).
+        priority: `[Q]` or `[Q, L]` integers from 0 up; the least one met infinitely often is even.
+        acceptance: `"cosafe"` or `"safety"` with `final`; else follows from what is given.
+        state_names: `[Q]` names, or none.
+
+    Raises:
+        ValueError: Naming the table, the entry and the fix.
+
+    >>> eventually_a = make_automaton([[0, 1], [1, 1]], 0, [[False], [True]], ["a"],
+    ...                               final=[False, True], acceptance="cosafe")
+    >>> int(eventually_a.delta[0, 1])
+    1
+    """
+    names, states = tuple(propositions), tuple(state_names)
+    table = np.asarray(delta)
+    if table.ndim != 2 or 0 in table.shape or table.dtype.kind not in "iu":
+        raise ValueError(
+            f"make_automaton: delta has shape {table.shape} and type {table.dtype}. "
+            "Pass integers [states, letters], with at least one of each."
+        )
+    count, width = table.shape
+    for q, letter in np.argwhere((table < 0) | (table >= count))[:1]:
+        raise ValueError(
+            f"make_automaton: delta[{q}, {letter}] = {table[q, letter]} is no state. "
+            f"The {count} rows of delta are the states 0..{count - 1}."
+        )
+    if initial not in range(count):
+        raise ValueError(
+            f"make_automaton: initial = {initial} is no state. Pass one of 0..{count - 1}."
+        )
+    if states and len(states) != count:
+        raise ValueError(
+            f"make_automaton: {len(states)} state_names for {count} states. Pass one each, or none."
+        )
+    rows = _booleans(letters, "letters", (width, len(names)))
+    _check_distinct(names, rows)
+    kind, priorities = _priorities(table, final, accepting, priority, acceptance)
+    return Automaton(
+        delta=table.astype(np.int32),
+        initial=np.asarray(initial, np.int32),
+        priority=priorities.astype(np.int32),
+        letters=rows,
+        propositions=names,
+        acceptance=kind,
+        state_names=states,
+    )
+
+
+def _priorities(
+    delta: NDArray[Any],
+    final: ArrayLike | None,
+    accepting: ArrayLike | None,
+    priority: ArrayLike | None,
+    acceptance: str | None,
+) -> tuple[str, NDArray[Any]]:
+    """The acceptance and its priorities `[Q, L]`, from the one table that is given."""
+    given = {"final": final, "accepting": accepting, "priority": priority}
+    (name, *more) = [key for key, table in given.items() if table is not None] or [""]
+    kinds = {"final": ("cosafe", "safety"), "accepting": ("buchi",), "priority": ("parity",)}
+    if not name or more:
+        raise ValueError("make_automaton: give exactly one of final, accepting and priority.")
+    kind = kinds[name][0] if acceptance is None and name != "final" else acceptance
+    if kind not in kinds[name]:
+        raise ValueError(
+            f"make_automaton: acceptance = {acceptance!r} with {name}. "
+            f"Pass one of {', '.join(kinds[name])}."
+        )
+    if name == "priority":
+        table = np.asarray(priority)
+        if table.dtype.kind not in "iu" or table.shape not in (delta.shape, delta.shape[:1]):
+            raise ValueError(
+                f"make_automaton: priority has shape {table.shape} and type {table.dtype}. "
+                f"Pass integers of shape {delta.shape} or {delta.shape[:1]}."
+            )
+        if (table < 0).any():
+            raise ValueError(f"make_automaton: priority {table.min()} is negative. Count from 0.")
+    elif name == "accepting":
+        shape = delta.shape[:1] if np.ndim(accepting) == 1 else delta.shape  # type: ignore[arg-type]
+        table = 1 - _booleans(accepting, "accepting", shape).astype(np.int32)
+    else:
+        is_final = _booleans(final, "final", delta.shape[:1])
+        absorbing = is_final if kind == "cosafe" else ~is_final
+        for q, letter in np.argwhere(absorbing[:, None] & ~absorbing[delta])[:1]:
+            inside = "final" if kind == "cosafe" else "non-final"
+            raise ValueError(
+                f"make_automaton: delta[{q}, {letter}] = {delta[q, letter]} leaves the {inside} "
+                f"states, which {kind!r} acceptance has absorbing. Redirect it, or change final."
+            )
+        table = 1 - is_final.astype(np.int32)
+    if table.ndim == 1:
+        table = np.repeat(table[:, None], delta.shape[1], axis=1)
+    assert kind is not None
+    return kind, table
+
+
+def _check_distinct(names: tuple[str, ...], rows: NDArray[np.bool_]) -> None:
+    for name in names:
+        if names.count(name) > 1 or not isinstance(name, str):
+            raise ValueError(f"make_automaton: propositions has {name!r}. Pass distinct strings.")
+    first: dict[bytes, int] = {}
+    for letter, row in enumerate(rows):
+        twin = first.setdefault(row.tobytes(), letter)
+        if twin != letter:
+            held = _letter_text(names, row)
+            raise ValueError(
+                f"make_automaton: letters {twin} and {letter} are both {held}. Keep one of them."
+            )
+
+
+def _booleans(values: ArrayLike | None, place: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    array = np.asarray(values)
+    if array.size == 0:  # an empty list says nothing of its type
+        array = array.astype(bool)
+    if array.shape != shape or array.dtype.kind != "b":
+        raise ValueError(
+            f"make_automaton: {place} has shape {array.shape} and type {array.dtype}. "
+            f"Pass booleans of shape {shape}."
+        )
+    return array
+
+
+# ---------------------------------------------------------------------------------------------
+# Runs
+# ---------------------------------------------------------------------------------------------
+
+
+def letter_index(automaton: Automaton, letter: Letter) -> int:
+    """The index l of a letter, so that `delta[q, l]` reads it.
+
+    Args:
+        automaton: The automaton.
+        letter: The propositions that hold; names unknown to the automaton are ignored.
+
+    Raises:
+        ValueError: For a combination of propositions that is not among the letters.
+
+    >>> from jaxltl.core.automata.translate import to_automaton
+    >>> letter_index(to_automaton("F a"), {"a", "unrelated"})
+    1
+    """
+    return _read(automaton, [letter], "letter_index: letter")[0]
+
+
+def _read(automaton: Automaton, word: Iterable[Letter], place: str) -> list[int]:
+    names = automaton.propositions
+    index = {
+        frozenset(name for name, holds in zip(names, row, strict=True) if holds): i
+        for i, row in enumerate(automaton.letters)
+    }
+    read = []
+    for position, letter in enumerate(as_letters(word, place)):
+        known = letter.intersection(names)
+        if known not in index:
+            raise ValueError(
+                f"{place} {position} is {set(known) or '{}'}, which is not among the "
+                f"{len(index)} letters of the automaton. Add it where the automaton is built "
+                "(the argument letters=)."
+            )
+        read.append(index[known])
+    return read
+
+
+def run(automaton: Automaton, word: Iterable[Letter]) -> NDArray[np.int32]:
+    """The states passed while reading a finite word, from `initial` on.
+
+    `q[0] = initial` and `q[t+1] = delta[q[t], w[t]]`.
+
+    Args:
+        automaton: The automaton.
+        word: `[T]` letters, each the collection of the propositions that hold.
+
+    Returns:
+        int32 `[T+1]`.
+
+    >>> from jaxltl.core.automata.translate import to_automaton
+    >>> run(to_automaton("F a"), [set(), {"a"}, set()]).tolist()
+    [0, 0, 1, 1]
+    """
+    states = [int(automaton.initial)]
+    for letter in _read(automaton, word, "run: letter"):
+        states.append(int(automaton.delta[states[-1], letter]))
+    return np.array(states, np.int32)
+
+
+def accepts_lasso(automaton: Automaton, prefix: Iterable[Letter], cycle: Iterable[Letter]) -> bool:
+    """Whether the automaton accepts the infinite word prefix·cycle^ω.
+
+    Args:
+        automaton: The automaton.
+        prefix: `[n]` letters, may be empty.
+        cycle: `[m]` letters, at least one.
+
+    >>> from jaxltl.core.automata.translate import to_automaton
+    >>> accepts_lasso(to_automaton("F a"), prefix=[set()], cycle=[set(), {"a"}])
+    True
+    """
+    laps = _read(automaton, cycle, "accepts_lasso: cycle letter")
+    if not laps:
+        raise ValueError("accepts_lasso: the cycle is empty. Pass at least one letter.")
+    state = int(automaton.initial)
+    for letter in _read(automaton, prefix, "accepts_lasso: prefix letter"):
+        state = int(automaton.delta[state, letter])
+    # The least priority of each lap, by the state in which the lap starts.
+    least: dict[int, int] = {}
+    lap_end: dict[int, int] = {}
+    while state not in least:
+        start = state
+        read = []
+        for letter in laps:
+            read.append(int(automaton.priority[state, letter]))
+            state = int(automaton.delta[state, letter])
+        least[start], lap_end[start] = min(read), state
+    on_cycle = {state}
+    while (state := lap_end[state]) not in on_cycle:
+        on_cycle.add(state)
+    return min(least[q] for q in on_cycle) % 2 == 0
+
+
+def complement(automaton: Automaton) -> Automaton:
+    """The automaton that accepts exactly the words that `automaton` rejects.
+
+    The run is the same. Final states become the others, which turns co-safe into safety
+    acceptance; other priorities grow by one, which turns Buchi into parity.
+
+    >>> from jaxltl.core.automata.translate import to_automaton
+    >>> complement(to_automaton("F a")).state_names
+    ('!(F a)', 'false')
+    """
+    constants = {"true": "false", "false": "true"}
+    kind = automaton.acceptance
+    priority = automaton.priority + 1
+    if kind in ("cosafe", "safety"):
+        priority = 1 - automaton.priority
+    elif automaton.priority.min() > 0:
+        priority = automaton.priority - 1
+    only_two = priority.max() <= 1
+    return replace(
+        automaton,
+        priority=priority,
+        acceptance={"cosafe": "safety", "safety": "cosafe"}.get(
+            kind, "buchi" if only_two else "parity"
+        ),
+        state_names=tuple(constants.get(name, f"!({name})") for name in automaton.state_names),
+    )
+
+
+Cube = tuple[tuple[int, bool], ...]  # (proposition, its value), by proposition
+
+
+def _extent(automaton: Automaton) -> str:
+    counts = zip(automaton.delta.shape, ("state", "letter"), strict=True)
+    sizes = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for n, name in counts)
+    return f"{sizes} over {', '.join(automaton.propositions) or 'no propositions'}"
+
+
+def _letter_text(names: Collection[str], row: NDArray[np.bool_]) -> str:
+    return "{" + ", ".join(name for name, holds in zip(names, row, strict=True) if holds) + "}"

@@ -1,0 +1,355 @@
+"""Deterministic parity automata made small, with the simplest acceptance that the language has.
+
+States with the same language need not stand side by side: of all that have it, those lowest in
+the order of strongly connected components suffice, because a run can move down only finitely
+often. Where no component has cycles of both verdicts, the automaton is weak and its minimal form
+is unique (Loeding 2001, "Efficient minimization of deterministic weak omega-automata").
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.emerson_lei import (
+    parity_condition,
+    reached_from,
+    strong_components,
+    to_parity,
+)
+
+Integers: TypeAlias = NDArray[np.integer[Any]]
+
+MAX_PAIRS = 3_000_000  # pair transitions up to which languages of states are compared
+MERGE_WORK = 20_000_000
+
+
+class Table(NamedTuple):
+    """A parity automaton as bare arrays: `delta [Q, L]`, `priority [Q, L]`, an initial state."""
+
+    delta: Integers
+    priority: Integers
+    initial: int
+
+
+def simplify(automaton: Automaton) -> Automaton:
+    """A small automaton with the same language and the simplest acceptance that it allows.
+
+    Co-safe and safety where a finite prefix proves or refutes (then the automaton is minimal),
+    else Buchi where the language has a deterministic Buchi automaton, else parity. If every
+    cycle's verdict is that of its component, the automaton is minimal too.
+
+    >>> from jaxltl.core.automata.automaton import make_automaton
+    >>> twice = make_automaton([[1, 1], [0, 0]], 0, [[False], [True]], ["a"],
+    ...                        accepting=[[False, True], [False, True]])
+    >>> small = simplify(twice)
+    >>> small.delta.tolist(), small.priority.tolist(), small.acceptance
+    ([[0, 0]], [[1, 0]], 'buchi')
+    """
+    table = Table(automaton.delta, automaton.priority, int(automaton.initial))
+    small, kind, base = reduce_table(table)
+    names = automaton.state_names
+    return replace(
+        automaton,
+        delta=small.delta.astype(np.int32),
+        priority=small.priority.astype(np.int32),
+        initial=np.asarray(small.initial, np.int32),
+        acceptance=kind,
+        state_names=tuple(names[q] for q in base) if names else (),
+    )
+
+
+def reduce_table(table: Table, thorough: bool = True) -> tuple[Table, str, Integers]:
+    """The small table, its acceptance and, for each new state, an old one of its language.
+
+    `thorough` also tries to merge states one by one, which takes most of the time.
+    """
+    columns, inverse = _distinct_columns(table)
+    base: Integers = np.arange(len(table.delta))
+    few = Table(table.delta[:, columns], table.priority[:, columns], table.initial)
+    while True:
+        few, base = _composed(quotient_table(few), base)
+        few, base = _composed(_fewest_priorities(few), base)
+        few, base = _composed(quotient_table(few), base)
+        if is_weak(few):
+            few, base = _composed(_weak_minimal(few), base)
+            few = _early(few)
+            break
+        size = len(few.delta)
+        few, base = _composed(_move_down(few), base)
+        if len(few.delta) < size:
+            continue
+        if thorough:
+            few, base = _composed(_merged(few), base)
+        if len(few.delta) == size:
+            break
+    kind = _acceptance(few)
+    return Table(few.delta[:, inverse], few.priority[:, inverse], few.initial), kind, base
+
+
+def _composed(step: tuple[Table, Integers], base: Integers) -> tuple[Table, Integers]:
+    return step[0], base[step[1]]
+
+
+def _distinct_columns(table: Table) -> tuple[Integers, Integers]:
+    both = np.concatenate([table.delta, table.priority]).T
+    _, first, inverse = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    return first, inverse.ravel()
+
+
+def _acceptance(table: Table) -> str:
+    """The kind of a reduced table."""
+    delta, priority = table.delta, table.priority
+    if (priority == priority[:, :1]).all() and priority.max() <= 1:
+        final = priority[:, 0] == 0
+        if final[delta[final]].all():
+            return "cosafe"
+        if not final[delta[~final]].any():
+            return "safety"
+    return "buchi" if priority.max() <= 1 else "parity"
+
+
+# ---------------------------------------------------------------------------------------------
+# Steps that keep the language
+# ---------------------------------------------------------------------------------------------
+
+
+def quotient_table(table: Table) -> tuple[Table, Integers]:
+    """Reachable states, merged where every word reads the same priorities (Moore 1956)."""
+    (delta, priority, _), old = reachable(table)
+    _, block = np.unique(priority, axis=0, return_inverse=True)
+    block = block.ravel()
+    count = block.max() + 1
+    while count < len(delta):
+        signature = np.concatenate([block[:, None], block[delta]], axis=1)
+        _, block = np.unique(signature, axis=0, return_inverse=True)
+        block = block.ravel()
+        if block.max() + 1 == count:
+            break
+        count = block.max() + 1
+    _, first = np.unique(block, return_index=True)
+    small = Table(block[delta[first]], priority[first], int(block[0]))
+    ordered, order = reachable(small)
+    return ordered, old[first[order]]
+
+
+def _order(table: Table) -> Integers:
+    """The reachable states, breadth first."""
+    seen = {table.initial: None}
+    rows = table.delta.tolist()
+    for state in (queue := [table.initial]):
+        for successor in dict.fromkeys(rows[state]):
+            if successor not in seen:
+                seen[successor] = None
+                queue.append(successor)
+    return np.array(queue)
+
+
+def reachable(table: Table) -> tuple[Table, Integers]:
+    """The reachable part, renumbered breadth first, and the old numbers."""
+    order = _order(table)
+    position = np.full(len(table.delta), -1)
+    position[order] = np.arange(len(order))
+    return Table(position[table.delta[order]], table.priority[order], 0), order
+
+
+def _fewest_priorities(table: Table) -> tuple[Table, Integers]:
+    """The same automaton with the fewest priorities, transient transitions at 1."""
+    condition = parity_condition(int(table.priority.max()) + 1)
+    marks = np.left_shift(1, table.priority.astype(np.int64))
+    delta, priority, initial, base = to_parity(table.delta, marks, table.initial, condition)
+    return Table(delta, priority, initial), base
+
+
+def components(table: Table) -> Integers:
+    """The strongly connected component of each state."""
+    count, width = table.delta.shape
+    source = np.repeat(np.arange(count), width)
+    return strong_components(source, table.delta.ravel(), count)
+
+
+def is_weak(table: Table) -> bool:
+    """Whether no component has cycles of both verdicts; priorities must be the fewest."""
+    component = components(table)
+    inside = component[table.delta] == component[:, None]
+    low = np.full(component.max() + 1, table.priority.max() + 1)
+    high = np.full(component.max() + 1, -1)
+    states = np.broadcast_to(component[:, None], inside.shape)[inside]
+    np.minimum.at(low, states, table.priority[inside])
+    np.maximum.at(high, states, table.priority[inside])
+    return bool((low >= high).all())
+
+
+def _reach(delta: Integers) -> NDArray[np.bool_]:
+    """bool `[Q, Q]`: which states are reachable from which, themselves included."""
+    count = len(delta)
+    reach = np.eye(count, dtype=bool)
+    reach[np.arange(count)[:, None], delta] = True
+    while True:
+        wider = (reach.astype(np.float32) @ reach.astype(np.float32)) > 0
+        if (wider == reach).all():
+            return reach
+        reach = wider
+
+
+def _weak_minimal(table: Table) -> tuple[Table, Integers]:
+    """The minimal form of a weak automaton, priorities 0 and 1 on states."""
+    component = components(table)
+    level = np.zeros(component.max() + 1, int)
+    inside = component[table.delta] == component[:, None]
+    verdict = np.full(component.max() + 1, -1)  # -1: transient
+    states = np.broadcast_to(component[:, None], inside.shape)[inside]
+    verdict[states] = table.priority[inside] % 2
+    # The level of a component is the greatest below it, raised where its verdict asks so.
+    source = np.repeat(component, table.delta.shape[1])
+    target = component[table.delta].ravel()
+    while True:
+        higher = np.zeros_like(level)
+        np.maximum.at(higher, source, np.where(source == target, 0, level[target]))
+        higher += (verdict >= 0) & (higher % 2 != verdict)
+        if (higher == level).all():
+            break
+        level = higher
+    priority = np.repeat((level % 2)[component][:, None], table.delta.shape[1], axis=1)
+    return quotient_table(Table(table.delta, priority, table.initial))
+
+
+def _early(table: Table) -> Table:
+    """A weak automaton with verdicts told as early as they are certain, where that suffices.
+
+    Where every accepting cycle is among states that accept all words, only those are final: the
+    language is co-safe. Where every rejecting cycle is among states that accept none, all
+    others are: it is safe.
+    """
+    component = components(table)
+    inside = component[table.delta] == component[:, None]
+    good, bad = (
+        (inside & (table.priority % 2 == parity)).any(axis=1) for parity in (0, 1)
+    )
+    reach = _reach(table.delta)
+    universal, live = ~(reach & bad).any(axis=1), (reach & good).any(axis=1)
+    if (good <= universal).all():
+        final = universal
+    elif (bad <= ~live).all():
+        final = live
+    else:
+        return table
+    priority = np.repeat(np.where(final, 0, 1)[:, None], table.delta.shape[1], axis=1)
+    return table._replace(priority=priority)
+
+
+def language_classes(table: Table) -> Integers | None:
+    """The states grouped by language, int `[Q]`; None where that is too much work.
+
+    Two states differ iff some word leads, from one, to a cycle of even least priority p and,
+    from the other, of odd least priority r: to a component of the pairs, without priorities
+    below p and r, that has transitions of both.
+    """
+    columns, _ = _distinct_columns(table)
+    delta, priority = table.delta[:, columns], table.priority[:, columns]
+    count, width = delta.shape
+    if count * count * width > MAX_PAIRS:
+        return None
+    follow = (delta[:, None] * count + delta[None]).reshape(count * count, width)
+    left = np.broadcast_to(priority[:, None], (count, count, width)).reshape(follow.shape)
+    right = np.broadcast_to(priority[None], (count, count, width)).reshape(follow.shape)
+    differ = _distinguished(follow, left, right)
+    apart = differ.reshape(count, count)
+    apart |= apart.T
+    return np.asarray(np.argmin(apart, axis=1))  # the first state that is not told apart
+
+
+def _distinguished(follow: Integers, left: Integers, right: Integers) -> NDArray[np.bool_]:
+    """The pairs from which some word is accepted on the left and rejected on the right."""
+    found = np.zeros(len(follow), bool)
+    number = np.arange(len(follow))
+    for p in range(0, int(left.max()) + 1, 2):
+        for r in range(1, int(right.max()) + 1, 2):
+            usable = (left >= p) & (right >= r)
+            row, column = np.nonzero(usable)
+            label = strong_components(row, follow[row, column], len(follow))
+            source, target = label[row], label[follow[row, column]]
+            stays = source == target
+            even = np.zeros(len(follow), bool)
+            odd = np.zeros(len(follow), bool)
+            even[source[stays & (left[row, column] == p)]] = True
+            odd[source[stays & (right[row, column] == r)]] = True
+            found |= (even & odd)[label[number]]
+    while True:
+        wider = found | found[follow].any(axis=1)
+        if (wider == found).all():
+            return found
+        found = wider
+
+
+def _move_down(table: Table) -> tuple[Table, Integers]:
+    """Replaces states by others of their language in the lowest component that has one."""
+    same = language_classes(table)
+    count = len(table.delta)
+    if same is None or len(np.unique(same)) == count:
+        return table, np.arange(count)
+    component = components(table)
+    rank = _reach(table.delta).sum(axis=1) * count + component  # lower below
+    target = np.arange(count)
+    for state in np.unique(same):
+        members = np.flatnonzero(same == state)
+        lowest = members[rank[members] == rank[members].min()]
+        target[np.setdiff1d(members, lowest)] = lowest[0]
+    moved = Table(target[table.delta], table.priority, int(target[table.initial]))
+    return quotient_table(moved)
+
+
+def _merged(table: Table) -> tuple[Table, Integers]:
+    """Merges states of one language, in one component, where the whole allows it, by trial."""
+    same = language_classes(table)
+    count = len(table.delta)
+    identity = np.arange(count)
+    if same is None:
+        return table, identity
+    columns, _ = _distinct_columns(table)
+    pairs = _Pairs(table.delta[:, columns], table.priority[:, columns], same)
+    budget = MERGE_WORK // max(pairs.follow.size, 1)
+    target = identity.copy()
+    start = table.initial
+    for kept in range(count):
+        for gone in np.flatnonzero(same == same[kept]).tolist():
+            if kept == gone or target[kept] != kept or target[gone] != gone:
+                continue
+            budget -= 1
+            if budget < 0:
+                break
+            trial = np.where(target == gone, kept, target)
+            if pairs.equal(start, trial):
+                target = trial
+    return quotient_table(Table(target[table.delta], table.priority, int(target[start])))
+
+
+class _Pairs:
+    """Pairs of states of one language, followed in a table and in it with states replaced."""
+
+    def __init__(self, delta: Integers, priority: Integers, same: Integers) -> None:
+        self.delta = delta
+        left, right = np.nonzero(same[:, None] == same[None])
+        self.number = np.full((len(delta), len(delta)), -1)
+        self.number[left, right] = np.arange(len(left))
+        self.follow = delta[left]
+        self.right = right
+        self.left_priority, self.right_priority = priority[left], priority[right]
+
+    def equal(self, initial: int, target: Integers) -> bool:
+        """Whether the table with each state q replaced by target[q] has the same language."""
+        follow = self.number[self.follow, target[self.delta[self.right]]]
+        start = self.number[initial, target[initial]]
+        reached = reached_from(follow, start)
+        place = np.cumsum(reached) - 1
+        follow = place[follow[reached]]
+        left, right = self.left_priority[reached], self.right_priority[reached]
+        first = place[start]
+        return not (
+            _distinguished(follow, left, right)[first]
+            or _distinguished(follow, right, left)[first]
+        )

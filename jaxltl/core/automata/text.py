@@ -1,0 +1,260 @@
+"""Automata in readable forms: guards as Boolean formulas, tables, Graphviz, and JSON."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.automata.automaton import Automaton, Cube, _extent, make_automaton
+from jaxltl.core.logic.ltl import proposition_text
+
+# ---------------------------------------------------------------------------------------------
+# Readable forms
+# ---------------------------------------------------------------------------------------------
+
+
+def guards(automaton: Automaton) -> dict[tuple[int, int], str]:
+    """A short condition on the propositions for each pair of states joined by a letter.
+
+    A guard is true of the letters that make the transition and false of the other letters; what
+    it says of combinations that are no letter is left to brevity. It is an irredundant
+    disjunction of prime cubes, not always the shortest.
+
+    >>> from jaxltl.core.automata.translate import to_automaton
+    >>> guards(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}]))
+    {(0, 0): '!g & !r', (0, 1): 'g', (0, 2): 'r', (1, 1): 'true', (2, 2): 'true'}
+    """
+    same = np.zeros_like(np.asarray(automaton.priority))
+    return {(q, end): text for (q, end, _), text in _guards(automaton, same).items()}
+
+
+def edge_guards(automaton: Automaton) -> dict[tuple[int, int, int], str]:
+    """The condition of each (state, successor, priority) that some letter has, see `guards`.
+
+    >>> from jaxltl.core.automata.translate import to_automaton
+    >>> edge_guards(to_automaton("G F a"))
+    {(0, 0, 0): 'a', (0, 0, 1): '!a'}
+    """
+    return _guards(automaton, np.asarray(automaton.priority))
+
+
+def _guards(automaton: Automaton, marks: NDArray[Any]) -> dict[tuple[int, int, int], str]:
+    """A guard for each (state, successor, mark), with the marks `[Q, L]` of transitions."""
+    literals = [proposition_text(name) for name in automaton.propositions]
+    # As numbers of any size, for automata over many propositions and few letters.
+    numbers = [
+        sum(1 << p for p in np.flatnonzero(row).tolist()) for row in np.asarray(automaton.letters)
+    ]
+    result = {}
+    for q, row in enumerate(np.asarray(automaton.delta).tolist()):
+        groups = defaultdict(set)
+        for number, successor, mark in zip(numbers, row, marks[q].tolist(), strict=True):
+            groups[successor, mark].add(number)
+        for successor, mark in sorted(groups):
+            chosen = groups[successor, mark]
+            cubes = prime_cover(chosen, set(numbers) - chosen, len(literals))
+            texts = [
+                " & ".join(literals[p] if value else f"!{literals[p]}" for p, value in cube)
+                for cube in cubes
+            ]
+            if len(texts) > 1:
+                texts = [f"({text})" if " & " in text else text for text in texts]
+            result[q, successor, mark] = " | ".join(texts) or "true"
+    return result
+
+
+def prime_cover(chosen: set[int], others: set[int], width: int) -> list[Cube]:
+    """Prime cubes, none to spare, that together hold in the chosen letters and in no other.
+
+    Minato 1993, "Fast generation of prime-irredundant covers from binary decision diagrams", on
+    sets of letters; letters that are in neither set may fall on either side.
+
+    Args:
+        chosen: Letters as numbers, with proposition p as bit p.
+        others: More letters.
+        width: The number of propositions.
+
+    >>> prime_cover({0b01, 0b11}, {0b00}, 2)
+    [((0, True),)]
+    """
+    if len(chosen) + len(others) < 1 << width:
+        # Where few letters occur, a few propositions tell, and guards of others would be long.
+        kept = _telling(chosen, others, width)
+        chosen, others = ({n & kept for n in part} for part in (chosen, others))
+    return sorted(_prime_cover(chosen, others, width))
+
+
+def _telling(chosen: set[int], others: set[int], width: int) -> int:
+    """Propositions, as bits, that tell all chosen letters from the others, found greedily."""
+    kept = 0
+    while True:
+        alike: dict[int, tuple[list[int], list[int]]] = defaultdict(lambda: ([], []))
+        for side, part in enumerate((chosen, others)):
+            for n in part:
+                alike[n & kept][side].append(n)
+        mixed = [(left, right) for left, right in alike.values() if left and right]
+        if not mixed:
+            return kept
+
+        def told(p: int, mixed: list[tuple[list[int], list[int]]] = mixed) -> int:
+            pairs = 0
+            for left, right in mixed:
+                held, others_held = (sum(n >> p & 1 for n in part) for part in (left, right))
+                pairs += held * (len(right) - others_held) + (len(left) - held) * others_held
+            return pairs
+
+        kept |= 1 << max(range(width), key=told)
+
+
+def _prime_cover(chosen: set[int], others: set[int], width: int) -> list[Cube]:
+    cubes: list[Cube] = []
+    for p in reversed(range(width)):
+        if not chosen or not others:
+            break
+        bit = 1 << p
+        chosen1, others1 = ({n - bit for n in part if n & bit} for part in (chosen, others))
+        chosen0, others0 = ({n for n in part if not n & bit} for part in (chosen, others))
+        # A literal of proposition p is needed just where it tells the two sides apart.
+        cubes0 = _prime_cover(chosen0 & others1, others0, p)
+        cubes1 = _prime_cover(chosen1 & others0, others1, p)
+        cubes += [(*cube, (p, False)) for cube in cubes0]
+        cubes += [(*cube, (p, True)) for cube in cubes1]
+        chosen = _outside(chosen0, cubes0) | _outside(chosen1, cubes1)
+        others = others0 | others1
+    return [*cubes, ()] if chosen else cubes
+
+
+def _outside(letters: set[int], cubes: list[Cube]) -> set[int]:
+    """The letters that no cube holds in."""
+    for cube in cubes:
+        mask = sum(1 << p for p, _ in cube)
+        held = sum(1 << p for p, value in cube if value)
+        letters = {n for n in letters if n & mask != held}
+    return letters
+
+
+def _state_labels(automaton: Automaton) -> list[str]:
+    names = automaton.state_names or [""] * len(automaton.delta)
+    return [f"{q}: {name}" if name else f"{q}" for q, name in enumerate(names)]
+
+
+def to_text(automaton: Automaton) -> str:
+    """The automaton for reading: `>` marks the initial state and `*` the final ones.
+
+    In a Buchi automaton `*` marks the accepting transitions instead, and in a parity automaton
+    each transition is followed by its priority in braces.
+
+    >>> from jaxltl.core.automata.translate import to_automaton
+    >>> print(to_text(to_automaton("F a")))
+    cosafe automaton: 2 states, 2 letters over a
+    >  0: F a
+         !a -> 0
+         a -> 1
+     * 1: true
+         true -> 1
+    >>> print(to_text(to_automaton("G F a")))
+    buchi automaton: 1 state, 2 letters over a
+    >  0: G F a
+         a -> 0 *
+         !a -> 0
+    """
+    lines = [f"{automaton.acceptance} automaton: {_extent(automaton)}"]
+    final = _final_states(automaton)
+    edges = defaultdict(list)
+    for (q, successor, priority), text in edge_guards(automaton).items():
+        mark = _mark(automaton, priority, " *")
+        edges[q].append(f"     {text} -> {successor}{mark}")
+    for q, label in enumerate(_state_labels(automaton)):
+        marks = (">" if q == automaton.initial else " ") + ("*" if final[q] else " ")
+        lines += [f"{marks} {label}", *edges[q]]
+    return "\n".join(lines)
+
+
+def _final_states(automaton: Automaton) -> NDArray[np.bool_]:
+    """bool `[Q]`, none where acceptance is on transitions."""
+    if automaton.acceptance in ("cosafe", "safety"):
+        return np.asarray(automaton.final)
+    return np.zeros(len(automaton.delta), bool)
+
+
+def _mark(automaton: Automaton, priority: int, accepting: str) -> str:
+    """What follows a transition, where acceptance is on transitions."""
+    if automaton.acceptance == "parity":
+        return f" {{{priority}}}"
+    return accepting if automaton.acceptance == "buchi" and priority == 0 else ""
+
+
+def to_dot(automaton: Automaton) -> str:
+    """The automaton as a graph in the DOT language, final states double circled.
+
+    The accepting transitions of a Buchi automaton are bold and have a dot after their condition,
+    and those of a parity automaton have their priority in braces there.
+
+    >>> from jaxltl.core.automata.translate import to_automaton
+    >>> print(to_dot(to_automaton("true")))
+    digraph automaton {
+      rankdir=LR;
+      start [shape=point, label=""];
+      start -> 0;
+      0 [shape=doublecircle, label="0: true"];
+      0 -> 0 [label="true"];
+    }
+    """
+    lines = ["rankdir=LR;", 'start [shape=point, label=""];', f"start -> {automaton.initial};"]
+    final = _final_states(automaton)
+    for q, label in enumerate(_state_labels(automaton)):
+        shape = "doublecircle" if final[q] else "circle"
+        lines.append(f"{q} [shape={shape}, label={_dot_string(label)}];")
+    for (q, successor, priority), text in edge_guards(automaton).items():
+        label = _dot_string(text + _mark(automaton, priority, " ●"))
+        bold = automaton.acceptance == "buchi" and priority == 0
+        style = ', style=bold, color="#1f6f8b"' if bold else ""
+        lines.append(f"{q} -> {successor} [label={label}{style}];")
+    return "\n".join(["digraph automaton {", *(f"  {line}" for line in lines), "}"])
+
+
+def _dot_string(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n") + '"'
+
+
+def to_dict(automaton: Automaton) -> dict[str, Any]:
+    """The automaton as lists, numbers and strings, for JSON; `from_dict` is the inverse.
+
+    >>> from jaxltl.core.automata.translate import to_automaton
+    >>> to_dict(to_automaton("F a"))["delta"]
+    [[0, 1], [1, 1]]
+    """
+    table = {"buchi": "accepting", "parity": "priority"}.get(automaton.acceptance, "final")
+    return {
+        "delta": automaton.delta.tolist(),
+        "initial": int(automaton.initial),
+        table: getattr(automaton, table).tolist(),
+        "letters": automaton.letters.tolist(),
+        "propositions": list(automaton.propositions),
+        "acceptance": automaton.acceptance,
+        "state_names": list(automaton.state_names),
+    }
+
+
+def from_dict(tables: Mapping[str, Any]) -> Automaton:
+    """The automaton that `to_dict` wrote.
+
+    Raises:
+        ValueError: For a missing or unknown entry, or tables that are no automaton.
+
+    >>> from jaxltl.core.automata.translate import to_automaton
+    >>> from_dict(to_dict(to_automaton("F a"))).acceptance
+    'cosafe'
+    """
+    table = {"buchi": "accepting", "parity": "priority"}.get(tables.get("acceptance", ""), "final")
+    fields = set(Automaton.__dataclass_fields__) - {"priority"} | {table}
+    if set(tables) != fields:
+        wrong = ", ".join(sorted(map(str, set(tables) ^ fields)))
+        raise ValueError(
+            f"from_dict: missing or unknown entries: {wrong}. Pass what to_dict returned."
+        )
+    return make_automaton(**tables)

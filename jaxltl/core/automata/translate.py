@@ -1,0 +1,365 @@
+"""From linear temporal logic to deterministic automata.
+
+A syntactically co-safe or safety formula becomes the automaton of its progression. Any other is
+a combination of Sigma-2 and Pi-2 formulas and limits (`normal_form`), each followed by one
+tracker; the trackers side by side are an automaton with an Emerson-Lei condition, which turns
+into parity (`emerson_lei`) and is then made small (`parity`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import chain, combinations
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.emerson_lei import to_parity
+from jaxltl.core.automata.language import find_not_included, live_states, universal_states
+from jaxltl.core.automata.minimal import equivalence_classes, quotient
+from jaxltl.core.automata.parity import Table, is_weak, reachable, reduce_table
+from jaxltl.core.automata.trackers import track
+from jaxltl.core.logic.diagram import FALSE, TRUE
+from jaxltl.core.logic.ltl import (
+    Formula,
+    Letter,
+    as_formula,
+    as_letters,
+    is_syntactically_cosafe,
+    is_syntactically_safe,
+    negation_normal_form,
+)
+from jaxltl.core.logic.normal_form import Combination, combination, extent
+from jaxltl.core.logic.progression import Namer, Progression
+from jaxltl.core.logic.simplify import simplify
+
+Acceptance = Literal["auto", "dfa", "buchi", "parity"]
+
+MAX_FREE_PROPOSITIONS = 12  # 2^12 letters
+GOOD_ENOUGH = 3  # states up to which no other combination is tried
+WORTHWHILE = 3  # how many times as much the other combinations may track
+MAX_STEPS = 200_000  # of rewriting
+MAX_NODES = 600_000  # of diagrams
+LARGE = 200_000  # transitions of an automaton that is taken as it is
+NAMED_STATES = 300
+
+
+def to_automaton(
+    formula: Formula | str,
+    letters: Iterable[Letter] | None = None,
+    max_states: int = 100_000,
+    *,
+    acceptance: Acceptance = "auto",
+) -> Automaton:
+    """A small complete deterministic automaton of a formula of linear temporal logic.
+
+    It accepts exactly the infinite words over `letters` that satisfy the formula. For co-safe
+    and safety languages it is minimal, and a state is final as early as the letters allow: for
+    co-safe as soon as every continuation satisfies the formula, for safety until no continuation
+    does. Where the verdict of a word depends on more, acceptance is on transitions.
+
+    Args:
+        formula: A formula or its text (see `parse_ltl`).
+        letters: The letters that occur, each a collection of proposition names; names that are
+            not in the formula are ignored. None stands for all 2^P subsets of its propositions.
+        max_states: The number of states, at any stage, at which to give up.
+        acceptance: `"auto"`, the simplest that the language has: `"cosafe"` or `"safety"`, where
+            a finite prefix proves or refutes; else `"buchi"`, where a deterministic Buchi
+            automaton exists; else `"parity"`. `"dfa"`, `"buchi"` and `"parity"` ask for that
+            form, by `"dfa"` either of the first two.
+
+    Returns:
+        An automaton over the sorted propositions of the formula. Letters are in the order of the
+        binary numbers with proposition p as bit p, states in breadth-first order, and each state
+        is named by the formula that is left to satisfy there.
+
+    Raises:
+        ValueError: For a language without the acceptance asked for, more than 12 propositions
+            without `letters`, a letter that is no collection, or too many states.
+
+    >>> automaton = to_automaton("!r U g", letters=[{}, {"r"}, {"g"}])
+    >>> automaton.delta.tolist(), automaton.state_names
+    ([[0, 1, 2], [1, 1, 1], [2, 2, 2]], ('!r U g', 'true', 'false'))
+    >>> often = to_automaton("G F a & G F b")
+    >>> often.acceptance, often.accepting.astype(int).tolist()
+    ('buchi', [[0, 1, 0, 1], [0, 0, 1, 1]])
+    """
+    if acceptance not in ("auto", "dfa", "buchi", "parity"):
+        raise ValueError(
+            f"to_automaton: acceptance = {acceptance!r}. Pass one of auto, dfa, buchi, parity."
+        )
+    formula = as_formula(formula)
+    alphabet = _alphabet(formula.propositions, letters)
+    normal = negation_normal_form(formula)
+    try:
+        if is_syntactically_cosafe(normal):
+            automaton = _progression_automaton(normal, alphabet, "cosafe", max_states)
+        elif is_syntactically_safe(normal):
+            automaton = _progression_automaton(normal, alphabet, "safety", max_states)
+        else:
+            automaton = _general(formula, alphabet, max_states)
+    except RecursionError:  # a diagram is as deep as the subformulas that a state combines
+        raise ValueError(
+            "to_automaton: too many subformulas are combined in one state (several hundred). "
+            "Split the formula into parts that are tracked side by side."
+        ) from None
+    return _with_acceptance(formula, automaton, acceptance)
+
+
+def _alphabet(propositions: tuple[str, ...], letters: Iterable[Letter] | None) -> NDArray[np.bool_]:
+    """The letters over the propositions, distinct, by binary number: bool `[L, P]`."""
+    if letters is None:
+        if len(propositions) > MAX_FREE_PROPOSITIONS:
+            raise ValueError(
+                f"to_automaton: the formula has {len(propositions)} propositions, so "
+                f"2^{len(propositions)} letters; the limit is 2^{MAX_FREE_PROPOSITIONS}. "
+                "Pass letters=, the sets of propositions that can hold at once."
+            )
+        sizes = range(len(propositions) + 1)
+        letters = chain.from_iterable(combinations(propositions, size) for size in sizes)
+    bit = {name: 1 << p for p, name in enumerate(propositions)}
+    given = as_letters(letters, "to_automaton: letters")
+    distinct = {letter.intersection(bit) for letter in given}
+    if not distinct:
+        raise ValueError(
+            "to_automaton: letters is empty. Pass at least one letter, such as set(), or None "
+            "for all of them."
+        )
+    rows = sorted(distinct, key=lambda letter: sum(bit[name] for name in letter))
+    table = [[name in letter for name in propositions] for letter in rows]
+    return np.array(table, bool).reshape(len(rows), len(propositions))
+
+
+# ---------------------------------------------------------------------------------------------
+# The fragments
+# ---------------------------------------------------------------------------------------------
+
+
+def _progression_automaton(
+    formula: Formula, alphabet: NDArray[np.bool_], acceptance: str, max_states: int
+) -> Automaton:
+    """The minimal automaton of a co-safe or safety formula in negation normal form."""
+    propositions = formula.propositions
+    progression = Progression([formula], alphabet, propositions)
+    states, delta = _explore(progression, progression.diagram_of[formula], max_states)
+    reached = np.array(states) == (TRUE if acceptance == "cosafe" else FALSE)
+    decided = _forced(delta, reached)
+    final = decided if acceptance == "cosafe" else ~decided
+    delta = delta[:, progression.class_of]
+    automaton = Automaton(
+        delta=delta,
+        initial=0,
+        priority=np.where(final, 0, 1)[:, None].repeat(delta.shape[1], axis=1).astype(np.int32),
+        letters=alphabet,
+        propositions=propositions,
+        acceptance=acceptance,
+    )
+    classes = equivalence_classes(automaton)
+    minimal = quotient(automaton, classes)
+    _, first = np.unique(classes, return_index=True)  # every state is reachable
+    return replace(minimal, state_names=_names(minimal, progression, [states[q] for q in first]))
+
+
+def _explore(
+    progression: Progression, start: int, max_states: int
+) -> tuple[list[int], NDArray[np.int32]]:
+    """The diagrams reached from `start`, breadth first, and their transitions `[Q, K]`."""
+    states = [start]
+    index = {start: 0}
+    rows = []
+    for state in states:
+        row = [after(state) for after in progression.after]
+        for successor in row:
+            if successor not in index:
+                index[successor] = len(states)
+                states.append(successor)
+        rows.append([index[successor] for successor in row])
+        if len(states) > max_states:
+            raise _too_many(max_states)
+    return states, np.array(rows, np.int32)
+
+
+def _too_many(max_states: int) -> ValueError:
+    return ValueError(
+        f"to_automaton: more than {max_states} states. Pass fewer letters=, split the "
+        "formula into parts that are tracked side by side, or raise max_states."
+    )
+
+
+def _forced(delta: NDArray[np.int32], target: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The states from which every word reaches the target, bool `[Q]`."""
+    while True:
+        wider = target | target[delta].all(axis=1)
+        if (wider == target).all():
+            return target
+        target = wider
+
+
+def _names(
+    automaton: Automaton, progression: Progression, diagrams: list[int] | None
+) -> tuple[str, ...]:
+    namer = Namer(progression)
+    names = []
+    still = (automaton.delta == np.arange(len(automaton.delta))[:, None]).all(axis=1)
+    for q, priorities in enumerate(automaton.priority):
+        if still[q] and (priorities % 2 == priorities[0] % 2).all():
+            names.append("false" if priorities[0] % 2 else "true")
+        else:
+            names.append("..." if diagrams is None else namer.name(diagrams[q]))
+    return tuple(names)
+
+
+# ---------------------------------------------------------------------------------------------
+# All of the logic
+# ---------------------------------------------------------------------------------------------
+
+
+def _general(formula: Formula, alphabet: NDArray[np.bool_], max_states: int) -> Automaton:
+    """The smallest automaton that the ways to combine trackers give."""
+    plain = simplify(formula)
+    ways = _combinations(plain)
+    best: tuple[Table, NDArray[np.intp]] | None = None
+    # The way that tracks least may explode where another does not, so all start with little.
+    for work in (MAX_NODES // 30, MAX_NODES // 5, MAX_NODES):
+        for parts, cost in ways:
+            if best is not None and cost > WORTHWHILE * ways[0][1]:
+                break
+            limit = max_states if work == MAX_NODES else min(max_states, work // 10)
+            if best is not None:
+                limit = min(limit, 20 * len(best[0].delta) + 100)
+            try:
+                found = _tracked(parts, alphabet, formula.propositions, limit, work)
+            except ValueError:
+                if best is None and work == MAX_NODES and parts is ways[-1][0]:
+                    raise
+                continue
+            if best is None or _size(found[0]) < _size(best[0]):
+                best = found
+            # A weak automaton is minimal, and a large one takes too long to do again.
+            if is_weak(found[0]) or _size(best[0])[0] <= GOOD_ENOUGH:
+                break
+            if best[0].delta.size > LARGE:
+                break
+        if best is not None:
+            break
+    assert best is not None
+    class_of = best[1]
+    small, kind, _ = reduce_table(best[0])
+    table, _ = reachable(Table(small.delta[:, class_of], small.priority[:, class_of], 0))
+    automaton = Automaton(
+        delta=table.delta.astype(np.int32),
+        initial=np.asarray(table.initial, np.int32),
+        priority=table.priority.astype(np.int32),
+        letters=alphabet,
+        propositions=formula.propositions,
+        acceptance=kind,
+    )
+    return replace(automaton, state_names=_residual_names(plain, automaton))
+
+
+def _combinations(formula: Formula) -> list[tuple[Combination, int]]:
+    """The different combinations of a formula, with how much they track, least first."""
+    found: list[tuple[Combination, int]] = []
+    for steps in (MAX_STEPS // 20, MAX_STEPS):
+        for grouped, dual in ((True, False), (True, True), (False, False), (False, True)):
+            try:
+                parts = combination(formula, grouped, dual, steps)
+            except ValueError:
+                if steps == MAX_STEPS and not found and grouped < dual:
+                    raise
+                continue
+            if all(parts != other for other, _ in found):
+                found.append((parts, extent(parts)))
+        if found:
+            break
+    return sorted(found, key=lambda entry: entry[1])
+
+
+def _size(table: Table) -> tuple[int, int]:
+    """States, a rejecting sink apart, then priorities."""
+    still = (table.delta == np.arange(len(table.delta))[:, None]).all(axis=1)
+    sink = still & (table.priority % 2 == 1).all(axis=1)
+    return len(table.delta) - int(sink.any()), len(np.unique(table.priority))
+
+
+def _tracked(
+    parts: Combination,
+    alphabet: NDArray[np.bool_],
+    propositions: tuple[str, ...],
+    max_states: int,
+    max_nodes: int,
+) -> tuple[Table, NDArray[np.intp]]:
+    """The reduced parity automaton of trackers, over classes of letters `[L]`."""
+    delta, colors, condition, class_of = track(
+        parts, alphabet, propositions, max_states, max_nodes
+    )
+    try:
+        table = to_parity(delta, colors, 0, condition, max_states)[:3]
+    except ValueError:
+        raise _too_many(max_states) from None
+    return reduce_table(Table(*table), thorough=False)[0], class_of
+
+
+def _residual_names(formula: Formula, automaton: Automaton) -> tuple[str, ...]:
+    """The formula left after a shortest word to each state, which has the state's language."""
+    progression = Progression([formula], automaton.letters, automaton.propositions)
+    if len(automaton.delta) > NAMED_STATES:
+        return _names(automaton, progression, None)
+    diagrams = {int(automaton.initial): progression.diagram_of[formula]}
+    delta = automaton.delta[:, progression.representative].tolist()
+    for state in (queue := list(diagrams)):
+        for after, successor in zip(progression.after, delta[state], strict=True):
+            if successor not in diagrams:
+                diagrams[successor] = after(diagrams[state])
+                queue.append(successor)
+    return _names(automaton, progression, [diagrams[q] for q in range(len(delta))])
+
+
+def _undecided(automaton: Automaton) -> str:
+    """Words that show why no finite prefix decides."""
+
+    def states(final: NDArray[np.bool_]) -> Automaton:
+        priority = np.repeat(np.where(final, 0, 1)[:, None], automaton.delta.shape[1], axis=1)
+        return replace(automaton, priority=priority.astype(np.int32), acceptance="buchi")
+
+    hopeful, sure = states(live_states(automaton)), states(universal_states(automaton))
+    fails = find_not_included(hopeful, automaton)
+    holds = find_not_included(automaton, sure)
+    assert fails is not None and holds is not None
+    return (
+        f"  It fails on {_lasso_text(fails)}, though each prefix can still be continued well.\n"
+        f"  It holds on {_lasso_text(holds)}, though each prefix can still be continued badly.\n"
+    )
+
+
+def _lasso_text(lasso: tuple[list[frozenset[str]], list[frozenset[str]]]) -> str:
+    prefix, cycle = (" ".join("{" + ", ".join(sorted(x)) + "}" for x in part) for part in lasso)
+    return f"{prefix} ({cycle})^w".strip()
+
+
+def _with_acceptance(formula: Formula, automaton: Automaton, acceptance: Acceptance) -> Automaton:
+    """The automaton with the acceptance that was asked for, if it can have it."""
+    kind = automaton.acceptance
+    if acceptance == "auto":
+        return automaton
+    if acceptance == "dfa":
+        if kind in ("cosafe", "safety"):
+            return automaton
+        raise ValueError(
+            f"to_automaton: {formula} has no finite acceptance, because neither a finite prefix "
+            "proves it wherever it holds (co-safe) nor one refutes it wherever it fails "
+            f"(safety).\n{_undecided(automaton)}"
+            '  Ask for acceptance="auto", or bound the formula by an event.'
+        )
+    if acceptance == "buchi":
+        if kind == "parity":
+            raise ValueError(
+                f"to_automaton: {formula} has no deterministic Buchi automaton: some word is "
+                "accepted because certain letters stop occurring, which a deterministic run "
+                'cannot foresee. Ask for acceptance="parity".'
+            )
+        return replace(automaton, acceptance="buchi")
+    return replace(automaton, acceptance="parity")

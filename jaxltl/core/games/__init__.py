@@ -1,0 +1,1 @@
+"""Games against an environment: objectives, winning regions, strategies and their check."""

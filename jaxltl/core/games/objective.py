@@ -1,0 +1,192 @@
+"""What a player of a game is to achieve, as sets and priorities of states.
+
+Every objective is one of two: :class:`Parity`, of which safety, reachability, Buchi and
+co-Buchi are cases, and :class:`GR1`, of which generalised Buchi is one. Sets of states are
+Boolean arrays, or Boolean formulas over the propositions of the game.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.core.logic.labels import satisfying
+from jaxltl.core.logic.ltl import Formula
+
+States: TypeAlias = chex.Array | Formula | str  # a set of states
+
+
+@struct.dataclass
+class Parity:
+    """The least priority met infinitely often is even; some states decide the run at once.
+
+    Attributes:
+      priority: ``int32[S]``, at least 0.
+      won: ``bool[S]``: whoever enters has achieved the objective, whatever follows.
+      lost: ``bool[S]``: whoever enters has failed it.
+      num_priorities: priorities are below it; static.
+    """
+
+    priority: jax.Array
+    won: jax.Array
+    lost: jax.Array
+    num_priorities: int = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class GR1:
+    """Generalised reactivity of rank one (Piterman, Pnueli and Sa'ar 2006).
+
+    If every assumption is met infinitely often then so is every guarantee; and no state
+    of `lost` is ever entered.
+
+    Attributes:
+      assumptions: ``bool[M, S]``, at least one.
+      guarantees: ``bool[J, S]``, at least one.
+      lost: ``bool[S]``.
+    """
+
+    assumptions: jax.Array
+    guarantees: jax.Array
+    lost: jax.Array
+
+
+def states_where(model: Any, condition: States, place: str = "condition") -> jax.Array:
+    """A set of states as ``bool[S]``: of an array, or of a Boolean formula over propositions.
+
+    Args:
+      model: an MDP, a DenseMDP, a Product or a Game.
+      condition: ``bool[S]``, or a formula without temporal operators. In a product it
+        speaks of the world's states.
+      place: what is asked for, to begin an error with.
+
+    Raises:
+      ValueError: wrong shape or dtype, an unknown proposition, or a temporal operator.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> world = from_dense([[[1.0, 0]], [[0, 1.0]]], label=[[0], [1]], propositions=["a"])
+      >>> states_where(world, "!a").tolist()
+      [True, False]
+    """
+    if isinstance(condition, str) and condition in ("true", "false"):
+        return jnp.full(model.state_shape, condition == "true")  # of traced games too
+    if isinstance(condition, str | Formula):
+        world = model
+        while hasattr(world, "mdp"):
+            world = world.mdp
+        holds = satisfying(np.asarray(world.label), world.propositions, condition, place)
+        extra = len(model.state_shape) - 1
+        return jnp.broadcast_to(holds.reshape(-1, *(1,) * extra), model.state_shape)
+    condition = jnp.asarray(condition)
+    if condition.shape != model.state_shape or condition.dtype != bool:
+        raise ValueError(
+            f"{place} is {condition.dtype}{list(condition.shape)}; give "
+            f"bool{list(model.state_shape)}, or a Boolean formula over propositions."
+        )
+    return condition
+
+
+def safety(game: Any, safe: States) -> Parity:
+    """Stay in `safe` for ever: ``G safe``."""
+    return _parity(game, 0, 1, lost=~states_where(game, safe, "safe"))
+
+
+def reach(game: Any, goal: States, *, safe: States = "true") -> Parity:
+    """Reach `goal`, through `safe` states until then: ``safe U goal``."""
+    goal = states_where(game, goal, "goal")
+    return _parity(game, 1, 2, won=goal, lost=~goal & ~states_where(game, safe, "safe"))
+
+
+def buchi(game: Any, accepting: States, *, safe: States = "true") -> Parity:
+    """Meet `accepting` infinitely often and stay in `safe`: ``G F accepting & G safe``."""
+    accepting = states_where(game, accepting, "accepting")
+    lost = ~states_where(game, safe, "safe")
+    return _parity(game, jnp.where(accepting, 0, 1), 2, lost=lost)
+
+
+def cobuchi(game: Any, persistent: States, *, safe: States = "true") -> Parity:
+    """Stay in `persistent` from some point on: ``F G persistent & G safe``."""
+    persistent = states_where(game, persistent, "persistent")
+    lost = ~states_where(game, safe, "safe")
+    return _parity(game, jnp.where(persistent, 2, 1), 3, lost=lost)
+
+
+def parity(
+    game: Any, priority: chex.Array, *, safe: States = "true", num_priorities: int | None = None
+) -> Parity:
+    """The least priority met infinitely often is even.
+
+    Args:
+      game: the game.
+      priority: ``int[S]``, at least 0.
+      safe: states never to leave.
+      num_priorities: an upper bound on ``1 + priority``; needed only where the
+        priorities are traced.
+
+    Raises:
+      ValueError: negative or non-integer priorities, or a wrong shape.
+    """
+    if num_priorities is None:
+        values = np.asarray(priority)
+        if not np.issubdtype(values.dtype, np.integer) or values.shape != game.state_shape:
+            raise ValueError(f"priority is {values.dtype}{list(values.shape)}; give "
+                             f"int{list(game.state_shape)}.")
+        if values.min(initial=0) < 0:
+            state = np.argwhere(values < 0)[0]
+            raise ValueError(f"state {state.tolist()} has priority {values.min()}; "
+                             "priorities start at 0.")
+        num_priorities = int(values.max(initial=0)) + 1
+    return _parity(game, priority, num_priorities, lost=~states_where(game, safe, "safe"))
+
+
+def _parity(game, priority, num_priorities: int, *, won=None, lost=None) -> Parity:
+    none = jnp.zeros(game.state_shape, bool)
+    return Parity(
+        priority=jnp.broadcast_to(jnp.asarray(priority, jnp.int32), game.state_shape),
+        won=none if won is None else won,
+        lost=none if lost is None else lost,
+        num_priorities=num_priorities,
+    )
+
+
+def generalized_buchi(game: Any, sets: Sequence[States], *, safe: States = "true") -> GR1:
+    """Meet each of several sets infinitely often and stay in `safe`."""
+    return gr1(game, (), sets, safe=safe)
+
+
+def gr1(
+    game: Any,
+    assumptions: Sequence[States],
+    guarantees: Sequence[States],
+    *,
+    safe: States = "true",
+) -> GR1:
+    """``G safe & ((G F A_1 & ... & G F A_M) -> (G F G_1 & ... & G F G_J))``.
+
+    Args:
+      game: the game.
+      assumptions, guarantees: sets of states, arrays or Boolean formulas, each of which is
+        to be met infinitely often; G and F are not written.
+      safe: states never to leave, whatever the environment does.
+
+    Raises:
+      ValueError: an entry is not Boolean or mentions an unknown proposition.
+    """
+    def rows(sets: Sequence[States], name: str) -> jax.Array:
+        if isinstance(sets, str | Formula):
+            raise ValueError(f"{name} is {str(sets)!r}; give a list of sets of states.")
+        found = [states_where(game, x, f"{name}[{i}]") for i, x in enumerate(sets)]
+        return jnp.stack(found or [jnp.ones(game.state_shape, bool)])
+
+    return GR1(
+        assumptions=rows(assumptions, "assumptions"),
+        guarantees=rows(guarantees, "guarantees"),
+        lost=~states_where(game, safe, "safe"),
+    )

@@ -1,0 +1,473 @@
+"""Permissive strategies: many ways to win at once, as a mask of moves (dissertation, 5.4.1).
+
+A permissive strategy leaves the system a choice, and whatever it chooses it wins. Learning inside
+its mask is therefore correct from the first move on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.games.gr1 import NEVER, gr1_layers
+from jaxltl.core.games.objective import GR1, Parity
+from jaxltl.core.games.winning import objective_at, on_states, solve
+from jaxltl.core.graphs.attractor import attractor
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models.game import Game, as_game
+from jaxltl.core.models.operators import (
+    first_action,
+    forall_successor,
+    is_deterministic,
+    least_successor,
+)
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.restrict import Restriction, restrict
+
+METHODS = ("auto", "stay", "rank", "counter", "parity")
+
+
+@struct.dataclass
+class Permissive:
+    """A permissive strategy: the moves it allows, on the game with the memory it needs.
+
+    Attributes:
+      game: the game itself, or a Game on a Product with the strategy's memory.
+      region: ``bool[S]`` (``[S, Q]``): where the strategy wins.
+      mask: ``bool[S, A]``: the moves it allows in the region, all of the environment's
+        among them; nothing elsewhere.
+      base_state, automaton_state: ``int32[S]``, the state of the world and of the task's
+        automaton that each of the game's world states stands for.
+      maximal: whether it includes every winning strategy; static.
+      reason: what it includes, in words; static.
+    """
+
+    game: Game
+    region: jax.Array
+    mask: jax.Array
+    base_state: jax.Array
+    automaton_state: jax.Array
+    maximal: bool = struct.field(pytree_node=False)
+    reason: str = struct.field(pytree_node=False)
+
+
+def permissive_strategy(
+    game: Any,
+    spec: Parity | GR1 | Automaton | Formula | str,
+    *,
+    method: str = "auto",
+    bound: int | None = None,
+) -> Permissive:
+    """Many winning strategies at once, on the host.
+
+    - ``"stay"``: every move that surely stays in the winning region. Wins only where
+      staying does, as for safety; it then includes every winning strategy (dissertation,
+      proposition 1), and otherwise no strategy does.
+    - ``"rank"``, for Buchi and GR(1): away from the goal, moves that come nearer to it.
+    - ``"counter"``, for Buchi: whatever meets the accepting states again within `bound` of
+      the system's moves (dissertation, example 3).
+    - ``"parity"``: whatever meets a state of odd priority at most `bound` times before one of
+      a lower even priority (Bernet, Janin and Walukiewicz 2002); without `bound` as many
+      times as there are such states, which includes every memoryless winning strategy. Its
+      memory is the product of the counts.
+    - ``"auto"``: ``"stay"`` where it wins; else ``"counter"`` if there is a bound and the
+      objective is Buchi; else ``"rank"``, or ``"parity"`` for other objectives.
+
+    Args:
+      game: a Game, an MDP or a Product.
+      spec: an objective, a formula or an automaton, as for
+        :func:`~jaxltl.core.games.winning.winning_region`.
+      method: see above.
+      bound: for ``"counter"`` and ``"parity"``.
+
+    Returns:
+      :class:`Permissive`. In stochastic games ``"rank"`` wins almost surely, and the counts
+      of ``"counter"`` and ``"parity"`` hold surely.
+
+    Raises:
+      ValueError: the specification is unrealizable from every initial state, or the method
+        does not fit the objective.
+
+    Example:
+      >>> from jaxltl.core.models.game import make_game
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]],
+      ...                    label=[[0], [1]], propositions=["crash"], initial=[1, 0])
+      >>> shield_ = permissive_strategy(world, "G !crash")
+      >>> shield_.maximal, shield_.mask[0].any(0).tolist()
+      (True, [True, False])
+    """
+    if method not in METHODS:
+        raise ValueError(f"method={method!r}; choose one of {', '.join(METHODS)}.")
+    if bound is not None and bound < 1:
+        raise ValueError(f"bound={bound}; it must be at least 1.")
+    game, objective = on_states(as_game(game), spec)
+    if isinstance(objective, Parity) and not _closed(game, objective.won):
+        game, objective, origin = _remember_won(game, objective)
+        found = permissive_strategy(game, objective, method=method, bound=bound)
+        return replace(
+            found, base_state=origin.base_state[found.base_state],
+            automaton_state=origin.memory[found.base_state],
+        )
+    if isinstance(objective, Parity):
+        objective = _without_won(objective)
+    region = solve(game, objective).region
+    _require_start(game, region)
+    stay = _staying(game, region)
+    maximal = _always_wins(game, objective, region, stay)
+    if method == "auto":
+        method = _choose(objective, maximal, bound)
+    if method == "stay":
+        if not maximal:
+            raise ValueError(
+                'method="stay": some run that stays in the winning region for ever does not '
+                "win, so no strategy includes every winning one; choose rank, counter or parity."
+            )
+        return _on(game, region, stay, True,
+                   "maximal: every run that stays in the winning region wins, so it includes "
+                   "every winning strategy")
+    build = {"rank": _by_rank, "counter": _by_counter, "parity": _by_parity}[method]
+    return build(game, objective, region, stay, bound)
+
+
+def apply_strategy(strategy: Permissive) -> Restriction:
+    """The game in which the system can only do what a permissive strategy allows.
+
+    What is reachable from the initial states where the strategy wins, as an ordinary game
+    (dissertation, algorithm 3, step 2). Every run of it wins.
+
+    Returns:
+      A :class:`~jaxltl.core.models.restrict.Restriction`; ``base_state`` and ``memory`` number the
+      states of ``strategy.game``.
+    """
+    initial = jnp.where(strategy.region, strategy.game.initial, 0)
+    return restrict(strategy.game, initial / initial.sum(), allowed=strategy.mask)
+
+
+def shield(policy: jax.Array, mask: jax.Array) -> jax.Array:
+    """A policy kept to the moves that a mask allows.
+
+    Args:
+      policy: ``float[S, A]``, or ``int32[S]`` for a deterministic policy.
+      mask: ``bool[S, A]``.
+
+    Returns:
+      A policy of the same kind: a distribution is scaled to the allowed moves, and uniform
+      over them where it had none of them; a deterministic policy changes to the first allowed
+      move where its own is not. Where nothing is allowed, outside of the winning region, the
+      policy is left as it is: no move is right there. Differentiable in the policy.
+
+    Raises:
+      ValueError: the mask allows nothing at all, or the shapes differ.
+
+    Example:
+      >>> shield(jnp.array([[0.5, 0.25, 0.25]]), jnp.array([[False, True, True]])).tolist()
+      [[0.0, 0.5, 0.5]]
+    """
+    if not isinstance(mask, jax.core.Tracer) and not np.any(np.asarray(mask)):
+        raise ValueError("the mask allows no move in any state; the specification is "
+                         "unrealizable, or the mask is of another game.")
+    some, first = first_action(mask)
+    if is_deterministic(policy):
+        if jnp.shape(policy) != mask.shape[:-1]:
+            raise ValueError(f"policy has shape {jnp.shape(policy)}; the mask's states have "
+                             f"{mask.shape[:-1]}.")
+        allowed = jnp.take_along_axis(mask, policy[..., None], axis=-1)[..., 0]
+        return jnp.where(allowed | ~some, policy, first)
+    if jnp.shape(policy) != mask.shape:
+        raise ValueError(f"policy has shape {jnp.shape(policy)}; the mask has {mask.shape}.")
+    kept = jnp.where(mask, policy, 0)
+    total = kept.sum(-1, keepdims=True)
+    uniform = mask / jnp.maximum(mask.sum(-1, keepdims=True), 1)
+    shielded = jnp.where(total > 0, kept / jnp.where(total > 0, total, 1), uniform)
+    return jnp.where(some[..., None], shielded, policy)
+
+
+# --- what all methods share -------------------------------------------------------------------
+
+
+def _staying(game: Game, region: jax.Array) -> jax.Array:
+    return game.available & region[..., None] & forall_successor(game, region)
+
+
+def _wins_somewhere(game: Game, region: jax.Array) -> bool:
+    return bool(np.asarray(region)[np.asarray(game.initial) > 0].any())
+
+
+def _require_start(game: Game, region: jax.Array) -> None:
+    if not _wins_somewhere(game, region):
+        state = np.argwhere(np.asarray(game.initial) > 0)[0].tolist()
+        name = state[0] if len(state) == 1 else tuple(state)
+        raise ValueError(
+            "the specification is unrealizable: the environment wins from every initial state, "
+            f"for example {name}. winning_region(...).counter_action shows how; weaken the "
+            "task, or assume something of the environment."
+        )
+
+
+def _always_wins(game: Game, objective: Any, region: jax.Array, mask: jax.Array) -> bool:
+    """Whether every run within a mask achieves the objective, whoever chooses."""
+    if isinstance(objective, Parity) and objective.num_priorities == 1:
+        return True  # nothing but safety
+    hostile = Game(game.mdp, jnp.zeros(game.state_shape, bool))
+    within = replace(objective, lost=objective.lost | ~region)
+    return bool(jnp.all(solve(hostile, within, mask).region | ~region))
+
+
+def _is_buchi(objective: Any) -> bool:
+    return isinstance(objective, Parity) and objective.num_priorities == 2
+
+
+def _choose(objective: Any, maximal: bool, bound: int | None) -> str:
+    if maximal:
+        return "stay"
+    if _is_buchi(objective):
+        return "rank" if bound is None else "counter"
+    return "rank" if isinstance(objective, GR1) else "parity"
+
+
+def _on(game, region, mask, maximal: bool, reason: str, origin: Restriction | None = None):
+    base = jnp.arange(game.mdp.mdp.num_states if _is_lazy(game) else game.num_states)
+    state, memory = (base, jnp.zeros_like(base)) if origin is None else origin[1:]
+    return Permissive(game, region, mask, state, memory, maximal, reason)
+
+
+def _is_lazy(game: Game) -> bool:
+    return isinstance(game.mdp, Product)
+
+
+def _explicit(
+    game: Game, objective: Any, region: jax.Array, mask: jax.Array
+) -> tuple[Game, Any, Restriction | None]:
+    """A game that can be put beside memory: a product is first made explicit, in its region."""
+    if not _is_lazy(game):
+        return game, objective, None
+    start = jnp.where(region, game.initial, 0)
+    found = restrict(game, start / start.sum(), allowed=mask)
+    origin = found.base_state * game.state_shape[1] + found.memory
+    return found.model, objective_at(objective, origin), found
+
+
+def _beside(
+    game: Game, delta: np.ndarray, initial: int, letter: chex.Array, label_on: str
+) -> Game:
+    """The game beside a memory that reads a letter of each state."""
+    num_letters = delta.shape[1]
+    automaton = Automaton(
+        delta=delta.astype(np.int32), initial=initial,
+        priority=np.zeros(delta.shape, np.int32), letters=np.eye(num_letters, dtype=bool),
+        propositions=tuple(f"letter_{i}" for i in range(num_letters)), acceptance="parity",
+    )
+    tables = jax.tree.map(jnp.asarray, automaton)
+    joint = Product(game.mdp, tables, jnp.asarray(letter, jnp.int32), label_on)
+    return Game(joint, jnp.broadcast_to(game.system[:, None], joint.state_shape))
+
+
+def _closed(game: Game, region: jax.Array) -> bool:
+    return bool(jnp.all(~region[..., None] | ~game.available | forall_successor(game, region)))
+
+
+def _without_won(objective: Parity) -> Parity:
+    """The same objective where what is won is never left: the best priority from then on."""
+    return replace(
+        objective, priority=jnp.where(objective.won, 0, objective.priority),
+        won=jnp.zeros_like(objective.won), lost=objective.lost & ~objective.won,
+    )
+
+
+def _remember_won(game: Game, objective: Parity) -> tuple[Game, Parity, Restriction]:
+    """The game beside one bit that tells whether the run has been won already, made explicit."""
+    first = restrict(game)
+    width = game.state_shape[1] if _is_lazy(game) else 1
+    objective = objective_at(objective, first.base_state * width + first.memory)
+    game = first.model
+    joint = _beside(game, np.array([[0, 1], [1, 1]]), 0, objective.won, "exit")
+    found = restrict(joint)
+    origin = Restriction(
+        found.model, first.base_state[found.base_state], first.memory[found.base_state]
+    )
+    objective = objective_at(objective, found.base_state)
+    won = found.memory == 1
+    return found.model, Parity(
+        priority=jnp.where(won, 0, objective.priority),
+        won=won,
+        lost=~won & objective.lost & ~objective.won,
+        num_priorities=objective.num_priorities,
+    ), origin
+
+
+# --- the methods ------------------------------------------------------------------------------
+
+
+def _by_rank(game, objective, region, stay, bound) -> Permissive:
+    del bound
+    if isinstance(objective, GR1):
+        return _by_layers(game, objective, region, stay)
+    if not _is_buchi(objective):
+        raise ValueError('method="rank" is for Buchi and GR(1) objectives; choose parity.')
+    goal = region & (objective.priority == 0)
+    near = attractor(game, goal, stay, rule=game.system, among=region)
+    nearer = _some_nearer(game, near.rank, region) | goal[..., None]
+    mask = stay & (nearer | ~game.system[..., None])
+    return _on(game, region, mask, False,
+               "not maximal: away from the accepting states it allows the moves that come nearer "
+               "to them, with positive probability where chance decides; at them, every move "
+               "that stays in the winning region")
+
+
+def _some_nearer(game: Game, rank: jax.Array, region: jax.Array) -> jax.Array:
+    """Moves with a successor in the region that has a smaller rank: ``bool[S, A]``."""
+    rank = jnp.where(region, rank, NEVER)
+    return least_successor(game, rank) < rank[..., None]
+
+
+def _by_layers(game, objective: GR1, region, stay) -> Permissive:
+    game, objective, origin = _explicit(game, objective, region, stay)
+    layers = gr1_layers(game, objective)
+    region = layers.region
+    stay = _staying(game, region)
+    num_goals, num_assumptions = layers.round.shape[:2]
+    masks = []
+    for j in range(num_goals):
+        rounds = layers.round[j]
+        covered = rounds.min(0)  # the round of the first layer that covers a state
+        mask = stay & (objective.guarantees[j][:, None] | _some_nearer(game, covered, region))
+        for i in range(num_assumptions):
+            first = region & (rounds.argmin(0) == i) & ~objective.assumptions[i]
+            latest = -least_successor(game, -jnp.where(region, rounds[i], NEVER))
+            mask |= stay & first[:, None] & (latest <= covered[:, None])
+        masks.append(mask | (stay & ~game.system[:, None]))
+    delta = np.array([[j, (j + 1) % num_goals] for j in range(num_goals)])
+    joint = _beside_goals(game, objective, delta)
+    both = jnp.broadcast_to(region[:, None], joint.state_shape)
+    return _on(joint, both, jnp.stack(masks, 1), False,
+               "not maximal: towards each guarantee in turn it allows the moves that come nearer "
+               "to it, and where an assumption does not hold those that wait for it", origin)
+
+
+def _beside_goals(game: Game, objective: GR1, delta: np.ndarray) -> Game:
+    """The game beside the guarantee that is pursued, which moves on where it holds."""
+    num_goals = len(delta)
+    # A letter tells which guarantees hold; those that occur are few.
+    rows, letter = np.unique(np.asarray(objective.guarantees).T, axis=0, return_inverse=True)
+    step = np.array([[delta[j, int(row[j])] for row in rows] for j in range(num_goals)])
+    return _beside(game, step, 0, letter.ravel(), "exit")
+
+
+def _by_counter(game, objective, region, stay, bound) -> Permissive:
+    if not _is_buchi(objective):
+        raise ValueError('method="counter" is for Buchi objectives; choose parity.')
+    if bound is None:
+        raise ValueError('method="counter" needs bound=m, the system\'s moves within which the '
+                         "accepting states are met again.")
+    game, objective, origin = _explicit(game, objective, region, stay)
+    accepting = objective.priority == 0
+    # Memory 2 c + b: c moves since the last accepting state, and b whether the state that is
+    # left is the system's; 2 m is too late. Letters tell both of the state that is entered.
+    count, mover = np.divmod(np.arange(2 * bound), 2)
+    delta = np.empty((2 * bound + 1, 4), int)
+    for entered_accepts in (0, 1):
+        for entered_system in (0, 1):
+            moved = np.where(entered_accepts, 0, count + mover)
+            late = moved >= bound
+            step = np.where(late, 2 * bound, 2 * moved + entered_system)
+            delta[:-1, 2 * entered_accepts + entered_system] = step
+    delta[-1] = 2 * bound
+    letter = 2 * accepting + game.system
+    joint = _beside(game, delta, 0, letter, "entry")
+    late = jnp.arange(2 * bound + 1) == 2 * bound
+    return _safe_beside(
+        joint, objective, late, bound, origin,
+        f"not maximal: it includes every strategy that surely meets the accepting states again "
+        f"within {bound} of the system's moves",
+    )
+
+
+def _by_parity(game, objective, region, stay, bound) -> Permissive:
+    if not isinstance(objective, Parity):
+        raise ValueError('method="parity" is for parity objectives; GR(1) has rank, and as a '
+                         "formula it is a parity objective.")
+    game, objective, origin = _explicit(game, objective, region, stay)
+    inside = np.ones(game.num_states, bool) if origin is not None else np.asarray(region)
+    priority = np.asarray(objective.priority)
+    odd = range(1, objective.num_priorities, 2)
+    caps = [int((inside & (priority == p)).sum()) for p in odd]
+    exact = bound is None or all(cap <= bound for cap in caps)
+    caps = caps if bound is None else [bound] * len(caps)
+    delta = budgets(caps, objective.num_priorities)
+    joint = _beside(game, delta, len(delta) - 2, objective.priority, "exit")
+    spent = jnp.arange(len(delta)) == len(delta) - 1
+    counts = ", ".join(f"{cap} of priority {p}" for p, cap in zip(odd, caps, strict=True))
+    return _safe_beside(
+        joint, objective, spent, bound, origin,
+        ("not maximal: it includes every memoryless winning strategy; " if exact
+         else "not maximal: it includes every strategy that keeps to these counts; ")
+        + f"between lower even priorities at most {counts} are met",
+    )
+
+
+def budgets(caps: list[int], num_priorities: int) -> np.ndarray:
+    """The memory of the parity construction: how often odd priorities may still be met.
+
+    State ``n`` writes the remaining counts of the priorities 1, 3, ... as digits, the first the
+    most significant; the last state says that they are spent. Meeting an odd priority takes one
+    from the number down to its digit; meeting any priority restores all less significant ones.
+
+    Returns:
+      ``int[N, num_priorities]``, the state after meeting a priority. A run starts in N - 2.
+
+    Raises:
+      ValueError: more than a million states.
+    """
+    base = [cap + 1 for cap in caps]
+    total = int(np.prod([float(b) for b in base]))
+    if total > 1_000_000:
+        raise ValueError(
+            f"the parity construction needs {total} memory states here; give a smaller bound, "
+            "which allows less."
+        )
+    # unit[k]: how much the k-th digit counts; unit[-1] is that of the whole number.
+    unit = [int(np.prod(base[k + 1 :], dtype=int)) for k in range(len(base))]
+    number = np.arange(total)
+    delta = np.full((total + 1, num_priorities), total)
+    for p in range(num_priorities):
+        digits = (p + 1) // 2  # odd priorities up to p
+        scale = unit[digits - 1] if digits else total
+        left = number // scale - p % 2
+        delta[:-1, p] = np.where(left >= 0, left * scale + scale - 1, total)
+    return delta
+
+
+def _safe_beside(
+    joint: Game, objective: Parity, spent: jax.Array, bound: int | None,
+    origin: Restriction | None, reason: str,
+) -> Permissive:
+    """The strategy that stays where the objective can be achieved without some memory states."""
+    # The objective itself still counts: the environment may move for ever where the system
+    # does not, and then no counter of the system's moves runs out.
+    kept = Parity(
+        priority=jnp.broadcast_to(objective.priority[:, None], joint.state_shape),
+        won=jnp.zeros(joint.state_shape, bool),
+        lost=spent | objective.lost[:, None],
+        num_priorities=objective.num_priorities,
+    )
+    region = solve(joint, kept).region
+    if not _wins_somewhere(joint, region):
+        if bound is None:
+            raise ValueError(
+                "the system wins, but chance can put it off any number of times, so that no "
+                "counts hold surely; choose rank for a Buchi objective, or one strategy by "
+                "winning_region."
+            )
+        raise ValueError(
+            f"bound={bound} is too small: the system wins, but not surely within it from any "
+            "initial state; raise it."
+        )
+    return _on(joint, region, _staying(joint, region), False, reason, origin)

@@ -1,0 +1,375 @@
+"""An independent check of winning regions and strategies, by end components on the host.
+
+With one player's strategy fixed, what is left is the other player's problem, and its
+qualitative answers are read off end components. No nested fixed point of the game is
+computed, so that the check shares nothing with the way in which a region was found.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.games.objective import GR1, Parity
+from jaxltl.core.models.game import as_game
+from jaxltl.core.models.mdp import DenseMDP
+
+Booleans = NDArray[np.bool_]
+Integers = NDArray[np.integer[Any]]
+
+
+class Verification(NamedTuple):
+    """What a check of both players' claims found; true if both hold.
+
+    Attributes:
+      system: the system's strategy wins almost surely in the region.
+      environment: the environment's strategy prevents that outside of the region.
+      reason: for each claim that fails what goes wrong, and in which state; else empty.
+    """
+
+    system: bool
+    environment: bool
+    reason: str
+
+    def __bool__(self) -> bool:
+        return self.system and self.environment
+
+
+def verify(winning: Any) -> Verification:
+    """Accepts or refutes a winning region with the strategies of both players; on the host.
+
+    *The system's claim.* Its actions are fixed, the environment and chance are free. The
+    run stays in the region until it is won, and no end component in the region fails the
+    objective: one whose least priority is odd, or one that meets every assumption and
+    misses a guarantee. With positive probability a run stays in some end component for
+    ever, and every other set of states is left almost surely (de Alfaro 1997).
+
+    *The environment's claim.* Its actions are fixed, the system and chance are free, and
+    entering the region counts as the system's success. From no state outside does
+    the system reach the region, or an end component that achieves the objective, with
+    probability one. Both claims together prove that the region is exactly the one in which
+    the system wins almost surely.
+
+    For :class:`GR1` the strategies have memory, and the claims are checked from every memory.
+    Every search is linear in the transitions times memories, and is repeated for each
+    priority, assumption or guarantee, and while components split.
+
+    Args:
+      winning: an object with the fields of ``Winning``: `game`, `objective`, `region`,
+        `action` and `counter_action`.
+
+    Returns:
+      :class:`Verification`.
+
+    Raises:
+      ValueError: the region or an action has the wrong shape, such as a batch of them.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl.core.games.objective import reach
+      >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]])
+      >>> found = SimpleNamespace(
+      ...     game=world, objective=reach(world, np.array([False, True])),
+      ...     region=np.array([True, True]), action=np.array([1, 0]),
+      ...     counter_action=np.array([0, 0]))
+      >>> bool(verify(found))
+      True
+      >>> found.action = np.array([0, 0])
+      >>> verify(found).reason
+      'around state 0 the run can stay for ever with least priority 1, which is odd'
+    """
+    claim = _claim(winning)
+    system, environment = _refute_system(claim), _refute_environment(claim)
+    reason = "; ".join(x for x in (system, environment) if x)
+    return Verification(not system, not environment, reason)
+
+
+class _Claim(NamedTuple):
+    """A ``Winning`` with flat states: ``[S]``, actions ``[S, memories]``, sets ``[n, S]``."""
+
+    game: Any
+    system: Booleans
+    region: Booleans
+    won: Booleans
+    lost: Booleans
+    action: Integers
+    counter_action: Integers
+    priority: Integers | None  # of a parity objective
+    assumptions: Booleans
+    guarantees: Booleans
+
+
+def _claim(winning: Any) -> _Claim:
+    game, objective = as_game(winning.game), winning.objective
+    shape = game.state_shape
+    if isinstance(objective, GR1):
+        sets = tuple(
+            np.asarray(x).reshape(len(x), -1) for x in (objective.assumptions, objective.guarantees)
+        )
+        priority, won = None, np.zeros(shape, bool)
+    elif isinstance(objective, Parity):
+        sets = (np.zeros((1, np.prod(shape, dtype=int)), bool),) * 2
+        priority = np.asarray(objective.priority).ravel()
+        won = np.asarray(objective.won & ~objective.lost)
+    else:
+        raise ValueError(f"objective is a {type(objective).__name__}; give a Parity or a GR1.")
+
+    def flat(name: str, width: int) -> NDArray[Any]:
+        value = np.asarray(getattr(winning, name))
+        expected = (*shape, width) if isinstance(objective, GR1) and width else shape
+        if value.shape != expected:
+            raise ValueError(
+                f"{name} has shape {value.shape}; expected {expected}. Of a batch, give one game "
+                "at a time."
+            )
+        return value.reshape(-1, max(width, 1))
+
+    return _Claim(
+        game, np.asarray(game.system).ravel(), flat("region", 0)[:, 0].astype(bool),
+        won.ravel(), np.asarray(objective.lost).ravel(),
+        flat("action", len(sets[1])), flat("counter_action", len(sets[0])), priority, *sets,
+    )
+
+
+def _refute_system(claim: _Claim) -> str:
+    """What is wrong with the system's claim; nothing if it holds."""
+    bad = np.flatnonzero(claim.region & claim.lost)
+    if bad.size:
+        return f"state {_name(claim, bad[0])} is in the region but already lost"
+    undecided = claim.region & ~claim.won
+    missing = _unavailable(claim, claim.action, undecided & claim.system)
+    if missing:
+        return f"the system's strategy has no valid action: {missing}"
+    play = _fix(claim, claim.system, claim.action, claim.guarantees)
+    memories = play.memories
+    node_in = np.repeat(undecided, memories)
+    edge = np.flatnonzero(
+        node_in[play.source] & ~np.repeat(claim.region, memories)[play.target]
+    )
+    if edge.size:
+        node, action = divmod(int(play.pair[edge[0]]), play.actions)
+        who = "strategy's" if claim.system[node // memories] else "environment's"
+        return f"from {_where(claim, play, node)} the {who} action {action} leaves the region"
+    for avoid, meet, what in _failures(claim):
+        found = _component(play, node_in & ~np.repeat(avoid, memories), meet)
+        if found is not None:
+            return f"around {_where(claim, play, found)} the run can {what}"
+    return ""
+
+
+def _refute_environment(claim: _Claim) -> str:
+    """What is wrong with the environment's claim; nothing if it holds."""
+    bad = np.flatnonzero(claim.won & ~claim.region)
+    if bad.size:
+        return f"state {_name(claim, bad[0])} is already won but outside the region"
+    undecided = ~claim.region & ~claim.lost
+    missing = _unavailable(claim, claim.counter_action, undecided & ~claim.system)
+    if missing:
+        return f"the environment's strategy has no valid action: {missing}"
+    play = _fix(claim, ~claim.system, claim.counter_action, claim.assumptions)
+    memories = play.memories
+    node_in = np.repeat(undecided, memories)
+    for avoid, meet, what in _successes(claim):
+        found = _component(play, node_in & ~np.repeat(avoid, memories), meet)
+        if found is not None:
+            where = _where(claim, play, found)
+            return f"around {where}, outside the region, the system can {what}"
+    # No component outside the region is a success, so all that is left is to enter the region.
+    goal = np.repeat(claim.region & ~claim.lost, memories)
+    entering = _almost_surely(play, goal, node_in)
+    nodes = np.flatnonzero(entering & node_in)
+    if nodes.size:
+        where = _where(claim, play, nodes[0])
+        return f"from {where}, outside the region, the system can enter the region almost surely"
+    return ""
+
+
+def _failures(claim: _Claim):
+    """What fails the objective: components in which a set is avoided and all of others are met."""
+    if claim.priority is not None:
+        yield from _least_priorities(claim.priority, 1)
+        return
+    for j, guarantee in enumerate(claim.guarantees):
+        yield guarantee, claim.assumptions, (
+            f"meet every assumption for ever and never guarantee {j}"
+        )
+
+
+def _successes(claim: _Claim):
+    """What achieves the objective, in the same form."""
+    if claim.priority is not None:
+        yield from _least_priorities(claim.priority, 0)
+        return
+    yield np.zeros_like(claim.region), claim.guarantees, "meet every guarantee for ever"
+    for i, assumption in enumerate(claim.assumptions):
+        yield assumption, claim.guarantees[:0], f"stay for ever without assumption {i}"
+
+
+def _least_priorities(priority: Integers, parity: int):
+    for p in np.unique(priority[priority % 2 == parity]).tolist():
+        kind = "odd" if parity else "even"
+        yield priority < p, (priority == p)[None], (
+            f"stay for ever with least priority {p}, which is {kind}"
+        )
+
+
+def _name(claim: _Claim, state: int) -> str:
+    where = tuple(int(i) for i in np.unravel_index(state, claim.game.state_shape))
+    return str(where[0]) if len(where) == 1 else str(where)
+
+
+def _where(claim: _Claim, play: _Play, node: int) -> str:
+    state, memory = divmod(int(node), play.memories)
+    extra = f" with memory {memory}" if play.memories > 1 else ""
+    return f"state {_name(claim, state)}{extra}"
+
+
+def _unavailable(claim: _Claim, action: Integers, where: Booleans) -> str:
+    """The first action of a strategy that cannot be taken."""
+    available = np.asarray(claim.game.available).reshape(action.shape[0], -1)
+    known = (action >= 0) & (action < available.shape[1])
+    valid = known & np.take_along_axis(available, np.where(known, action, 0), axis=1)
+    wrong = np.argwhere(where[:, None] & ~valid)
+    if not wrong.size:
+        return ""
+    state, memory = wrong[0]
+    extra = f" with memory {memory}" if action.shape[1] > 1 else ""
+    return f"{action[state, memory]} is not available in state {_name(claim, state)}{extra}"
+
+
+# --- one player against chance ----------------------------------------------------------------
+
+
+class _Play(NamedTuple):
+    """What one player faces: edges from nodes ``state * memories + memory`` by numbered pairs.
+
+    The pair ``node * actions + action`` is a choice; all its edges are possible at once.
+    """
+
+    source: Integers
+    pair: Integers
+    target: Integers
+    into: Integers  # the pairs with an edge into node n are into[start[n]:start[n + 1]]
+    start: Integers
+    nodes: int
+    memories: int
+    actions: int
+
+
+def _fix(claim: _Claim, owner: Booleans, action: Integers, goals: Booleans) -> _Play:
+    """The game with one player's actions fixed; the memory advances past a goal that is met."""
+    state, taken, successor = _edges(claim.game)
+    memories = len(goals)
+    memory = np.arange(memories)
+    after = np.where(goals.T, (memory + 1) % memories, memory)  # [S, memories]
+    kept = ~owner[state, None] | (action[state] == taken[:, None])
+    nodes, actions = owner.size * memories, claim.game.num_actions
+    source = (state[:, None] * memories + memory)[kept]
+    pair = source * actions + np.broadcast_to(taken[:, None], kept.shape)[kept]
+    target = (successor[:, None] * memories + after[state])[kept]
+    order = np.argsort(target, kind="stable")
+    start = np.searchsorted(target[order], np.arange(nodes + 1))
+    return _Play(source, pair, target, pair[order], start, nodes, memories, actions)
+
+
+def _edges(game: Any) -> tuple[Integers, Integers, Integers]:
+    """The state, action and successor of every possible move, states numbered flat."""
+    model = game.mdp
+    world = getattr(model, "mdp", model)
+    used = np.asarray(world.successor_probability) > 0
+    s, a, k = (used & np.asarray(world.available)[..., None]).nonzero()
+    t = k if isinstance(world, DenseMDP) else np.asarray(world.successor)[s, a, k].astype(int)
+    if world is model:
+        return s, a, t
+    step = np.asarray(model.next_memory)
+    memories = step.shape[1]
+    after = step[t if model.label_on == "entry" else s]
+    source = s[:, None] * memories + np.arange(memories)
+    return source.ravel(), np.repeat(a, memories), (t[:, None] * memories + after).ravel()
+
+
+def _component(play: _Play, inside: Booleans, meet: Booleans) -> int | None:
+    """A node of an end component among some nodes that meets every set of states, if any does."""
+    if not inside.any():
+        return None
+    label = _end_components(play, inside)
+    found = np.unique(label[label >= 0])
+    for met in np.repeat(meet, play.memories, axis=1):
+        found = np.intersect1d(found, label[met & (label >= 0)])
+    return int(np.flatnonzero(label == found[0])[0]) if found.size else None
+
+
+def _end_components(play: _Play, inside: Booleans) -> Integers:
+    """The maximal end component of each node among some, numbered; -1 without one."""
+    from scipy.sparse import csgraph
+
+    alive = _staying(play, inside, inside)
+    while True:
+        _trim(play, alive, inside)
+        edge = alive[play.pair]
+        source, target = play.source[edge], play.target[edge]
+        _, label = csgraph.connected_components(_matrix(play, source, target), connection="strong")
+        leaving = label[source] != label[target]
+        if not leaving.any():
+            stuck = np.ones(play.nodes, bool)
+            stuck[source] = False
+            return np.where(stuck, -1, label[:-1])
+        alive[play.pair[edge][leaving]] = False
+
+
+def _almost_surely(play: _Play, goal: Booleans, inside: Booleans) -> Booleans:
+    """Nodes from which choices reach the goal with probability one, through inside nodes."""
+    from scipy.sparse import csgraph
+
+    while True:
+        alive = _staying(play, inside, inside | goal)
+        _trim(play, alive, inside)
+        edge = alive[play.pair]
+        # One search backwards from a node of its own that leads to every goal.
+        ends = np.flatnonzero(goal)
+        graph = _matrix(
+            play,
+            np.concatenate([play.target[edge], np.full(ends.size, play.nodes)]),
+            np.concatenate([play.source[edge], ends]),
+        )
+        reached = csgraph.breadth_first_order(graph, play.nodes, return_predecessors=False)
+        smaller = np.zeros(play.nodes + 1, bool)
+        smaller[reached] = True
+        smaller = smaller[:-1] & inside
+        if (smaller == inside).all():
+            return inside | goal
+        inside = smaller
+
+
+def _staying(play: _Play, sources: Booleans, targets: Booleans) -> Booleans:
+    """Pairs of some nodes that surely lead to some nodes: ``bool[nodes * actions]``."""
+    alive = np.zeros(play.nodes * play.actions, bool)
+    alive[play.pair] = True
+    alive[play.pair[~sources[play.source] | ~targets[play.target]]] = False
+    return alive
+
+
+def _trim(play: _Play, alive: Booleans, inside: Booleans) -> None:
+    """Drops the pairs that lead to an inside node without a pair, again and again, in place."""
+    remaining = alive.reshape(play.nodes, play.actions).sum(1)
+    stuck = np.flatnonzero(inside & (remaining == 0)).tolist()
+    while stuck:
+        node = stuck.pop()
+        for pair in play.into[play.start[node] : play.start[node + 1]].tolist():
+            if alive[pair]:
+                alive[pair] = False
+                source = pair // play.actions
+                remaining[source] -= 1
+                if not remaining[source]:
+                    stuck.append(source)
+
+
+def _matrix(play: _Play, source: Integers, target: Integers) -> Any:
+    from scipy.sparse import csr_array  # a tenth of a second that only host graphs need
+
+    # Repeated entries are merged; of Booleans they never add up to zero.
+    size = play.nodes + 1
+    return csr_array((np.ones(source.size, bool), (source, target)), shape=(size, size))

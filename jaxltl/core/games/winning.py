@@ -1,0 +1,290 @@
+"""Who wins a game from where, and how: exact, on supports, with strategies for both players.
+
+In a stochastic game the system wins almost surely or the environment wins with positive
+probability; without chance both are sure. Regions are fixpoints of attractors
+(:mod:`jaxltl.core.graphs.attractor`), which work inside ``jit`` and ``vmap`` and, on concrete
+arrays, in time linear in the transitions.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.games.gr1 import solve_gr1
+from jaxltl.core.games.objective import GR1, Parity, States, buchi
+from jaxltl.core.graphs.attractor import attractor
+from jaxltl.core.graphs.support import repeat
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models.game import Game, as_game
+from jaxltl.core.models.mdp import make_mdp
+from jaxltl.core.models.operators import exists_successor, first_action, forall_successor
+from jaxltl.core.models.product import product
+from jaxltl.core.models.restrict import restrict
+
+
+@struct.dataclass
+class Winning:
+    """The two players' regions, and a strategy of each that wins in its own.
+
+    A strategy for GR(1) has memory: the system pursues guarantee j, at first the one of
+    number 0, and leaving a state of that guarantee goes on to the next in a circle; the
+    environment does the same with its assumptions.
+
+    Attributes:
+      game: the game that was solved; of a formula, the product with its automaton.
+      objective: what the system is to achieve in it.
+      region: ``bool[S]``: from here the system wins, almost surely; from all other states
+        the environment prevents it, with positive probability.
+      action: ``int32[S]``, for GR(1) ``int32[S, J]``: the system's winning moves, at its
+        own states in the region.
+      counter_action: ``int32[S]``, for GR(1) ``int32[S, M]``: the environment's, at its own
+        states outside of the region.
+    """
+
+    game: Game
+    objective: Parity | GR1
+    region: jax.Array
+    action: jax.Array
+    counter_action: jax.Array
+
+    @property
+    def realizable(self) -> jax.Array:
+        """``bool[]``: whether the system wins from every initial state."""
+        return jnp.all(self.region | (self.game.initial <= 0))
+
+
+def winning_region(
+    game: Any, spec: Parity | GR1 | Automaton | Formula | str, *, chance: str = "random"
+) -> Winning:
+    """From where the system wins, and winning strategies of both players.
+
+    Parity by nested fixpoints in the manner of Zielonka (1998) and, where chance takes
+    part, of Banerjee, Majumdar, Mallik, Schmuck and Soudjani (2022); GR(1) by the triple
+    fixpoint of Piterman, Pnueli and Sa'ar (2006). With few priorities the cost is that
+    of few attractors.
+
+    Args:
+      game: a Game; an MDP or a Product is the game in which the system always moves.
+      spec: an objective on the game's states (see :mod:`jaxltl.core.games.objective`), or a
+        formula or an automaton, which is put beside the game (``label_on="exit"``).
+      chance: ``"random"``: by the model's probabilities; ``"adversarial"``: the environment
+        decides where a random move leads, so that winning is sure. States from S on are
+        then the moves that it decides (on the host only).
+
+    Returns:
+      :class:`Winning`. :func:`~jaxltl.core.games.verify.verify` checks it independently.
+
+    Raises:
+      ValueError: a formula over unknown propositions, or an unknown `chance`.
+
+    Example:
+      >>> from jaxltl.core.models.game import make_game
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> world = from_dense([[[0, 1.0], [1.0, 0]], [[1.0, 0], [0, 1.0]]],
+      ...                    label=[[0], [1]], propositions=["a"])
+      >>> winning_region(make_game(world, [True, True]), buchi(world, "a")).region.tolist()
+      [True, True]
+      >>> winning_region(make_game(world, [False, True]), buchi(world, "a")).region.tolist()
+      [False, True]
+    """
+    if chance not in ("random", "adversarial"):
+        raise ValueError(f"chance={chance!r}; choose random or adversarial.")
+    game = as_game(game)
+    game, objective = on_states(game, spec)
+    if chance == "adversarial":
+        game, origin = adversarial_chance(game)
+        objective = objective_at(objective, origin)
+    return solve(game, objective)
+
+
+def solve(game: Game, objective: Parity | GR1, moves: jax.Array | None = None) -> Winning:
+    """:func:`winning_region` of an objective, where only some moves exist.
+
+    Args:
+      game: the game.
+      objective: what the system is to achieve.
+      moves: ``bool[S, A]``; default the available ones. A state without any is won for the
+        player who need not move there.
+    """
+    if isinstance(objective, GR1):
+        return Winning(game, objective, *solve_gr1(game, objective, moves))
+    moves = game.available if moves is None else moves
+    start = _Found(objective.won & ~objective.lost, first_action(moves)[1])
+    found = _level(game, objective, 0, start, ~(objective.won | objective.lost), moves)
+    return Winning(game, objective, found.region, found.action, found.action)
+
+
+def almost_sure_buchi(game: Any, accepting: States) -> Winning:
+    """From where the system can meet a set infinitely often with probability one.
+
+    Args:
+      game: the game.
+      accepting: ``bool[S]``, or a Boolean formula.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> world = from_dense([[[1.0, 0, 0, 0]], [[0.5, 0.5, 0, 0]], [[0.5, 0, 0, 0.5]],
+      ...                     [[0, 0, 0, 1.0]]])
+      >>> almost_sure_buchi(world, jnp.arange(4) == 0).region.tolist()
+      [True, True, False, False]
+    """
+    return winning_region(game, buchi(game, accepting))
+
+
+def on_states(
+    game: Game, spec: Parity | GR1 | Automaton | Formula | str
+) -> tuple[Game, Parity | GR1]:
+    """A game and an objective on its states; of a formula or an automaton, :func:`task_game`."""
+    return (game, spec) if isinstance(spec, Parity | GR1) else task_game(game, spec)
+
+
+def task_game(game: Game, spec: Automaton | Formula | str) -> tuple[Game, Parity]:
+    """The product of a game with a task, and the task as an objective on its states.
+
+    A state ``(s, q)`` has read what came before s, and shows the priority of reading s.
+    """
+    joint = product(game, spec, label_on="exit")
+    automaton, letter = joint.mdp.automaton, joint.mdp.letter
+    none = jnp.zeros(joint.state_shape, bool)
+    if automaton.acceptance in ("cosafe", "safety"):
+        final = joint.mdp.final
+        cosafe = automaton.acceptance == "cosafe"
+        return joint, Parity(
+            priority=jnp.full(joint.state_shape, int(cosafe), jnp.int32),
+            won=final if cosafe else none,
+            lost=none if cosafe else ~final,
+            num_priorities=1 + int(cosafe),
+        )
+    priority = jnp.asarray(automaton.priority)[:, letter].T
+    return joint, Parity(priority, none, none, int(np.max(np.asarray(automaton.priority))) + 1)
+
+
+def objective_at(objective: Parity | GR1, origin: jax.Array) -> Any:
+    """The objective on states that each stand for an original one."""
+    states = objective.lost.ndim
+
+    def take(x: jax.Array) -> jax.Array:
+        flat = x.reshape(*x.shape[: x.ndim - states], -1)
+        return flat[..., origin]
+
+    return jax.tree.map(take, objective)
+
+
+def adversarial_chance(game: Game) -> tuple[Game, jax.Array]:
+    """The game in which the environment decides where each random move leads, on the host.
+
+    What the system wins surely in a stochastic game it wins in this deterministic one.
+
+    Args:
+      game: a game over an MDP, or over a Product of one.
+
+    Returns:
+      A game whose first S states (a product's, numbered ``s * Q + q``) are those of
+      `game`, followed by one for each random move, where the environment chooses among
+      its successors; and ``int32[S']``, the original state that each stands for.
+
+    Raises:
+      ValueError: the world has no successor lists.
+    """
+    everywhere = np.full(game.num_states, 1 / game.num_states)
+    explicit = restrict(game, everywhere).model
+    successor, used = np.asarray(explicit.mdp.successor), np.asarray(explicit.mdp.probability) > 0
+    num_states, num_actions, width = used.shape
+    random = used.sum(-1) > 1
+    s, a = np.nonzero(random)
+    size, moves = num_states + s.size, max(num_actions, width)
+    target = np.zeros((size, moves, 1), np.int32)
+    available = np.zeros((size, moves), bool)
+    only = np.take_along_axis(successor, used.argmax(-1)[..., None], -1)[..., 0]
+    target[:num_states, :num_actions, 0] = only
+    target[s, a, 0] = np.arange(num_states, size)
+    available[:num_states, :num_actions] = np.asarray(explicit.available)
+    target[num_states:, :width, 0] = successor[s, a]
+    available[num_states:, :width] = used[s, a]
+    origin = np.concatenate([np.arange(num_states), s])
+    label = np.asarray(explicit.label)[origin]
+    initial = np.concatenate([np.asarray(game.initial).ravel(), np.zeros(s.size)])
+    mdp = make_mdp(
+        target, available[:, :, None].astype(float), available=available, initial=initial,
+        label=label, propositions=explicit.propositions,
+    )
+    system = np.concatenate([np.asarray(game.system).ravel(), np.zeros(s.size, bool)])
+    return Game(mdp, jnp.asarray(system)), jnp.asarray(origin, jnp.int32)
+
+
+# --- parity -----------------------------------------------------------------------------------
+
+
+class _Found(NamedTuple):
+    """A set that the system wins, with moves: its own inside, the environment's outside."""
+
+    region: jax.Array
+    action: jax.Array
+
+
+def _level(
+    game: Game, objective: Parity, p: int, won: _Found, open_: jax.Array, allowed: jax.Array
+) -> _Found:
+    """The open states that the system wins, where it also wins on reaching `won`.
+
+    Args:
+      p: no open state has a priority below it.
+      won: decided already, with the moves so far.
+      open_: ``bool[S]``, undecided; all other states are lost for the system.
+      allowed: ``bool[S, A]``; the environment's other moves help the system, since each
+        brings it nearer, with positive probability, to what it seeks at a lower priority.
+    """
+    if p == objective.num_priorities:
+        return won
+    solve = _even if p % 2 == 0 else _odd
+    return solve(game, objective, p, won, open_, allowed)
+
+
+def _even(game, objective, p, won, open_, allowed) -> _Found:
+    """The greatest set in which the system can remain, so that meeting p for ever is good."""
+    here = open_ & (objective.priority == p)
+
+    def body(carry):
+        inside, found, _ = carry
+        # Where the environment can force the play out, with positive probability.
+        left = attractor(game, ~inside, allowed, rule=~game.system, among=open_ & inside)
+        action = jnp.where(inside & left.region, left.action, found.action)
+        inside = inside & ~left.region
+        good = _Found(won.region | (here & inside), action)
+        deeper = _level(game, objective, p + 1, good, open_ & ~here & inside, allowed)
+        return deeper.region, deeper, jnp.any(deeper.region != inside)
+
+    inside = won.region | open_
+    inside, found, _ = repeat(body, (inside, won, jnp.bool_(True)), (game, objective, won, open_))
+    stays = first_action(allowed & forall_successor(game, inside))[1]
+    return _Found(inside, jnp.where(here & inside & game.system, stays, found.action))
+
+
+def _odd(game, objective, p, won, open_, allowed) -> _Found:
+    """The least set from which the system can avoid meeting p for ever."""
+    here = open_ & (objective.priority == p)
+    # The system makes no move that may leave what an even priority above has it remain in.
+    keeps = forall_successor(game, won.region | open_)
+    allowed = allowed & (keeps | ~game.system[..., None])
+
+    def body(carry):
+        found, _ = carry
+        drawn = attractor(game, found.region, allowed, rule=game.system, among=open_)
+        new = drawn.region & ~found.region & game.system
+        near = _Found(drawn.region, jnp.where(new, drawn.action, found.action))
+        closer = exists_successor(game, near.region) & ~game.system[..., None]
+        deeper = _level(
+            game, objective, p + 1, near, open_ & ~here & ~near.region, allowed & ~closer
+        )
+        return deeper, jnp.any(deeper.region != near.region)
+
+    found, _ = repeat(body, (won, jnp.bool_(True)), (game, objective, won, open_))
+    avoids = first_action(allowed & ~exists_successor(game, found.region))[1]
+    refused = here & ~found.region & ~game.system
+    return _Found(found.region, jnp.where(refused, avoids, found.action))

@@ -1,0 +1,1 @@
+"""Exact questions about supports: attractors, end components, acceptance."""

@@ -1,0 +1,1 @@
+"""Temporal logic: formulas, their truth, normal forms and letters. No JAX here."""

@@ -1,0 +1,92 @@
+"""Where a Boolean formula over propositions holds in an array of labels."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.logic.ltl import Formula, as_formula, holds_on_lasso, subformulas
+
+_BOOLEAN = frozenset(("true", "false", "ap", "!", "&", "|", "->", "<->", "xor"))
+
+
+def require_known(needed: Collection[str], known: Sequence[str], place: str) -> None:
+    """Raises a ValueError that names the first proposition that is not known.
+
+    Args:
+      needed, known: names of propositions.
+      place: what mentions them, the subject of the message.
+    """
+    for name in needed:
+        if name not in known:
+            guess = difflib.get_close_matches(name, known, n=1)
+            raise ValueError(
+                f"{place} mentions the proposition {name!r}, which the world does not have; "
+                f"its propositions are {', '.join(known) or '(none)'}."
+                + (f" Did you mean {guess[0]!r}?" if guess else "")
+            )
+
+
+def satisfying(
+    label: NDArray[np.bool_], propositions: Sequence[str], condition: Formula | str, place: str
+) -> NDArray[np.bool_]:
+    """The rows of labels that satisfy a Boolean formula.
+
+    Args:
+      label: ``bool[S, P]``.
+      propositions: the P names.
+      condition: a formula without temporal operators.
+      place: what is asked for, to begin an error with.
+
+    Returns:
+      ``bool[S]``.
+
+    Raises:
+      ValueError: an unknown proposition or a temporal operator.
+
+    >>> satisfying(np.array([[1, 0], [1, 1]], bool), ["a", "b"], "a & !b", "here").tolist()
+    [True, False]
+    """
+    condition = as_formula(condition)
+    temporal = [f for f in subformulas(condition) if f.operator not in _BOOLEAN]
+    if temporal:
+        raise ValueError(
+            f"{place}: {str(condition)!r} is not Boolean: {str(temporal[0])!r} is temporal. "
+            "Write a condition on single states with ! & | -> <-> xor."
+        )
+    require_known(condition.propositions, propositions, f"{place}: {str(condition)!r}")
+    column = [list(propositions).index(p) for p in condition.propositions]
+    rows, number = distinct_rows(np.asarray(label, bool)[:, column])
+    names = np.array(condition.propositions, dtype=object)
+    # A formula without temporal operators has its truth in the first letter of any word.
+    truth = np.array([holds_on_lasso(condition, [], [set(names[row])]) for row in rows], bool)
+    return np.asarray(truth[number])
+
+
+_COUNTED = 16  # columns up to which every combination has a counter of its own
+
+
+def distinct_rows(rows: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """The different rows of a Boolean array, and the number of each row among them.
+
+    Args:
+      rows: ``bool[S, P]``.
+
+    Returns:
+      ``bool[L, P]`` and ``int64[S]``. Without sorting where P is small.
+    """
+    width = rows.shape[1]
+    if width > _COUNTED:
+        found, number = np.unique(rows, axis=0, return_inverse=True)
+        return found, number.ravel()
+    code = np.zeros(len(rows), np.int32)
+    for i in range(width):
+        code = code << 1 | rows[:, i]
+    present = np.flatnonzero(np.bincount(code, minlength=1 << width))
+    number = np.zeros(1 << width, np.int64)
+    number[present] = np.arange(present.size)
+    bits = np.arange(width - 1, -1, -1)
+    return (present[:, None] >> bits & 1).astype(bool), number[code]

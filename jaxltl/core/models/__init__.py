@@ -1,0 +1,1 @@
+"""What is acted in: MDPs, games, products, and the primitives through which they are seen."""

@@ -1,0 +1,187 @@
+"""Turn-based games: a model, and whose turn it is in each state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.core.models import operators
+
+
+@struct.dataclass
+class Game:
+    """A turn-based game of the system against the environment, stochastic or deterministic.
+
+    Attributes:
+      mdp: the model: an MDP, a DenseMDP or a Product, in which each state's player chooses.
+      system: ``bool[S]`` (``[S, Q]`` in a product): True where the system moves, who
+        maximises; False where the environment does.
+    """
+
+    mdp: Any
+    system: jax.Array
+
+    @property
+    def num_states(self) -> int:
+        return self.mdp.num_states
+
+    @property
+    def num_actions(self) -> int:
+        return self.mdp.num_actions
+
+    @property
+    def num_successors(self) -> int:
+        return self.mdp.num_successors
+
+    @property
+    def state_shape(self) -> tuple[int, ...]:
+        """The shape of a value: ``(S,)``, or ``(S, Q)`` in a product."""
+        return self.mdp.state_shape
+
+    @property
+    def successor_probability(self) -> jax.Array:
+        """As of the model."""
+        return self.mdp.successor_probability
+
+    @property
+    def available(self) -> jax.Array:
+        """``bool[S, A]``: the moves of each state's player."""
+        return self.mdp.available
+
+    @property
+    def initial(self) -> jax.Array:
+        return self.mdp.initial
+
+    @property
+    def label(self) -> jax.Array:
+        return self.mdp.label
+
+    @property
+    def propositions(self) -> tuple[str, ...]:
+        return self.mdp.propositions
+
+    @property
+    def dtype(self) -> jnp.dtype:
+        return self.mdp.dtype
+
+
+def make_game(model: Any, system: Sequence[bool] | chex.Array) -> Game:
+    """A checked :class:`Game`, on the host.
+
+    Args:
+      model: an MDP, a DenseMDP or a Product.
+      system: whose turn it is in each state: True the system's, False the environment's.
+
+    Raises:
+      ValueError: a state has no owner, or no move.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> game = make_game(from_dense([[[0, 1.0]], [[1.0, 0]]]), [True, False])
+      >>> game.system.tolist()
+      [True, False]
+    """
+    owner = _owners(system, model.state_shape)
+    check_moves(np.asarray(model.available), owner)
+    return Game(model, jnp.asarray(owner))
+
+
+def check_moves(available: np.ndarray, system: np.ndarray) -> None:
+    """Raises a ValueError that names the first state whose player has no move."""
+    stuck = np.argwhere(~available.any(-1))
+    if stuck.size:
+        state = tuple(int(i) for i in stuck[0])
+        player = "system" if system[state] else "environment"
+        raise ValueError(
+            f"state {_name(state)} is the {player}'s and has no move; give it one, for "
+            "example a loop to itself."
+        )
+
+
+def _name(state: tuple[int, ...]) -> str:
+    return str(state[0]) if len(state) == 1 else str(state)
+
+
+def _owners(system: Any, shape: tuple[int, ...]) -> np.ndarray:
+    owner = np.asarray(system)
+    if owner.shape != shape:
+        least = min(owner.shape[0] if owner.ndim else 0, shape[0])
+        missing = f" State {least} has no owner." if owner.ndim == 1 and least < shape[0] else ""
+        raise ValueError(
+            f"system has shape {owner.shape}; expected {shape}, whose turn it is in each "
+            f"state.{missing}"
+        )
+    if owner.dtype == bool:
+        return owner
+    flat = owner.ravel().tolist()
+    for i, value in enumerate(flat):
+        if value not in (0, 1):
+            state = tuple(int(k) for k in np.unravel_index(i, shape))
+            raise ValueError(
+                f"state {_name(state)} has no owner: system is {value!r} there; give True (the "
+                "system moves) or False (the environment moves)."
+            )
+    return owner.astype(bool)
+
+
+def as_game(model: Any) -> Game:
+    """A game as it is; any other model as the game in which the system always moves."""
+    if isinstance(model, Game):
+        return model
+    return Game(model, jnp.ones(model.state_shape, bool))
+
+
+def is_deterministic(model: Any) -> bool:
+    """Whether every move has one successor, so that chance plays no part; on the host."""
+    weights = np.asarray(model.successor_probability)
+    return bool(((weights > 0).sum(-1) <= 1).all())
+
+
+def swap_players(game: Game) -> Game:
+    """The same game with the players' names exchanged."""
+    return replace(game, system=~game.system)
+
+
+# --- the primitives: those of the model -----------------------------------------------------
+
+
+@operators.expectation.register
+def _(game: Game, value: jax.Array) -> jax.Array:
+    return operators.expectation(game.mdp, value)
+
+
+@operators.exists_successor.register
+def _(game: Game, region: jax.Array) -> jax.Array:
+    return operators.exists_successor(game.mdp, region)
+
+
+@operators.forall_successor.register
+def _(game: Game, region: jax.Array) -> jax.Array:
+    return operators.forall_successor(game.mdp, region)
+
+
+@operators.least_successor.register
+def _(game: Game, value: jax.Array) -> jax.Array:
+    return operators.least_successor(game.mdp, value)
+
+
+@operators.sample_successor.register
+def _(game: Game, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
+    return operators.sample_successor(game.mdp, key, state, action)
+
+
+@operators.induced_chain.register
+def _(game: Game, policy: jax.Array) -> Any:
+    return operators.induced_chain(game.mdp, policy)
+
+
+@operators.transition_matrix.register
+def _(game: Game, policy: jax.Array) -> jax.Array:
+    return operators.transition_matrix(game.mdp, policy)

@@ -1,0 +1,357 @@
+"""The primitives through which every algorithm sees a model.
+
+A model is an :class:`~jaxltl.core.models.mdp.MDP`, a :class:`~jaxltl.core.models.mdp.DenseMDP` or a
+:class:`~jaxltl.core.models.product.Product`. Values have the shape of the model's states,
+``[S]`` or ``[S, Q]``, and quantities on actions have one more axis, A. The functions
+are open (``functools.singledispatch``): a representation of one's own needs
+``expectation``, ``exists_successor``, ``forall_successor`` and ``sample_successor``, and
+``least_successor`` where ranks are compared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import singledispatch
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from jaxltl.core.models.mdp import MDP, DenseMDP
+
+# Up to this many successors a sum over them is written out term by term, which XLA
+# fuses into one pass; a reduction over a short last axis is two to three times slower.
+_UNROLL = 16
+
+
+@singledispatch
+def expectation(model: Any, value: jax.Array) -> jax.Array:
+    """Expected value of the next state, ``(P v)(s, a) = sum_t P(t | s, a) v(t)``.
+
+    Args:
+      model: the model.
+      value: ``float[S]``.
+
+    Returns:
+      ``float[S, A]``, zero at unavailable actions. Linear in `value` and in the
+      transition probabilities, and differentiable in both.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
+      >>> expectation(mdp, jnp.array([0.0, 4.0])).tolist()
+      [[2.0], [4.0]]
+    """
+    raise TypeError(_unknown(model))
+
+
+@singledispatch
+def exists_successor(model: Any, region: jax.Array) -> jax.Array:
+    """Whether some successor lies in a region: ``bool[S, A]`` from ``bool[S]``.
+
+    Decided on the support of the transition function. False at unavailable actions.
+    """
+    raise TypeError(_unknown(model))
+
+
+@singledispatch
+def forall_successor(model: Any, region: jax.Array) -> jax.Array:
+    """Whether all successors lie in a region: ``bool[S, A]`` from ``bool[S]``.
+
+    Decided on the support; padding counts as true, so unavailable actions are True.
+    """
+    raise TypeError(_unknown(model))
+
+
+@singledispatch
+def least_successor(model: Any, value: jax.Array) -> jax.Array:
+    """Smallest value among the successors: ``[S, A]`` from ``[S]``.
+
+    Decided on the support; the largest value of the dtype at unavailable actions.
+    """
+    raise TypeError(_unknown(model))
+
+
+@singledispatch
+def sample_successor(
+    model: Any, key: chex.PRNGKey, state: jax.Array, action: jax.Array
+) -> jax.Array:
+    """One draw from ``P(. | state, action)``; the key is consumed.
+
+    A product's states are numbered ``s * Q + q``, the order of a flattened value.
+
+    Args:
+      model: the model.
+      key: a PRNG key.
+      state, action: ``int32[]``.
+
+    Returns:
+      ``int32[]``, the successor.
+    """
+    raise TypeError(_unknown(model))
+
+
+@singledispatch
+def induced_chain(model: Any, policy: jax.Array) -> MDP | DenseMDP:
+    """The Markov chain of a deterministic policy, as a model with one action.
+
+    Args:
+      model: the model.
+      policy: ``int32[S]``.
+
+    Returns:
+      A model without labels. Of a product it has ``S * Q`` states, numbered
+      ``s * Q + q``. Differentiable in the transition probabilities.
+    """
+    raise TypeError(_unknown(model))
+
+
+@singledispatch
+def transition_matrix(model: Any, policy: jax.Array) -> jax.Array:
+    """``P_pi(s, t) = sum_a pi(s, a) P(t | s, a)`` as a full matrix, for small models.
+
+    Args:
+      model: the model.
+      policy: ``float[S, A]``.
+
+    Returns:
+      ``float[S, S]``; of a product, over states numbered ``s * Q + q``.
+    """
+    raise TypeError(_unknown(model))
+
+
+def pushforward(model: Any, mass: jax.Array) -> jax.Array:
+    """Mass that flows into each state, ``(P' x)(t) = sum_{s, a} P(t | s, a) x(s, a)``.
+
+    The transpose of :func:`expectation`, for every representation.
+
+    Args:
+      model: the model.
+      mass: ``float[S, A]``.
+
+    Returns:
+      ``float[S]``. Linear in `mass` and in the transition probabilities.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
+      >>> pushforward(mdp, jnp.array([[1.0], [2.0]])).tolist()
+      [0.5, 2.5]
+    """
+    value = jax.ShapeDtypeStruct(model.state_shape, mass.dtype)
+    (result,) = jax.linear_transpose(lambda v: expectation(model, v), value)(mass)
+    return result
+
+
+def _unknown(model: Any) -> str:
+    return f"{type(model).__name__} is not a model: pass an MDP, a DenseMDP, a Product or a Game."
+
+
+def _gather(value: jax.Array, index: jax.Array) -> jax.Array:
+    return jnp.asarray(value).at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+@expectation.register
+def _(model: MDP, value: jax.Array) -> jax.Array:
+    successor, probability = model.successor, model.probability
+    width = successor.shape[-1]
+    if width > _UNROLL:
+        return jnp.sum(probability * _gather(value, successor), axis=-1)
+    terms = [probability[..., k] * _gather(value, successor[..., k]) for k in range(width)]
+    return sum(terms[1:], start=terms[0])
+
+
+@exists_successor.register
+def _(model: MDP, region: jax.Array) -> jax.Array:
+    probability, successor = model.probability, model.successor
+    if successor.shape[-1] > _UNROLL:
+        return jnp.any((probability > 0) & _gather(region, successor), axis=-1)
+    found = jnp.zeros(model.available.shape, bool)
+    for k in range(successor.shape[-1]):
+        found |= (probability[..., k] > 0) & _gather(region, successor[..., k])
+    return found
+
+
+@forall_successor.register
+def _(model: MDP, region: jax.Array) -> jax.Array:
+    return ~exists_successor(model, ~jnp.asarray(region))
+
+
+@least_successor.register
+def _(model: MDP, value: jax.Array) -> jax.Array:
+    found = jnp.full(model.available.shape, largest(value.dtype), value.dtype)
+    for k in range(model.successor.shape[-1]):
+        term = only_real(model.probability[..., k], _gather(value, model.successor[..., k]))
+        found = jnp.minimum(found, term)
+    return found
+
+
+def only_real(weight: jax.Array, value: jax.Array) -> jax.Array:
+    """The value where a successor has positive weight, else the largest of its dtype."""
+    return jnp.where(weight > 0, value, largest(value.dtype))
+
+
+def largest(dtype: Any) -> Any:
+    """The largest value of a dtype."""
+    is_float = jnp.issubdtype(dtype, jnp.floating)
+    return jnp.inf if is_float else jnp.iinfo(dtype).max
+
+
+@sample_successor.register
+def _(model: MDP, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
+    k = _sample(key, model.probability[state, action])
+    return model.successor[state, action, k]
+
+
+@induced_chain.register
+def _(model: MDP, policy: jax.Array) -> MDP:
+    pick = policy[:, None, None]
+    return make_chain(
+        jnp.take_along_axis(model.successor, pick, axis=1)[:, 0],
+        jnp.take_along_axis(model.probability, pick, axis=1)[:, 0],
+        model.initial,
+    )
+
+
+@transition_matrix.register
+def _(model: MDP, policy: jax.Array) -> jax.Array:
+    return scatter_matrix(model.successor, policy[:, :, None] * model.probability)
+
+
+def scatter_matrix(successor: jax.Array, weight: jax.Array) -> jax.Array:
+    """``float[S, S]`` that adds weights ``[S, A, K]`` at (s, successor)."""
+    num_states = successor.shape[0]
+    row = jnp.arange(num_states)[:, None, None]
+    return jnp.zeros((num_states, num_states), weight.dtype).at[row, successor].add(weight)
+
+
+def make_chain(successor: jax.Array, probability: jax.Array, initial: jax.Array) -> MDP:
+    """An MDP with one action from ``int32[S, K]`` successors and their probabilities."""
+    num_states = successor.shape[0]
+    return MDP(
+        successor=successor[:, None, :], probability=probability[:, None, :],
+        available=jnp.ones((num_states, 1), bool), initial=initial,
+        label=jnp.zeros((num_states, 0), bool),
+    )
+
+
+@expectation.register
+def _(model: DenseMDP, value: jax.Array) -> jax.Array:
+    return jnp.einsum("sat,t->sa", model.transition, value)
+
+
+@induced_chain.register
+def _(model: DenseMDP, policy: jax.Array) -> DenseMDP:
+    rows = jnp.take_along_axis(model.transition, policy[:, None, None], axis=1)
+    return replace(
+        model,
+        transition=rows, available=jnp.ones((model.num_states, 1), bool),
+        label=jnp.zeros((model.num_states, 0), bool), propositions=(),
+    )
+
+
+@transition_matrix.register
+def _(model: DenseMDP, policy: jax.Array) -> jax.Array:
+    return jnp.einsum("sa,sat->st", policy, model.transition)
+
+
+@exists_successor.register
+def _(model: DenseMDP, region: jax.Array) -> jax.Array:
+    return jnp.any((model.transition > 0) & region, axis=-1)
+
+
+@forall_successor.register
+def _(model: DenseMDP, region: jax.Array) -> jax.Array:
+    return jnp.all((model.transition <= 0) | region, axis=-1)
+
+
+@least_successor.register
+def _(model: DenseMDP, value: jax.Array) -> jax.Array:
+    return only_real(model.transition, value).min(-1)
+
+
+@sample_successor.register
+def _(model: DenseMDP, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
+    return _sample(key, model.transition[state, action]).astype(jnp.int32)
+
+
+def _sample(key: chex.PRNGKey, probability: jax.Array) -> jax.Array:
+    return jax.random.categorical(key, jnp.log(probability))
+
+
+# --- what a policy does to quantities on actions -----------------------------------------
+
+
+def action_mean(policy: jax.Array, quantity: jax.Array) -> jax.Array:
+    """Mean over a policy's actions, ``sum_a pi(s, a) x(s, a)``.
+
+    Args:
+      policy: ``float[S, A]``, or ``int32[S]`` for a deterministic policy.
+      quantity: ``[S, A]``, finite.
+
+    Returns:
+      ``[S]``.
+    """
+    if is_deterministic(policy):
+        return jnp.take_along_axis(quantity, policy[..., None], axis=-1)[..., 0]
+    return jnp.sum(policy * quantity, axis=-1)
+
+
+def action_max(quantity: jax.Array, available: jax.Array) -> jax.Array:
+    """Maximum over available actions, ``[S]`` from ``[S, A]``; written out for few actions."""
+    quantity = jnp.where(available, quantity, -jnp.inf)
+    if quantity.shape[-1] > _UNROLL:
+        return quantity.max(axis=-1)
+    best = quantity[..., 0]
+    for a in range(1, quantity.shape[-1]):
+        best = jnp.maximum(best, quantity[..., a])
+    return best
+
+
+def action_argmax(quantity: jax.Array, available: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Maximum over available actions and the first action that attains it, ``[S]`` each."""
+    quantity = jnp.where(available, quantity, -jnp.inf)
+    if quantity.shape[-1] > _UNROLL:
+        return quantity.max(axis=-1), quantity.argmax(axis=-1).astype(jnp.int32)
+    best, action = quantity[..., 0], jnp.zeros(quantity.shape[:-1], jnp.int32)
+    for a in range(1, quantity.shape[-1]):
+        better = quantity[..., a] > best
+        best = jnp.where(better, quantity[..., a], best)
+        action = jnp.where(better, a, action)
+    return best, action
+
+
+def first_action(condition: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Whether a condition ``bool[S, A]`` holds for some action, and the first one (or 0)."""
+    if condition.shape[-1] > _UNROLL:
+        return condition.any(axis=-1), condition.argmax(axis=-1).astype(jnp.int32)
+    some = jnp.zeros(condition.shape[:-1], bool)
+    action = jnp.zeros(condition.shape[:-1], jnp.int32)
+    for a in reversed(range(condition.shape[-1])):
+        some |= condition[..., a]
+        action = jnp.where(condition[..., a], a, action)
+    return some, action
+
+
+def is_deterministic(policy: jax.Array) -> bool:
+    """Whether a policy is given as one action per state (integers) rather than a distribution."""
+    return jnp.issubdtype(jnp.result_type(policy), jnp.integer)
+
+
+def policy_distribution(model: Any, policy: jax.Array) -> jax.Array:
+    """Any policy as ``float[S, A]``, with its shape checked against the model.
+
+    Raises:
+      ValueError: the policy has neither the shape of states nor of state-action pairs.
+    """
+    states, actions = model.state_shape, model.num_actions
+    if is_deterministic(policy):
+        if jnp.shape(policy) != states:
+            raise ValueError(f"policy has shape {jnp.shape(policy)}; a deterministic policy "
+                             f"(integers) for this model has shape {states}.")
+        return jax.nn.one_hot(policy, actions, dtype=model.dtype)
+    if jnp.shape(policy) != (*states, actions):
+        raise ValueError(f"policy has shape {jnp.shape(policy)}; a stochastic policy for this "
+                         f"model has shape {(*states, actions)}.")
+    return policy

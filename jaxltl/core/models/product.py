@@ -1,0 +1,399 @@
+"""A world run beside an automaton: the lazy product, and what crosses it.
+
+Nothing is copied. A value on the product has shape ``[S, Q]``, and the automaton only
+decides at which memory state the value of a successor is read.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.core.automata.automaton import Automaton, letter_index
+from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.logic.labels import distinct_rows, require_known
+from jaxltl.core.logic.ltl import Formula, parse_ltl
+from jaxltl.core.models import operators
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.trajectories import Trajectories
+
+jax.tree_util.register_dataclass(
+    Automaton,
+    data_fields=["delta", "initial", "priority", "letters"],
+    meta_fields=["propositions", "acceptance", "state_names"],
+)
+
+
+@struct.dataclass
+class Product:
+    """A world beside an automaton that remembers the task's progress.
+
+    With ``label_on="entry"``, ``(s, q) -> (t, delta(q, L(t)))``, starting in
+    ``delta(q_I, L(s0))``: the label of the state that is entered is read. With
+    ``label_on="exit"``, ``(s, q) -> (t, delta(q, L(s)))``, starting in ``q_I``: the
+    label of the state that is left.
+
+    Attributes:
+      mdp: the world, an MDP or a DenseMDP.
+      automaton: the task.
+      letter: ``int32[S]``, the automaton's letter that each world state shows.
+      label_on: which label a step reads; static.
+    """
+
+    mdp: MDP | DenseMDP
+    automaton: Automaton
+    letter: jax.Array
+    label_on: str = struct.field(pytree_node=False, default="entry")
+
+    @property
+    def num_states(self) -> int:
+        """Product states: S times Q."""
+        return self.mdp.num_states * self.num_memory
+
+    @property
+    def num_memory(self) -> int:
+        return self.automaton.delta.shape[-2]
+
+    @property
+    def num_actions(self) -> int:
+        return self.mdp.num_actions
+
+    @property
+    def state_shape(self) -> tuple[int, ...]:
+        """The shape of a value: ``(S, Q)``."""
+        return (self.mdp.num_states, self.num_memory)
+
+    @property
+    def num_successors(self) -> int:
+        return self.mdp.num_successors
+
+    @property
+    def successor_probability(self) -> jax.Array:
+        """``float[S, 1, A, K]``: the same in every memory state."""
+        return self.mdp.successor_probability[:, None]
+
+    @property
+    def dtype(self) -> jnp.dtype:
+        return self.mdp.dtype
+
+    @property
+    def available(self) -> jax.Array:
+        """``bool[S, Q, A]``."""
+        shape = (*self.state_shape, self.num_actions)
+        return jnp.broadcast_to(self.mdp.available[:, None, :], shape)
+
+    @property
+    def next_memory(self) -> jax.Array:
+        """``int32[S, Q]``: the memory after reading the label of a world state in memory q."""
+        return jnp.asarray(self.automaton.delta)[:, self.letter].T
+
+    @property
+    def initial_memory(self) -> jax.Array:
+        """``int32[S]``: the memory in which a run starts at each world state."""
+        start = jnp.asarray(self.automaton.initial)
+        if self.label_on == "exit":
+            return jnp.full(self.letter.shape, start, jnp.int32)
+        return jnp.asarray(self.automaton.delta)[start, self.letter]
+
+    @property
+    def initial(self) -> jax.Array:
+        """``float[S, Q]``, the initial distribution."""
+        memory = jax.nn.one_hot(self.initial_memory, self.num_memory, dtype=self.dtype)
+        return self.mdp.initial[:, None] * memory
+
+    @property
+    def final(self) -> jax.Array:
+        """``bool[S, Q]``: the automaton is in a final state."""
+        return jnp.broadcast_to(jnp.asarray(self.automaton.final), self.state_shape)
+
+
+def letters(world: MDP | DenseMDP, propositions: Collection[str] | None = None) -> list[frozenset]:
+    """The sets of propositions that occur at some state of a world, for ``to_automaton``.
+
+    Args:
+      world: the model.
+      propositions: keep only these; default all.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> world = from_dense([[[1.0, 0]], [[0, 1.0]]], label=[[0], [1]], propositions=["a"])
+      >>> [sorted(letter) for letter in letters(world)]
+      [[], ['a']]
+    """
+    keep = [i for i, p in enumerate(world.propositions)
+            if propositions is None or p in propositions]
+    names = [world.propositions[i] for i in keep]
+    rows, _ = distinct_rows(np.asarray(world.label)[:, keep])
+    return [frozenset(n for n, holds in zip(names, row, strict=True) if holds) for row in rows]
+
+
+def product(world: Any, task: Automaton | Formula | str, *, label_on: str = "entry") -> Any:
+    """The lazy product of a world and a task.
+
+    A formula is translated over the letters that occur in the world.
+
+    Args:
+      world: the model, an MDP, a DenseMDP or a Game; its labels are read on the host.
+      task: an automaton, a formula, or a formula's text.
+      label_on: ``"entry"`` or ``"exit"``, see :class:`Product`.
+
+    Returns:
+      A :class:`Product`; of a game, the :class:`~jaxltl.core.models.game.Game` on the product, in
+      which the same player moves in every memory state.
+
+    Raises:
+      ValueError: the task mentions a proposition that the world lacks, or the world
+        shows a letter that the automaton was not built for.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["goal"])
+      >>> product(world, "F goal").state_shape
+      (2, 2)
+    """
+    if label_on not in ("entry", "exit"):
+        raise ValueError(f'label_on={label_on!r}; it must be "entry" or "exit".')
+    if isinstance(world, Game):
+        model = product(world.mdp, task, label_on=label_on)
+        return Game(model, jnp.broadcast_to(world.system[:, None], model.state_shape))
+    if isinstance(task, str | Formula):
+        formula = parse_ltl(task) if isinstance(task, str) else task
+        require_known(formula.propositions, world.propositions, "the task")
+        task = to_automaton(formula, letters=letters(world, formula.propositions))
+    require_known(task.propositions, world.propositions, "the task")
+    column = [world.propositions.index(p) for p in task.propositions]
+    rows, letter = distinct_rows(np.asarray(world.label)[:, column])
+    index = np.array(
+        [_letter(task, row, int(np.argmax(letter == i))) for i, row in enumerate(rows)], np.int32
+    )
+    automaton = jax.tree.map(jnp.asarray, task)
+    return Product(world, automaton, jnp.asarray(index[letter.ravel()]), label_on)
+
+
+def _letter(automaton: Automaton, row: np.ndarray, state: int) -> int:
+    shown = {p for p, holds in zip(automaton.propositions, row, strict=True) if holds}
+    try:
+        return letter_index(automaton, shown)
+    except ValueError as error:
+        raise ValueError(
+            f"world state {state} shows the letter {{{', '.join(sorted(shown))}}}, which the "
+            "automaton was not built for; translate with letters=letters(world)."
+        ) from error
+
+
+_SELECT = 16  # memory states up to which reading at a memory is a selection
+
+
+_WRITTEN_OUT = 64  # transitions per state up to which the product's sweep is written out
+
+
+# --- the primitives -----------------------------------------------------------------------
+
+
+def _through(model: Product, operator, value: jax.Array, term, combine) -> jax.Array:
+    """Applies a primitive of the world at every memory state: ``[S, Q, A]`` from ``[S, Q]``.
+
+    On entry the value of t is read at delta(q, L(t)), before the world's operator; on
+    exit at delta(q, L(s)), after it.
+    """
+    if model.label_on == "entry":
+        value = _read_at(value, model.next_memory)
+        return _each_memory(model.mdp, operator, value, term, combine)
+    result = _each_memory(model.mdp, operator, value, term, combine)
+    return _read_at(result, model.next_memory[:, :, None])
+
+
+def _each_memory(world: MDP | DenseMDP, operator, value, term, combine) -> jax.Array:
+    """A world's primitive on each column of ``[S, Q]``: ``[S, Q, A]``.
+
+    The primitive combines a term of weight and value over the successors of a pair.
+
+    Few transitions per state are written out, so that XLA gathers whole rows of Q and
+    fuses what reads single actions; the general form is ten times slower in loops.
+    """
+    if isinstance(world, DenseMDP) or math.prod(world.probability.shape[1:]) > _WRITTEN_OUT:
+        return jax.vmap(lambda v: operator(world, v), in_axes=1, out_axes=1)(value)
+    columns = []
+    for a in range(world.num_actions):
+        terms = [
+            term(
+                world.probability[:, a, k, None],
+                value.at[world.successor[:, a, k]].get(
+                    mode="promise_in_bounds", wrap_negative_indices=False
+                ),
+            )
+            for k in range(world.num_successors)
+        ]
+        columns.append(functools.reduce(combine, terms))
+    return jnp.stack(columns, axis=-1)
+
+
+def reads(model: Product, marked: jax.Array) -> jax.Array:
+    """Whether an action can make the automaton read a marked transition: ``bool[S, Q, A]``.
+
+    Args:
+      model: the product.
+      marked: ``bool[Q, L]``, transitions of the automaton.
+    """
+    here = jnp.asarray(marked)[:, model.letter].T
+    if model.label_on == "exit":
+        return here[:, :, None] & model.available
+    return _each_memory(model.mdp, operators.exists_successor, here, _hits, jnp.logical_or)
+
+
+def _hits(weight: jax.Array, inside: jax.Array) -> jax.Array:
+    return (weight > 0) & inside
+
+
+def _read_at(value: jax.Array, memory: jax.Array) -> jax.Array:
+    """``value[s, memory[s, q]]``, as a selection for few memory states.
+
+    Its transpose is then a sum, where that of a gather is a scatter, which is slow.
+    """
+    num_memory = value.shape[1]
+    if num_memory > _SELECT:
+        return jnp.take_along_axis(value, memory, axis=1)
+    result = jnp.broadcast_to(value[:, :1], value.shape)
+    for q in range(1, num_memory):
+        result = jnp.where(memory == q, value[:, q : q + 1], result)
+    return result
+
+
+@operators.expectation.register
+def _(model: Product, value: jax.Array) -> jax.Array:
+    return _through(model, operators.expectation, value, jnp.multiply, jnp.add)
+
+
+@operators.exists_successor.register
+def _(model: Product, region: jax.Array) -> jax.Array:
+    return _through(model, operators.exists_successor, region, _hits, jnp.logical_or)
+
+
+@operators.forall_successor.register
+def _(model: Product, region: jax.Array) -> jax.Array:
+    return ~operators.exists_successor(model, ~region)
+
+
+@operators.least_successor.register
+def _(model: Product, value: jax.Array) -> jax.Array:
+    return _through(model, operators.least_successor, value, operators.only_real, jnp.minimum)
+
+
+@operators.sample_successor.register
+def _(model: Product, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
+    world, memory = state // model.num_memory, state % model.num_memory
+    successor = operators.sample_successor(model.mdp, key, world, action)
+    read = successor if model.label_on == "entry" else world
+    memory = jnp.asarray(model.automaton.delta)[memory, model.letter[read]]
+    return successor * model.num_memory + memory
+
+
+@operators.induced_chain.register
+def _(model: Product, policy: jax.Array) -> MDP:
+    s = jnp.arange(model.mdp.num_states)[:, None]
+    q = jnp.arange(model.num_memory)[None, :, None]
+    probability = model.mdp.successor_probability[s, policy]  # [S, Q, K]
+    successor = _successor(model.mdp)[s, policy]
+    flat = _flat_successor(successor, model.next_memory, s[..., None], q, model.label_on)
+    width = flat.shape[-1]
+    return operators.make_chain(
+        flat.reshape(-1, width).astype(jnp.int32), probability.reshape(-1, width),
+        model.initial.ravel(),
+    )
+
+
+@operators.transition_matrix.register
+def _(model: Product, policy: jax.Array) -> jax.Array:
+    s = jnp.arange(model.mdp.num_states)[:, None, None, None]
+    q = jnp.arange(model.num_memory)[None, :, None, None]
+    successor = _successor(model.mdp)[:, None]
+    flat = _flat_successor(successor, model.next_memory, s, q, model.label_on)
+    weight = policy[..., None] * model.successor_probability
+    shape = (model.num_states, *weight.shape[2:])
+    return operators.scatter_matrix(flat.reshape(shape), weight.reshape(shape))
+
+
+def _successor(world: MDP | DenseMDP) -> jax.Array:
+    if isinstance(world, MDP):
+        return world.successor
+    return jnp.broadcast_to(jnp.arange(world.num_states), world.transition.shape)
+
+
+# --- lifting and projecting -----------------------------------------------------------------
+
+
+@jax.jit  # so that a call outside of jit compiles once, not operation by operation
+def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectories:
+    """World trajectories with the memory that the automaton had along them.
+
+    Args:
+      model: the product.
+      trajectories: of the world.
+
+    Returns:
+      Trajectories of the product, states numbered ``s * Q + q``.
+    """
+    delta = jnp.asarray(model.automaton.delta)
+
+    def one(states: jax.Array) -> jax.Array:
+        letter = model.letter[states]
+        read = letter[1:] if model.label_on == "entry" else letter[:-1]
+        start = model.initial_memory[states[0]]
+        _, rest = jax.lax.scan(lambda q, x: (delta[q, x],) * 2, start, read)
+        return states * model.num_memory + jnp.concatenate([start[None], rest])
+
+    inside = jnp.arange(trajectories.state.shape[1]) < trajectories.length[:, None]
+    state = jax.vmap(one)(trajectories.state)
+    return replace(trajectories, state=jnp.where(inside, state, 0).astype(jnp.int32))
+
+
+def lift_policy(model: Product, policy: jax.Array) -> jax.Array:
+    """A memoryless policy of the world as a policy of the product: ``[S, Q, ...]``."""
+    return jnp.repeat(policy[:, None], model.num_memory, axis=1)
+
+
+@struct.dataclass
+class FiniteMemoryPolicy:
+    """A policy of the world whose memory is the automaton's state.
+
+    Attributes:
+      action: ``float[S, Q, A]`` or ``int32[S, Q]``, the product policy.
+      initial_memory: ``int32[S]``, the memory at the start of a run in s.
+      next_memory: ``int32[S, Q]``, the memory after reading the label of s.
+      label_on: static, as in :class:`Product`.
+    """
+
+    action: jax.Array
+    initial_memory: jax.Array
+    next_memory: jax.Array
+    label_on: str = struct.field(pytree_node=False, default="entry")
+
+    def update(self, memory: jax.Array, state: jax.Array, successor: jax.Array) -> jax.Array:
+        """The memory after the step from `state` to `successor`."""
+        return self.next_memory[successor if self.label_on == "entry" else state, memory]
+
+
+def project_policy(model: Product, policy: jax.Array) -> FiniteMemoryPolicy:
+    """A product policy as a finite-memory policy that runs on the world alone.
+
+    Raises:
+      ValueError: the policy does not have the product's shape.
+    """
+    operators.policy_distribution(model, policy)
+    return FiniteMemoryPolicy(policy, model.initial_memory, model.next_memory, model.label_on)
+
+
+def _flat_successor(successor, next_memory, s, q, label_on):
+    """Numbers ``t * Q + q'`` of the product states that follow (s, q) when t follows s."""
+    read = successor if label_on == "entry" else s
+    return successor * next_memory.shape[1] + next_memory[read, q]

@@ -1,0 +1,106 @@
+"""The reachable part of a model, as an ordinary one."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.mdp import MDP, make_mdp
+from jaxltl.core.models.product import Product, _flat_successor
+
+
+class Restriction(NamedTuple):
+    """The reachable part of a model as an ordinary one.
+
+    State i of `model` is the state ``base_state[i]`` of the world, in a product with the
+    memory ``memory[i]`` (zero otherwise).
+    """
+
+    model: Any
+    base_state: jax.Array
+    memory: jax.Array
+
+
+def restrict(
+    model: Any, initial: chex.Array | None = None, *, allowed: chex.Array | None = None
+) -> Restriction:
+    """The states that are reachable from initial ones by allowed actions, on the host.
+
+    Args:
+      model: an MDP, a Product over one, or a Game on either.
+      initial: ``float[S]`` or ``[S, Q]``, a distribution to start from; default the model's.
+      allowed: ``bool[S, A]`` or ``[S, Q, A]``, the actions to keep, such as a permissive
+        strategy's mask; default the available ones.
+
+    Returns:
+      A :class:`Restriction` to an MDP, or to a Game on one; labels and propositions are
+      the world's.
+
+    Raises:
+      ValueError: the world has no successor lists, or a reachable state keeps no action.
+    """
+    lazy = model.mdp if isinstance(model, Game) else model
+    world = lazy.mdp if isinstance(lazy, Product) else lazy
+    if not isinstance(world, MDP):
+        raise ValueError("restrict needs successor lists; convert the world by from_dense.")
+    initial = np.asarray(model.initial if initial is None else initial).ravel()
+    if not (initial > 0).any():
+        raise ValueError("the initial distribution is zero; give a state to start from.")
+    allowed = np.asarray(model.available if allowed is None else model.available & allowed)
+    allowed = allowed.reshape(-1, model.num_actions)
+    successor, used = np.asarray(world.successor), np.asarray(world.probability) > 0
+    step, label_on = np.zeros((world.num_states, 1), np.int32), "entry"
+    if isinstance(lazy, Product):
+        step, label_on = np.asarray(lazy.next_memory), lazy.label_on
+    num_memory = step.shape[1]
+
+    def targets(states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        s, q = np.divmod(states, num_memory)
+        flat = _flat_successor(successor[s], step, *_columns(s, q), label_on)
+        return flat, used[s] & allowed[states][:, :, None], s
+
+    number = np.full(allowed.shape[0], -1)
+    seen = initial > 0
+    frontier = np.flatnonzero(seen)
+    while frontier.size:
+        flat, real, _ = targets(frontier)
+        new = flat[real]
+        new = new[~seen[new]]
+        # One of each without sorting: of equal entries, the one that `number` has kept.
+        number[new] = np.arange(new.size)
+        frontier = new[number[new] == np.arange(new.size)]
+        seen[frontier] = True
+    states = np.flatnonzero(seen)
+    stuck = states[~allowed[states].any(-1)]
+    if stuck.size:
+        first, memory_of = divmod(int(stuck[0]), num_memory)
+        where = f"{first}" + (f" with memory {memory_of}" if num_memory > 1 else "")
+        raise ValueError(
+            f"no action is allowed in state {where}, which is reachable; the mask is empty "
+            "there. Start inside the winning region, or allow an action."
+        )
+    number[states] = np.arange(states.size)
+    flat, real, s = targets(states)
+    mdp = make_mdp(
+        np.where(real, number[flat], 0),
+        np.where(real, np.asarray(world.probability)[s], 0),
+        available=allowed[states],
+        initial=initial[states],
+        label=np.asarray(world.label)[s],
+        propositions=world.propositions,
+    )
+    memory = jnp.asarray(states - s * num_memory, jnp.int32)
+    base = jnp.asarray(s, jnp.int32)
+    if not isinstance(model, Game):
+        return Restriction(mdp, base, memory)
+    owner = jnp.asarray(np.asarray(model.system).ravel()[states])
+    return Restriction(Game(mdp, owner), base, memory)
+
+
+def _columns(s: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return s[:, None, None], q[:, None, None]

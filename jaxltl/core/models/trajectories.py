@@ -1,0 +1,144 @@
+"""Trajectories, checked and padded, and their simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.operators import policy_distribution, sample_successor
+
+
+@struct.dataclass
+class Trajectories:
+    """N sequences of state-action pairs, padded with zeros to length T.
+
+    Attributes:
+      state: ``int32[N, T]``.
+      action: ``int32[N, T]``, the action taken in that state.
+      length: ``int32[N]``, the number of pairs that count.
+    """
+
+    state: jax.Array
+    action: jax.Array
+    length: jax.Array
+
+    @property
+    def mask(self) -> jax.Array:
+        """``bool[N, T]``: which pairs count."""
+        return jnp.arange(self.state.shape[-1]) < self.length[..., None]
+
+
+def make_trajectories(
+    model: MDP | DenseMDP, sequences: Sequence[Sequence[tuple[int, int]]]
+) -> Trajectories:
+    """Checked trajectories of a model from sequences of ``(state, action)`` pairs.
+
+    Args:
+      model: the model in which they were recorded.
+      sequences: N sequences of at least one pair each.
+
+    Raises:
+      ValueError: a state or action does not exist, an action is not available, or a
+        step leads where the model cannot go. The message names the trajectory, the
+        step and the values (all counted from 0).
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]])
+      >>> make_trajectories(world, [[(0, 0), (1, 0)], [(1, 0)]]).length.tolist()
+      [2, 1]
+    """
+    if not sequences:
+        raise ValueError("there are no trajectories; give at least one.")
+    length = [len(pairs) for pairs in sequences]
+    state = np.zeros((len(sequences), max(length)), np.int32)
+    action = np.zeros_like(state)
+    available = np.asarray(model.available)
+    for n, pairs in enumerate(sequences):
+        if not pairs:
+            raise ValueError(f"trajectory {n} is empty; give at least one (state, action) pair.")
+        for t, (s, a) in enumerate(pairs):
+            where = f"trajectory {n}, step {t}"
+            if not 0 <= s < model.num_states:
+                raise ValueError(f"{where}: state {s} does not exist; "
+                                 f"states are 0 to {model.num_states - 1}.")
+            if not 0 <= a < model.num_actions or not available[s, a]:
+                raise ValueError(f"{where}: action {a} is not available in state {s}; "
+                                 f"available are {np.flatnonzero(available[s]).tolist()}.")
+            state[n, t], action[n, t] = s, a
+    trajectories = Trajectories(*(jnp.asarray(x, jnp.int32) for x in (state, action, length)))
+    _check_steps(model, state, action, np.asarray(length))
+    return trajectories
+
+
+def _check_steps(
+    model: MDP | DenseMDP, state: np.ndarray, action: np.ndarray, length: np.ndarray
+) -> None:
+    s, a, t = state[:, :-1], action[:, :-1], state[:, 1:]
+    if isinstance(model, DenseMDP):
+        possible = np.asarray(model.transition)[s, a, t] > 0
+    else:
+        hit = np.asarray(model.successor)[s, a] == t[..., None]
+        possible = (hit & (np.asarray(model.probability)[s, a] > 0)).any(axis=-1)
+    wrong = ~possible & (np.arange(s.shape[1]) < length[:, None] - 1)
+    if wrong.any():
+        n, i = np.argwhere(wrong)[0]
+        raise ValueError(
+            f"trajectory {n}, step {i}: action {a[n, i]} in state {s[n, i]} cannot lead to "
+            f"state {t[n, i]}, which is recorded next; the demonstration does not fit the model."
+        )
+
+
+def rollout(
+    model: Any,
+    policy: jax.Array,
+    key: chex.PRNGKey,
+    *,
+    num_trajectories: int,
+    num_steps: int,
+    stop: jax.Array | None = None,
+) -> Trajectories:
+    """Simulated trajectories of a policy.
+
+    Args:
+      model: an MDP, a DenseMDP or a Product (states then numbered ``s * Q + q``).
+      policy: ``float[S, A]`` or ``int32[S]``; ``[S, Q, A]`` or ``[S, Q]`` in a product.
+      key: a PRNG key, consumed.
+      num_trajectories: N.
+      num_steps: T, the longest.
+      stop: ``bool[S]`` (or ``bool[S, Q]``); a trajectory's last pair is the one that
+        enters such a state. A start in one has length 0.
+
+    Returns:
+      :class:`Trajectories` with N rows. Jit-compiled callers pass the counts statically.
+    """
+    distribution = policy_distribution(model, policy).reshape(-1, model.num_actions)
+    logits = jnp.log(distribution)
+    initial = jnp.log(model.initial.ravel())
+    stop = jnp.zeros(model.state_shape, bool) if stop is None else stop
+    stop = stop.ravel()
+
+    def one(key: chex.PRNGKey) -> tuple[jax.Array, jax.Array, jax.Array]:
+        start_key, key = jax.random.split(key)
+        start = jax.random.categorical(start_key, initial).astype(jnp.int32)
+
+        def step(state: jax.Array, t: jax.Array):
+            action_key, successor_key = jax.random.split(jax.random.fold_in(key, t))
+            action = jax.random.categorical(action_key, logits[state]).astype(jnp.int32)
+            successor = sample_successor(model, successor_key, state, action)
+            # A stopped run stays where it is; its pairs are cut off below.
+            return jnp.where(stop[state], state, successor), (state, action, stop[state])
+
+        _, (states, actions, ended) = jax.lax.scan(step, start, jnp.arange(num_steps))
+        return states, actions, jnp.sum(~ended).astype(jnp.int32)
+
+    states, actions, length = jax.vmap(one)(jax.random.split(key, num_trajectories))
+    mask = jnp.arange(num_steps) < length[:, None]
+    return Trajectories(jnp.where(mask, states, 0), jnp.where(mask, actions, 0), length)

@@ -1,0 +1,1 @@
+"""Values and probabilities with their evidence, and their implicit derivatives."""

@@ -1,0 +1,98 @@
+"""Discounted visitation measures of a policy, and expectations under them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxltl.core.models.operators import policy_distribution, pushforward
+from jaxltl.core.types import Solution, status_code
+from jaxltl.core.values.fixed_point import implicit, solve_linear
+
+
+@jax.jit
+def occupancy_measure(
+    model: Any,
+    policy: jax.Array,
+    discount: jax.Array | float,
+    *,
+    initial: jax.Array | None = None,
+    tolerance: jax.Array | float | None = None,
+) -> Solution:
+    """Expected discounted visits, ``x(s, a) = sum_t discount^t P(s_t = s, a_t = a)``.
+
+    The solution of ``x(t, .) = pi(. | t) (initial(t) + discount * (P' x)(t))`` (Puterman
+    1994, section 6.9). Its sum is ``1 / (1 - discount)``.
+
+    Args:
+      model: the model.
+      policy: ``float[S, A]`` or ``int32[S]``.
+      discount: scalar in [0, 1).
+      initial: ``float[S]``, mass to start from; default the model's distribution.
+      tolerance: certified absolute error asked for; default: what the dtype allows.
+
+    Returns:
+      :class:`Solution` whose `value`, `lower` and `upper` are ``float[S, A]``.
+
+    Raises:
+      ValueError: policy has the wrong shape.
+
+    Differentiable in the policy, the discount, `initial` and the probabilities.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> mdp = from_dense([[[0, 1.0]], [[0, 1.0]]], initial=[1, 0])
+      >>> x = occupancy_measure(mdp, jnp.array([0, 0]), 0.5).value
+      >>> [round(v, 4) for v in x[:, 0].tolist()]
+      [1.0, 1.0]
+    """
+    policy = policy_distribution(model, policy)
+    discount = jnp.asarray(discount, model.dtype)
+    start = model.initial if initial is None else jnp.asarray(initial, model.dtype)
+
+    def flow(d: jax.Array) -> jax.Array:
+        return start + discount * pushforward(model, d[..., None] * policy)
+
+    visits = lax.stop_gradient(
+        solve_linear(
+            lambda d: d - (flow(d) - start), jnp.broadcast_to(start, model.state_shape),
+            tolerance=float(jnp.finfo(model.dtype).eps),
+        )
+    )
+    residual = jnp.sum(jnp.abs(flow(visits) - visits))
+    gap = jnp.where(discount < 1, 1 - discount, jnp.nan)
+    # The operator is a contraction in the sum norm, and each state's inflow may sum up
+    # contributions of all pairs.
+    rounding = (
+        (model.num_actions * model.num_successors + 4)
+        * jnp.finfo(model.dtype).eps * jnp.sum(jnp.abs(visits)) / gap
+    )
+    bound = residual / gap + rounding
+    finite = jnp.isfinite(bound)
+    bound = jnp.where(finite, bound, jnp.inf)
+    goal = 4 * rounding if tolerance is None else tolerance
+    visits = implicit(flow, visits)
+    value = visits[..., None] * policy
+    frozen = lax.stop_gradient(value)
+    return Solution(
+        value=value,
+        policy=policy,
+        lower=lax.stop_gradient(jnp.maximum(frozen - bound, 0)),
+        upper=lax.stop_gradient(frozen + bound),
+        residual=lax.stop_gradient(residual),
+        num_steps=jnp.int32(1),
+        status=status_code(lax.stop_gradient(bound <= goal), lax.stop_gradient(finite)),
+    )
+
+
+def feature_expectation(occupancy: jax.Array, features: jax.Array) -> jax.Array:
+    """Expected discounted features, ``sum_{s, a} x(s, a) f(s, a)``: ``float[F]``.
+
+    Args:
+      occupancy: ``float[S, A]``, the value of :func:`occupancy_measure`.
+      features: ``float[S, A, F]``.
+    """
+    return jnp.tensordot(occupancy, features, axes=occupancy.ndim)

@@ -1,0 +1,108 @@
+"""Probabilities of satisfying a formula: of a policy, largest and smallest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.graphs.acceptance import accepting_bottom_components, accepting_end_components
+from jaxltl.core.models.operators import (
+    policy_distribution,
+)
+from jaxltl.core.models.product import Product
+from jaxltl.core.types import Solution
+from jaxltl.core.values.reachability import _complement, reachability_probability
+
+
+def satisfaction_probability(
+    model: Product,
+    policy: jax.Array,
+    *,
+    method: str = "auto",
+    tolerance: jax.Array | float | None = None,
+) -> Solution:
+    """Probability that a policy satisfies the product's task, from every product state.
+
+    For a co-safe task, of reaching a final state (2.5); for a safety task, of never
+    leaving the final states; for Buchi and parity, of reaching a closed component of the
+    policy's chain whose least priority is even.
+
+    Args:
+      model: the product.
+      policy: ``float[S, Q, A]`` or ``int32[S, Q]``.
+      method: as in :func:`reachability_probability`.
+      tolerance: half the width of the enclosure asked for.
+
+    Returns:
+      :class:`Solution`; `value` is ``float[S, Q]``. The probability from the start is
+      ``jnp.sum(model.initial * solution.value)``.
+
+    Differentiable in the policy and in the world's transition probabilities, with the
+    support held fixed.
+    """
+    kind = model.automaton.acceptance
+    if kind in ("cosafe", "safety"):
+        target = model.final if kind == "cosafe" else ~model.final
+    else:
+        policy = policy_distribution(model, policy)
+        target = accepting_bottom_components(model, lax.stop_gradient(policy))
+    reach = reachability_probability(
+        model, target, policy=policy, method=method, tolerance=tolerance
+    )
+    return _complement(reach) if kind == "safety" else reach
+
+
+def optimal_satisfaction(
+    model: Product,
+    *,
+    objective: str = "max",
+    tolerance: jax.Array | float | None = None,
+    max_steps: jax.Array | int = 1_000_000,
+) -> Solution:
+    """Largest or smallest probability of satisfying the product's task, with its policy.
+
+    For a co-safe task, of reaching a final state; for a safety task, of never leaving
+    them; for Buchi and parity, of reaching an accepting end component, where the policy
+    goes on so that acceptance is almost sure (Baier and Katoen 2008, section 10.6.4).
+    The least probability of a task is one minus the largest of its negation.
+
+    Args:
+      model: the product.
+      objective: ``"max"`` or ``"min"``.
+      tolerance: half the width of the enclosure asked for.
+      max_steps: sweeps at most.
+
+    Returns:
+      :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``, memoryless in
+      the product: its memory is the automaton's state.
+
+    Raises:
+      ValueError: the objective is unknown.
+    """
+    if objective not in ("max", "min"):
+        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    limits: dict[str, Any] = {"tolerance": tolerance, "max_steps": max_steps}
+    kind = model.automaton.acceptance
+    if kind == "cosafe":
+        return reachability_probability(model, model.final, objective=objective, **limits)
+    if kind == "safety":
+        opposite = "min" if objective == "max" else "max"
+        return _complement(
+            reachability_probability(model, ~model.final, objective=opposite, **limits)
+        )
+    if objective == "min":
+        negated = replace(model, automaton=_shifted(model.automaton))
+        return _complement(optimal_satisfaction(negated, **limits))
+    accepting = accepting_end_components(model)
+    reach = reachability_probability(model, accepting.region, objective="max", **limits)
+    return replace(reach, policy=jnp.where(accepting.region, accepting.action, reach.policy))
+
+
+def _shifted(automaton: Automaton) -> Automaton:
+    """The automaton of the negation; unlike `complement`, for traced tables too."""
+    return replace(automaton, priority=automaton.priority + 1, acceptance="parity", state_names=())

@@ -1,0 +1,154 @@
+"""Values of many models of one game at once, each from a first guess.
+
+For learners that solve a model again and again as it changes. Under ``vmap`` over models of one
+graph the lanes become the last axis of every array, so that whole rows of lanes are read at
+each successor, several times faster than lane by lane.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxltl.core.models.game import Game
+
+_MOST_SWEEPS = 100_000
+_WRITTEN_OUT = 16  # successors up to which a sum over them is written out
+
+
+class _Graph(NamedTuple):
+    """What all lanes share."""
+
+    successor: jax.Array  # [S, A, K]
+    allowed: jax.Array  # [S, A]
+    sign: jax.Array  # [S], 1 where the system moves and -1 elsewhere
+
+
+class _Models(NamedTuple):
+    """What differs, with a last axis of lanes, or none."""
+
+    gain: jax.Array  # [S, A]
+    probability: jax.Array  # [S, A, K]; with K = 1 not read
+    value: jax.Array  # [S]
+    discount: jax.Array
+    enough: jax.Array
+    active: jax.Array
+
+
+def span_iteration(
+    game: Game,
+    allowed: jax.Array,
+    gain: jax.Array,
+    probability: jax.Array,
+    value: jax.Array,
+    discount: jax.Array,
+    *,
+    enough: jax.Array,
+    active: jax.Array | bool = True,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The value of a discounted game from a first guess, and the moves' values.
+
+    Sweeps ``v <- T v + c`` with ``T v(s) = max_a gain(s, a) + discount * P v`` (min where the
+    environment moves), where c is the middle of MacQueen's (1966) bounds ``discount / (1 -
+    discount) * [min, max](T v - v)``. A constant changes no choice, so that it is the width of
+    the bounds that counts, which shrinks faster than their distance from zero.
+
+    Args:
+      game: explicit; its graph and whose turn it is are used, not its probabilities.
+      allowed: ``bool[S, A]``, the moves that exist; states without any stay as they are, and
+        must not be led to.
+      gain: ``float[S, A]``, expected rewards.
+      probability: ``float[S, A, K]``, of the listed successors.
+      value: ``float[S]``, the first guess.
+      discount: of every move.
+      enough: the error at which to stop.
+      active: ``bool[]``, False to return the guess.
+
+    Returns:
+      The value ``float[S]``, its error at most (infinite if not active), up to rounding; and
+      ``gain + discount * P v`` for it, ``float[S, A]``.
+    """
+    dtype = game.dtype
+    graph = _Graph(game.mdp.successor, allowed, jnp.where(game.system, 1, -1).astype(dtype))
+    models = _Models(
+        gain, probability, value, jnp.asarray(discount, dtype), jnp.asarray(enough, dtype),
+        jnp.asarray(active),
+    )
+    return _iterate(graph, models)
+
+
+def _plain(graph: _Graph, models: _Models) -> tuple[jax.Array, jax.Array, jax.Array]:
+    shape = (1,) * (models.value.ndim - 1)
+
+    def beside(x: jax.Array) -> jax.Array:
+        """One entry for all lanes."""
+        return x.reshape(x.shape + shape)
+
+    allowed, sign = beside(graph.allowed), beside(graph.sign)
+    live = beside(graph.allowed.any(-1))
+    ahead = models.discount / (1 - models.discount)
+
+    def reached(value: jax.Array, *where: Any) -> jax.Array:
+        return value.at[graph.successor[:, *where]].get(
+            mode="promise_in_bounds", wrap_negative_indices=False)
+
+    def quantities(value: jax.Array) -> list[jax.Array]:
+        """One column for each action: written out, it is read in the order of memory."""
+        num_actions, width = graph.successor.shape[1:]
+        columns = []
+        for a in range(num_actions):
+            if width == 1:  # what is certain need not be weighed
+                mean = reached(value, a, 0)
+            elif width > _WRITTEN_OUT:
+                mean = jnp.sum(models.probability[:, a] * reached(value, a), axis=1)
+            else:
+                terms = [models.probability[:, a, k] * reached(value, a, k) for k in range(width)]
+                mean = sum(terms[1:], start=terms[0])
+            columns.append(models.gain[:, a] + models.discount * mean)
+        return columns
+
+    def sweep(carry):
+        value, error, n = carry
+        best = jnp.full_like(value, -jnp.inf)
+        for a, column in enumerate(quantities(value)):
+            best = jnp.maximum(best, jnp.where(allowed[:, a], sign * column, -jnp.inf))
+        change = jnp.where(live, sign * best - value, 0)
+        top = jnp.where(live, change, -jnp.inf).max(axis=0)
+        bottom = jnp.where(live, change, jnp.inf).min(axis=0)
+        going = models.active & (error > models.enough)
+        moved = jnp.where(live & going, value + change + ahead * (top + bottom) / 2, value)
+        return moved, jnp.where(going, ahead * (top - bottom) / 2, error), n + 1
+
+    def unfinished(carry):
+        _, error, n = carry
+        return jnp.any(models.active & (error > models.enough)) & (n < _MOST_SWEEPS)
+
+    start = (models.value, jnp.full_like(models.enough, jnp.inf), jnp.int32(0))
+    value, error, _ = lax.while_loop(unfinished, sweep, start)
+    return value, error, jnp.stack(quantities(value), axis=1)
+
+
+_iterate = jax.custom_batching.custom_vmap(_plain)
+
+
+@_iterate.def_vmap
+def _lanes_last(size: int, batched: Any, graph: _Graph, models: _Models) -> Any:
+    shared, own = batched
+    if any(shared):
+        axes = jax.tree.map(lambda b: 0 if b else None, (shared, own))
+        return jax.vmap(_plain, axes)(graph, models), (True, True, True)
+    lanes = models.value.ndim - own.value - 1
+
+    def last(x: jax.Array, is_batched: bool) -> jax.Array:
+        x = x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+        x = jnp.moveaxis(x, 0, -1)
+        return x.reshape(*x.shape[:-2], -1) if lanes else x
+
+    def first(x: jax.Array) -> jax.Array:
+        return jnp.moveaxis(x.reshape(*x.shape[:-1], -1, size) if lanes else x, -1, 0)
+
+    found = _iterate(graph, jax.tree.map(last, models, own))
+    return jax.tree.map(first, found), (True, True, True)

@@ -1,0 +1,28 @@
+"""Pictures, one call each: automata, grid maps, games of two robots, learning curves.
+
+Each function returns a new matplotlib ``Figure`` and touches no global state, so it works
+without a display and in any thread. ``figure.savefig("name.svg")`` writes it.
+"""
+
+from jaxltl.plot.automata import automaton
+from jaxltl.plot.curves import bands, curves, lines, paths
+from jaxltl.plot.games import compare, game_moves, game_region, game_values
+from jaxltl.plot.maps import grid, strategies
+from jaxltl.plot.style import to_bytes
+from jaxltl.plot.worlds import temporal_gridworld
+
+__all__ = [
+    "automaton",
+    "bands",
+    "compare",
+    "curves",
+    "game_moves",
+    "game_region",
+    "game_values",
+    "grid",
+    "lines",
+    "paths",
+    "strategies",
+    "temporal_gridworld",
+    "to_bytes",
+]

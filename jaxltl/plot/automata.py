@@ -1,0 +1,240 @@
+"""Automata as pictures."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, FancyArrowPatch
+from matplotlib.path import Path
+from numpy.typing import NDArray
+
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.text import edge_guards
+from jaxltl.plot import layout as drawing
+from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER
+
+_NOTES = {
+    "buchi": "●: accepting; a word is accepted if its run takes such arrows infinitely often",
+    "parity": "a word is accepted if the least number that its run meets infinitely often is even",
+}
+
+
+# --- automata -------------------------------------------------------------------------------
+
+
+def automaton(
+    automaton: Automaton,
+    *,
+    names: bool = True,
+    layout: Literal["auto", "graphviz", "matplotlib"] = "auto",
+) -> Figure:
+    """An automaton as a graph from left to right.
+
+    Final states have a double circle. Accepting transitions of a Buchi automaton are coloured
+    and have a dot before their guard; in a parity automaton each guard has its priority there,
+    filled if it is even. States in which the word is already rejected are grey, and no mark
+    counts on the way to them.
+
+    Args:
+      automaton: the automaton.
+      names: list the formula that each state has left to satisfy under the graph.
+      layout: who places the states: ``"graphviz"``, ``"matplotlib"`` for our own way, which needs
+        nothing else and puts rejecting states below, or ``"auto"``, which is graphviz if its
+        program ``dot`` is there.
+
+    Returns:
+      The figure, in inches that suit the graph.
+
+    Raises:
+      ValueError: graphviz is asked for and cannot be run.
+    """
+    table = _on_the_host(automaton)
+    doomed = drawing.rejecting(table)
+    texts = _edge_texts(table, doomed)
+    graph = drawing.arrange(
+        table.delta, int(table.initial), doomed, texts, _places(table, texts, layout)
+    )
+    width, height = graph.size
+    lines = _notes(table, texts, width) if names else []
+    # As wide as the notes, at 8 points a character of a monospaced font.
+    full = max([width, *(0.5 + 0.602 * 8 / 72 * len(line) for line in lines)])
+    below = 0.19 * len(lines) + (0.25 if lines else 0.0)
+    figure = Figure(figsize=(full, height + below), facecolor=PAPER)
+    axes = figure.add_axes((0, below / (height + below), 1, height / (height + below)))
+    axes.set(xlim=((width - full) / 2, (width + full) / 2), ylim=(0, height), aspect="equal")
+    axes.axis("off")
+    for edge in graph.edges:
+        _edge(axes, edge.curve, _edge_color(table, edge.key, doomed))
+    for label in graph.labels:
+        _label(axes, label, MUTED if doomed[label.key[1]] else INK)
+    start = graph.position[int(table.initial)]
+    tail = start - [drawing.RADIUS + 0.42, 0]
+    _edge(axes, np.array([tail, (tail + start) / 2, start - [drawing.RADIUS, 0]]), INK)
+    final = table.final if table.acceptance in ("cosafe", "safety") else doomed & False
+    for q, center in enumerate(graph.position):
+        _state(axes, center, str(q), bool(final[q]), bool(doomed[q]))
+    for i, line in enumerate(lines):
+        figure.text(
+            0.25 / full, (below - 0.19 * (i + 0.5)) / (height + below), line, fontsize=8,
+            color=MUTED, va="center", family="monospace", parse_math=False,
+        )
+    return figure
+
+
+def _on_the_host(automaton: Automaton) -> Automaton:
+    return replace(
+        automaton,
+        delta=np.asarray(automaton.delta),
+        priority=np.asarray(automaton.priority),
+        letters=np.asarray(automaton.letters),
+        initial=int(automaton.initial),
+    )
+
+
+def _places(
+    table: Automaton, texts: Mapping[drawing.Key, drawing.Rows], layout: str
+) -> NDArray[np.float64] | None:
+    if layout not in ("auto", "graphviz", "matplotlib"):
+        raise ValueError(f"layout = {layout!r}. Pass one of auto, graphviz, matplotlib.")
+    if layout == "matplotlib":
+        return None
+    places = drawing.graphviz_positions(len(table.delta), int(table.initial), texts)
+    if places is None and layout == "graphviz":
+        raise ValueError(
+            "layout = 'graphviz', but its program dot is not on the path or fails. Install "
+            "graphviz, or pass layout='matplotlib'."
+        )
+    return places
+
+
+def pretty_guard(text: str) -> str:
+    """A guard in the signs of logic; quoted names stay as they are.
+
+    >>> pretty_guard('!a & b | "x & y"')
+    '¬a ∧ b ∨ "x & y"'
+    """
+    signs = {"!": "¬", "&": "∧", "|": "∨", "true": "⊤"}
+    return re.sub(
+        r'"(?:[^"\\]|\\.)*"|!|&|\||\btrue\b', lambda m: signs.get(m[0], m[0]), text
+    )
+
+
+def _edge_texts(
+    table: Automaton, doomed: NDArray[np.bool_]
+) -> dict[drawing.Key, drawing.Rows]:
+    """The marks and guards on each curve.
+
+    Two states have one curve from one to the other, with a guard for each priority; but
+    accepting transitions of a Buchi automaton have their own. The longest guard of each state
+    says "else", which is shorter and exact.
+    """
+    # Nothing is accepted after an arrow to a doomed state, whatever its priority.
+    priority = np.where(doomed[table.delta], 1, table.priority)
+    texts = {k: pretty_guard(t) for k, t in edge_guards(replace(table, priority=priority)).items()}
+    for q in range(len(table.delta)):
+        mine = [key for key in texts if key[0] == q]
+        longest = max(mine, key=lambda key: (len(texts[key]), key[0] == key[1], key[2]))
+        if len(mine) > 1 and len(texts[longest]) > 8:
+            texts[longest] = "else"
+    curves: dict[drawing.Key, drawing.Rows] = {}
+    for (source, target, number), text in texts.items():
+        mark, curve = "", 0
+        if table.acceptance == "buchi":
+            mark, curve = ("●", 0) if number == 0 else ("", 1)
+        elif table.acceptance == "parity" and not doomed[target]:
+            mark = str(number)
+        key = (source, target, curve)
+        curves[key] = (*curves.get(key, ()), (mark, text))
+    return curves
+
+
+def _notes(
+    table: Automaton, texts: Mapping[drawing.Key, drawing.Rows], width: float
+) -> list[str]:
+    """What stands under the graph."""
+    lines = _state_lines(table, width)
+    if table.acceptance in _NOTES:
+        lines += textwrap.wrap(_NOTES[table.acceptance], max(44, int(width * 13.5)))
+    if any(text == "else" for rows in texts.values() for _, text in rows):
+        lines.append("else: every letter that no other arrow of the state reads")
+    return lines
+
+
+def _state_lines(table: Automaton, width: float) -> list[str]:
+    lines = []
+    for q, name in enumerate(table.state_names):
+        wrapped = textwrap.wrap(name, max(30, int(width * 13.5)), max_lines=3, placeholder=" …")
+        indent = " " * (len(str(q)) + 2)
+        lines += [f"{q}: {wrapped[0]}", *(indent + w for w in wrapped[1:])]
+    return lines
+
+
+def _edge_color(table: Automaton, key: drawing.Key, doomed: NDArray[np.bool_]) -> str:
+    source, target, curve = key
+    if doomed[source]:
+        return FAINT
+    if doomed[target]:
+        return MUTED
+    return ACCENT if table.acceptance == "buchi" and curve == 0 else INK
+
+
+def _label(axes: Axes, label: drawing.Label, color: str) -> None:
+    """The lines of a label in the middle; if some have marks, to the left, after the marks."""
+    rows, (x, y) = label.rows, label.center
+    style: dict[str, Any] = {
+        "fontsize": drawing.FONT_SIZE, "color": color, "zorder": 4, "parse_math": False,
+        "bbox": {"facecolor": PAPER, "edgecolor": "none", "pad": 0.8},
+    }
+    if not drawing.is_marked(rows):
+        text = "\n".join(line for _, line in rows)
+        axes.text(x, y, text, ha="center", va="center", linespacing=1.15, **style)
+        return
+    left = x - (drawing.text_width(rows) - drawing.MARK_WIDTH) / 2
+    for i, (mark, line) in enumerate(rows):
+        row = y + drawing.MARKED_HEIGHT * ((len(rows) - 1) / 2 - i)
+        axes.text(left, row, line, ha="left", va="center_baseline", **style)
+        if mark:
+            _mark(axes, (left - drawing.MARK_WIDTH / 2 - 0.02, row), mark)
+
+
+def _mark(axes: Axes, center: tuple[float, float], mark: str) -> None:
+    """A dot, or a priority in a circle that is filled if it is even."""
+    filled = mark == "●" or int(mark) % 2 == 0
+    axes.add_patch(
+        Circle(center, 0.04 if mark == "●" else 0.078, facecolor=ACCENT if filled else PAPER,
+               edgecolor=ACCENT if filled else MUTED, lw=0.8, zorder=4.5)
+    )
+    if mark != "●":
+        axes.text(*center, mark, ha="center", va="center_baseline", fontsize=7,
+                  color=PAPER if filled else INK, zorder=5)
+
+
+def _edge(axes: Axes, curve: NDArray[np.float64], color: str) -> None:
+    codes = [Path.MOVETO] + [Path.CURVE3 if len(curve) == 3 else Path.CURVE4] * (len(curve) - 1)
+    axes.add_patch(
+        FancyArrowPatch(
+            path=Path(curve, codes), arrowstyle="-|>,head_length=5,head_width=2.4",
+            mutation_scale=1, color=color, linewidth=1.1, zorder=2, joinstyle="miter",
+        )
+    )
+
+
+def _state(axes: Axes, center: NDArray[np.float64], text: str, final: bool, doomed: bool) -> None:
+    line, fill = (MUTED, "#f2f3f5") if doomed else (INK, GOOD if final else PAPER)
+    axes.add_patch(
+        Circle(tuple(center), drawing.RADIUS, facecolor=fill, edgecolor=line, lw=1.3, zorder=5)
+    )
+    if final:
+        inner = drawing.RADIUS - 0.05
+        axes.add_patch(
+            Circle(tuple(center), inner, facecolor="none", edgecolor=line, lw=1, zorder=5)
+        )
+    axes.text(center[0], center[1], text, ha="center", va="center_baseline", fontsize=11,
+              color=line, zorder=6)

@@ -1,0 +1,197 @@
+"""Curves over steps, bands over seeds, and paths."""
+
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+from numpy.typing import ArrayLike, NDArray
+
+from jaxltl.plot.style import (
+    _KINDS,
+    _SERIES,
+    ACCENT,
+    FAINT,
+    INK,
+    MUTED,
+    PAPER,
+    _bottom_labels,
+    _panel_rows,
+    _plain_axes,
+)
+
+# --- curves ---------------------------------------------------------------------------------
+
+
+def curves(
+    metrics: Mapping[str, ArrayLike] | Any,
+    *,
+    steps: ArrayLike | None = None,
+    show: Sequence[str] | None = None,
+) -> Figure:
+    """Learning curves, one panel per figure: the median over seeds, and their spread.
+
+    Args:
+      metrics: figures ``[T]`` or ``[N, T]`` by name, or a learner's ``Metrics``.
+      steps: ``[T]``, the step of each figure; default 1, 2, ...
+      show: names in order; default all that are not wholly NaN.
+
+    Returns:
+      The figure. The band holds all the seeds; it is left out for a single one.
+
+    Raises:
+      ValueError: there is nothing to show.
+    """
+    if not isinstance(metrics, Mapping):
+        metrics = {name: getattr(metrics, name) for name in metrics.__dataclass_fields__}
+    series = {k: np.atleast_2d(np.asarray(v, float)) for k, v in metrics.items()}
+    chosen = [
+        k for k in (show or series) if k in series and np.isfinite(series[k]).any()
+    ]
+    if not chosen:
+        raise ValueError(f"curves: nothing to show among {', '.join(series) or 'no figures'}.")
+    figure = Figure(figsize=(3.1 * len(chosen) + 0.2, 2.5), layout="constrained", facecolor=PAPER)
+    for i, (name, axes) in enumerate(
+        zip(chosen, figure.subplots(1, len(chosen), squeeze=False)[0], strict=True)
+    ):
+        _curve(axes, series[name], steps, name.replace("_", " "), _SERIES[i % len(_SERIES)])
+    return figure
+
+
+def _curve(
+    axes: Axes, rows: NDArray[np.float64], steps: ArrayLike | None, name: str, color: str
+) -> None:
+    x = np.arange(1, rows.shape[1] + 1) if steps is None else np.asarray(steps)
+    rows = np.where(np.isfinite(rows), rows, np.nan)
+    middle = np.nanmedian(rows, axis=0) if len(rows) > 1 else rows[0]
+    if len(rows) > 1:
+        axes.fill_between(x, np.nanmin(rows, axis=0), np.nanmax(rows, axis=0), color=color,
+                          alpha=0.18, lw=0)
+    axes.plot(x, middle, color=color, lw=1.6)
+    positive = rows[rows > 0]
+    if positive.size and np.nanmin(rows) > 0 and positive.max() > 100 * positive.min():
+        axes.set_yscale("log")
+    axes.set_title(name, fontsize=9.5, color=INK, loc="left")
+    axes.set_xlabel("step", fontsize=8.5, color=MUTED)
+    _plain_axes(axes)
+
+
+def bands(
+    rows: Mapping[str, Mapping[str, Mapping[str, tuple[ArrayLike, ArrayLike, ArrayLike]]]],
+    *,
+    limits: Mapping[str, Mapping[str, float]] | None = None,
+    label: str = "step",
+) -> Figure:
+    """Learning curves of several methods: a row of panels for each task.
+
+    Args:
+      rows: by the titles of row and column and the name of the series, the horizontal places
+        ``[T]``, a mean ``[T]``, and how far the band goes to either side ``[T]``.
+      limits: by the titles of row and column, a number at which a dashed line is drawn.
+      label: of the horizontal axis.
+
+    Raises:
+      ValueError: there is nothing to show.
+    """
+    figure, panels = _panel_rows(rows, "bands", (3.6, 1.9))
+    names = list(dict.fromkeys(n for row in rows.values() for cell in row.values() for n in cell))
+    for (row, column), axes in panels.items():
+        for name, (x, mean, spread) in rows[row][column].items():
+            color = _SERIES[names.index(name) % len(_SERIES)]
+            place, middle, width = (np.asarray(v, float) for v in (x, mean, spread))
+            axes.fill_between(place, middle - width, middle + width, color=color, alpha=0.15, lw=0)
+            axes.plot(place, middle, color=color, lw=1.4, label=name)
+        if limits and column in limits.get(row, {}):
+            axes.axhline(limits[row][column], color=INK, lw=1, ls="--")
+    _bottom_labels(panels, [label] * len(panels))
+    handles = [Line2D([], [], color=_SERIES[i % len(_SERIES)]) for i in range(len(names))]
+    figure.legend(handles, names, loc="outside lower center", ncols=len(names), frameon=False,
+                  fontsize=8.5, labelcolor=INK)
+    return figure
+
+
+def lines(
+    rows: Mapping[str, Mapping[str, tuple[ArrayLike, ArrayLike | None]]],
+    *,
+    labels: Sequence[str] = (),
+    names: tuple[str, str] = ("found", "reference"),
+) -> Figure:
+    """Many runs over time, and one to compare them with: a row of panels for each setting.
+
+    Args:
+      rows: by the titles of row and column, runs ``[K, T]`` and a reference ``[T]`` or None.
+      labels: of the horizontal axes, one for each column.
+      names: of the runs and of the reference.
+
+    Raises:
+      ValueError: there is nothing to show.
+    """
+    figure, panels = _panel_rows(rows, "lines", (2.1, 1.5))
+    for (row, column), axes in panels.items():
+        runs, reference = rows[row][column]
+        several = np.asarray(runs, float)
+        axes.plot(several.T, color=ACCENT, lw=1.4 if len(several) == 1 else 0.7,
+                  alpha=1 if len(several) == 1 else 0.35)
+        if reference is not None:
+            axes.plot(np.asarray(reference, float), color=_SERIES[1], lw=1.3, ls="--")
+    _bottom_labels(panels, labels)
+    figure.legend(
+        [Line2D([], [], color=ACCENT), Line2D([], [], color=_SERIES[1], ls="--")], names,
+        loc="outside lower center", ncols=2, frameon=False, fontsize=8.5, labelcolor=INK)
+    return figure
+
+
+def paths(
+    maps: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    boxes: Mapping[str, ArrayLike],
+    *,
+    bounds: ArrayLike,
+    columns: int = 4,
+) -> Figure:
+    """Trajectories in the plane, a map for each title.
+
+    Args:
+      maps: by title, coordinates x and y of M trajectories, ``[M, T]`` each.
+      boxes: by name, regions ``((x, y), (x, y))``, the lower left corner first; drawn in all maps.
+      bounds: the box that is shown.
+      columns: of maps.
+
+    Raises:
+      ValueError: there is nothing to show.
+    """
+    if not maps:
+        raise ValueError("paths: nothing to show; give at least one map.")
+    columns = min(columns, len(maps))
+    count = -(-len(maps) // columns)
+    figure = Figure(figsize=(2.3 * columns, 2.4 * count + 0.3), layout="constrained",
+                    facecolor=PAPER)
+    every = figure.subplots(count, columns, squeeze=False).ravel()
+    low, high = np.asarray(bounds, float)
+    handles: list[Any] = []
+    for i, axes in enumerate(every):
+        axes.set_axis_off()
+        if i >= len(maps):
+            continue
+        title, (x, y) = list(maps.items())[i]
+        handles = []
+        for j, (corner, end) in enumerate(np.asarray(list(boxes.values()), float)):
+            box = Rectangle(tuple(corner), *(end - corner), lw=0, color=_KINDS[(j + 2) % 6])
+            handles.append(axes.add_patch(box))
+        axes.add_patch(Rectangle(tuple(low), *(high - low), fill=False, color=FAINT, lw=1.5))
+        xs, ys = np.asarray(x, float), np.asarray(y, float)
+        axes.plot(xs.T, ys.T, color=ACCENT, lw=0.9, alpha=0.75)
+        axes.plot(xs[:, 0], ys[:, 0], "o", color=INK, ms=2.2)
+        axes.plot(xs[:, -1], ys[:, -1], "s", color=_SERIES[1], ms=2.6)
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        axes.set_title(title, fontsize=8.5, color=INK, loc="left", parse_math=False)
+    ends = [Line2D([], [], ls="", marker=m, color=c, ms=4) for m, c in (
+        ("o", INK), ("s", _SERIES[1]))]
+    figure.legend([*handles, *ends], [*boxes, "first", "last"], loc="outside lower center",
+                  ncols=len(boxes) + 2, frameon=False, fontsize=8.5, labelcolor=INK)
+    return figure

@@ -1,0 +1,336 @@
+"""Games of two robots: values, regions and moves."""
+
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.patches import Circle
+from numpy.typing import ArrayLike, NDArray
+
+from jaxltl.plot.board import _LOSES, _ROBOT, _Board, _board, _fill, _frame, _moves, _robot
+from jaxltl.plot.maps import _as_mask, _cell_size, _number_cells, _require_directions, _rows_of_maps
+from jaxltl.plot.style import (
+    _SCALE,
+    _SERIES,
+    _STEPS,
+    ACCENT,
+    FAINT,
+    INK,
+    MUTED,
+    PAPER,
+    _note,
+    _plain_axes,
+)
+
+# --- games of two robots --------------------------------------------------------------------
+
+
+_CELLS = "The cells of a map are those of the system's robot."
+
+
+def game_values(
+    values: ArrayLike,
+    board: int | str,
+    *,
+    policy: ArrayLike | None = None,
+    actions: Sequence[str] = (*_STEPS, "stay"),
+    environment: Sequence[int] | None = None,
+    label: str = "",
+    limits: tuple[float, float] | None = None,
+    wall: str = "#",
+) -> Figure:
+    """A value where the system moves: for each cell of the environment a map of the system's.
+
+    Args:
+      values: ``float[2 * C * C]``, of the states of :func:`jaxltl.envs.robots.robots` or
+        :func:`jaxltl.envs.robots.grid_game`; NaN leaves a cell blank.
+      board: the size of the former, or the text map of the latter.
+      policy: ``int[S]``, the system's moves, as arrows instead of figures; negative for none. Or
+        ``bool[S, A]``, several moves.
+      actions: the name of each action, of up, down, left, right and stay.
+      environment: numbers of the environment's places to show; default all, laid out as they lie.
+      label: what the colours mean.
+      limits: values at the ends of the scale; default the data's.
+      wall: the kind of cell that is not a place.
+
+    Returns:
+      The figure, with one scale for all maps.
+
+    Raises:
+      ValueError: values or policy do not fit the board, or an action has no direction.
+    """
+    world = _board(board, wall)
+    table = _of_turns(np.asarray(values, float), world, "values")
+    allowed = None
+    if policy is not None:
+        _require_directions(actions)
+        allowed = _of_turns(_as_mask(policy, len(actions)), world, "policy")
+    finite = table[np.isfinite(table)]
+    if limits is None:
+        limits = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+        limits = limits if limits[0] < limits[1] else (limits[0] - 1, limits[1])
+    figure, maps, size = _small_multiples(world, environment, bar=0.75)
+    image: Any = None
+    for place, axes in maps.items():
+        image = _shade(axes, world, table[place], limits)
+        _robot(axes, world, place)
+        if allowed is not None:
+            _moves(axes, world, allowed[place], actions, table[place] < sum(limits) / 2)
+        elif size >= 0.27:
+            _figures(axes, world, table[place], place, sum(limits) / 2)
+    bar = figure.colorbar(image, ax=list(maps.values()), shrink=0.6, pad=0.015, aspect=28)
+    bar.set_label(label, fontsize=9, color=INK)
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(labelsize=8, color=MUTED, labelcolor=INK, length=2)
+    _note(figure, [(_ROBOT, "the environment's robot", "o")], _CELLS)
+    return figure
+
+
+def game_region(
+    region: ArrayLike,
+    board: int | str,
+    *,
+    environment: Sequence[int] | None = None,
+    wall: str = "#",
+) -> Figure:
+    """From where the system wins on its turn: for each cell of the environment a map.
+
+    Args:
+      region: ``bool[2 * C * C]``, see :func:`game_values`.
+      board, environment, wall: as there.
+
+    Returns:
+      The figure.
+
+    Raises:
+      ValueError: the region does not fit the board.
+    """
+    world = _board(board, wall)
+    table = _of_turns(np.asarray(region, bool), world, "region")
+    figure, maps, _ = _small_multiples(world, environment)
+    for place, axes in maps.items():
+        _paint(axes, world, table[place])
+        _robot(axes, world, place)
+    _note(figure, _REGION_MARKS, _CELLS)
+    return figure
+
+
+_REGION_MARKS = [
+    ("#cfe6d6", "the system wins", "s"),
+    (_LOSES, "the environment wins", "s"),
+    (_ROBOT, "the environment's robot", "o"),
+]
+
+
+def game_moves(
+    allowed: ArrayLike,
+    board: int | str,
+    environment: int,
+    *,
+    region: ArrayLike | None = None,
+    available: ArrayLike | None = None,
+    system: int | None = None,
+    actions: Sequence[str] = (*_STEPS, "stay"),
+    titles: Sequence[str] | str = "",
+    wall: str = "#",
+) -> Figure:
+    """What the system may do in each cell while the environment's robot is in a certain one.
+
+    Args:
+      allowed: ``bool[2 * C * C, A]``, or with M panels first, such as one for each memory
+        state of a strategy; see :func:`game_values` for the states.
+      board, actions, wall: as there.
+      environment: the number of the environment's place.
+      region: ``bool[2 * C * C]``, or with M panels first: where the system wins.
+      available: ``bool[2 * C * C, A]``: those that are not allowed get a hollow mark.
+      system: the number of the system's place, to be ringed.
+      titles: one per panel.
+
+    Returns:
+      The figure. A triangle is an allowed move, a dot is staying.
+
+    Raises:
+      ValueError: an array does not fit the board, or an action has no direction.
+    """
+    world = _board(board, wall)
+    _require_place(world, environment)
+    _require_directions(actions)
+    panels = np.asarray(allowed, bool)
+    panels = panels[None] if panels.ndim == 2 else panels
+    regions = None if region is None else np.asarray(region, bool)
+    if regions is not None and regions.ndim == 1:
+        regions = np.broadcast_to(regions, (len(panels), *regions.shape))
+    titles = [titles] * len(panels) if isinstance(titles, str) else list(titles)
+    rows, columns = world.cells.shape
+    most = 3 if columns * _cell_size((rows, columns)) > 1.5 else 4
+    figure, every = _rows_of_maps((rows, columns), len(panels), min(len(panels), most))
+    for m, axes in enumerate(every):
+        mask = _of_turns(panels[m], world, "allowed")[environment]
+        wins = mask.any(-1)
+        if regions is not None:
+            wins = _of_turns(regions[m], world, "region")[environment]
+        _paint(axes, world, wins)
+        _number_cells(axes, rows, columns)
+        if available is not None:
+            can = _of_turns(np.asarray(available, bool), world, "available")[environment]
+            _moves(axes, world, can & ~mask & wins[:, None], actions, hollow=True)
+        _moves(axes, world, mask, actions)
+        _robot(axes, world, environment)
+        if system is not None:
+            row, column = world.places[system]
+            axes.add_patch(Circle((column + 0.5, row + 0.5), 0.44, fill=False, lw=1.6,
+                                  edgecolor=ACCENT, zorder=6))
+        axes.set_title(titles[m], fontsize=9.5, color=INK, pad=5, loc="left", parse_math=False)
+    marks = [*_REGION_MARKS, (INK, "allowed", "^")]
+    _note(figure, marks + ([(PAPER, "not allowed", "^")] if available is not None else []))
+    return figure
+
+
+def _require_place(world: _Board, number: int) -> int:
+    if not 0 <= number < len(world.places):
+        raise ValueError(
+            f"environment {number} is no place of the board, whose places are 0 to "
+            f"{len(world.places) - 1}."
+        )
+    return int(number)
+
+
+def _of_turns(array: NDArray[Any], world: _Board, name: str) -> NDArray[Any]:
+    """An array over states as ``[environment, system, ...]``, where the system moves."""
+    count = len(world.places)
+    if array.ndim < 1 or len(array) != 2 * count**2:
+        raise ValueError(
+            f"{name} has shape {array.shape}; the board has {count} places, so that the game has "
+            f"2 * {count}**2 = {2 * count**2} states."
+        )
+    return np.asarray(array.reshape(count, count, 2, *array.shape[1:])[:, :, 1])
+
+
+def _small_multiples(
+    world: _Board, environment: Sequence[int] | None, bar: float = 0.0
+) -> tuple[Figure, dict[int, Axes], float]:
+    """A figure, its axes by the environment's place, and the inches of a cell."""
+    rows, columns = world.cells.shape
+    if environment is None:
+        down, across = rows, columns
+        spots = [int(r * columns + c) for r, c in world.places]
+        chosen = list(range(len(spots)))
+    else:
+        chosen = [_require_place(world, e) for e in environment]
+        across = min(int(np.ceil(np.sqrt(len(chosen)))), 4)
+        down, spots = -(-len(chosen) // across), list(range(len(chosen)))
+    size = float(np.clip(8.5 / max(across * columns, down * rows), 0.085, 0.42))
+    gap = 0.18 if environment is None else 0.32
+    width = across * (columns * size + 0.14) + bar + 0.2
+    figure = Figure(
+        figsize=(max(width, 3.4), down * (rows * size + gap) + 0.5), layout="constrained",
+        facecolor=PAPER,
+    )
+    every = figure.subplots(down, across, squeeze=False).ravel()
+    maps = {place: every[spot] for place, spot in zip(chosen, spots, strict=True)}
+    for axes in every:
+        if all(axes is not shown for shown in maps.values()):
+            axes.axis("off")
+    if environment is not None:
+        for place, axes in maps.items():
+            row, column = world.places[place] + 1
+            axes.set_title(f"row {row}, column {column}", fontsize=8, color=MUTED, pad=3)
+    return figure, maps, size
+
+
+def _on_board(world: _Board, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    shown: NDArray[np.float64] = np.full(world.cells.shape, np.nan)
+    shown[tuple(world.places.T)] = values
+    return shown
+
+
+def _shade(
+    axes: Axes, world: _Board, values: NDArray[np.float64], limits: tuple[float, float]
+) -> Any:
+    rows, columns = world.cells.shape
+    image = axes.imshow(
+        np.ma.masked_invalid(_on_board(world, values)), cmap=_SCALE, vmin=limits[0],
+        vmax=limits[1], extent=(0, columns, rows, 0), interpolation="nearest",
+    )
+    _frame(axes, world)
+    return image
+
+
+def _paint(axes: Axes, world: _Board, wins: NDArray[np.bool_]) -> None:
+    _fill(axes, world, [_REGION_MARKS[0][0] if good else _LOSES for good in wins])
+
+
+def _figures(
+    axes: Axes, world: _Board, values: NDArray[np.float64], robot: int, middle: float
+) -> None:
+    for place, (row, column) in enumerate(world.places):
+        if place != robot and np.isfinite(values[place]):
+            axes.text(column + 0.5, row + 0.5, f"{values[place]:.3g}", ha="center", va="center",
+                      fontsize=6.5, color=PAPER if values[place] < middle else INK, zorder=4)
+
+
+# --- values side by side --------------------------------------------------------------------
+
+
+def compare(
+    values: Mapping[str, ArrayLike],
+    *,
+    groups: Sequence[str] | None = None,
+    label: str = "value",
+) -> Figure:
+    """Values of the same states under several strategies, a column of marks for each state.
+
+    Args:
+      values: ``float[S]`` by the name of the strategy. States are sorted by the first, then by
+        the second, and so on; those that come first are drawn on top.
+      groups: the name of each state's group; groups stand side by side as they first occur.
+      label: what the values are.
+
+    Returns:
+      The figure.
+
+    Raises:
+      ValueError: there is nothing to show, or lengths differ.
+    """
+    series = {name: np.asarray(value, float) for name, value in values.items()}
+    sizes = {len(value) for value in series.values()}
+    if len(sizes) != 1 or 0 in sizes:
+        found = ", ".join(f"{name}: {len(value)}" for name, value in series.items())
+        raise ValueError(f"compare needs values of the same states; it has {found or 'none'}.")
+    count = sizes.pop()
+    names = [""] * count if groups is None else list(groups)
+    if len(names) != count:
+        raise ValueError(f"groups has {len(names)} names; there are {count} states.")
+    kinds = list(dict.fromkeys(names))
+    group = np.array([kinds.index(name) for name in names])
+    order = np.lexsort((*reversed(series.values()), group))
+    place = np.arange(count) + 1.5 * group[order]
+    figure = Figure(
+        figsize=(float(np.clip(0.085 * count + 1.2, 4, 10)), 3.2),
+        layout=ConstrainedLayoutEngine(h_pad=0.1), facecolor=PAPER,
+    )
+    axes = figure.subplots()
+    styles = [("_", 8), ("o", 4.5), ("x", 4), ("D", 3.5), ("v", 4), ("s", 3.5)]
+    for i, (name, value) in reversed(list(enumerate(series.items()))):
+        marker, size = styles[i % len(styles)]
+        axes.plot(place, value[order], ls="", marker=marker, ms=size, label=name,
+                  color=_SERIES[i % len(_SERIES)], mew=1.4 if marker in "_x" else 0)
+    for i, name in enumerate(kinds):
+        here = place[group[order] == i]
+        axes.text(here.mean(), 1.02, name, transform=axes.get_xaxis_transform(), ha="center",
+                  va="bottom", fontsize=8.5, color=MUTED, parse_math=False)
+        if i:
+            axes.axvline(here[0] - 1.25, color=FAINT, lw=1)
+    axes.set_ylabel(label, fontsize=9, color=INK)
+    axes.set(xticks=[], ylim=(min(0, axes.get_ylim()[0]), None))
+    _plain_axes(axes)
+    handles, texts = axes.get_legend_handles_labels()
+    figure.legend(handles[::-1], texts[::-1], loc="outside lower left", ncols=len(series),
+                  frameon=False, fontsize=8.5, labelcolor=INK, handletextpad=0.2)
+    return figure

@@ -1,0 +1,105 @@
+"""Colours, files and axes that all pictures share."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+INK, MUTED, FAINT = "#1f2a37", "#6b7785", "#d5dae0"
+
+
+ACCENT, GOOD, PAPER = "#1f6f8b", "#e4f1ea", "#ffffff"
+
+
+# What is well is light, so that the cells that are not stand out.
+_SCALE = LinearSegmentedColormap.from_list(
+    "probability", ["#2f2b57", "#4a5a92", "#7f9cc0", "#bfd3df", "#f6f8f4"]
+)
+
+
+_STEPS = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)}
+
+
+def to_bytes(figure: Figure, kind: str = "svg", dpi: int = 150) -> bytes:
+    """A figure as the bytes of a file.
+
+    Args:
+      figure: the figure.
+      kind: ``"svg"``, ``"png"`` or ``"pdf"``.
+      dpi: dots per inch of a PNG.
+    """
+    buffer = io.BytesIO()
+    # Without a date, the same figure gives the same bytes.
+    metadata = {"Date": None} if kind == "svg" else None
+    figure.savefig(buffer, format=kind, dpi=dpi, metadata=metadata, facecolor=PAPER)
+    return buffer.getvalue()
+
+
+def _note(figure: Figure, marks: Sequence[tuple[Any, ...]], title: str = "") -> None:
+    """What colours and marks mean, under the maps: colour, text, marker and, if not 7, its size."""
+    handles = [
+        Line2D([], [], ls="", marker=marker, color=color, markersize=size[0] if size else 7,
+               label=text, markeredgecolor=MUTED if color == PAPER else "none")
+        for color, text, marker, *size in marks
+    ]
+    if not handles:
+        return
+    across = max(1, min(len(handles), int(figure.get_figwidth() / 1.6)))
+    legend = figure.legend(
+        handles=handles, loc="outside lower left", ncols=across, frameon=False, fontsize=8,
+        labelcolor=INK, handletextpad=0.1, columnspacing=1.2, title=title, alignment="left",
+    )
+    legend.get_title().set(fontsize=8, color=MUTED)
+
+
+def _plain_axes(axes: Axes) -> None:
+    axes.tick_params(labelsize=8, color=FAINT, labelcolor=INK, length=3)
+    axes.grid(color=FAINT, lw=0.5)
+    axes.set_axisbelow(True)
+    for side, spine in axes.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(FAINT)
+
+
+def _panel_rows(
+    rows: Mapping[str, Mapping[str, Any]], name: str, size: tuple[float, float]
+) -> tuple[Figure, dict[tuple[str, str], Axes]]:
+    """Empty panels by the titles of row and column."""
+    columns = list(dict.fromkeys(column for row in rows.values() for column in row))
+    if not columns:
+        raise ValueError(f"{name}: nothing to show; give at least one row with a panel.")
+    figure = Figure(
+        figsize=(size[0] * len(columns), size[1] * len(rows) + 0.5), layout="constrained",
+        facecolor=PAPER)
+    grid = figure.subplots(len(rows), len(columns), squeeze=False)
+    found = {}
+    for i, row in enumerate(rows):
+        for j, column in enumerate(columns):
+            axes = grid[i, j]
+            _plain_axes(axes)
+            if i == 0:
+                axes.set_title(column, fontsize=9.5, color=INK, loc="left")
+            if j == 0:
+                axes.set_ylabel(row, fontsize=9.5, color=INK)
+            if column in rows[row]:
+                found[row, column] = axes
+            else:
+                axes.set_visible(False)
+    return figure, found
+
+
+def _bottom_labels(panels: Mapping[tuple[str, str], Axes], labels: Sequence[str]) -> None:
+    last, columns = list(panels)[-1][0], list(dict.fromkeys(column for _, column in panels))
+    for column, label in zip(columns, labels, strict=False):
+        if (last, column) in panels:
+            panels[last, column].set_xlabel(label, fontsize=8.5, color=MUTED)
+
+_KINDS = ("#dfd0ea", "#f5d6b3", "#d3e6e8", "#e3ddd0", "#f0d3df", "#dbe3b8")
+
+_SERIES = ("#1f6f8b", "#c2571a", "#5b7f2b", "#7a4f9a", "#a23b5b", "#4a5a6a")

@@ -1,0 +1,219 @@
+"""Coloured worlds, what is done in them, and what it is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
+from numpy.typing import ArrayLike, NDArray
+
+from jaxltl.envs.temporal_gridworld import World
+from jaxltl.plot.maps import _arrows, _number_cells
+from jaxltl.plot.style import _SCALE, _SERIES, _STEPS, ACCENT, INK, MUTED, PAPER, _note
+
+# --- coloured worlds ------------------------------------------------------------------------
+
+
+# Of temporal_gridworld.COLORS: paler than their names, so that what is drawn on them shows.
+_TINTS = ("#e79a8c", "#f5db80", "#fdfcf8", "#c3add8", "#4a4f58")
+
+
+_IS_LIGHT = np.array([1.0, 1.0, 1.0, 1.0, 0.0])
+
+
+def temporal_gridworld(
+    world: World,
+    policy: ArrayLike | None = None,
+    memory: int | Sequence[int] = 0,
+    trajectories: Any = None,
+    value: ArrayLike | None = None,
+    *,
+    title: str | Sequence[str] = "",
+    label: str = "value",
+    limits: tuple[float, float] | None = None,
+    actions: Sequence[str] = ("up", "down", "left", "right"),
+) -> Figure:
+    """A coloured world and its objects, with a policy as arrows and trajectories as lines.
+
+    Objects and obstacles have a frame and their name; the ring that only patches show is pale.
+
+    Args:
+      world: a :class:`jaxltl.envs.temporal_gridworld.World`.
+      policy: ``float[S, A]``, or ``float[S, Q, A]`` by the task's memory.
+      memory: the memory state to show, or several, with a panel for each.
+      trajectories: of the world, drawn from a dot to a square, side by side where they overlap.
+      value: ``float[S]`` or ``float[S, Q]``, as colours in a second row of panels.
+      title: one per panel.
+      label: what the value is.
+      limits: values at the ends of the scale; default the data's.
+      actions: the name of each action, of up, down, left and right.
+
+    Returns:
+      The figure.
+
+    Raises:
+      ValueError: policy, value, memory or trajectories do not fit the world.
+    """
+    chosen = [memory] if isinstance(memory, int | np.integer) else list(memory)
+    size, shape = int(np.prod(world.shape)), world.shape
+    moves = _of_memory(policy, chosen, size, (len(actions),), "policy")
+    values = _of_memory(value, chosen, size, (), "value")
+    for name in actions:
+        if policy is not None and name not in _STEPS:
+            raise ValueError(f"action {name!r} has no direction; use {', '.join(_STEPS)}.")
+    titles = [title] * len(chosen) if isinstance(title, str) else list(title)
+    lines = _walks(trajectories, world)
+    wide = max(shape) + 2 * world.margin
+    inches = float(np.clip(5.4 / wide, 0.06, 0.42)) * wide
+    down = 1 if values is None else 2
+    figure = Figure(
+        figsize=(len(chosen) * (inches + 0.3) + (0.8 if down == 2 else 0.1),
+                 down * (inches * (shape[0] + 2 * world.margin) / wide + 0.55)
+                 + (0.3 if lines else 0)),
+        layout=ConstrainedLayoutEngine(h_pad=0.1), facecolor=PAPER,
+    )
+    every = figure.subplots(down, len(chosen), squeeze=False)
+    for i, (axes, name) in enumerate(zip(every[0], titles, strict=True)):
+        light = _color_cells(axes, world)
+        if moves is not None:
+            _arrows(axes, shape, moves[i], light, 0.0, 1.0, actions)
+        _draw_walks(axes, lines)
+        _name_kinds(axes, world)
+        axes.set_title(name, fontsize=9.5, color=INK, pad=5, loc="left", parse_math=False)
+    if values is not None:
+        _value_panels(figure, every[1], world, values, moves, limits, label, actions)
+    if lines:
+        _note(figure, [(ACCENT, "first cell", "o"), (ACCENT, "last cell", "s")])
+    return figure
+
+
+def _of_memory(
+    array: ArrayLike | None, chosen: Sequence[int], size: int, rest: tuple[int, ...], name: str
+) -> NDArray[np.float64] | None:
+    """An array over states, or states and memory, as panels ``[M, S, ...]``."""
+    if array is None:
+        return None
+    given = np.asarray(array, float)
+    if given.shape == (size, *rest):
+        return np.repeat(given[None], len(chosen), axis=0)
+    if given.ndim != 2 + len(rest) or (given.shape[0], *given.shape[2:]) != (size, *rest):
+        wanted = ", ".join(map(str, rest))
+        raise ValueError(
+            f"{name} has shape {given.shape}; the world has {size} cells, so pass "
+            f"({size}, {wanted}) or ({size}, memory{', ' if rest else ''}{wanted})."
+        )
+    for q in chosen:
+        if not 0 <= q < given.shape[1]:
+            raise ValueError(f"memory {q} does not exist; {name} has 0 to {given.shape[1] - 1}.")
+    return np.moveaxis(given[:, list(chosen)], 1, 0)
+
+
+def _color_cells(axes: Axes, world: World) -> NDArray[np.float64]:
+    """The colours of a world and its ring; returns which cells are light, ``[S]``."""
+    (rows, columns), margin = world.shape, world.margin
+    colors = np.asarray(world.colors)
+    axes.imshow(
+        np.array([to_rgb(tint) for tint in _TINTS])[colors],
+        extent=(-margin, columns + margin, rows + margin, -margin), interpolation="nearest",
+    )
+    for corner, width, height in (
+        ((-margin, -margin), columns + 2 * margin, margin),
+        ((-margin, rows), columns + 2 * margin, margin),
+        ((-margin, 0), margin, rows), ((columns, 0), margin, rows),
+    ):
+        axes.add_patch(Rectangle(corner, width, height, facecolor=PAPER, alpha=0.62, lw=0))
+    if max(rows, columns) <= 32:
+        grid = [((0, r), (columns, r)) for r in range(rows + 1)]
+        grid += [((c, 0), (c, rows)) for c in range(columns + 1)]
+        axes.add_collection(LineCollection(grid, colors=PAPER, linewidths=0.7))
+    axes.add_patch(Rectangle((0, 0), columns, rows, fill=False, edgecolor=INK, lw=1.1))
+    _number_cells(axes, rows, columns)
+    axes.set(xlim=(-margin, columns + margin), ylim=(rows + margin, -margin), aspect="equal")
+    inner = colors[margin : margin + rows, margin : margin + columns]
+    return _IS_LIGHT[inner.ravel()]
+
+
+def _name_kinds(axes: Axes, world: World) -> None:
+    """A frame around each object and obstacle, and its name where there is room."""
+    kinds = np.asarray(world.mdp.label)
+    tiny = max(world.shape) > 16
+    for state, number in np.argwhere(kinds):
+        row, column = divmod(int(state), world.shape[1])
+        name = world.mdp.propositions[number]
+        inset = 0.05
+        axes.add_patch(Rectangle(
+            (column + inset, row + inset), 1 - 2 * inset, 1 - 2 * inset, fill=False,
+            edgecolor=_SERIES[1], lw=0.9 if tiny else 1.6, zorder=5,
+        ))
+        # Where cells are tiny, the name of what is rare stands beside it.
+        if not tiny or kinds[:, number].sum() <= 3:
+            x, y = (column + 1.2, row + 0.04) if tiny else (column + 0.04, row + 0.04)
+            axes.text(x, y, name, ha="left", va="top", fontsize=6.5,
+                      color=PAPER, weight="bold", parse_math=False, zorder=7,
+                      bbox={"facecolor": _SERIES[1], "edgecolor": "none", "pad": 0.9})
+
+
+def _walks(trajectories: Any, world: World) -> list[NDArray[np.float64]]:
+    """Points ``[T, 2]``, column and row, of each trajectory."""
+    if trajectories is None:
+        return []
+    states, lengths = np.asarray(trajectories.state), np.asarray(trajectories.length)
+    size = int(np.prod(world.shape))
+    if states.size and not 0 <= states.min() <= states.max() < size:
+        raise ValueError(
+            f"trajectories have states {states.min()} to {states.max()}; the world's cells are 0 "
+            f"to {size - 1}. Pass trajectories of the world, not of a product."
+        )
+    count = len(states)
+    # Beside one another, so that what many do looks broad.
+    offset = np.linspace(-0.22, 0.22, count) if count > 1 else np.zeros(1)
+    points = []
+    for row, length, shift in zip(states, lengths, offset, strict=True):
+        down, across = np.divmod(row[:length], world.shape[1])
+        points.append(np.stack([across, down], 1) + 0.5 + shift)
+    return [p for p in points if len(p)]
+
+
+def _draw_walks(axes: Axes, walks: Sequence[NDArray[np.float64]]) -> None:
+    faint = float(np.clip(4 / max(len(walks), 1), 0.25, 1.0))
+    halo = [withStroke(linewidth=2.6, foreground=PAPER, alpha=faint)]
+    for walk in walks:
+        axes.plot(*walk.T, color=ACCENT, lw=1.3, alpha=faint, zorder=5.5, path_effects=halo)
+        for point, marker in ((walk[0], "o"), (walk[-1], "s")):
+            axes.plot(*point, marker, color=ACCENT, ms=4.5, mec=PAPER, mew=0.8, zorder=6,
+                      alpha=max(faint, 0.6))
+
+
+def _value_panels(
+    figure: Figure, every: Sequence[Axes], world: World, values: NDArray[np.float64],
+    moves: NDArray[np.float64] | None, limits: tuple[float, float] | None, label: str,
+    actions: Sequence[str],
+) -> None:
+    if limits is None:
+        finite = values[np.isfinite(values)]
+        limits = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+        limits = limits if limits[0] < limits[1] else (limits[0] - 1, limits[1])
+    rows, columns = world.shape
+    image: Any = None
+    for i, axes in enumerate(every):
+        image = axes.imshow(
+            np.ma.masked_invalid(values[i].reshape(rows, columns)), cmap=_SCALE, vmin=limits[0],
+            vmax=limits[1], extent=(0, columns, rows, 0), interpolation="nearest",
+        )
+        if moves is not None:
+            _arrows(axes, world.shape, moves[i], values[i], *limits, actions)
+        _number_cells(axes, rows, columns)
+        axes.set(xlim=(0, columns), ylim=(rows, 0), aspect="equal")
+        _name_kinds(axes, world)
+    bar = figure.colorbar(image, ax=list(every), shrink=0.7, pad=0.015, aspect=24)
+    bar.set_label(label, fontsize=9, color=INK)
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(labelsize=8, color=MUTED, labelcolor=INK, length=2)

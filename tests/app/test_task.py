@@ -1,0 +1,250 @@
+"""Task files: what is read, and that every mistake is named with its place and fix."""
+
+import json
+import re
+
+import jax
+import numpy as np
+import pytest
+
+from jaxltl.app.files.task import (
+    load_demonstrations,
+    load_world,
+    read_task,
+    synthetic_demonstrations,
+)
+from jaxltl.core.models.product import product
+
+TASK = """
+[world]
+map = '''
+. . r
+b . y
+'''
+absorbing = ["y"]
+initial = "!r & !y"
+
+[task]
+formula = "!r U y"
+
+[demonstrations]
+file = "shown.json"
+
+[learner]
+method = "mlirl"
+discount = 0.9
+"""
+SHOWN = {"demonstrations": [{"cells": [[2, 1], [2, 2], [2, 3]], "actions": ["right", "right"]}]}
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Writes a task, after replacing parts of it, and its demonstrations."""
+
+    def write(*replacements, shown=SHOWN):
+        text = TASK
+        for old, new in replacements:
+            assert old in text
+            text = text.replace(old, new)
+        (tmp_path / "task.toml").write_text(text)
+        if shown is not None:
+            text = shown if isinstance(shown, str) else json.dumps(shown)
+            (tmp_path / "shown.json").write_text(text)
+        return tmp_path / "task.toml"
+
+    return write
+
+
+def test_a_task_is_read(write):
+    task = read_task(write())
+    world = load_world(task)
+    assert task.name == "task" and task.label_on == "entry"
+    assert world.cells.shape == (2, 3) and world.place(5) == "row 2, column 3"
+    shown = load_demonstrations(task, world)
+    assert shown.state.tolist() == [[3, 4]] and shown.action.tolist() == [[3, 3]]
+
+
+def test_states_and_action_numbers_from_zero(write):
+    shown = {"demonstrations": [{"states": [3, 4], "actions": [3, "right"]}]}
+    task = read_task(write(shown=shown))
+    assert load_demonstrations(task, load_world(task)).state.tolist() == [[3, 4]]
+
+
+def test_a_map_and_legend_from_a_file(write, tmp_path):
+    (tmp_path / "map.txt").write_text("a b\nb a\n")
+    task = read_task(write(
+        ("map = '''\n. . r\nb . y\n'''", 'map = { file = "map.txt" }\n'
+         'legend = { a = [], b = ["r", "y"] }\nslip = 0.2')))
+    mdp = load_world(task).mdp
+    assert mdp.propositions == ("r", "y") and mdp.num_successors == 3
+    assert np.asarray(mdp.initial).tolist() == [0.5, 0, 0, 0.5]
+
+
+def test_the_digest_covers_named_files(write):
+    first = read_task(write()).digest
+    other = {"demonstrations": [{"cells": [[2, 2]], "actions": ["right"]}]}
+    assert read_task(write(shown=other)).digest != first
+    assert read_task(write(("0.9", "0.8"))).digest != first
+    assert read_task(write()).digest == first
+
+
+@pytest.mark.parametrize(("replacement", "message"), [
+    (("discount = 0.9", "discount = "), r"task\.toml: this is not TOML: .*line 18"),
+    (("[learner]", "[learnt]"), r"has no key 'learnt'; did you mean 'learner'\?"),
+    (("discount", "discnt"), r"\[learner\] has no key 'discnt'; did you mean 'discount'\?"),
+    (("absorbing", "absorb"), r"\[world\] has no key 'absorb'; did you mean 'absorbing'\?"),
+    (("discount = 0.9", ""), r"\[learner\] lacks discount, a number in \[0, 1\)"),
+    (("discount = 0.9", "discount = 1.0"), r"discount = 1\.0; it must be a number in \[0, 1\)"),
+    (("discount = 0.9", "discount = true"), r"discount = True; it must be"),
+    (("discount = 0.9", "discount = nan"), r"discount = nan; it must be"),
+    (("discount = 0.9", "discount = 0.9\nsteps = 0"), r"steps = 0; it must be a whole number"),
+    (("discount = 0.9", "discount = 0.9\nmu = -1"), r"mu = -1; it must be a number of at least 0"),
+    (("discount = 0.9", 'discount = 0.9\nin = "world"'), r"lacks goal"),
+    (("discount = 0.9", 'discount = 0.9\nin = "world"\ngoal = ["y"]\nmu = 1'), r"mu weighs"),
+    (("discount = 0.9", 'discount = 0.9\ngoal = ["y"]'), r'goal belongs to in = "world"'),
+    (("discount = 0.9", 'discount = 0.9\nprogress = ["y"]'), r"a list of automaton states"),
+    (('"mlirl"', '"irl"'), r'method = \'irl\'; it must be "mlirl"'),
+    (('formula = "!r U y"', ""), r"\[task\] lacks formula"),
+    (("[task]", "[tsk]"), r"has no key 'tsk'; did you mean 'task'\?"),
+    (('file = "shown.json"', ""), r"either file"),
+    (('file = "shown.json"', "synthetic = 3"), r"lacks discount"),
+    (('file = "shown.json"', 'file = "shown.json"\nlength = 3'), r"length belongs to synthetic"),
+    (('file = "shown.json"', 'file = "gone.json"'), r"gone\.json': No such file"),
+    (("map = '''\n. . r\nb . y\n'''", ""), r"\[world\] must have either a map or a model"),
+    (("map = '''\n. . r\nb . y\n'''", 'model = "m.npz"'), r"absorbing belongs to a map"),
+    (("map = '''\n. . r\nb . y\n'''", "map = { name = 'x' }"), r'or \{ file = "map\.txt" \}'),
+])
+def test_mistakes_in_the_task_file(write, replacement, message):
+    with pytest.raises(ValueError, match=message):
+        read_task(write(replacement))
+
+
+def test_a_missing_task_file(tmp_path):
+    with pytest.raises(ValueError, match=r"the task file cannot be read: '.*none\.toml'"):
+        read_task(tmp_path / "none.toml")
+
+
+@pytest.mark.parametrize(("replacement", "message"), [
+    ((". . r\n", ". . .\n"), r"\[world\] initial: .* mentions the proposition 'r'"),
+    (("b . y", "b y"), r"\[world\] map row 2 has 2 cells, row 1 has 3"),
+    (('absorbing = ["y"]', "slip = 0.1\nlegend = { b = [] }"), r"\(row 1, column 1\) is not in"),
+])
+def test_mistakes_in_the_world(write, replacement, message):
+    with pytest.raises(ValueError, match=message):
+        load_world(read_task(write(replacement)))
+
+
+@pytest.mark.parametrize(("shown", "message"), [
+    ("{", r"shown\.json: this is not JSON: .*line 1 column 2"),
+    ([], r"expected \{\"demonstrations\": \[\.\.\.\]\}"),
+    ({"demonstrations": []}, r"at least one demonstration"),
+    ({"demonstrations": [[1, 2]]}, r"demonstration 1: expected .* got \[1, 2\]"),
+    ({"demonstrations": [{"cells": [[1, 1]], "action": []}]}, r"it has 'action', 'cells'"),
+    ({"demonstrations": [{"cells": [[1, 1]], "actions": []}]}, r"at least one action"),
+    ({"demonstrations": [{"cells": [[1, 1]], "actions": ["up"] * 3}]}, r"1 cells and 3 actions"),
+    ({"demonstrations": [*SHOWN["demonstrations"], {"cells": [[2, 1], [1, 2]],
+      "actions": ["right", "up"]}]},
+     r"demonstration 2, step 1: 'right' in row 2, column 1 cannot lead to row 1, column 2, "
+     r"which comes next; it leads to row 2, column 2\."),
+    ({"demonstrations": [{"cells": [[2, 1], [2, 3]], "actions": ["right"]}]},
+     r"demonstration 1, step 1: .* cannot lead to row 2, column 3"),
+    ({"demonstrations": [{"cells": [[2, 1], [3, 1]], "actions": ["up", "up"]}]},
+     r"demonstration 1, step 2: the cell \[3, 1\] is off the map, which has rows 1 to 2"),
+    ({"demonstrations": [{"cells": [[2, 0]], "actions": ["up"]}]}, r"\[2, 0\] is off the map"),
+    ({"demonstrations": [{"cells": [[2]], "actions": ["up"]}]}, r"must be \[row, column\]"),
+    ({"demonstrations": [{"cells": [[2, 1]], "actions": ["jump"]}]},
+     r"step 1: the action 'jump' is unknown; the actions are up, down, left, right"),
+    ({"demonstrations": [{"states": [6], "actions": [0]}]}, r"state is 6; states are 0 to 5"),
+])
+def test_mistakes_in_demonstrations(write, shown, message):
+    task = read_task(write(shown=shown))
+    with pytest.raises(ValueError, match=message):
+        load_demonstrations(task, load_world(task))
+
+
+def _model_task(write, *more, **arrays):
+    path = write(("map = '''\n. . r\nb . y\n'''", 'model = "m.npz"'),
+                 ('absorbing = ["y"]\ninitial = "!r & !y"', ""), *more)
+    np.savez(path.parent / "m.npz", **arrays)
+    return read_task(path)
+
+
+CHAIN = np.array([[[0.5, 0.5], [1, 0]], [[0, 1], [0, 1]]])
+
+
+def test_a_model_from_arrays(write):
+    task = _model_task(
+        write, transition=CHAIN, label=[[False], [True]], propositions=["y"], actions=["go", "wait"]
+    )
+    world = load_world(task)
+    assert world.actions == ("go", "wait") and world.cells is None
+    assert world.place(1) == "state 1"
+    path = task.path.parent / "shown.json"
+    path.write_text('{"demonstrations": [{"states": [0, 0, 1], "actions": ["go", "go"]}]}')
+    assert load_demonstrations(task, world).state.tolist() == [[0, 0]]
+    path.write_text('{"demonstrations": [{"states": [0, 1], "actions": ["wait"]}]}')
+    with pytest.raises(ValueError, match=r"'wait' in state 0 cannot lead to state 1"):
+        load_demonstrations(task, world)
+    path.write_text('{"demonstrations": [{"cells": [[1, 1]], "actions": ["wait"]}]}')
+    with pytest.raises(ValueError, match=r"the model has no map"):
+        load_demonstrations(task, world)
+
+
+def test_a_model_from_successor_lists_with_initial_formula(write):
+    task = _model_task(
+        write, ("[task]", 'initial = "!y"\n[task]'), successor=[[[0, 1]], [[1, 0]]],
+        probability=[[[0.5, 0.5]], [[1.0, 0]]], label=[[False], [True]], propositions=["y"],
+    )
+    world = load_world(task)
+    assert np.asarray(world.mdp.initial).tolist() == [1, 0]
+    assert world.actions == ("action 0",)
+
+
+@pytest.mark.parametrize(("arrays", "message"), [
+    ({"transition": CHAIN * 1.1}, r"m\.npz': state 0, action 0: the probabilities sum to 1\.1"),
+    ({"transition": CHAIN, "labels": [1]}, r"holds an array 'labels'; it may hold"),
+    ({"successor": [[[0]]]}, r"needs the array transition, or successor and probability"),
+    ({"transition": CHAIN, "actions": ["a"]}, r"1 distinct names; the model has 2 actions"),
+    ({"successor": [[[2]]], "probability": [[[1.0]]]}, r"successor 2 is out of range"),
+])
+def test_mistakes_in_a_model(write, arrays, message):
+    with pytest.raises(ValueError, match=message):
+        load_world(_model_task(write, **arrays))
+
+
+def test_a_model_that_is_no_npz(write, tmp_path):
+    path = write(("map = '''\n. . r\nb . y\n'''", 'model = "m.npz"'),
+                 ('absorbing = ["y"]\ninitial = "!r & !y"', ""))
+    (tmp_path / "m.npz").write_bytes(b"nonsense")
+    with pytest.raises(ValueError, match=r"is not an \.npz of plain arrays"):
+        load_world(read_task(path))
+
+
+def test_an_unknown_proposition_in_a_models_initial(write):
+    task = _model_task(write, ("[task]", 'initial = "!q"\n[task]'), transition=CHAIN)
+    with pytest.raises(ValueError, match=r"initial: '!q' mentions the proposition 'q'"):
+        load_world(task)
+
+
+def test_synthetic_demonstrations_do_the_task(write):
+    synthetic = ('file = "shown.json"', "synthetic = 5\ndiscount = 0.9\nlength = 9")
+    task = read_task(write(synthetic))
+    world = load_world(task)
+    model = product(world.mdp, task.formula)
+    shown, dropped = synthetic_demonstrations(task, model, jax.random.key(0))
+    lengths = np.asarray(shown.length)
+    assert len(lengths) + dropped == 5 and dropped == 0
+    for states, actions, n in zip(shown.state, shown.action, lengths, strict=True):
+        last = int(world.mdp.successor[states[n - 1], actions[n - 1], 0])
+        assert last == 5 and 2 not in states[:n].tolist()
+
+
+def test_synthetic_demonstrations_need_a_task_that_can_be_done(write):
+    synthetic = ('file = "shown.json"', "synthetic = 5\ndiscount = 0.9\nlength = 1")
+    task = read_task(write(synthetic, ('initial = "!r & !y"', 'initial = "b"')))
+    model = product(load_world(task).mdp, task.formula)
+    with pytest.raises(ValueError, match=r"none of 5 synthetic runs did the task within 1 steps"):
+        synthetic_demonstrations(task, model, jax.random.key(0))
+    safety = product(load_world(task).mdp, "G !r")
+    with pytest.raises(ValueError, match=re.escape("takes a co-safe formula")):
+        synthetic_demonstrations(task, safety, jax.random.key(0))

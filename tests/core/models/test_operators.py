@@ -1,0 +1,184 @@
+"""The primitives: every representation against loops, and the laws that tie them together."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxltl as jl
+from jaxltl.core.models import operators
+from tests import reference
+from tests.support import REPRESENTATIONS, assert_gradients, mass_preserving, random_representation
+
+
+@pytest.mark.parametrize("kind", REPRESENTATIONS)
+@pytest.mark.parametrize("num_successors", [1, 3, 20])  # short rows are summed term by term
+def test_primitives_equal_loops(kind, num_successors):
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        model, explicit = random_representation(rng, kind, num_successors=num_successors)
+        size = explicit.num_states
+        value = jnp.asarray(rng.normal(size=size))
+        region = jnp.asarray(rng.random(size) < 0.5)
+        mass = jnp.asarray(rng.random((size, explicit.num_actions)))
+        shape, actions = model.state_shape, (*model.state_shape, model.num_actions)
+        pairs = [
+            (jl.expectation(model, value.reshape(shape)), reference.expectation(explicit, value)),
+            (jl.pushforward(model, mass.reshape(actions)), reference.pushforward(explicit, mass)),
+        ]
+        for found, expected in pairs:
+            np.testing.assert_allclose(np.ravel(found), expected.ravel(), rtol=0, atol=1e-14)
+        region_ = region.reshape(shape)
+        np.testing.assert_array_equal(
+            jl.exists_successor(model, region_).reshape(size, -1),
+            reference.exists_successor(explicit, region),
+        )
+        np.testing.assert_array_equal(
+            jl.forall_successor(model, region_).reshape(size, -1),
+            reference.forall_successor(explicit, region),
+        )
+
+
+@pytest.mark.parametrize("label_on", ["entry", "exit"])
+@pytest.mark.parametrize("num_memory", [3, 20])  # many memory states are gathered, few selected
+def test_products_with_few_and_many_memory_states(label_on, num_memory):
+    rng = np.random.default_rng(2)
+    model, explicit = random_representation(
+        rng, "product", num_memory=num_memory, label_on=label_on
+    )
+    value = jnp.asarray(rng.normal(size=explicit.num_states))
+    mass = jnp.asarray(rng.random((explicit.num_states, explicit.num_actions)))
+    found = jl.expectation(model, value.reshape(model.state_shape))
+    np.testing.assert_allclose(
+        found.reshape(mass.shape), reference.expectation(explicit, value), atol=1e-14
+    )
+    np.testing.assert_allclose(
+        jl.pushforward(model, mass.reshape(found.shape)).ravel(),
+        reference.pushforward(explicit, mass), atol=1e-14,
+    )
+
+
+@pytest.mark.parametrize("kind", REPRESENTATIONS)
+def test_padding_and_unavailable_actions(kind):
+    model, _ = random_representation(np.random.default_rng(3), kind)
+    nowhere, everywhere = jnp.zeros(model.state_shape, bool), jnp.ones(model.state_shape, bool)
+    closed = ~model.available
+    assert closed.any(), "the example has an unavailable action"
+    assert jl.forall_successor(model, nowhere)[closed].all()
+    assert not jl.exists_successor(model, everywhere)[closed].any()
+    assert not jl.expectation(model, jnp.ones(model.state_shape))[closed].any()
+
+
+@pytest.mark.parametrize("kind", REPRESENTATIONS)
+def test_numpy_arrays_are_taken(kind):
+    model, _ = random_representation(np.random.default_rng(3), kind)
+    ones = np.ones(model.state_shape)
+    expected = jl.expectation(model, jnp.asarray(ones))
+    np.testing.assert_array_equal(jl.expectation(model, ones), expected)
+    assert jl.exists_successor(model, ones > 0).dtype == bool
+    assert jl.forall_successor(model, ones > 0).all()
+
+
+@pytest.mark.parametrize("kind", REPRESENTATIONS)
+def test_pushforward_is_the_transpose_of_expectation(kind):
+    rng = np.random.default_rng(4)
+    model, _ = random_representation(rng, kind)
+    value = rng.normal(size=model.state_shape)
+    mass = rng.normal(size=(*model.state_shape, model.num_actions))
+    left = jnp.vdot(jl.expectation(model, jnp.asarray(value)), mass)
+    right = jnp.vdot(value, jl.pushforward(model, jnp.asarray(mass)))
+    np.testing.assert_allclose(left, right, rtol=1e-13)
+
+
+@pytest.mark.parametrize("kind", REPRESENTATIONS)
+def test_induced_chain_follows_the_policy(kind):
+    rng = np.random.default_rng(5)
+    model, explicit = random_representation(rng, kind)
+    policy = explicit.available.argmax(axis=1)
+    chain = operators.induced_chain(model, jnp.asarray(policy).reshape(model.state_shape))
+    value = rng.normal(size=explicit.num_states)
+    expected = reference.expectation(explicit, value)[np.arange(policy.size), policy]
+    np.testing.assert_allclose(
+        jl.expectation(chain, jnp.asarray(value))[:, 0], expected, atol=1e-14
+    )
+    np.testing.assert_array_equal(chain.initial, explicit.initial)
+
+
+@pytest.mark.parametrize("kind", REPRESENTATIONS)
+def test_samples_have_the_rows_frequencies(kind):
+    model, explicit = random_representation(np.random.default_rng(6), kind, certainty=0.0)
+    transition = explicit.transition
+    s, a = np.argwhere((transition > 0).sum(-1) > 1)[0]
+    keys = jax.random.split(jax.random.key(0), 20_000)
+    draw = jax.vmap(lambda key: jl.sample_successor(model, key, jnp.int32(s), jnp.int32(a)))
+    frequency = np.bincount(draw(keys), minlength=explicit.num_states) / len(keys)
+    # Five standard deviations of a frequency.
+    assert np.abs(frequency - transition[s, a]).max() < 5 * np.sqrt(0.25 / len(keys))
+    assert not frequency[transition[s, a] == 0].any()
+
+
+@pytest.mark.parametrize("kind", REPRESENTATIONS)
+def test_expectation_and_pushforward_are_differentiable(kind):
+    rng = np.random.default_rng(7)
+    model, _ = random_representation(rng, kind, certainty=0.0)
+    value, mass = rng.normal(size=model.state_shape), rng.random(model.available.shape)
+    world = getattr(model, "mdp", model)
+    field = "transition" if kind == "dense" else "probability"
+    probability = getattr(world, field)
+
+    def both(x):
+        changed = world.replace(**{field: x["probability"]})
+        changed = model.replace(mdp=changed) if kind == "product" else changed
+        return jl.expectation(changed, x["value"]), jl.pushforward(changed, x["mass"])
+
+    assert_gradients(
+        both,
+        {"value": value, "mass": mass, "probability": probability},
+        {
+            "value": rng.normal(size=value.shape),
+            "mass": rng.normal(size=mass.shape),
+            "probability": mass_preserving(rng, probability),
+        },
+    )
+
+
+def test_actions_maximum_for_few_and_many_actions():
+    rng = np.random.default_rng(8)
+    for num_actions in (1, 4, 30):
+        quantity = rng.normal(size=(6, num_actions))
+        quantity[3] = 1.0  # ties go to the first
+        available = rng.random(quantity.shape) < 0.6
+        available[:, -1] = True
+        masked = np.where(available, quantity, -np.inf)
+        best, action = operators.action_argmax(jnp.asarray(quantity), jnp.asarray(available))
+        np.testing.assert_array_equal(best, masked.max(axis=1))
+        np.testing.assert_array_equal(action, masked.argmax(axis=1))
+        np.testing.assert_array_equal(
+            operators.action_max(jnp.asarray(quantity), jnp.asarray(available)), best
+        )
+
+
+def test_deterministic_and_stochastic_policies_mean_the_same():
+    rng = np.random.default_rng(9)
+    model, _ = random_representation(rng, "sparse")
+    policy = jnp.asarray(rng.integers(model.num_actions, size=model.num_states))
+    quantity = jnp.asarray(rng.normal(size=model.available.shape))
+    distribution = operators.policy_distribution(model, policy)
+    np.testing.assert_array_equal(
+        operators.action_mean(policy, quantity), operators.action_mean(distribution, quantity)
+    )
+
+
+def test_errors_name_the_argument():
+    model, _ = random_representation(np.random.default_rng(10), "sparse")
+    with pytest.raises(ValueError, match=r"policy has shape \(3,\); a deterministic .* \(4,\)"):
+        operators.policy_distribution(model, jnp.zeros(3, int))
+    with pytest.raises(ValueError, match=r"policy has shape \(4,\); a stochastic .* \(4, 3\)"):
+        operators.policy_distribution(model, jnp.zeros(4))
+    for function in (jl.expectation, jl.exists_successor, jl.forall_successor):
+        with pytest.raises(TypeError, match="dict is not a model"):
+            function({}, jnp.zeros(3))
+    with pytest.raises(TypeError, match="dict is not a model"):
+        jl.sample_successor({}, jax.random.key(0), 0, 0)
+    with pytest.raises(TypeError, match="dict is not a model"):
+        operators.induced_chain({}, jnp.zeros(3, int))
