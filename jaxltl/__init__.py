@@ -4,151 +4,26 @@ State a task by a temporal-logic formula, demonstrations, a reward, or a mix; le
 product of the world and the task's automaton; get every answer with its evidence.
 """
 
-from jaxltl.core.automata.automaton import Automaton, complement, make_automaton
-from jaxltl.core.automata.language import find_difference, is_equivalent
-from jaxltl.core.automata.synchronize import synchronize
-from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.games.objective import (
-    GR1,
-    Parity,
-    buchi,
-    cobuchi,
-    generalized_buchi,
-    gr1,
-    parity,
-    reach,
-    safety,
-    states_where,
-)
-from jaxltl.core.games.permissive import Permissive, apply_strategy, permissive_strategy, shield
-from jaxltl.core.games.verify import Verification, verify
-from jaxltl.core.games.winning import Winning, almost_sure_buchi, winning_region
-from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor, avoidable
-from jaxltl.core.graphs.end_components import end_components
-from jaxltl.core.logic.ltl import Formula, holds_on_lasso, parse_ltl
-from jaxltl.core.models.batch import lift_memory, stack_products
-from jaxltl.core.models.game import Game, make_game
-from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp, to_dense
-from jaxltl.core.models.monitor import Monitor, Verdict, make_monitor, monitor_step, verdict
-from jaxltl.core.models.operators import (
-    exists_successor,
-    expectation,
-    forall_successor,
-    pushforward,
-    sample_successor,
-)
-from jaxltl.core.models.product import (
-    FiniteMemoryPolicy,
-    Product,
-    letters,
-    lift_policy,
-    lift_trajectories,
-    product,
-    project_policy,
-)
-from jaxltl.core.models.restrict import restrict
-from jaxltl.core.models.trajectories import Trajectories, make_trajectories, rollout
-from jaxltl.core.types import NotConverged, Solution, Status, check
-from jaxltl.core.values.boltzmann import boltzmann_fixed_points, boltzmann_value
-from jaxltl.core.values.discounted import optimal_value, policy_value
-from jaxltl.core.values.mean_payoff import mean_payoff
-from jaxltl.core.values.minimax import minimax_value, strategy_value
-from jaxltl.core.values.occupancy import feature_expectation, occupancy_measure
-from jaxltl.core.values.performance import task_performance, task_performances
-from jaxltl.core.values.reachability import reachability_probability
-from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
-from jaxltl.core.values.soft import soft_value
-from jaxltl.envs.gridworld import gridworld
-from jaxltl.envs.robots import grid_game
-from jaxltl.io.hoa import read_hoa, write_hoa
+import importlib
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "GR1",
-    "MDP",
-    "Automaton",
-    "DenseMDP",
-    "FiniteMemoryPolicy",
-    "Formula",
-    "Game",
-    "Monitor",
-    "NotConverged",
-    "Parity",
-    "Permissive",
-    "Product",
-    "Solution",
-    "Status",
-    "Trajectories",
-    "Verdict",
-    "Verification",
-    "Winning",
-    "almost_sure_buchi",
-    "almost_surely_reaching",
-    "apply_strategy",
-    "attractor",
-    "avoidable",
-    "boltzmann_fixed_points",
-    "boltzmann_value",
-    "buchi",
-    "check",
-    "cobuchi",
-    "complement",
-    "end_components",
-    "exists_successor",
-    "expectation",
-    "feature_expectation",
-    "find_difference",
-    "forall_successor",
-    "from_dense",
-    "generalized_buchi",
-    "gr1",
-    "grid_game",
-    "gridworld",
-    "holds_on_lasso",
-    "is_equivalent",
-    "letters",
-    "lift_memory",
-    "lift_policy",
-    "lift_trajectories",
-    "make_automaton",
-    "make_game",
-    "make_mdp",
-    "make_monitor",
-    "make_trajectories",
-    "mean_payoff",
-    "minimax_value",
-    "monitor_step",
-    "occupancy_measure",
-    "optimal_satisfaction",
-    "optimal_value",
-    "parity",
-    "parse_ltl",
-    "permissive_strategy",
-    "policy_value",
-    "product",
-    "project_policy",
-    "pushforward",
-    "reach",
-    "reachability_probability",
-    "read_hoa",
-    "restrict",
-    "rollout",
-    "safety",
-    "sample_successor",
-    "satisfaction_probability",
-    "shield",
-    "soft_value",
-    "stack_products",
-    "states_where",
-    "strategy_value",
-    "synchronize",
-    "task_performance",
-    "task_performances",
-    "to_automaton",
-    "to_dense",
-    "verdict",
-    "verify",
-    "winning_region",
-    "write_hoa",
-]
+if TYPE_CHECKING:
+    from jaxltl._public import *  # noqa: F403
+    from jaxltl._public import __all__ as __all__
+else:
+    # With the first public name, so that the command line can speak before JAX is imported.
+
+    def __getattr__(name: str) -> Any:
+        if name.startswith("_") and name != "__all__":
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        public = importlib.import_module("jaxltl._public")
+        found = {"__all__": public.__all__, **{x: getattr(public, x) for x in public.__all__}}
+        globals().update(found)
+        if name not in globals():
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return globals()[name]
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__getattr__("__all__")})

@@ -16,7 +16,7 @@ from jaxltl.cli import main
 from jaxltl.core.automata.language import is_equivalent
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.io.hoa import read_hoa_stream
-from tests.test_task import SHOWN, TASK, write  # noqa: F401
+from tests.app.test_task import SHOWN, TASK, write  # noqa: F401
 
 QUICK = ("discount = 0.9", 'discount = 0.9\nsteps = 40\ntolerance = 1e-6\n'
          'optimizer = "adam"\nlearning_rate = 0.3\navoid = ["r"]')

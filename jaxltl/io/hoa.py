@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.automata.automaton import Automaton, Cube, _letter_text, make_automaton
+from jaxltl.core.automata.automaton import Automaton, letter_text, make_automaton
 from jaxltl.core.automata.text import prime_cover
+from jaxltl.core.logic.diagram import Cube
 from jaxltl.core.logic.ltl import Letter, as_letters
 
 if TYPE_CHECKING:
@@ -721,7 +722,7 @@ def _nondeterminism(
 ) -> ValueError:
     return _error(
         edge.line,
-        f"state {q} has two edges for the letter {_letter_text(header.propositions, letter)}, to "
+        f"state {q} has two edges for the letter {letter_text(header.propositions, letter)}, to "
         f"state {other.targets[0]} and to state {edge.targets[0]}. Only deterministic automata are "
         "read; determinise it first, in Spot with the options -D -G.",
     )

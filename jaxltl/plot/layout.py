@@ -20,7 +20,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.automata.language import live_states
+from jaxltl.core.automata.runs import live_states
 
 RADIUS = 0.24
 FONT_SIZE = 9.5

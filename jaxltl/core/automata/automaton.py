@@ -5,7 +5,7 @@ An automaton reads one letter per step; a letter is the set of the propositions 
 
 from __future__ import annotations
 
-import importlib
+import functools
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,6 +19,12 @@ ACCEPTANCES = ("cosafe", "safety", "buchi", "parity")
 
 
 DRAWN_STATES, DRAWN_ARROWS = 40, 120  # up to which a notebook shows a picture
+
+
+@functools.singledispatch
+def picture(value: object) -> str | None:
+    """A value as SVG, by whoever draws its type; None where nobody does."""
+    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,16 +78,14 @@ class Automaton:
         return self.priority % 2 == 0
 
     def __repr__(self) -> str:
-        return f"Automaton({self.acceptance}, {_extent(self)})"
+        return f"Automaton({self.acceptance}, {extent_text(self)})"
 
     def _repr_svg_(self) -> str | None:
         """The picture that notebooks show; None, so that they show text, where it would crowd."""
         arrows = sum(len(set(row)) for row in np.asarray(self.delta).tolist())
         if len(self.delta) > DRAWN_STATES or arrows > DRAWN_ARROWS:
             return None
-        # By name, since the core does not depend on drawing and only a notebook gets here.
-        plot = importlib.import_module("jaxltl.plot")
-        return plot.to_bytes(plot.automaton(self), "svg").decode()
+        return picture(self)
 
 
 def make_automaton(
@@ -207,7 +211,7 @@ def _check_distinct(names: tuple[str, ...], rows: NDArray[np.bool_]) -> None:
     for letter, row in enumerate(rows):
         twin = first.setdefault(row.tobytes(), letter)
         if twin != letter:
-            held = _letter_text(names, row)
+            held = letter_text(names, row)
             raise ValueError(
                 f"make_automaton: letters {twin} and {letter} are both {held}. Keep one of them."
             )
@@ -350,14 +354,11 @@ def complement(automaton: Automaton) -> Automaton:
     )
 
 
-Cube = tuple[tuple[int, bool], ...]  # (proposition, its value), by proposition
-
-
-def _extent(automaton: Automaton) -> str:
+def extent_text(automaton: Automaton) -> str:
     counts = zip(automaton.delta.shape, ("state", "letter"), strict=True)
     sizes = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for n, name in counts)
     return f"{sizes} over {', '.join(automaton.propositions) or 'no propositions'}"
 
 
-def _letter_text(names: Collection[str], row: NDArray[np.bool_]) -> str:
+def letter_text(names: Collection[str], row: NDArray[np.bool_]) -> str:
     return "{" + ", ".join(name for name, holds in zip(names, row, strict=True) if holds) + "}"

@@ -9,12 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.automata.automaton import Automaton, Cube, _extent, make_automaton
+from jaxltl.core.automata.automaton import Automaton, extent_text, make_automaton
+from jaxltl.core.logic.diagram import FALSE, TRUE, Cube, Diagrams, prime_cubes
 from jaxltl.core.logic.ltl import proposition_text
-
-# ---------------------------------------------------------------------------------------------
-# Readable forms
-# ---------------------------------------------------------------------------------------------
 
 
 def guards(automaton: Automaton) -> dict[tuple[int, int], str]:
@@ -70,8 +67,7 @@ def _guards(automaton: Automaton, marks: NDArray[Any]) -> dict[tuple[int, int, i
 def prime_cover(chosen: set[int], others: set[int], width: int) -> list[Cube]:
     """Prime cubes, none to spare, that together hold in the chosen letters and in no other.
 
-    Minato 1993, "Fast generation of prime-irredundant covers from binary decision diagrams", on
-    sets of letters; letters that are in neither set may fall on either side.
+    Letters that are in neither set may fall on either side; see `diagram.prime_cubes`.
 
     Args:
         chosen: Letters as numbers, with proposition p as bit p.
@@ -85,7 +81,11 @@ def prime_cover(chosen: set[int], others: set[int], width: int) -> list[Cube]:
         # Where few letters occur, a few propositions tell, and guards of others would be long.
         kept = _telling(chosen, others, width)
         chosen, others = ({n & kept for n in part} for part in (chosen, others))
-    return sorted(_prime_cover(chosen, others, width))
+    diagrams = Diagrams()
+    lower = _diagram_of(chosen, width, diagrams)
+    upper = diagrams.negation(_diagram_of(others, width, diagrams))
+    cubes, _ = prime_cubes(lower, upper, diagrams)
+    return sorted(tuple((-variable, value) for variable, value in cube[::-1]) for cube in cubes)
 
 
 def _telling(chosen: set[int], others: set[int], width: int) -> int:
@@ -110,31 +110,14 @@ def _telling(chosen: set[int], others: set[int], width: int) -> int:
         kept |= 1 << max(range(width), key=told)
 
 
-def _prime_cover(chosen: set[int], others: set[int], width: int) -> list[Cube]:
-    cubes: list[Cube] = []
-    for p in reversed(range(width)):
-        if not chosen or not others:
-            break
-        bit = 1 << p
-        chosen1, others1 = ({n - bit for n in part if n & bit} for part in (chosen, others))
-        chosen0, others0 = ({n for n in part if not n & bit} for part in (chosen, others))
-        # A literal of proposition p is needed just where it tells the two sides apart.
-        cubes0 = _prime_cover(chosen0 & others1, others0, p)
-        cubes1 = _prime_cover(chosen1 & others0, others1, p)
-        cubes += [(*cube, (p, False)) for cube in cubes0]
-        cubes += [(*cube, (p, True)) for cube in cubes1]
-        chosen = _outside(chosen0, cubes0) | _outside(chosen1, cubes1)
-        others = others0 | others1
-    return [*cubes, ()] if chosen else cubes
-
-
-def _outside(letters: set[int], cubes: list[Cube]) -> set[int]:
-    """The letters that no cube holds in."""
-    for cube in cubes:
-        mask = sum(1 << p for p, _ in cube)
-        held = sum(1 << p for p, value in cube if value)
-        letters = {n for n in letters if n & mask != held}
-    return letters
+def _diagram_of(letters: set[int], width: int, diagrams: Diagrams) -> int:
+    """The diagram that holds in the given letters; proposition p is the variable -p."""
+    if not letters or not width:
+        return TRUE if letters else FALSE
+    bit = 1 << (width - 1)
+    low = _diagram_of({n for n in letters if not n & bit}, width - 1, diagrams)
+    high = _diagram_of({n - bit for n in letters if n & bit}, width - 1, diagrams)
+    return diagrams.node(1 - width, low, high)
 
 
 def _state_labels(automaton: Automaton) -> list[str]:
@@ -162,7 +145,7 @@ def to_text(automaton: Automaton) -> str:
          a -> 0 *
          !a -> 0
     """
-    lines = [f"{automaton.acceptance} automaton: {_extent(automaton)}"]
+    lines = [f"{automaton.acceptance} automaton: {extent_text(automaton)}"]
     final = _final_states(automaton)
     edges = defaultdict(list)
     for (q, successor, priority), text in edge_guards(automaton).items():

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.emerson_lei import to_parity
-from jaxltl.core.automata.language import find_not_included, live_states, universal_states
 from jaxltl.core.automata.minimal import equivalence_classes, quotient
 from jaxltl.core.automata.parity import Table, is_weak, reachable, reduce_table
+from jaxltl.core.automata.runs import EVEN, ODD, find_lasso, live_states, universal_states
 from jaxltl.core.automata.trackers import track
 from jaxltl.core.logic.diagram import FALSE, TRUE
 from jaxltl.core.logic.ltl import (
@@ -37,6 +37,7 @@ from jaxltl.core.logic.progression import Namer, Progression
 from jaxltl.core.logic.simplify import simplify
 
 Acceptance = Literal["auto", "dfa", "buchi", "parity"]
+Task = Automaton | Formula | str
 
 MAX_FREE_PROPOSITIONS = 12  # 2^12 letters
 GOOD_ENOUGH = 3  # states up to which no other combination is tried
@@ -318,6 +319,11 @@ def _residual_names(formula: Formula, automaton: Automaton) -> tuple[str, ...]:
     return _names(automaton, progression, [diagrams[q] for q in range(len(delta))])
 
 
+def as_automaton(task: Task, letters: Iterable[Letter] | None = None) -> Automaton:
+    """The automaton itself, or that of a formula or its text; see `to_automaton`."""
+    return task if isinstance(task, Automaton) else to_automaton(task, letters)
+
+
 def _undecided(automaton: Automaton) -> str:
     """Words that show why no finite prefix decides."""
 
@@ -326,8 +332,8 @@ def _undecided(automaton: Automaton) -> str:
         return replace(automaton, priority=priority.astype(np.int32), acceptance="buchi")
 
     hopeful, sure = states(live_states(automaton)), states(universal_states(automaton))
-    fails = find_not_included(hopeful, automaton)
-    holds = find_not_included(automaton, sure)
+    fails = find_lasso([hopeful, automaton], [(EVEN, ODD)])
+    holds = find_lasso([automaton, sure], [(EVEN, ODD)])
     assert fails is not None and holds is not None
     return (
         f"  It fails on {_lasso_text(fails)}, though each prefix can still be continued well.\n"

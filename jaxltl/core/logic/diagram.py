@@ -6,6 +6,8 @@ import sys
 
 FALSE, TRUE = 0, 1
 
+Cube = tuple[tuple[int, bool], ...]  # (variable, its value), by variable
+
 
 class Diagrams:
     """Reduced ordered binary decision diagrams (Bryant 1986), equal iff equivalent.
@@ -63,9 +65,7 @@ class Diagrams:
         return self.choice(diagram, FALSE, TRUE)
 
 
-def prime_cubes(
-    lower: int, upper: int, diagrams: Diagrams
-) -> tuple[list[tuple[tuple[int, bool], ...]], int]:
+def prime_cubes(lower: int, upper: int, diagrams: Diagrams) -> tuple[list[Cube], int]:
     """An irredundant disjunction of prime cubes between two diagrams, and its own diagram.
 
     Minato 1993, "Fast generation of prime-irredundant covers from binary decision diagrams".

@@ -7,7 +7,6 @@ no recursion and shared subformulas are visited once.
 from __future__ import annotations
 
 import functools
-import importlib
 import re
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -93,20 +92,6 @@ class Formula:
     def propositions(self) -> tuple[str, ...]:
         """The names of the propositions in the formula, sorted."""
         return tuple(sorted({f.proposition for f in subformulas(self) if f.operator == "ap"}))
-
-    def equivalent(self, other: Formula | str) -> bool:
-        """Whether the same infinite words satisfy both formulas.
-
-        Their automata are compared; `language.find_difference` gives a word that tells them
-        apart.
-
-        >>> parse_ltl("F (a | b)").equivalent("F a | F b")
-        True
-        """
-        # By name, because the logic itself must not depend on the automata built upon it.
-        translate = importlib.import_module("jaxltl.core.automata.translate").to_automaton
-        is_equivalent = importlib.import_module("jaxltl.core.automata.language").is_equivalent
-        return bool(is_equivalent(translate(self), translate(other)))
 
     def __str__(self) -> str:
         texts: dict[Formula, str] = {}

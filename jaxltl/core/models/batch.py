@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.automata.synchronize import Task
-from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, letters, product

@@ -19,7 +19,7 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.automata.automaton import Automaton, run
-from jaxltl.core.automata.language import live_states, universal_states
+from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.logic.ltl import Letter
 
 

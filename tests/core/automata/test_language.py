@@ -8,7 +8,6 @@ import pytest
 
 from jaxltl.core.automata.automaton import ACCEPTANCES, accepts_lasso, complement, make_automaton
 from jaxltl.core.automata.language import (
-    align,
     difference,
     find_accepted,
     find_difference,
@@ -18,10 +17,9 @@ from jaxltl.core.automata.language import (
     is_equivalent,
     is_included,
     is_universal,
-    live_states,
     union,
-    universal_states,
 )
+from jaxltl.core.automata.runs import align, live_states, universal_states
 from tests.reference_logic import random_lasso, subsets, words
 
 EVEN, ODD = 0, 1

@@ -7,13 +7,9 @@ import numpy as np
 import pytest
 
 from jaxltl.core.automata.automaton import accepts_lasso, complement, make_automaton
-from jaxltl.core.automata.language import (
-    find_difference,
-    is_equivalent,
-    live_states,
-    universal_states,
-)
+from jaxltl.core.automata.language import find_difference, is_equivalent
 from jaxltl.core.automata.minimal import minimize
+from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.text import to_dict
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.ltl import (
@@ -622,9 +618,9 @@ def test_formulas_are_compared_by_their_words():
     different = 0
     for _ in range(60):
         formula, other = (random_formula(rng, rng.randint(2, 8), "ab") for _ in range(2))
-        assert formula.equivalent(simplify(formula)) and formula.equivalent(str(formula))
-        word = find_difference(to_automaton(formula), to_automaton(other))
-        assert formula.equivalent(other) == (word is None)
+        assert is_equivalent(formula, simplify(formula)) and is_equivalent(formula, str(formula))
+        word = find_difference(formula, other)
+        assert is_equivalent(formula, other) == (word is None)
         if word is not None:
             different += 1
             assert holds_on_lasso(formula, *word) != holds_on_lasso(other, *word)

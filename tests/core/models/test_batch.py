@@ -155,7 +155,7 @@ def test_both_run_and_the_second_decides(memory, task):
 
 
 def test_automata_without_a_common_letter_are_refused():
-    with pytest.raises(ValueError, match="no letter in common"):
+    with pytest.raises(ValueError, match="no letter of one automaton agrees"):
         synchronize(
             jl.to_automaton("F a", letters=[{"a"}]), jl.to_automaton("F a", letters=[set()]))
 

@@ -20,7 +20,7 @@ from jaxltl.core.models.monitor import (
     verdict,
 )
 from jaxltl.core.models.product import product
-from tests.core.test_language import (
+from tests.core.automata.test_language import (
     EVEN,
     ODD,
     letter_sets,
