@@ -15,18 +15,30 @@ SolutionT = TypeVar("SolutionT", bound="Solution")
 
 
 class Status(enum.IntEnum):
-    """How a solver ended. One code per lane under ``vmap``."""
+    """How a solver ended, the more severe the greater. One code per lane under ``vmap``.
+
+    - ``CONVERGED``: the certified bounds are as narrow as asked.
+    - ``UNCERTIFIED``: the residual is as small as asked, but no bound on the error is known.
+    - ``PRECISION``: rounding alone keeps the bounds wider than asked.
+    - ``MAX_STEPS``: it was stopped, or cannot get nearer.
+    - ``NONFINITE``: NaN or infinity where a number should be.
+    - ``INVALID``: a policy that is no distribution over available actions.
+    """
 
     CONVERGED = 0
-    MAX_STEPS = 1
-    NONFINITE = 2
-    PRECISION = 3
+    UNCERTIFIED = 1
+    PRECISION = 2
+    MAX_STEPS = 3
+    NONFINITE = 4
+    INVALID = 5
 
 
 _REMEDY = {
+    Status.UNCERTIFIED: "nothing bounds the error here; check(..., certified=False) accepts a "
+                        "small residual in place of a bound",
+    Status.PRECISION: "rounding alone exceeds the tolerance; loosen it, or use float64",
     Status.MAX_STEPS: "raise max_steps, loosen tolerance, or use float64",
     Status.NONFINITE: "look for NaN or infinity in the reward, the policy or the discount",
-    Status.PRECISION: "rounding alone exceeds the tolerance; loosen it, or use float64",
 }
 
 
@@ -46,7 +58,7 @@ class Solution:
         deterministic, ``float[S, A]`` where it is stochastic.
       lower, upper: a certified enclosure of the true value, or infinite.
       residual: how far the value is from satisfying its equation (sup norm).
-      num_steps: sweeps of the operator that were spent.
+      num_steps: applications of the operator that were spent.
       status: an array of :class:`Status` codes.
     """
 
@@ -59,13 +71,17 @@ class Solution:
     status: jax.Array
 
 
-def check(solution: SolutionT) -> SolutionT:
+def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:
     """Returns `solution` if every lane converged; a host-side gate, not for use inside ``jit``.
+
+    Args:
+      solution: one, or a batch.
+      certified: insist on bounds; False accepts ``UNCERTIFIED``, a small residual, too.
 
     Raises:
       NotConverged: some lane did not converge. The message names the status, the
         first such lane, the residual and what to do.
-      ValueError: called on traced values.
+      ValueError: a policy was none, with the state and its row; or called on traced values.
     """
     if isinstance(solution.status, jax.core.Tracer):
         raise ValueError(
@@ -73,12 +89,16 @@ def check(solution: SolutionT) -> SolutionT:
             "call it outside jit and vmap, or read solution.status inside."
         )
     status = np.asarray(solution.status)
-    failed = np.flatnonzero(status.ravel() != Status.CONVERGED)
+    failed = np.flatnonzero(status.ravel() > (Status.CONVERGED if certified else 1))
     if failed.size:
         lane = int(failed[0])
         code = Status(int(status.ravel()[lane]))
-        residual = np.asarray(solution.residual).ravel()[lane]
         where = f" in lane {lane} ({failed.size} of {status.size} lanes)" if status.ndim else ""
+        if code == Status.INVALID:
+            lanes = np.asarray(solution.policy).reshape(status.size, -1)
+            shape = np.shape(solution.policy)[status.ndim :]
+            raise ValueError(f"{_invalid_row(lanes[lane].reshape(shape))}{where}.")
+        residual = np.asarray(solution.residual).ravel()[lane]
         raise NotConverged(
             f"the solver ended with {code.name}{where}, residual {residual:.3g}, after "
             f"{int(np.asarray(solution.num_steps).ravel()[lane])} steps: {_REMEDY[code]}."
@@ -87,15 +107,67 @@ def check(solution: SolutionT) -> SolutionT:
 
 
 def status_code(
-    converged: chex.Array, finite: chex.Array, exhausted: chex.Array | bool = False
+    converged: chex.Array,
+    finite: chex.Array,
+    exhausted: chex.Array | bool = False,
+    *,
+    certified: chex.Array | bool = True,
+    valid: chex.Array | bool = True,
 ) -> jax.Array:
-    """The :class:`Status` of a loop that has ended, as ``int32``.
+    """The :class:`Status` of a solver that has ended, as ``int32``.
 
-    `exhausted`: whether the bounds are as narrow as rounding lets them be.
+    Args:
+      converged: whether it reached what was asked.
+      finite: whether there are numbers where numbers should be.
+      exhausted: whether the bounds are as narrow as rounding lets them be.
+      certified: whether what converged is a bound, not just a residual.
+      valid: whether what it was given is allowed.
     """
     code = jnp.where(exhausted, Status.PRECISION, Status.MAX_STEPS)
-    code = jnp.where(converged, Status.CONVERGED, code)
-    return jnp.where(finite, code, Status.NONFINITE).astype(jnp.int32)
+    code = jnp.where(
+        converged, jnp.where(certified, Status.CONVERGED, Status.UNCERTIFIED), code)
+    code = jnp.where(finite, code, Status.NONFINITE)
+    return jnp.where(valid, code, Status.INVALID).astype(jnp.int32)
+
+
+def worst(*statuses: chex.Array, axis: int | None = None) -> jax.Array:
+    """The most severe of several statuses; of one batch, along an axis or of all of it."""
+    if len(statuses) == 1:
+        return jnp.max(statuses[0], axis=axis)
+    found = statuses[0]
+    for status in statuses[1:]:
+        found = jnp.maximum(found, status)
+    return found
+
+
+# --- policies that are none -----------------------------------------------------------------
+
+
+def row_tolerance(dtype: Any) -> float:
+    """How far from one the sum of a policy's row may be."""
+    return max(1e-6, 128 * float(jnp.finfo(dtype).eps))
+
+
+def _invalid_row(policy: np.ndarray) -> str:
+    """What is wrong with the first row that is no distribution; NaN marks what is unavailable."""
+    rows = policy.reshape(-1, policy.shape[-1])
+    bad = ~(np.abs(rows.sum(-1) - 1) <= row_tolerance(rows.dtype)) | ~(rows >= 0).all(-1)
+    state = int(np.argmax(bad))
+    return describe_row(rows[state], np.unravel_index(state, policy.shape[:-1]))
+
+
+def describe_row(row: np.ndarray, state: tuple[Any, ...]) -> str:
+    """What is wrong with the row of a policy, in words."""
+    where = int(state[0]) if len(state) == 1 else tuple(int(i) for i in state)
+    shown = "[" + ", ".join(f"{x:.4g}" for x in row) + "]"
+    if np.isnan(row).any():
+        what = f"takes action {int(np.argmax(np.isnan(row)))}, which is not available (or is NaN)"
+    elif (row < 0).any():
+        what = f"has the negative probability {row.min():.4g}"
+    else:
+        what = f"sums to {row.sum():.6g}, not 1"
+    return (f"the policy's row {shown} of state {where} {what}; give each state a distribution "
+            "over its available actions")
 
 
 def require_shape(name: str, array: Any, shape: tuple[int, ...]) -> None:

@@ -54,8 +54,8 @@ class MDP:
 
     @property
     def successor_probability(self) -> jax.Array:
-        """Weights of the successors of each pair, ``float[S, A, K]``."""
-        return self.probability
+        """Weights of the successors, ``float[S, A, K]``; zero at unavailable actions."""
+        return jnp.where(self.available[..., None], self.probability, 0)
 
     @property
     def dtype(self) -> jnp.dtype:
@@ -96,8 +96,8 @@ class DenseMDP:
 
     @property
     def successor_probability(self) -> jax.Array:
-        """``float[S, A, S]``: every state counts as a successor."""
-        return self.transition
+        """``float[S, A, S]``: every state counts as a successor; zero at unavailable actions."""
+        return jnp.where(self.available[..., None], self.transition, 0)
 
     @property
     def dtype(self) -> jnp.dtype:

@@ -12,17 +12,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import singledispatch
-from typing import Any
+from typing import Any, NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 
+from jaxltl.core.models import kernels
+from jaxltl.core.models.kernels import only_real
 from jaxltl.core.models.mdp import MDP, DenseMDP
-
-# Up to this many successors a sum over them is written out term by term, which XLA
-# fuses into one pass; a reduction over a short last axis is two to three times slower.
-_UNROLL = 16
+from jaxltl.core.types import describe_row, row_tolerance
 
 
 @singledispatch
@@ -148,29 +149,14 @@ def _unknown(model: Any) -> str:
     return f"{type(model).__name__} is not a model: pass an MDP, a DenseMDP, a Product or a Game."
 
 
-def _gather(value: jax.Array, index: jax.Array) -> jax.Array:
-    return jnp.asarray(value).at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-
 @expectation.register
 def _(model: MDP, value: jax.Array) -> jax.Array:
-    successor, probability = model.successor, model.probability
-    width = successor.shape[-1]
-    if width > _UNROLL:
-        return jnp.sum(probability * _gather(value, successor), axis=-1)
-    terms = [probability[..., k] * _gather(value, successor[..., k]) for k in range(width)]
-    return sum(terms[1:], start=terms[0])
+    return _combined(model, value, jnp.multiply, jnp.add)
 
 
 @exists_successor.register
 def _(model: MDP, region: jax.Array) -> jax.Array:
-    probability, successor = model.probability, model.successor
-    if successor.shape[-1] > _UNROLL:
-        return jnp.any((probability > 0) & _gather(region, successor), axis=-1)
-    found = jnp.zeros(model.available.shape, bool)
-    for k in range(successor.shape[-1]):
-        found |= (probability[..., k] > 0) & _gather(region, successor[..., k])
-    return found
+    return _combined(model, jnp.asarray(region), kernels.hits, jnp.logical_or)
 
 
 @forall_successor.register
@@ -180,27 +166,17 @@ def _(model: MDP, region: jax.Array) -> jax.Array:
 
 @least_successor.register
 def _(model: MDP, value: jax.Array) -> jax.Array:
-    found = jnp.full(model.available.shape, largest(value.dtype), value.dtype)
-    for k in range(model.successor.shape[-1]):
-        term = only_real(model.probability[..., k], _gather(value, model.successor[..., k]))
-        found = jnp.minimum(found, term)
-    return found
+    return _combined(model, value, only_real, jnp.minimum)
 
 
-def only_real(weight: jax.Array, value: jax.Array) -> jax.Array:
-    """The value where a successor has positive weight, else the largest of its dtype."""
-    return jnp.where(weight > 0, value, largest(value.dtype))
-
-
-def largest(dtype: Any) -> Any:
-    """The largest value of a dtype."""
-    is_float = jnp.issubdtype(dtype, jnp.floating)
-    return jnp.inf if is_float else jnp.iinfo(dtype).max
+def _combined(model: MDP, value: jax.Array, term: Any, combine: Any) -> jax.Array:
+    weight = model.successor_probability
+    return kernels.stacked(kernels.by_action(model.successor, weight, value, term, combine))
 
 
 @sample_successor.register
 def _(model: MDP, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
-    k = _sample(key, model.probability[state, action])
+    k = _sample(key, model.successor_probability[state, action])
     return model.successor[state, action, k]
 
 
@@ -209,14 +185,14 @@ def _(model: MDP, policy: jax.Array) -> MDP:
     pick = policy[:, None, None]
     return make_chain(
         jnp.take_along_axis(model.successor, pick, axis=1)[:, 0],
-        jnp.take_along_axis(model.probability, pick, axis=1)[:, 0],
+        jnp.take_along_axis(model.successor_probability, pick, axis=1)[:, 0],
         model.initial,
     )
 
 
 @transition_matrix.register
 def _(model: MDP, policy: jax.Array) -> jax.Array:
-    return scatter_matrix(model.successor, policy[:, :, None] * model.probability)
+    return scatter_matrix(model.successor, policy[:, :, None] * model.successor_probability)
 
 
 def scatter_matrix(successor: jax.Array, weight: jax.Array) -> jax.Array:
@@ -238,12 +214,12 @@ def make_chain(successor: jax.Array, probability: jax.Array, initial: jax.Array)
 
 @expectation.register
 def _(model: DenseMDP, value: jax.Array) -> jax.Array:
-    return jnp.einsum("sat,t->sa", model.transition, value)
+    return jnp.einsum("sat,t->sa", model.successor_probability, value)
 
 
 @induced_chain.register
 def _(model: DenseMDP, policy: jax.Array) -> DenseMDP:
-    rows = jnp.take_along_axis(model.transition, policy[:, None, None], axis=1)
+    rows = jnp.take_along_axis(model.successor_probability, policy[:, None, None], axis=1)
     return replace(
         model,
         transition=rows, available=jnp.ones((model.num_states, 1), bool),
@@ -253,27 +229,27 @@ def _(model: DenseMDP, policy: jax.Array) -> DenseMDP:
 
 @transition_matrix.register
 def _(model: DenseMDP, policy: jax.Array) -> jax.Array:
-    return jnp.einsum("sa,sat->st", policy, model.transition)
+    return jnp.einsum("sa,sat->st", policy, model.successor_probability)
 
 
 @exists_successor.register
 def _(model: DenseMDP, region: jax.Array) -> jax.Array:
-    return jnp.any((model.transition > 0) & region, axis=-1)
+    return jnp.any((model.successor_probability > 0) & region, axis=-1)
 
 
 @forall_successor.register
 def _(model: DenseMDP, region: jax.Array) -> jax.Array:
-    return jnp.all((model.transition <= 0) | region, axis=-1)
+    return jnp.all((model.successor_probability <= 0) | region, axis=-1)
 
 
 @least_successor.register
 def _(model: DenseMDP, value: jax.Array) -> jax.Array:
-    return only_real(model.transition, value).min(-1)
+    return only_real(model.successor_probability, value).min(-1)
 
 
 @sample_successor.register
 def _(model: DenseMDP, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
-    return _sample(key, model.transition[state, action]).astype(jnp.int32)
+    return _sample(key, model.successor_probability[state, action]).astype(jnp.int32)
 
 
 def _sample(key: chex.PRNGKey, probability: jax.Array) -> jax.Array:
@@ -301,7 +277,7 @@ def action_mean(policy: jax.Array, quantity: jax.Array) -> jax.Array:
 def action_max(quantity: jax.Array, available: jax.Array) -> jax.Array:
     """Maximum over available actions, ``[S]`` from ``[S, A]``; written out for few actions."""
     quantity = jnp.where(available, quantity, -jnp.inf)
-    if quantity.shape[-1] > _UNROLL:
+    if quantity.shape[-1] > kernels.UNROLL:
         return quantity.max(axis=-1)
     best = quantity[..., 0]
     for a in range(1, quantity.shape[-1]):
@@ -312,7 +288,7 @@ def action_max(quantity: jax.Array, available: jax.Array) -> jax.Array:
 def action_argmax(quantity: jax.Array, available: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Maximum over available actions and the first action that attains it, ``[S]`` each."""
     quantity = jnp.where(available, quantity, -jnp.inf)
-    if quantity.shape[-1] > _UNROLL:
+    if quantity.shape[-1] > kernels.UNROLL:
         return quantity.max(axis=-1), quantity.argmax(axis=-1).astype(jnp.int32)
     best, action = quantity[..., 0], jnp.zeros(quantity.shape[:-1], jnp.int32)
     for a in range(1, quantity.shape[-1]):
@@ -324,7 +300,7 @@ def action_argmax(quantity: jax.Array, available: jax.Array) -> tuple[jax.Array,
 
 def first_action(condition: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Whether a condition ``bool[S, A]`` holds for some action, and the first one (or 0)."""
-    if condition.shape[-1] > _UNROLL:
+    if condition.shape[-1] > kernels.UNROLL:
         return condition.any(axis=-1), condition.argmax(axis=-1).astype(jnp.int32)
     some = jnp.zeros(condition.shape[:-1], bool)
     action = jnp.zeros(condition.shape[:-1], jnp.int32)
@@ -355,3 +331,68 @@ def policy_distribution(model: Any, policy: jax.Array) -> jax.Array:
         raise ValueError(f"policy has shape {jnp.shape(policy)}; a stochastic policy for this "
                          f"model has shape {(*states, actions)}.")
     return policy
+
+
+class Policy(NamedTuple):
+    """A policy as a solver uses it.
+
+    Attributes:
+      distribution: ``float[S, A]``; the policy, made uniform where its row is none.
+      given: the same with the rows as they were, NaN at unavailable actions that they take.
+      valid: ``bool[]``, whether every row was a distribution over available actions.
+    """
+
+    distribution: jax.Array
+    given: jax.Array
+    valid: jax.Array
+
+
+def valid_policy(model: Any, policy: jax.Array, where: jax.Array | bool = True) -> Policy:
+    """A policy and whether it is one: rows at least 0, summing to 1, on available actions.
+
+    Args:
+      model: the model.
+      policy: ``float[S, A]`` or ``int32[S]``; differentiable in the former.
+      where: ``bool[S]``, the states whose rows count.
+    """
+    policy = policy_distribution(model, policy)
+    available = model.available
+    given = jnp.where(available | (policy == 0), policy, jnp.nan)
+    total = jnp.sum(given, axis=-1)
+    row = (jnp.abs(total - 1) <= row_tolerance(policy.dtype)) & jnp.all(given >= 0, axis=-1)
+    row |= ~jnp.asarray(where)
+    uniform = available / jnp.maximum(jnp.sum(available, axis=-1, keepdims=True), 1)
+    used = jnp.where(row[..., None], jnp.where(available, policy, 0), uniform.astype(policy.dtype))
+    return Policy(used, lax.stop_gradient(given), jnp.all(row))
+
+
+def require_policy(model: Any, policy: Any, where: Any = True) -> None:
+    """Raises on the host unless a policy is one; passes over traced arrays.
+
+    Raises:
+      ValueError: a row is no distribution over available actions, with its state; or a shape.
+    """
+    tracer = jax.core.Tracer
+    if any(isinstance(x, tracer) for x in jax.tree.leaves((model, policy, where))):
+        return
+    shape = (*model.state_shape, model.num_actions)
+    table, available = np.asarray(policy), np.asarray(model.available)
+    if is_deterministic(table):
+        policy_distribution(model, table)  # its shape
+        known = (table >= 0) & (table < shape[-1])
+        place = np.where(known, table, 0)[..., None]
+        bad = ~(known & np.take_along_axis(available, place, -1)[..., 0]) & where
+        if bad.any():
+            state = np.argwhere(bad)[0]
+            name = state[0] if len(state) == 1 else tuple(state.tolist())
+            actions = np.flatnonzero(available[tuple(state)]).tolist()
+            raise ValueError(f"the policy takes action {table[tuple(state)]} in state {name}, "
+                             f"which is not available; choose one of {actions}.")
+        return
+    if table.shape != shape:
+        policy_distribution(model, table)
+    given = np.where(available | (table == 0), table, np.nan)
+    good = (np.abs(given.sum(-1) - 1) <= row_tolerance(table.dtype)) & (given >= 0).all(-1)
+    if not (good | ~np.asarray(where)).all():
+        state = np.argwhere(~good & where)[0]
+        raise ValueError(f"{describe_row(given[tuple(state)], tuple(state))}.")

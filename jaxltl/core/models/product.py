@@ -6,8 +6,6 @@ decides at which memory state the value of a successor is read.
 
 from __future__ import annotations
 
-import functools
-import math
 from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
@@ -22,7 +20,7 @@ from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.labels import distinct_rows, require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
-from jaxltl.core.models import operators
+from jaxltl.core.models import kernels, operators
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.trajectories import Trajectories
@@ -194,9 +192,6 @@ def _letter(automaton: Automaton, row: np.ndarray, state: int) -> int:
 _SELECT = 16  # memory states up to which reading at a memory is a selection
 
 
-_WRITTEN_OUT = 64  # transitions per state up to which the product's sweep is written out
-
-
 # --- the primitives -----------------------------------------------------------------------
 
 
@@ -217,25 +212,11 @@ def _each_memory(world: MDP | DenseMDP, operator, value, term, combine) -> jax.A
     """A world's primitive on each column of ``[S, Q]``: ``[S, Q, A]``.
 
     The primitive combines a term of weight and value over the successors of a pair.
-
-    Few transitions per state are written out, so that XLA gathers whole rows of Q and
-    fuses what reads single actions; the general form is ten times slower in loops.
     """
-    if isinstance(world, DenseMDP) or math.prod(world.probability.shape[1:]) > _WRITTEN_OUT:
+    if isinstance(world, DenseMDP):
         return jax.vmap(lambda v: operator(world, v), in_axes=1, out_axes=1)(value)
-    columns = []
-    for a in range(world.num_actions):
-        terms = [
-            term(
-                world.probability[:, a, k, None],
-                value.at[world.successor[:, a, k]].get(
-                    mode="promise_in_bounds", wrap_negative_indices=False
-                ),
-            )
-            for k in range(world.num_successors)
-        ]
-        columns.append(functools.reduce(combine, terms))
-    return jnp.stack(columns, axis=-1)
+    weight = world.successor_probability
+    return kernels.stacked(kernels.by_action(world.successor, weight, value, term, combine))
 
 
 def reads(model: Product, marked: jax.Array) -> jax.Array:
@@ -248,11 +229,7 @@ def reads(model: Product, marked: jax.Array) -> jax.Array:
     here = jnp.asarray(marked)[:, model.letter].T
     if model.label_on == "exit":
         return here[:, :, None] & model.available
-    return _each_memory(model.mdp, operators.exists_successor, here, _hits, jnp.logical_or)
-
-
-def _hits(weight: jax.Array, inside: jax.Array) -> jax.Array:
-    return (weight > 0) & inside
+    return _each_memory(model.mdp, operators.exists_successor, here, kernels.hits, jnp.logical_or)
 
 
 def _read_at(value: jax.Array, memory: jax.Array) -> jax.Array:
@@ -276,7 +253,7 @@ def _(model: Product, value: jax.Array) -> jax.Array:
 
 @operators.exists_successor.register
 def _(model: Product, region: jax.Array) -> jax.Array:
-    return _through(model, operators.exists_successor, region, _hits, jnp.logical_or)
+    return _through(model, operators.exists_successor, region, kernels.hits, jnp.logical_or)
 
 
 @operators.forall_successor.register
@@ -286,7 +263,7 @@ def _(model: Product, region: jax.Array) -> jax.Array:
 
 @operators.least_successor.register
 def _(model: Product, value: jax.Array) -> jax.Array:
-    return _through(model, operators.least_successor, value, operators.only_real, jnp.minimum)
+    return _through(model, operators.least_successor, value, kernels.only_real, jnp.minimum)
 
 
 @operators.sample_successor.register

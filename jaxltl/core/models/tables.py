@@ -1,0 +1,175 @@
+"""Successors and predecessors of numbered states, for sweeps whose speed matters.
+
+A model's states are numbered in order of their arrays (``s * Q + q`` in a product), and what
+is swept has the states first and, behind them, lanes that are solved side by side: one gather
+then moves whole rows of lanes. The transposed sweep gathers from lists of predecessors: XLA
+runs a scatter on a CPU one entry at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.core.models import kernels, operators
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.product import Product
+
+_LARGEST = 2**22  # transitions up to which a product's are written down, one by one
+_WIDEST = 6  # predecessor lists are at most this many times wider than successor lists
+
+
+class Successors(NamedTuple):
+    """Where the pairs of a model lead, an array ``[N]`` for each action and successor.
+
+    Separate arrays lie side by side in memory whatever layout XLA chooses, without which
+    its loops over states are not vectorised.
+
+    Attributes:
+      successor: ``int32[N]``, by action and number of the successor.
+      probability: ``float[N]``, likewise; zero at unavailable actions.
+    """
+
+    successor: list[list[jax.Array]]
+    probability: list[list[jax.Array]]
+
+    def expectation(self, value: jax.Array) -> list[jax.Array]:
+        """Expected value of the next state, ``[N, ...]`` for each action, from ``[N, ...]``."""
+        pairs = zip(self.successor, self.probability, strict=True)
+        return [kernels.fold(targets, weights, value) for targets, weights in pairs]
+
+
+@struct.dataclass
+class Primitives:
+    """The same by a model's own primitive, for models that are too wide or too large to write down.
+
+    Attributes:
+      model: any model.
+    """
+
+    model: Any
+
+    def expectation(self, value: jax.Array) -> list[jax.Array]:
+        """As :meth:`Successors.expectation`."""
+        shape = self.model.state_shape
+
+        def one(value: jax.Array) -> list[jax.Array]:
+            found = operators.expectation(self.model, value.reshape(shape))
+            return [x.ravel() for x in jnp.moveaxis(found, -1, 0)]
+
+        if value.ndim == 1:
+            return one(value)
+        return jax.vmap(one, in_axes=-1, out_axes=-1)(value)
+
+
+class Predecessors(NamedTuple):
+    """The pairs that lead to each state, ``a * N + i``, padded with probability zero.
+
+    Attributes:
+      pair: ``int32[P, N]``.
+      probability: ``float[P, N]``.
+    """
+
+    pair: jax.Array
+    probability: jax.Array
+
+    def pushforward(self, mass: jax.Array) -> jax.Array:
+        """Mass that flows into each state: ``[N, ...]`` from ``[A * N, ...]``."""
+        return kernels.fold(list(self.pair), list(self.probability), mass)
+
+
+def table(model: Any) -> Successors | Primitives:
+    """What sweeps a model: its successors where they can be written down, else its primitives."""
+    return successors(model) or Primitives(model)
+
+
+def successors(model: Any) -> Successors | None:
+    """The successor table of an MDP, of a product of one or of a game; None where it is too large.
+    """
+    model = model.mdp if isinstance(model, Game) else model
+    world = model.mdp if isinstance(model, Product) else model
+    if not isinstance(world, MDP):
+        return None
+    num_pairs = int(np.prod(world.probability.shape[-2:]))
+    if num_pairs > kernels.WRITTEN_OUT:
+        return None
+    weight = world.successor_probability
+    if world is model:
+        return Successors(_columns(world.successor), _columns(weight))
+    if model.num_states * num_pairs > _LARGEST:
+        return None
+    num_memory, memory = model.num_memory, model.next_memory
+    shape = (*model.state_shape, *world.successor.shape[1:])
+    if model.label_on == "exit":
+        after = jnp.broadcast_to(memory[:, :, None, None], shape)
+    else:
+        after = jnp.swapaxes(memory[world.successor], 1, -1)  # [S, Q, K, A]
+        after = jnp.swapaxes(after, 2, 3)
+    flat = world.successor[:, None] * num_memory + after
+    probability = jnp.broadcast_to(weight[:, None], shape)
+    rows = (model.num_states, *shape[2:])
+    return Successors(_columns(flat.reshape(rows)), _columns(probability.reshape(rows)))
+
+
+def _columns(entries: jax.Array) -> list[list[jax.Array]]:
+    """``[N, A, K]`` as arrays ``[N]``."""
+    _, num_actions, width = entries.shape
+    return [[entries[:, a, k] for k in range(width)] for a in range(num_actions)]
+
+
+def action_columns(num_actions: int, quantity: jax.Array) -> list[jax.Array]:
+    """``[S, A]`` as A arrays ``[N]``, which lie side by side in memory."""
+    rows = quantity.reshape(-1, num_actions)
+    return [rows[:, a] for a in range(num_actions)]
+
+
+def mean(weight: Sequence[jax.Array], quantity: Sequence[jax.Array]) -> jax.Array:
+    """``sum_a w(s, a) x(s, a)``, of columns; weights may lack the lanes."""
+    terms = []
+    for w, x in zip(weight, quantity, strict=True):
+        terms.append(w.reshape(w.shape + (1,) * (x.ndim - w.ndim)) * x)
+    return reduce(jnp.add, terms)
+
+
+def predecessors(models: Sequence[Any]) -> Predecessors | None:
+    """The predecessor lists of models of one shape, with a leading axis, on the host.
+
+    Args:
+      models: W models.
+
+    Returns:
+      Lists padded to the longest, ``[W, P, N]``; None if there is no successor table, or if
+      some state has too many predecessors for that to pay.
+    """
+    table_of = jax.jit(successors)
+    tables = [table_of(model) for model in models]
+    lists = []
+    for table in tables:
+        if table is None:
+            return None
+        target, weight = (np.asarray(x) for x in table)
+        num_actions, width, num_states = target.shape
+        numbers = np.arange(num_actions * num_states).reshape(num_actions, 1, num_states)
+        pair = np.broadcast_to(numbers, target.shape).ravel()
+        used = weight.ravel() > 0
+        target, weight, pair = target.ravel()[used], weight.ravel()[used], pair[used]
+        order = np.argsort(target, kind="stable")
+        target, weight, pair = target[order], weight[order], pair[order]
+        count = np.bincount(target, minlength=num_states)
+        rank = np.arange(target.size) - np.repeat(np.cumsum(count) - count, count)
+        lists.append((target, rank, pair, weight, count.max()))
+        if lists[-1][-1] > _WIDEST * num_actions * width:
+            return None
+    widest = max(x[-1] for x in lists)
+    pairs = np.zeros((len(lists), widest, num_states), np.int32)
+    probability = np.zeros(pairs.shape, weight.dtype)
+    for w, (target, rank, pair, weight, _) in enumerate(lists):
+        pairs[w, rank, target], probability[w, rank, target] = pair, weight
+    return Predecessors(jnp.asarray(pairs), jnp.asarray(probability))
