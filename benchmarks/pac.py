@@ -7,13 +7,14 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.tree_util import Partial
 
 from benchmarks.games import random_game
 from benchmarks.timing import once
 from jaxltl.algos import rmax
 from jaxltl.envs.post_offices import patrol
 
-_QUIET = 20_000
+_REST = 20_000
 _SEEDS = 256
 
 
@@ -24,12 +25,17 @@ def _row(name: str, peer: str, seconds: float, asked: float, first: float, **mor
     }
 
 
+def _made(moves: Any, before: Any, after: Any, metrics: Any) -> Any:
+    return after.moves >= moves
+
+
 def run() -> list[dict[str, Any]]:
     """The example of section 6.7, alone and as a batch, and a large random game."""
     found = patrol()
     problem = rmax.make_problem(found.game, found.accepting, found.reward)
     hparams = rmax.Hparams(discount=0.6, reward_bound=1.0, epsilon=1e-4, restart=1 / 50)
-    train = jax.jit(lambda key, p, h: rmax.train_until(key, p, h, quiet=_QUIET))
+    train = jax.jit(lambda key, p, h: rmax.train_until(
+        key, p, h, until=rmax.strategy_rests(_REST), num_steps=10**6))
     keys = jax.random.split(jax.random.key(0), _SEEDS)
     first, _ = once(lambda: train(keys[0], problem, hparams))
     times = [once(lambda i=i: train(keys[i], problem, hparams))[0] for i in range(11)]
@@ -51,7 +57,7 @@ def run() -> list[dict[str, Any]]:
 
     def million(moves: int):
         return rmax.train_until(
-            jax.random.key(0), large, hparams, quiet=moves, max_moves=moves)
+            jax.random.key(0), large, hparams, until=Partial(_made, moves), num_steps=moves)
 
     first, _ = once(lambda: million(1))
     seconds, learned = once(lambda: million(1_000_000))

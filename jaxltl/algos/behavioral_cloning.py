@@ -23,6 +23,7 @@ from jaxltl.algos import learner
 from jaxltl.core.models.batch import stack_models, stack_observations, training_counts
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.types import status_code
 
 # --- policy networks -----------------------------------------------------------------------------
 
@@ -34,13 +35,13 @@ class ConvolutionalPolicy(nn.Module):
     what they found at the first dense layer.
 
     Attributes:
-      image: height, width and channels of an observation; section 3.5 has (3, 3, 5).
+      observation_shape: height, width and channels; section 3.5 has (3, 3, 5).
       num_actions: how many scores to give.
       kernels: of each convolution, 2 x 2 with stride 1 and no padding.
       hidden: widths of the dense layers.
     """
 
-    image: Sequence[int] = (3, 3, 5)
+    observation_shape: Sequence[int] = (3, 3, 5)
     num_actions: int = 4
     kernels: Sequence[int] = (12, 24)
     hidden: Sequence[int] = (100, 100)
@@ -48,7 +49,7 @@ class ConvolutionalPolicy(nn.Module):
     @nn.compact
     def __call__(self, observation: jax.Array, memory: jax.Array) -> jax.Array:
         rows = observation.shape[:-1]
-        x = observation.reshape(-1, *self.image)
+        x = observation.reshape(-1, *self.observation_shape)
         for features in self.kernels:
             x = nn.relu(nn.Conv(features, (2, 2), padding="VALID")(x))
         return _dense_layers(self, x.reshape(*rows, -1), memory)
@@ -151,11 +152,13 @@ class Metrics:
       loss: of the minibatch, per pair, with the prior.
       held_out: negative log-likelihood of the average held-out pair; NaN without any.
       gradient_norm: Euclidean.
+      status: NONFINITE if the loss or its gradient is no number, else CONVERGED.
     """
 
     loss: jax.Array
     held_out: jax.Array
     gradient_norm: jax.Array
+    status: jax.Array
 
 
 def make_problem(
@@ -194,12 +197,12 @@ def make_problem(
 
 
 def _require_scores(problem: Problem) -> None:
-    height_width_channels = getattr(problem.network, "image", None)
+    height_width_channels = getattr(problem.network, "observation_shape", None)
     size = problem.observation.shape[-1]
     if height_width_channels is not None and int(np.prod(height_width_channels)) != size:
         raise ValueError(
-            f"an observation has {size} numbers, which are no image of shape "
-            f"{tuple(height_width_channels)}; set ConvolutionalPolicy(image=...)."
+            f"an observation has {size} numbers, which are none of shape "
+            f"{tuple(height_width_channels)}; set ConvolutionalPolicy(observation_shape=...)."
         )
     found = jax.eval_shape(
         lambda *x: problem.network.init_with_output(jax.random.key(0), *x)[0], *_inputs(problem)
@@ -219,7 +222,7 @@ def _inputs(problem: Problem) -> tuple[jax.Array, jax.Array]:
     return problem.observation[0, :, None], memory[None]
 
 
-def policy(
+def policy_in_world(
     network: nn.Module, parameters: Any, model: Product, observation: jax.Array
 ) -> jax.Array:
     """The policy in a world, which may be a new one: ``float[S, Q, A]``.
@@ -235,10 +238,24 @@ def policy(
     return jax.nn.softmax(jnp.where(model.available, scores, -jnp.inf), axis=-1)
 
 
+def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """The best policy so far in the problem's worlds: ``float[W, S, Q, A]``."""
+    del hparams
+    scores = _scores(state.best.parameters, problem)
+    return jax.nn.softmax(
+        jnp.where(problem.available[:, :, None], scores, -jnp.inf), axis=-1)
+
+
+def _scores(parameters: Any, problem: Problem) -> jax.Array:
+    memory = jnp.eye(problem.counts.shape[2], dtype=problem.observation.dtype)[None, None]
+    return jnp.asarray(
+        problem.network.apply(parameters, problem.observation[:, :, None], memory))
+
+
 # --- learning -------------------------------------------------------------------------------------
 
 
-def likelihood(parameters: Any, problem: Problem, counts: jax.Array) -> jax.Array:
+def neg_log_likelihood(parameters: Any, problem: Problem, counts: jax.Array) -> jax.Array:
     """Negative log-likelihood (3.10) of the average counted pair; NaN if there is none.
 
     Args:
@@ -246,9 +263,7 @@ def likelihood(parameters: Any, problem: Problem, counts: jax.Array) -> jax.Arra
       problem: the worlds.
       counts: ``float[W, S, Q, A]``.
     """
-    memory = jnp.eye(counts.shape[2], dtype=problem.observation.dtype)[None, None]
-    scores: Any = problem.network.apply(parameters, problem.observation[:, :, None], memory)
-    log_policy = _log_policy(scores, problem.available[:, :, None])
+    log_policy = _log_policy(_scores(parameters, problem), problem.available[:, :, None])
     return -jnp.sum(counts * log_policy) / jnp.sum(counts)
 
 
@@ -260,7 +275,7 @@ def _log_policy(scores: jax.Array, available: jax.Array) -> jax.Array:
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """A state at the network's own random start; the key is kept."""
     dtype = problem.observation.dtype
-    drawn = problem.network.init(jax.random.fold_in(key, 0), *_inputs(problem))
+    drawn = problem.network.init(learner.init_key(key), *_inputs(problem))
     parameters = jax.tree.map(lambda x: jnp.asarray(x, dtype), drawn)
     return State(
         key=key, step=jnp.int32(0), parameters=parameters,
@@ -278,7 +293,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     The loss is (3.10) with the network's outputs read as logits; softmax twice, as the
     formula has it where they are probabilities, does not train.
     """
-    pairs = _draw(jax.random.fold_in(state.key, state.step + 1), problem.counts, hparams.batch)
+    pairs = _draw(learner.step_key(state), problem.counts, hparams.batch)
 
     def loss_of(parameters: Any) -> jax.Array:
         w, s, q, a = pairs
@@ -292,12 +307,15 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     loss, gradient = jax.value_and_grad(loss_of)(state.parameters)
     updates, optimizer = _optimizer(hparams).update(gradient, state.optimizer, state.parameters)
     parameters = optax.apply_updates(state.parameters, updates)
-    held_out = likelihood(state.parameters, problem, problem.held_out)
+    held_out = neg_log_likelihood(state.parameters, problem, problem.held_out)
     best, stopped = learner.stop_early(
         state, parameters, held_out, jnp.any(problem.held_out > 0), hparams.patience)
     parameters, optimizer = learner.choose(
         stopped, (state.parameters, state.optimizer), (parameters, optimizer))
-    metrics = Metrics(loss=loss, held_out=held_out, gradient_norm=optax.tree.norm(gradient))
+    norm = optax.tree.norm(gradient)
+    finite = jnp.isfinite(loss) & jnp.isfinite(norm)
+    metrics = Metrics(
+        loss=loss, held_out=held_out, gradient_norm=norm, status=status_code(finite, finite))
     return State(
         key=state.key, step=state.step + 1, parameters=parameters, optimizer=optimizer,
         best=best, stopped=stopped,
@@ -321,3 +339,5 @@ def _optimizer(hparams: Hparams) -> optax.GradientTransformation:
 
 run = partial(learner.run, step)
 train = partial(learner.train, init, step)
+run_until = partial(learner.run_until, step)
+train_until = partial(learner.train_until, init, step)

@@ -167,10 +167,10 @@ class State:
       least: the sample of the least violation, likewise.
       elites: the last ones; None without reuse.
       num_evaluated, num_invalid: samples so far, and those that could not be used: an objective
-        that is NaN or plus infinity, or a cost that is NaN.
+        that is NaN or plus infinity, or a cost that is NaN. At most 2^31 - 1 are counted.
       num_restarts: so far.
       status: NONFINITE if no sample of the last step could be used (the distribution then stays
-        as it was), else MAX_STEPS: the search has no end of its own.
+        as it was), else CONVERGED, which says nothing of the search: it has no end of its own.
     """
 
     key: jax.Array
@@ -594,14 +594,14 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     return State(
         key=key, step=zero, family=problem.family, best=sample(-jnp.inf, jnp.inf),
         least=sample(jnp.nan, jnp.inf), elites=elites, num_evaluated=zero, num_invalid=zero,
-        num_restarts=zero, status=jnp.int32(Status.MAX_STEPS),
+        num_restarts=zero, status=jnp.int32(Status.CONVERGED),
     )
 
 
 def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     """One population: drawn, evaluated, ranked, and the distribution moved."""
     _check(problem, hparams)
-    draw_key, evaluate_key = jax.random.split(jax.random.fold_in(state.key, state.step))
+    draw_key, evaluate_key = jax.random.split(learner.step_key(state))
     draw = families.sample_antithetic if hparams.antithetic else families.sample
     samples = draw(state.family, draw_key, hparams.population)
     objective, cost = _evaluate(problem, hparams, samples, evaluate_key)
@@ -632,10 +632,10 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
         best=_better(state.best, fresh, excess, feasible, objective, state.best.objective),
         least=_better(state.least, fresh, excess, usable, -excess, -state.least.excess),
         elites=elites if hparams.elite_reuse else None,
-        num_evaluated=(state.num_evaluated + num_samples).astype(jnp.int32),
-        num_invalid=(state.num_invalid + invalid).astype(jnp.int32),
+        num_evaluated=learner.count(state.num_evaluated, num_samples),
+        num_invalid=learner.count(state.num_invalid, invalid),
         num_restarts=state.num_restarts + restarted.astype(jnp.int32),
-        status=jnp.where(fine, Status.MAX_STEPS, Status.NONFINITE).astype(jnp.int32),
+        status=jnp.where(fine, Status.CONVERGED, Status.NONFINITE).astype(jnp.int32),
     )
     num_usable = jnp.sum(usable)
     return new, Metrics(
@@ -651,6 +651,17 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
 
 run = partial(learner.run, step)
 train = partial(learner.train, init, step)
+run_until = partial(learner.run_until, step)
+train_until = partial(learner.train_until, init, step)
+
+
+def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """The mean policy of the last distribution: parameters ``float[D]`` of what is evaluated.
+
+    It may be infeasible: see :func:`result`, which evaluates it anew.
+    """
+    del problem, hparams
+    return families.center(state.family)
 
 
 def _evaluate(

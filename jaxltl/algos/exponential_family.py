@@ -27,6 +27,8 @@ from flax import struct
 from jax import lax
 from jax.scipy.special import digamma, gammaln
 
+from jaxltl.algos import splitmix
+
 
 @struct.dataclass
 class DiagonalGaussian:
@@ -265,15 +267,11 @@ def _unknown(family: Any) -> str:
 def _normal(key: chex.PRNGKey, num_samples: int, like: jax.Array) -> jax.Array:
     """Standard normal numbers, ``float[num_samples, D]``.
 
-    Only D streams are drawn from the key, each a start and an odd increment, and the words of a
-    stream are those of a mixed Weyl sequence (Steele, Lea and Flood 2014). A keyed hash of each
-    number would cost more than small policies cost to evaluate.
+    Only D streams are drawn from the key: a keyed hash of each number would cost more than small
+    policies cost to evaluate.
     """
-    start, increment = jax.random.bits(key, (2, *like.shape, 1), jnp.uint32)
-    word = start + (increment | 1) * jnp.arange(num_samples, dtype=jnp.uint32)
-    word = (word ^ (word >> 16)) * jnp.uint32(0x21F0AAAD)
-    word = (word ^ (word >> 15)) * jnp.uint32(0xD35A2D97)
-    word = word ^ (word >> 15)
+    stream = splitmix.streams(key, (*like.shape, 1))
+    word = splitmix.words(stream, jnp.arange(num_samples, dtype=jnp.uint32))
     # The middles of equal intervals of (-1, 1), as many as are exact.
     kept = 32 if jnp.finfo(like.dtype).nmant >= 32 else jnp.finfo(like.dtype).nmant
     middle = (word >> (32 - kept)).astype(like.dtype) + 0.5

@@ -1,23 +1,24 @@
-"""What all learners share: one loop, progress, and resuming bitwise.
+"""What all learners share: one loop, ended early or not, progress, and resuming bitwise.
 
 A learner is a module with ``init(key, problem, hparams) -> State`` and
-``step(state, problem, hparams) -> (State, Metrics)``, both pure. From these follow
-its ``run`` and ``train``::
+``step(state, problem, hparams) -> (State, Metrics)``, both pure. From these follow::
 
     run = partial(learner.run, step)
     train = partial(learner.train, init, step)
+    run_until = partial(learner.run_until, step)
+    train_until = partial(learner.train_until, init, step)
+
+What was learned is ``policy(state, problem, hparams)``. The root key stays in the state: what step
+n draws comes from ``step_key(state)``, the key with n folded in, and what ``init`` draws from
+``init_key(key)``, a number that no step reaches.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
-import tempfile
-import zipfile
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
-from typing import Any
+from functools import cache, partial
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -26,12 +27,34 @@ import numpy as np
 import optax
 from flax import struct
 from jax import lax
+from jax.tree_util import Partial
+
+from jaxltl.algos import checkpoint as files
+from jaxltl.core.types import Status, worst
 
 Init = Callable[..., Any]
 Step = Callable[..., tuple[Any, Any]]
+Until = Callable[[Any, Any, Any], Any]
+
+MOST = np.iinfo(np.int32).max  # counters stay here; see `count`
 
 
-@partial(jax.jit, static_argnames=("step", "num_steps", "max_rows"))
+def init_key(key: chex.PRNGKey) -> chex.PRNGKey:
+    """The key of what ``init`` draws; no step folds in as large a number."""
+    return jax.random.fold_in(key, 0xFFFFFFFF)
+
+
+def step_key(state: Any) -> chex.PRNGKey:
+    """The key of what the next step draws: the root key with the number of steps folded in."""
+    return jax.random.fold_in(state.key, state.step)
+
+
+def count(total: jax.Array, more: jax.Array | int) -> jax.Array:
+    """``total + more`` of counters ``int32``, which stay at ``2 ** 31 - 1`` once they are there."""
+    more = jnp.asarray(more, jnp.int32)
+    return jnp.where(total > MOST - more, MOST, total + more).astype(jnp.int32)
+
+
 def run(
     step: Step, state: Any, problem: Any, hparams: Any, *, num_steps: int, max_rows: int = 1000
 ) -> tuple[Any, Any]:
@@ -41,7 +64,7 @@ def run(
       step: the learner's step.
       state: where to go on from.
       problem, hparams: arrays; new values do not recompile.
-      num_steps: static.
+      num_steps: a number; another one with as many rows does not recompile.
       max_rows: metrics are kept of at most this many evenly spaced steps, always
         including the last, so memory does not grow with `num_steps`.
 
@@ -55,19 +78,27 @@ def run(
         raise ValueError(f"num_steps={num_steps}, max_rows={max_rows}; both must be at least 1.")
     stride = -(-num_steps // max_rows)
     # The first block is the short one, so that every row ends a full stride.
-    first = num_steps - (num_steps - 1) // stride * stride
+    lengths = np.full(-(-num_steps // stride), stride, np.int32)
+    lengths[0] = num_steps - (num_steps - 1) // stride * stride
+    return _run(step, state, problem, hparams, lengths)
 
-    # One trace of the step serves all: two could be compiled to different roundings.
-    _, shape = jax.eval_shape(step, state, problem, hparams)
-    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
+
+@partial(jax.jit, static_argnames="step")
+def _run(step: Step, state: Any, problem: Any, hparams: Any, lengths: jax.Array) -> Any:
+    empty = _no_metrics(step, state, problem, hparams)
 
     def block(state: Any, length: jax.Array) -> tuple[Any, Any]:
         return lax.fori_loop(
             0, length, lambda _, carry: step(carry[0], problem, hparams), (state, empty)
         )
 
-    lengths = jnp.full(-(-num_steps // stride), stride).at[0].set(first)
     return lax.scan(block, state, lengths)
+
+
+def _no_metrics(step: Step, *arguments: Any) -> Any:
+    # One trace of the step serves all: two could be compiled to different roundings.
+    _, shape = jax.eval_shape(step, *arguments)
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
 
 
 def train(
@@ -83,6 +114,145 @@ def train(
     """:func:`run` from a fresh state; ``vmap`` it over keys for a sweep of seeds."""
     state = init(key, problem, hparams)
     return run(step, state, problem, hparams, num_steps=num_steps, max_rows=max_rows)
+
+
+# --- ended early ----------------------------------------------------------------------------
+
+
+@struct.dataclass
+class Learned:
+    """What a run that ends early ends with; ``check`` accepts it.
+
+    Attributes:
+      state: where it ended.
+      metrics: of the last step.
+      num_steps: steps made by this run.
+      status: CONVERGED if the condition was met, MAX_STEPS if it was not; or worse, as the last
+        step's metrics say.
+    """
+
+    state: Any
+    metrics: Any
+    num_steps: jax.Array
+    status: jax.Array
+
+    @property
+    def residual(self) -> jax.Array:
+        """Of the last step's metrics, or their ``gradient_norm``; NaN if they have neither."""
+        norm = getattr(self.metrics, "gradient_norm", jnp.full(self.status.shape, jnp.nan))
+        return getattr(self.metrics, "residual", norm)
+
+
+def run_until(
+    step: Step,
+    state: Any,
+    problem: Any,
+    hparams: Any,
+    *,
+    until: Until,
+    num_steps: chex.Numeric,
+    check_every: int = 1,
+    keep: str = "after",
+    idle: bool = False,
+) -> Learned:
+    """Steps until a condition is met, or `num_steps` of them. Under ``jit`` and ``vmap``.
+
+    Under ``vmap`` a run that has ended stays as it is while others go on.
+
+    Args:
+      step: the learner's step.
+      state: where to go on from.
+      problem, hparams: arrays; new values do not recompile.
+      until: ``(before, after, metrics) -> bool[]``: the states before and after some steps and
+        the metrics of the last of them. With ``jax.tree_util.Partial(function, *numbers)`` new
+        numbers do not recompile, with a new function they do.
+      num_steps: steps at most; traced.
+      check_every: steps between `before` and `after`; static.
+      keep: which state a run ends with that met the condition, ``"after"`` or ``"before"``: the
+        one that the learner's metrics describe; static.
+      idle: whether the step takes another argument, ``bool[]``, and by itself leaves alone a
+        state for which that is False; else its arrays are chosen one by one; static.
+
+    Returns:
+      :class:`Learned`.
+
+    Raises:
+      ValueError: an unknown `keep`, or a number below 1.
+    """
+    if keep not in ("after", "before"):
+        raise ValueError(f'keep={keep!r}; choose "after" or "before".')
+    if idle and (check_every, keep) != (1, "after"):
+        raise ValueError('idle=True goes with check_every=1 and keep="after".')
+    for name, number in {"num_steps": num_steps, "check_every": check_every}.items():
+        if not isinstance(number, jax.Array) and number < 1:
+            raise ValueError(f"{name}={number}; it must be at least 1.")
+    until = until if isinstance(until, Partial) else Partial(until)
+    most = jnp.asarray(num_steps, jnp.int32)
+    return _run_until(step, state, problem, hparams, until, most, check_every, keep, idle)
+
+
+def train_until(
+    init: Init, step: Step, key: chex.PRNGKey, problem: Any, hparams: Any, **options: Any
+) -> Learned:
+    """:func:`run_until` from a fresh state; ``vmap`` it over keys for a sweep of seeds."""
+    return run_until(step, init(key, problem, hparams), problem, hparams, **options)
+
+
+@struct.dataclass
+class _Progress:
+    """A run on its way: `count` steps have been asked for; `done` if the condition was met."""
+
+    state: Any
+    metrics: Any
+    count: jax.Array
+    done: jax.Array
+
+
+@partial(jax.jit, static_argnames=("step", "check_every", "keep", "idle"))
+def _run_until(step, state, problem, hparams, until, most, check_every, keep, idle) -> Learned:
+    def active(carry: Any, given: Any) -> jax.Array:
+        return ~carry[0].done & (carry[0].count < given[-1])
+
+    def body(carry: Any, given: Any) -> Any:
+        going, (problem, hparams, until, _) = active(carry, given), given
+        now, window = carry
+        before = now.state if window is None else window
+        arguments = (now.state, problem, hparams, *([going] if idle else []))
+        after, metrics = step(*arguments)
+        number = now.count + 1
+        due = number % check_every == 0
+        done = due & jnp.asarray(until(before, after, metrics))
+        last = choose(done, before, after) if keep == "before" else after
+        new = _Progress(last, metrics, jnp.where(going, number, now.count), done & going)
+        if idle:  # `after` is as it was where nothing is to go on
+            metrics = choose(going, metrics, now.metrics)
+            new = new.replace(metrics=metrics, done=new.done | now.done)
+        else:
+            new = choose(going, new, now)
+        return new, None if window is None else choose(due, new.state, window)
+
+    empty = _no_metrics(step, state, problem, hparams, *([jnp.bool_(True)] if idle else []))
+    begin = _Progress(state, empty, jnp.int32(0), jnp.bool_(False))
+    window = None if check_every == 1 else state
+    found, _ = while_active(active, body, (begin, window), (problem, hparams, until, most))
+    status = jnp.where(found.done, Status.CONVERGED, Status.MAX_STEPS).astype(jnp.int32)
+    said = getattr(found.metrics, "status", status)
+    return Learned(found.state, found.metrics, found.count, worst(status, said))
+
+
+@Partial
+def has_stopped(before: Any, after: Any, metrics: Any) -> jax.Array:
+    """A condition for :func:`run_until`: the learner has stopped early, as its state says."""
+    return after.stopped
+
+
+def gradient_vanishes(tolerance: chex.Numeric) -> Until:
+    """A condition for :func:`run_until`: the gradient's norm is at most a tolerance."""
+    return Partial(_gradient_vanishes, tolerance)
+
+
+def _gradient_vanishes(tolerance: Any, before: Any, after: Any, metrics: Any) -> jax.Array:
+    return metrics.gradient_norm <= tolerance
 
 
 def while_active(
@@ -120,6 +290,26 @@ def while_active(
     return loop(carry, given)
 
 
+# --- in chunks, on the host -----------------------------------------------------------------
+
+
+class Chunks(NamedTuple):
+    """What :func:`run_in_chunks` ends with.
+
+    Attributes:
+      state: where it ended; with lanes, a first axis of N.
+      metrics: of evenly spaced steps of each chunk, NumPy arrays with a first axis of rows, those
+        before an interruption included; with lanes ``[rows, N, ...]``.
+      step: ``int[rows]``, the number of the step that each row is of, from 1.
+      done: whether the condition was met; with lanes ``bool[N]``.
+    """
+
+    state: Any
+    metrics: Any
+    step: np.ndarray
+    done: np.ndarray
+
+
 def run_in_chunks(
     step: Step,
     state: Any,
@@ -127,42 +317,127 @@ def run_in_chunks(
     hparams: Any,
     *,
     num_steps: int,
-    chunk: int = 50,
+    until: Until | None = None,
+    keep: str = "after",
+    lanes: bool = False,
+    chunk: int | None = None,
+    max_rows: int = 10,
     report: Callable[[int, Any], None] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
-) -> tuple[Any, Any]:
-    """The same steps in compiled chunks, with a report and a saved state after each.
+) -> Chunks:
+    """Steps in compiled chunks, with a report and a saved state after each.
 
     Args:
-      step, state, problem, hparams: as for :func:`run`.
-      num_steps: the step counter to reach: a state that has already made some steps
+      step, problem: as for :func:`run`.
+      state: where to start; with `lanes` of N runs side by side, with a first axis of N.
+      hparams: numbers; with `lanes` shared by the runs, or one for each, ``[N]``.
+      num_steps: the number of steps to reach: a state that has already made some
         (``state.step``) makes only the rest.
-      chunk: steps between reports.
-      report: called with the steps made and the newest metrics.
-      checkpoint: a file that holds the state after every chunk, written atomically. If
-        it exists, the run goes on from it.
+      until, keep: as for :func:`run_until`. A run that has met the condition stays where it is,
+        so that none depends on the others; when all have, the loop ends.
+      lanes: whether there are N runs.
+      chunk: steps between reports; default `max_rows`, or a hundredth of `num_steps`.
+      max_rows: metrics are kept of at most so many steps of a chunk.
+      report: called with the number of steps and the newest metrics after each chunk.
+      checkpoint: a file that holds all of this after every chunk, written atomically. If it
+        exists, the run goes on from it, and ends with the same bits.
 
     Returns:
-      The state, and the metrics of the steps made in this call (None if there were none).
+      :class:`Chunks`.
 
     Raises:
-      ValueError: the checkpoint belongs to another learner or problem.
+      ValueError: the checkpoint belongs to another learner, problem or setting.
     """
-    if checkpoint is not None and os.path.exists(checkpoint):
-        state = load(checkpoint, state)
-    rows = []
-    while (done := int(np.max(state.step))) < num_steps:
-        state, metrics = run(
-            step, state, problem, hparams, num_steps=min(chunk, num_steps - done)
+    chunk = chunk or max(max_rows, -(-num_steps // 100))
+    num_lanes = len(state.step) if lanes else None
+    hparams = _spread(hparams, state) if lanes else hparams
+    until = until if until is None or isinstance(until, Partial) else Partial(until)
+    now = _begin(step, state, problem, hparams, num_lanes)
+    rows = jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), (now.count, now.metrics))
+    given: Any = None
+    if checkpoint is not None:
+        given = files.fingerprint(step=step, problem=problem, hparams=hparams)
+        if os.path.exists(checkpoint):
+            now, rows = files.load(checkpoint, (now, rows), given)
+    advance = _lane_steps(step, keep, num_lanes)
+    while (made := int(np.max(now.count))) < num_steps and not np.all(now.done):
+        now, fresh = run(
+            advance, _strong(now), problem, (hparams, until),
+            num_steps=min(chunk, num_steps - made), max_rows=max_rows,
         )
-        rows.append(jax.device_get(metrics))
+        rows = jax.tree.map(
+            lambda x, y: np.concatenate([x, y]), jax.device_get(rows), jax.device_get(fresh))
         if checkpoint is not None:
-            save(checkpoint, state)
+            files.save(checkpoint, (now, rows), given)
         if report is not None:
-            report(int(np.max(state.step)), jax.tree.map(lambda x: x[-1], rows[-1]))
-    if not rows:
-        return state, None
-    return state, jax.tree.map(lambda *x: np.concatenate(x), *rows)
+            report(int(np.max(now.count)), jax.tree.map(lambda x: x[-1], rows[1]))
+    step_of = np.asarray(rows[0])
+    return Chunks(
+        now.state, jax.tree.map(np.asarray, rows[1]), step_of[:, 0] if lanes else step_of,
+        np.asarray(now.done),
+    )
+
+
+def _begin(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | None) -> _Progress:
+    """Before the first chunk; nothing is compiled for it."""
+    taken = step if num_lanes is None else jax.vmap(step, (0, None, 0))
+    _, shape = jax.eval_shape(taken, state, problem, hparams)
+    metrics = jax.tree.map(lambda x: jnp.asarray(np.zeros(x.shape, x.dtype)), shape)
+    count = np.asarray(state.step, np.int32)
+    return _Progress(state, metrics, jnp.asarray(count), jnp.asarray(np.zeros(count.shape, bool)))
+
+
+@cache  # compiled once for each step, so it must stay the same function
+def _lane_steps(step: Step, keep: str, num_lanes: int | None) -> Step:
+    """A step of :class:`_Progress`, of one run or of several; its rows are counts and metrics."""
+
+    def one(now: _Progress, problem: Any, given: Any) -> tuple[_Progress, Any]:
+        hparams, until = given
+        after, metrics = step(now.state, problem, hparams)
+        new = _Progress(after, metrics, now.count + 1, now.done)
+        if until is not None:
+            done = jnp.asarray(until(now.state, after, metrics))
+            state = choose(done, now.state, after) if keep == "before" else after
+            new = choose(now.done, now, new.replace(state=state, done=done))
+            new = new.replace(count=now.count + 1)
+        return new, (new.count, new.metrics)
+
+    if num_lanes is None:
+        return one
+    if num_lanes > 1:
+        return jax.vmap(one, in_axes=(0, None, (0, None)))
+
+    def alone(now: _Progress, problem: Any, given: Any) -> tuple[_Progress, Any]:
+        # Without vmap, whose loops and branches take several times as long to compile.
+        first, hparams = jax.tree.map(lambda x: x[0], (now, given[0]))
+        return jax.tree.map(lambda x: x[None], one(first, problem, (hparams, given[1])))
+
+    return alone
+
+
+def _spread(hparams: Any, state: Any) -> Any:
+    """Numbers for each of N runs, floats in the precision of the states."""
+    size = len(state.step)
+    floats = [
+        x.dtype for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)
+    ]
+
+    def one(x: Any) -> jax.Array:
+        x = np.asarray(x)
+        x = x.astype(floats[0]) if floats and np.issubdtype(x.dtype, np.floating) else x
+        return jnp.asarray(np.broadcast_to(x, (size, *x.shape[1:])))
+
+    return jax.tree.map(one, hparams)
+
+
+def _strong(tree: Any) -> Any:
+    """Arrays whose type is not weak, so that the first chunk's program serves the others too."""
+
+    def one(x: jax.Array) -> jax.Array:
+        is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        return x if is_key else lax.convert_element_type(x, x.dtype)
+
+    return jax.tree.map(one, tree)
 
 
 # --- optimisers --------------------------------------------------------------------------
@@ -231,96 +506,3 @@ def choose(condition: jax.Array, one: Any, other: Any) -> Any:
         return x if is_key else jnp.where(condition, x, y)
 
     return jax.tree.map(leaf, one, other)
-
-
-# --- files ---------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def atomic_write(path: str | os.PathLike[str]):
-    """A binary file that appears under its name only when complete.
-
-    Raises:
-      ValueError: the place cannot be written to.
-    """
-    path = Path(path)
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    except OSError as error:
-        raise ValueError(
-            f"cannot write {str(path)!r}: {error.strerror}; choose a directory that exists and is "
-            "writable."
-        ) from error
-    try:
-        with os.fdopen(handle, "wb") as file:
-            yield file
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-def save(path: str | os.PathLike[str], state: Any) -> None:
-    """Writes a learner's state as an ``.npz``, atomically.
-
-    Raises:
-      ValueError: the place cannot be written to.
-    """
-    arrays: dict[str, Any] = {name: np.asarray(_data(leaf)) for name, leaf in _named(state)}
-    with atomic_write(path) as file:
-        np.savez(file, **arrays)
-
-
-def load(path: str | os.PathLike[str], like: Any) -> Any:
-    """Reads a state saved by :func:`save`, bit for bit.
-
-    Args:
-      path: the file.
-      like: a state of the same learner and problem (for example from ``init``).
-
-    Raises:
-      ValueError: the file is damaged, or its arrays do not fit `like`.
-    """
-    try:
-        # An open file of our own is closed even where a damaged archive is given up.
-        with open(path, "rb") as handle, np.load(handle, allow_pickle=False) as file:
-            arrays = dict(file)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{str(path)!r} is not a saved state: {error}") from error
-    leaves = []
-    for name, leaf in _named(like):
-        expected = _data(leaf)
-        found = arrays.get(name)
-        if found is None or found.shape != expected.shape or found.dtype != expected.dtype:
-            is_ = "missing" if found is None else f"{found.dtype}{list(found.shape)}"
-            raise ValueError(
-                f"{str(path)!r} does not belong to this run: {name} is {is_}, expected "
-                f"{expected.dtype}{list(expected.shape)}. Delete the file to start afresh."
-            )
-        value = jnp.asarray(found)
-        if expected is not leaf:
-            value = jax.random.wrap_key_data(value, impl=jax.random.key_impl(leaf))
-        leaves.append(value)
-    return jax.tree.unflatten(jax.tree.structure(like), leaves)
-
-
-def _named(tree: Any) -> list[tuple[str, Any]]:
-    """Leaves with distinct file-safe names, whose numbers keep nested paths apart."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return [
-        (f"{i}{jax.tree_util.keystr(path)}".replace("/", "_"), jnp.asarray(leaf))
-        for i, (path, leaf) in enumerate(leaves)
-    ]
-
-
-def _data(leaf: jax.Array) -> jax.Array:
-    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-    return jax.random.key_data(leaf) if is_key else leaf

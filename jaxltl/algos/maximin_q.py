@@ -34,17 +34,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import lax
+from jax.tree_util import Partial
 
-from jaxltl.algos import learner
+from jaxltl.algos import learner, splitmix
 from jaxltl.algos.play import (
     check_distributions,
     check_reward,
     cumulative,
     draw,
-    mixed_bits,
     observed_reward,
     take,
-    uniform,
 )
 from jaxltl.core.graphs.end_components import bottom_components
 from jaxltl.core.models.game import Game, as_game
@@ -129,7 +128,7 @@ class State:
       q: ``float[S, A]``, or ``float[S, A, A]`` of a system state, its move and the answer;
         minus infinity at system moves that are not allowed, plus infinity at the
         environment's, so that maxima and minima pass over them.
-      visits: ``int32`` like `q`, how often each entry was updated.
+      visits: ``int32`` like `q`, how often each entry was updated, counted up to 2^30.
       value: ``float[S]``, of `q`.
       residual: the largest change of `value` in the last step.
       violations: moves made that were not allowed, of all chains. It stays zero.
@@ -161,6 +160,8 @@ class Metrics:
       visited: distinct entries of the table that were updated.
       violations: moves made so far that were not allowed.
       error: the largest error over the measured states; NaN where the value is not known.
+      status: NONFINITE if a value is no number, else CONVERGED: that it is the game's value is
+        not known; see :func:`value_rests`.
     """
 
     residual: jax.Array
@@ -168,24 +169,6 @@ class Metrics:
     visited: jax.Array
     violations: jax.Array
     error: jax.Array
-
-
-@struct.dataclass
-class Learned:
-    """What :func:`train_until` ends with; ``check`` accepts it.
-
-    Attributes:
-      state: where the run ended.
-      metrics: after the last step, with the residual of the last window.
-      residual: the largest change of the value in the last window.
-      num_steps: steps made by this run.
-      status: a code of :class:`~jaxltl.core.types.Status`.
-    """
-
-    state: State
-    metrics: Metrics
-    residual: jax.Array
-    num_steps: jax.Array
     status: jax.Array
 
 
@@ -231,7 +214,7 @@ def make_problem(
       >>> problem = make_problem(mdp, [[0.0, 0.0], [1.0, 1.0]])
       >>> hparams = Hparams(discount=0.5, restart=0.5, num_chains=4, moves_per_step=8)
       >>> state, metrics = train(jax.random.key(0), problem, hparams, num_steps=10)
-      >>> [round(v, 3) for v in state.value.tolist()], greedy(state, problem).tolist()
+      >>> [round(v, 3) for v in state.value.tolist()], policy(state, problem, hparams).tolist()
       ([1.0, 2.0], [1, 0])
     """
     if method not in ("generalized", "maximin"):
@@ -332,6 +315,8 @@ def _check_alternating(game: Game, system: np.ndarray, reachable: np.ndarray) ->
 # and 8 of the action to take above it.
 _BITS = 24
 
+_MOST_VISITS = 2**30  # counted; a step adds at most as many again
+
 _WRITTEN_OUT = 16  # actions up to which a maximum over them is written out
 
 
@@ -376,8 +361,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     else:
         worst = jnp.where(system, -jnp.inf, jnp.inf)[:, None]
     q = jnp.where(legal, jnp.asarray(hparams.initial_value, dtype), worst.astype(dtype))
-    # Steps fold in their own numbers, which stay below this one.
-    words = jax.random.bits(jax.random.fold_in(key, 0xFFFFFFFF), (hparams.num_chains,), jnp.uint32)
+    words = jax.random.bits(learner.init_key(key), (hparams.num_chains,), jnp.uint32)
     waiting = problem.method == "maximin"
     return State(
         key=key, step=jnp.int32(0), q=q, visits=jnp.zeros(q.shape, jnp.int32),
@@ -400,25 +384,25 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     Cost: a few nanoseconds for each move and allowed action, without arrays of their number.
     """
     _check(problem, hparams)
-    state_key = jax.random.fold_in(state.key, state.step)
-    restart, play, chance = jax.random.split(state_key, 3)
-    state = _restart(restart, state, problem, hparams)
-    # A stream for each chain: a start and an odd increment, both from the key.
-    words = jax.random.bits(play, (2, hparams.num_chains), jnp.uint32)
-    stream = (words[0], words[1] | 1)
+    start_key, action_key, successor_key = (
+        jax.random.fold_in(learner.step_key(state), i) for i in range(3))
+    state = _restart(start_key, state, problem, hparams)
+    stream = splitmix.streams(action_key, (hparams.num_chains,))
     table = _Table(
         state.q.ravel(), state.visits.ravel(), state.position,
         take(problem.game.system, state.position), state.pending, state.held, state.violations,
     )
-    move = partial(_move, problem, hparams, _epsilons(state.step, hparams), stream, chance)
+    move = partial(_move, problem, hparams, _epsilons(state.step, hparams), stream, successor_key)
     count = jnp.arange(hparams.moves_per_step, dtype=jnp.uint32)
     table, _ = lax.scan(lambda t, i: (move(t, i), None), table, count)
     q = table.q.reshape(state.q.shape)
-    image = value(q, problem)
-    residual = jnp.max(jnp.abs(image - state.value))
+    updated = value(q, problem)
+    residual = jnp.max(jnp.abs(updated - state.value))
     state = State(
-        key=state.key, step=state.step + 1, q=q, visits=table.visits.reshape(q.shape),
-        value=image, residual=residual, violations=table.violations, position=table.position,
+        key=state.key, step=state.step + 1, q=q,
+        visits=jnp.minimum(table.visits, _MOST_VISITS).reshape(q.shape),
+        value=updated, residual=residual,
+        violations=jnp.minimum(table.violations, _MOST_VISITS), position=table.position,
         pending=table.pending, held=table.held,
     )
     return state, measure(state, problem, hparams)
@@ -426,12 +410,14 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
 
 run = partial(learner.run, step)
 train = partial(learner.train, init, step)
+run_until = partial(learner.run_until, step)
+train_until = partial(learner.train_until, init, step)
 
 
 def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
     """The :class:`Metrics` of a state."""
     dtype = problem.game.dtype
-    error = jnp.asarray(jnp.nan, dtype)
+    error, finite = jnp.asarray(jnp.nan, dtype), jnp.all(jnp.isfinite(state.value))
     if problem.exact is not None:
         gap = jnp.abs(state.value - problem.exact)
         error = jnp.max(jnp.where(problem.measured, gap, 0))
@@ -441,74 +427,25 @@ def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
         visited=jnp.sum(state.visits > 0, dtype=jnp.int32),
         violations=state.violations,
         error=error,
+        status=status_code(finite, finite),
     )
 
 
-@jax.jit
-def run_until(
-    state: State,
-    problem: Problem,
-    hparams: Hparams,
-    *,
-    tolerance: jax.Array | float,
-    max_steps: jax.Array | int,
-    check_every: jax.Array | int = 10,
-) -> Learned:
-    """Steps until the value changes by at most `tolerance` within a window.
+def value_rests(tolerance: chex.Numeric) -> learner.Until:
+    """A condition for :func:`run_until`: no state's value has changed by more than a tolerance.
 
-    A window in which a move was made for the first time never ends the run. That the
-    value rests is evidence of convergence and no proof of it: the longer the window, the
-    better the evidence.
-
-    Args:
-      state: where to go on from.
-      problem, hparams: as for :func:`step`.
-      tolerance: largest change of a state's value.
-      max_steps: steps at most.
-      check_every: steps in a window.
-
-    Returns:
-      :class:`Learned`.
+    A move that was made for the first time counts as a change. That the value rests is evidence
+    of convergence and no proof of it: the longer the window, ``check_every``, the better the
+    evidence.
     """
-    window = jnp.maximum(jnp.asarray(check_every, jnp.int32), 1)
-    first = state.step
-
-    def body(carry):
-        state, _, _ = carry
-        before, seen = state.value, jnp.sum(state.visits > 0)
-        length = jnp.minimum(window, max_steps - (state.step - first))
-        state = lax.fori_loop(0, length, lambda _, s: step(s, problem, hparams)[0], state)
-        residual = jnp.max(jnp.abs(state.value - before))
-        quiet = (residual <= tolerance) & (jnp.sum(state.visits > 0) == seen)
-        return state, residual, quiet & (length == window)
-
-    def unfinished(carry):
-        state, residual, done = carry
-        return ~done & ~jnp.isnan(residual) & (state.step - first < max_steps)
-
-    begin = (state, jnp.asarray(jnp.inf, state.value.dtype), jnp.bool_(False))
-    state, residual, done = lax.while_loop(unfinished, body, begin)
-    return Learned(
-        state=state, metrics=replace(measure(state, problem, hparams), residual=residual),
-        residual=residual, num_steps=state.step - first,
-        status=status_code(done, ~jnp.isnan(residual)),
-    )
+    return Partial(_value_rests, tolerance)
 
 
-def train_until(
-    key: chex.PRNGKey,
-    problem: Problem,
-    hparams: Hparams,
-    *,
-    tolerance: jax.Array | float,
-    max_steps: jax.Array | int,
-    check_every: jax.Array | int = 10,
-) -> Learned:
-    """:func:`run_until` from a fresh state."""
-    state = init(key, problem, hparams)
-    return run_until(
-        state, problem, hparams, tolerance=tolerance, max_steps=max_steps, check_every=check_every
-    )
+def _value_rests(tolerance: Any, before: State, after: State, metrics: Metrics) -> jax.Array:
+    change = jnp.max(jnp.abs(after.value - before.value))
+    unseen = jnp.any((before.visits == 0) & (after.visits > 0))
+    # A run whose values are no numbers ends too, with the status that says so.
+    return ((change <= tolerance) & ~unseen) | jnp.isnan(change)
 
 
 def value(q: jax.Array, problem: Problem) -> jax.Array:
@@ -523,12 +460,13 @@ def value(q: jax.Array, problem: Problem) -> jax.Array:
     return _finite(jnp.where(problem.game.system, most, least))
 
 
-def greedy(state: State, problem: Problem) -> jax.Array:
-    """Each player's first best move by the table, ``int32[S]``; the policy that was learned.
+def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """Each player's first best move by the table, ``int32[S]``.
 
     With maximin the environment's moves are its first ones: its best answer depends on the
     system's move, and is the minimum of ``state.q[s, a]``.
     """
+    del hparams
     if problem.method == "maximin":
         worst = jnp.where(problem.game.system[:, None], state.q.min(-1), 0)
         return action_argmax(worst, problem.allowed)[1]
@@ -551,7 +489,7 @@ class _Table(NamedTuple):
     violations: jax.Array
 
 
-def _move(problem, hparams, epsilons, stream, chance, table: _Table, i: jax.Array) -> _Table:
+def _move(problem, hparams, epsilons, stream, key, table: _Table, i: jax.Array) -> _Table:
     """The i-th move of every chain in a step, and what it teaches."""
     game, num_actions = problem.game, problem.game.num_actions
     source, system = table.position, table.system
@@ -559,7 +497,7 @@ def _move(problem, hparams, epsilons, stream, chance, table: _Table, i: jax.Arra
     pair = source * num_actions + action
     violations = table.violations + jnp.sum(
         ~take(problem.allowed.ravel(), pair), dtype=jnp.int32)
-    target = _sample(game, jax.random.fold_in(chance, i), source, action)
+    target = _sample(game, jax.random.fold_in(key, i), source, action)
     reward = observed_reward(game, problem.reward, source, action, target)
     discount = jnp.asarray(hparams.discount, table.q.dtype)
     after = discount if hparams.per == "move" else jnp.ones_like(discount)
@@ -598,7 +536,7 @@ def _learn(hparams, q, visits, entry, aim, mode) -> tuple[jax.Array, jax.Array]:
 def _choose(problem, epsilons, stream, table: _Table, i) -> jax.Array:
     """Each chain's action: greedy with the probability of its player, else by behaviour."""
     num_actions = problem.game.num_actions
-    word = (mixed_bits(stream, 2 * i) >> 8) * jnp.uint32(num_actions)
+    word = (splitmix.words(stream, 2 * i) >> 8) * jnp.uint32(num_actions)
     slot = (word >> _BITS).astype(jnp.int32)
     entry = take(problem.behavior_table.ravel(), table.position * num_actions + slot)
     alias = (entry & 0xFF).astype(jnp.int32)
@@ -606,9 +544,9 @@ def _choose(problem, epsilons, stream, table: _Table, i) -> jax.Array:
     if epsilons == (None, None):
         return action
     best, known = _best(problem, table)
-    chance = uniform(mixed_bits(stream, 2 * i + 1), table.q.dtype)
+    drawn = splitmix.uniform(splitmix.words(stream, 2 * i + 1), table.q.dtype)
     mine, theirs = (jnp.inf if e is None else e for e in epsilons)
-    return jnp.where(known & (chance >= jnp.where(table.system, mine, theirs)), best, action)
+    return jnp.where(known & (drawn >= jnp.where(table.system, mine, theirs)), best, action)
 
 
 def _best(problem, table: _Table) -> tuple[jax.Array, jax.Array]:
@@ -655,7 +593,7 @@ def _restart(key, state: State, problem, hparams) -> State:
     """Some chains start anew, and forget a move that waits for its answer."""
     def redraw(position, pending):
         words = jax.random.bits(key, (2, hparams.num_chains), jnp.uint32)
-        anew = uniform(words[0], state.value.dtype) < hparams.restart
+        anew = splitmix.uniform(words[0], state.value.dtype) < hparams.restart
         pending = None if pending is None else jnp.where(anew, -1, pending)
         return jnp.where(anew, draw(problem.start_table, words[1]), position), pending
 
@@ -691,6 +629,11 @@ def _check(problem: Problem, hparams: Hparams) -> None:
         raise ValueError(
             f"num_chains={hparams.num_chains}, moves_per_step={hparams.moves_per_step}; both "
             "must be at least 1."
+        )
+    if hparams.num_chains * hparams.moves_per_step > _MOST_VISITS:
+        raise ValueError(
+            f"num_chains={hparams.num_chains} times moves_per_step={hparams.moves_per_step} is "
+            f"more than {_MOST_VISITS} moves; make them in several steps."
         )
     if hparams.step_size is None and problem.game.num_successors > 1:
         raise ValueError(

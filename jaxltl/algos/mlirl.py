@@ -18,16 +18,16 @@ import numpy as np
 import optax
 from flax import struct
 from jax.flatten_util import ravel_pytree
-
-from jaxltl.algos import learner
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.operators import expectation
 from jaxltl.core.models.product import Product, lift_trajectories
 from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.types import Solution, Status
+from jaxltl.core.types import Solution, Status, require_shape
 from jaxltl.core.values.boltzmann import boltzmann_value
 from jaxltl.core.values.satisfaction import satisfaction_probability
 from jaxltl.core.values.soft import policy_logits, soft_value
+
+from jaxltl.algos import learner
 
 Reward = Callable[[Any, jax.Array], jax.Array]
 
@@ -46,7 +46,7 @@ class Problem:
       features: ``float[S, A, F]`` (``[S, Q, A, F]``).
       counts: ``float[S, A]``, how often each pair was demonstrated.
       start: parameters around which learning starts, any pytree.
-      watched: ``float[S]``, weights of the states whose satisfaction counts in g.
+      satisfaction_weight: ``float[S]``, of the states over which g sums the satisfaction.
       reward: ``(parameters, features) -> float[S, A]``; static.
     """
 
@@ -54,7 +54,7 @@ class Problem:
     features: jax.Array
     counts: jax.Array
     start: Any
-    watched: jax.Array
+    satisfaction_weight: jax.Array
     reward: Reward = struct.field(pytree_node=False, default=linear_reward)
 
 
@@ -129,7 +129,7 @@ def make_problem(
     *,
     start: Any = None,
     reward: Reward = linear_reward,
-    watched: str | jax.Array = "initial",
+    satisfaction_over: str | jax.Array = "initial",
 ) -> Problem:
     """A checked :class:`Problem`.
 
@@ -140,12 +140,12 @@ def make_problem(
       start: initial parameters; default zero weights, one per feature.
       reward: any differentiable reward of parameters and features, such as a flax
         network's ``apply``.
-      watched: the states over which g sums (2.6): ``"initial"`` (where the model
+      satisfaction_over: the states over which g sums (2.6): ``"initial"`` (where the model
         starts; the dissertation's prose), ``"all"`` (its formula), or weights ``float[S]``.
 
     Raises:
       ValueError: features or weights of the wrong shape, features that are not finite,
-        an unknown `watched`, or a reward of the wrong shape.
+        an unknown `satisfaction_over`, or a reward of the wrong shape.
     """
     actions = (*model.state_shape, model.num_actions)
     features = jnp.asarray(features, model.dtype)
@@ -157,13 +157,15 @@ def make_problem(
         raise ValueError(f"feature {feature} at {tuple(pair)} is not finite.")
     if isinstance(model, Product):
         demonstrations = lift_trajectories(model, demonstrations)
-    if isinstance(watched, str):
-        if watched not in ("initial", "all"):
-            raise ValueError(f'watched={watched!r}; choose "initial", "all" or weights.')
-        watched = jnp.ones(model.state_shape) if watched == "all" else model.initial > 0
-    watched = jnp.asarray(watched, model.dtype)
-    if watched.shape != model.state_shape:
-        raise ValueError(f"watched has shape {watched.shape}; expected {model.state_shape}.")
+    weight = satisfaction_over
+    if isinstance(weight, str):
+        if weight not in ("initial", "all"):
+            raise ValueError(
+                f'satisfaction_over={weight!r}; choose "initial", "all" or weights.')
+        starts = np.asarray(model.initial) > 0
+        weight = np.ones(model.state_shape) if weight == "all" else starts
+    weight = jnp.asarray(weight, model.dtype)
+    require_shape("satisfaction_over", weight, model.state_shape)
     start = jnp.zeros(features.shape[-1], model.dtype) if start is None else start
     start = jax.tree.map(lambda x: jnp.asarray(x, model.dtype), start)
     shape = jax.eval_shape(reward, start, features).shape
@@ -171,7 +173,7 @@ def make_problem(
         raise ValueError(f"the reward has shape {shape}; expected {actions}.")
     return Problem(
         model=model, features=features, counts=pair_counts(model, demonstrations),
-        start=start, watched=watched, reward=reward,
+        start=start, satisfaction_weight=weight, reward=reward,
     )
 
 
@@ -234,9 +236,9 @@ def objective(
     logits = policy_logits(problem.model, reward, hparams.discount, solution.value)
     log_policy = jax.nn.log_softmax(logits, axis=-1)
     seen = problem.counts > 0
-    likelihood = jnp.sum(problem.counts * jnp.where(seen, log_policy, 0))
+    log_likelihood = jnp.sum(problem.counts * jnp.where(seen, log_policy, 0))
     flat, _ = ravel_pytree(parameters)
-    loss = -likelihood + hparams.l2 / 2 * jnp.sum(flat * flat)
+    loss = -log_likelihood + hparams.l2 / 2 * jnp.sum(flat * flat)
     satisfaction, status = jnp.full((), jnp.nan, loss.dtype), solution.status
     if hparams.mu is not None:
         if not isinstance(problem.model, Product):
@@ -245,18 +247,18 @@ def objective(
         done = satisfaction_probability(
             problem.model, jax.nn.softmax(logits, axis=-1), method="iterative"
         )
-        total = jnp.sum(problem.watched * done.value)
+        total = jnp.sum(problem.satisfaction_weight * done.value)
         loss -= hparams.mu * total
-        satisfaction = total / jnp.sum(problem.watched)
+        satisfaction = total / jnp.sum(problem.satisfaction_weight)
         solved = done.residual <= jnp.sqrt(jnp.finfo(loss.dtype).eps)
         status = jnp.where(solved, status, jnp.maximum(status, Status.MAX_STEPS))
-    return loss, Objective(-likelihood, satisfaction, solution.value, status)
+    return loss, Objective(-log_likelihood, satisfaction, solution.value, status)
 
 
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """Parameters at ``problem.start`` plus noise of ``hparams.start_scale``; the key is kept."""
     flat, unravel = ravel_pytree(problem.start)
-    noise = jax.random.normal(jax.random.fold_in(key, 0), flat.shape, flat.dtype)
+    noise = jax.random.normal(learner.init_key(key), flat.shape, flat.dtype)
     parameters = unravel(flat + hparams.start_scale * noise)
     return State(
         key=key, step=jnp.int32(0), parameters=parameters,
@@ -299,6 +301,17 @@ def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
 
 run = partial(learner.run, step)
 train = partial(learner.train, init, step)
+# The metrics, and so their gradient, are of the state before a step.
+run_until = partial(learner.run_until, step, keep="before")
+train_until = partial(learner.train_until, init, step, keep="before")
+
+
+def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """The softmax policy of the reward: ``float[S, A]``, in a product ``[S, Q, A]``.
+
+    :func:`solve` tells with it how well its value is known.
+    """
+    return solve(state.parameters, problem, hparams, state.value).policy
 
 
 # --- the features of Table 1 -----------------------------------------------------------------

@@ -74,24 +74,6 @@ def draw(table: jax.Array, words: jax.Array) -> jax.Array:
     return found.astype(jnp.int32)
 
 
-def mixed_bits(stream: tuple[jax.Array, jax.Array], i: jax.Array) -> jax.Array:
-    """The i-th 32 random bits of each stream, a start and an odd increment: a mixed Weyl sequence.
-
-    The construction of SplitMix (Steele, Lea and Flood 2014) with a 32-bit mixer. It is
-    several times cheaper than a keyed hash for each move; a learner starts streams afresh
-    from its key at every step.
-    """
-    x = stream[0] + stream[1] * i
-    x = (x ^ (x >> 16)) * jnp.uint32(0x7FEB352D)
-    x = (x ^ (x >> 15)) * jnp.uint32(0x846CA68B)
-    return x ^ (x >> 16)
-
-
-def uniform(word, dtype) -> jax.Array:
-    """24 random bits as a number in [0, 1)."""
-    return (word >> 8).astype(dtype) / 2.0**24
-
-
 def observed_reward(
     game: Game, reward: jax.Array, state: jax.Array, action: jax.Array, successor: jax.Array
 ) -> jax.Array:

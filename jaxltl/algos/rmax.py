@@ -23,18 +23,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.tree_util import Partial
 
-from jaxltl.algos import learner, pac
+from jaxltl.algos import learner, pac, splitmix
 from jaxltl.algos.play import (
     check_distributions,
     check_reward,
     cumulative,
     draw,
-    mixed_bits,
     observed_reward,
     successor_slot,
     take,
-    uniform,
 )
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.objective import Parity, buchi
@@ -116,7 +115,7 @@ class State:
     Attributes:
       key: of the whole run.
       step: steps made.
-      moves: moves made.
+      moves: moves made; with 2^31 - 1 of them a run is over, and steps make no more.
       position: ``int32[]``, the state of the game.
       counts: ``int32[S, A, K]``, how often each transition was seen; in a game without chance,
         whether it was.
@@ -160,6 +159,9 @@ class Metrics:
       moves, num_known, last_update, num_updates: so far.
       value: of the optimistic model at the start.
       always_almost_sure, fault: see :class:`State`.
+      residual: ``state.error``.
+      status: of the last solve of the optimistic model; MAX_STEPS if it could not be solved, or if
+        all moves that can be counted have been made.
     """
 
     moves: jax.Array
@@ -169,23 +171,7 @@ class Metrics:
     value: jax.Array
     always_almost_sure: jax.Array
     fault: jax.Array
-
-
-@struct.dataclass
-class Learned:
-    """What :func:`train_until` ends with; ``check`` accepts it.
-
-    Attributes:
-      state, metrics: at the end.
-      residual: ``state.error``.
-      num_steps: steps made by this run.
-      status: CONVERGED if the strategy rested for as long as was asked.
-    """
-
-    state: State
-    metrics: Metrics
     residual: jax.Array
-    num_steps: jax.Array
     status: jax.Array
 
 
@@ -257,7 +243,8 @@ def make_problem(
       >>> problem.region.tolist()
       [True, True]
       >>> hparams = Hparams(discount=0.5, reward_bound=1.0, epsilon=0.1)
-      >>> learned = train_until(jax.random.key(0), problem, hparams, quiet=1000)
+      >>> learned = train_until(jax.random.key(0), problem, hparams, num_steps=10_000,
+      ...                       until=strategy_rests(1000))
       >>> sure = evidence(learned.state, problem, hparams)
       >>> bool(sure.almost_sure), sure.epsilon_optimal.all().tolist()
       (True, True)
@@ -398,8 +385,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     bound = jnp.asarray(_bound(hparams), game.dtype)
     gain = jnp.where(problem.allowed, bound, 0)
     value = jnp.where(problem.region, bound / (1 - hparams.discount), 0)
-    # Steps fold in their own numbers, which stay below this one.
-    word = jax.random.bits(jax.random.fold_in(key, 0xFFFFFFFF), (), jnp.uint32)
+    word = jax.random.bits(learner.init_key(key), (), jnp.uint32)
     return State(
         key=key, step=jnp.int32(0), moves=jnp.int32(0), position=draw(problem.start_table, word),
         counts=jnp.zeros(shape, jnp.int32), reward=jnp.full(shape, bound, game.dtype),
@@ -417,83 +403,51 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
 
     Under ``vmap`` every lane goes on to its next update, and then one solve serves all.
     """
+    return _step_if(state, problem, hparams, jnp.bool_(True))
+
+
+def _step_if(
+    state: State, problem: Problem, hparams: Hparams, active: jax.Array
+) -> tuple[State, Metrics]:
+    """A step, or the same state: its arrays are not copied, which would take longer."""
     _check(hparams)
-    state = _advance(state, problem, hparams, jnp.int32(hparams.moves_per_step))
-    return state, measure(state, problem)
+    moves = jnp.where(active, hparams.moves_per_step, 0)
+    moves = jnp.minimum(moves, learner.MOST - state.moves).astype(jnp.int32)
+    state = _advance(state, problem, hparams, moves)
+    state = replace(state, step=state.step + active)
+    return state, measure(state, problem, hparams)
 
 
 run = partial(learner.run, step)
 train = partial(learner.train, init, step)
+run_until = partial(learner.run_until, _step_if, idle=True)
+train_until = partial(learner.train_until, init, _step_if, idle=True)
 
 
-def measure(state: State, problem: Problem) -> Metrics:
+def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
     """The :class:`Metrics` of a state."""
+    solved = state.error <= _solver_tolerance(problem, hparams)
+    status = status_code(solved & (state.moves < learner.MOST), jnp.isfinite(state.error))
     return Metrics(
         moves=state.moves,
         num_known=jnp.sum(state.known_at >= 0, dtype=jnp.int32),
         last_update=state.last_update, num_updates=state.num_updates,
         value=jnp.sum(problem.start * state.value),
         always_almost_sure=state.always_almost_sure, fault=state.fault,
+        residual=state.error, status=status,
     )
 
 
-@jax.jit
-def run_until(
-    state: State,
-    problem: Problem,
-    hparams: Hparams,
-    *,
-    quiet: jax.Array | int,
-    max_moves: jax.Array | int = 10_000_000,
-) -> Learned:
-    """Steps until the strategy has rested for `quiet` moves.
-
-    Args:
-      state: where to go on from.
-      problem, hparams: as for :func:`step`.
-      quiet: moves without an update after which the run ends.
-      max_moves: moves at most, of the whole run.
-
-    Returns:
-      :class:`Learned`.
-    """
-    _check(hparams)
-    first = state.step
-
-    def left(state: State, limits: Any) -> jax.Array:
-        quiet, most = limits
-        rest = jnp.minimum(quiet - (state.moves - state.last_update), most - state.moves)
-        return jnp.maximum(rest, 0)
-
-    def body(state: State, given: Any) -> State:
-        problem, hparams, limits = given
-        moves = jnp.minimum(left(state, limits), hparams.moves_per_step)
-        return _advance(state, problem, hparams, moves)
-
-    limits = (jnp.asarray(quiet, jnp.int32), jnp.asarray(max_moves, jnp.int32))
-    state = learner.while_active(
-        lambda s, given: left(s, given[2]) > 0, body, state, (problem, hparams, limits))
-    done = state.moves - state.last_update >= limits[0]
-    return Learned(
-        state=state, metrics=measure(state, problem), residual=state.error,
-        num_steps=state.step - first, status=status_code(done, jnp.isfinite(state.error)),
-    )
+def strategy_rests(moves: chex.Numeric) -> learner.Until:
+    """A condition for :func:`run_until`: no update of the strategy for so many moves."""
+    return Partial(_strategy_rests, moves)
 
 
-def train_until(
-    key: chex.PRNGKey,
-    problem: Problem,
-    hparams: Hparams,
-    *,
-    quiet: jax.Array | int,
-    max_moves: jax.Array | int = 10_000_000,
-) -> Learned:
-    """:func:`run_until` from a fresh state."""
-    state = init(key, problem, hparams)
-    return run_until(state, problem, hparams, quiet=quiet, max_moves=max_moves)
+def _strategy_rests(moves: Any, before: State, after: State, metrics: Metrics) -> jax.Array:
+    return after.moves - after.last_update >= moves
 
 
-def strategy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     """The system's strategy, ``float[S, A]``: Remark 4 of section 6.5.2; zero elsewhere."""
     allowed = problem.allowed & problem.game.system[:, None]
     return pac.hat_strategy(state.best, allowed, _exploration(problem, hparams))
@@ -510,7 +464,7 @@ def observe(
     """One move of a world outside, seen by the learner; on the host.
 
     Whoever moves at ``state.position`` has made it; the system's moves are drawn from
-    ``strategy(state, problem, hparams)[state.position]``. Where a run starts anew, give the
+    ``policy(state, problem, hparams)[state.position]``. Where a run starts anew, give the
     place first: ``state.replace(position=jnp.int32(s))``.
 
     Raises:
@@ -555,7 +509,7 @@ def evidence(state: State, problem: Problem, hparams: Hparams) -> Evidence:
     if fault >= 0:
         s, a = divmod(fault, problem.game.num_actions)
         raise ValueError(_outside(s, a, hparams, f"{float(jnp.max(problem.reward[s, a])):g}"))
-    play, game = strategy(state, problem, hparams), problem.game
+    play, game = policy(state, problem, hparams), problem.game
     value = partial(strategy_value, _inside(problem), play, problem.reward, hparams.discount)
     worst, met = value(), value(environment=problem.environment)
     optimal = minimax_value(game, problem.reward, hparams.discount, allowed=problem.allowed)
@@ -615,10 +569,10 @@ class _Rules(NamedTuple):
 
 
 def _rules(state: State, problem: Problem, hparams: Hparams) -> _Rules:
-    dtype, key = problem.game.dtype, jax.random.fold_in(state.key, state.step)
-    words = jax.random.bits(key, (2,), jnp.uint32)
+    dtype, key = problem.game.dtype, learner.step_key(state)
     return _Rules(
-        problem, state.best, state.known_at, key, (words[0], words[1] | 1),
+        problem, state.best, state.known_at, jax.random.fold_in(key, 1),
+        splitmix.streams(jax.random.fold_in(key, 0)),
         _exploration(problem, hparams), _enough(problem, hparams),
         jnp.asarray(hparams.reward_bound, dtype), jnp.asarray(hparams.restart, dtype),
         jnp.bool_(hparams.update == "every"),
@@ -667,8 +621,7 @@ def _advance(state: State, problem: Problem, hparams: Hparams, moves: jax.Array)
     rules = _rules(state, problem, hparams)
     walk = learner.while_active(
         lambda w, _: w.left > 0, _move, _walk_from(state, moves), rules)
-    after = _updated(state, _noted(walk, problem), problem, hparams)
-    return replace(after, step=state.step + (moves > 0))
+    return _updated(state, _noted(walk, problem), problem, hparams)
 
 
 def _move(walk: _Walk, rules: _Rules) -> _Walk:
@@ -676,15 +629,15 @@ def _move(walk: _Walk, rules: _Rules) -> _Walk:
     active, game = walk.left > 0, rules.problem.game
     dtype = game.dtype
     count = walk.moves.astype(jnp.uint32)
-    words = [mixed_bits(rules.stream, 4 * count + i) for i in range(4)]
-    anew = uniform(words[0], dtype) < rules.restart
+    words = [splitmix.words(rules.stream, 4 * count + i) for i in range(4)]
+    anew = splitmix.uniform(words[0], dtype) < rules.restart
     s = jnp.where(anew, draw(rules.problem.start_table, words[1]), walk.position)
     mine = jnp.where(
-        uniform(words[2], dtype) < rules.explore,
+        splitmix.uniform(words[2], dtype) < rules.explore,
         take(rules.problem.allowed, s), take(rules.best, s),
     )
     weight = jnp.where(take(game.system, s), mine, take(rules.problem.environment, s))
-    action = _draw_action(weight, uniform(words[3], dtype))
+    action = _draw_action(weight, splitmix.uniform(words[3], dtype))
     # Where chance plays no part the key is not worth making.
     key = rules.key if game.num_successors == 1 else jax.random.fold_in(rules.key, walk.moves)
     successor = sample_successor(game, key, s, action)
@@ -692,11 +645,11 @@ def _move(walk: _Walk, rules: _Rules) -> _Walk:
     return _record(walk, _Seen(s, action, successor, reward), rules, active)
 
 
-def _draw_action(weight: jax.Array, chance: jax.Array) -> jax.Array:
+def _draw_action(weight: jax.Array, uniform: jax.Array) -> jax.Array:
     """An action with the probability of its weight; never one without any."""
     total = jnp.cumsum(weight)
     # The largest weight that rounding lets be drawn stays below the total.
-    drawn = jnp.minimum(chance, 1 - jnp.finfo(weight.dtype).eps) * total[-1]
+    drawn = jnp.minimum(uniform, 1 - jnp.finfo(weight.dtype).eps) * total[-1]
     return jnp.argmax(total > drawn).astype(jnp.int32)
 
 
@@ -788,10 +741,9 @@ def _solved(state: State, problem: Problem, hparams: Hparams, news: jax.Array) -
     dtype = problem.game.dtype
     asked = pac.action_tolerance(hparams.epsilon, hparams.discount)
     discount = jnp.asarray(hparams.discount, dtype)
-    rounding = 8 * jnp.finfo(dtype).eps * jnp.asarray(_bound(hparams), dtype) / (1 - discount)
     value, error, quantity = span_iteration(
         problem.game, problem.allowed, state.gain, state.probability, state.value, discount,
-        enough=jnp.maximum(asked / 4, rounding), active=news,
+        enough=_solver_tolerance(problem, hparams), active=news,
     )
     # What is within eps_1 by these values less twice their error is within eps_1 by the true.
     strict = jnp.maximum(asked - 2 * error, 0).astype(dtype)
@@ -828,6 +780,15 @@ def _enough(problem: Problem, hparams: Hparams) -> jax.Array:
         jnp.sum(problem.region), problem.game.num_actions,
     )
     return jnp.asarray(visits, problem.game.dtype)
+
+
+def _solver_tolerance(problem: Problem, hparams: Hparams) -> jax.Array:
+    """The error of the optimistic model's value at which a solve ends."""
+    dtype = problem.game.dtype
+    asked = pac.action_tolerance(hparams.epsilon, hparams.discount) / 4
+    left = 1 - jnp.asarray(hparams.discount, dtype)
+    rounding = 8 * jnp.finfo(dtype).eps * jnp.asarray(_bound(hparams), dtype) / left
+    return jnp.maximum(asked, rounding).astype(dtype)
 
 
 def _inside(problem: Problem) -> Game:

@@ -21,15 +21,15 @@ import optax
 from flax import linen as nn
 from flax import struct
 from jax import lax
-
-from jaxltl.algos import learner
 from jaxltl.core.models.batch import stack_models, stack_observations, training_counts
 from jaxltl.core.models.batch import world as lane
-from jaxltl.core.models.kernels import Predecessors, predecessors
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.tables import Predecessors, predecessors
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values.soft import policy_logits, soft_policy_adjoint, soft_value
+
+from jaxltl.algos import learner
 
 # --- reward networks ---------------------------------------------------------------------------
 
@@ -453,7 +453,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """A state at the network's own random start; the key is kept."""
     dtype = problem.model.dtype
     inputs = _inputs(problem.model, problem.observation[0])
-    drawn = _draw(problem.network, jax.random.fold_in(key, 0), inputs)
+    drawn = _draw(problem.network, learner.init_key(key), inputs)
     parameters = jax.tree.map(lambda x: jnp.asarray(x, dtype), drawn)
     return State(
         key=key, step=jnp.int32(0), parameters=parameters, value=_initial(problem, None),
@@ -505,3 +505,13 @@ def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
 
 run = partial(learner.run, step)
 train = partial(learner.train, init, step)
+run_until = partial(learner.run_until, step)
+train_until = partial(learner.train_until, init, step)
+
+
+def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """The soft policy of the best reward so far: ``float[W, S, Q, A]``.
+
+    With a horizon ``[W, T, S, Q, A]``; :func:`plan` finds it in other worlds.
+    """
+    return solve(state.best.parameters, problem, hparams).policy

@@ -85,8 +85,8 @@ class Hparams:
     Attributes:
       discount: of rewards, in [0, 1].
       cost_discount: of costs; 1 limits the expected sum of a trajectory's costs.
-      trace: lambda of the generalised advantage of rewards: 1 has no bias, 0 least variance.
-      cost_trace: the same of costs. Costs that come late need a value near 1.
+      gae_lambda: of the generalised advantage of rewards: 1 has no bias, 0 least variance.
+      cost_gae_lambda: the same of costs. Costs that come late need a value near 1.
       delta: the mean divergence that a step may cause.
       damping: added to the Fisher matrix, times the identity.
       penalty: TRPO only: learn from ``reward - penalty * cost``; None: from the reward.
@@ -107,8 +107,8 @@ class Hparams:
 
     discount: jax.Array | float
     cost_discount: jax.Array | float = 1.0
-    trace: jax.Array | float = 0.97
-    cost_trace: jax.Array | float = 0.97
+    gae_lambda: jax.Array | float = 0.97
+    cost_gae_lambda: jax.Array | float = 0.97
     delta: jax.Array | float = 0.01
     damping: jax.Array | float = 1e-3
     penalty: jax.Array | float | None = None
@@ -149,7 +149,7 @@ class State:
       value_moments: ``float[2, V]``, mean and deviation by which their output is scaled.
       optimizer: of `values`.
       moments: of the observations.
-      trajectories: drawn so far.
+      trajectories: drawn so far; at most 2^31 - 1 are counted.
     """
 
     key: jax.Array
@@ -358,7 +358,17 @@ def _value_network(hparams: Hparams, dtype: Any) -> Network:
     return Network(hparams.value_hidden, 1, 0.1, dtype)
 
 
-def policy(state: State, hparams: Hparams, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+def policy(state: State, problem: Problem, hparams: Hparams) -> Partial:
+    """What was learned, as a function of the observation: :func:`act` of the state.
+
+    ``policy(state, problem, hparams)(observation)`` are mean and standard deviation of the action;
+    a pytree.
+    """
+    del problem
+    return Partial(act, state, hparams)
+
+
+def act(state: State, hparams: Hparams, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Mean and standard deviation of the action: both ``float[..., A]``.
 
     Args:
@@ -473,13 +483,13 @@ def rollout(
 
     def move(carry: Any, key: chex.PRNGKey) -> Any:
         worlds, active = carry
-        noise, chance = jax.random.split(key)
+        action_key, world_key = jax.random.split(key)
         observation = jax.vmap(problem.observe)(worlds)
-        mean, deviation = policy(state, hparams, observation)
+        mean, deviation = act(state, hparams, observation)
         action = mean
         if sampled:
-            action += deviation * jax.random.normal(noise, mean.shape, mean.dtype)
-        keys = jax.random.split(chance, num_trajectories)
+            action += deviation * jax.random.normal(action_key, mean.shape, mean.dtype)
+        keys = jax.random.split(world_key, num_trajectories)
         after, reward, cost, done = jax.vmap(problem.step)(worlds, action, keys)
 
         def held(x: jax.Array, y: jax.Array) -> jax.Array:
@@ -509,11 +519,11 @@ def advantages(
     value: jax.Array,
     valid: jax.Array,
     discount: chex.Numeric,
-    trace: chex.Numeric,
+    gae_lambda: chex.Numeric,
 ) -> jax.Array:
     """Generalised advantages (Schulman et al. 2016, equation 16) of finite trajectories::
 
-        A_t = sum_l (discount trace)^l d_{t+l},    d_t = r_t + discount V_{t+1} - V_t,
+        A_t = sum_l (discount lambda)^l d_{t+l},    d_t = r_t + discount V_{t+1} - V_t,
 
     with V = 0 after the last step.
 
@@ -521,7 +531,7 @@ def advantages(
       signal: ``float[T, ...]``, rewards or costs.
       value: ``float[T, ...]``, V of the states where they are earned.
       valid: ``bool[T, ...]``, whether the step was made; true up to the end of a trajectory.
-      discount, trace: in [0, 1].
+      discount, gae_lambda: in [0, 1].
 
     Returns:
       ``float[T, ...]``, zero where `valid` is false.
@@ -536,7 +546,7 @@ def advantages(
     error = jnp.where(valid, signal + discount * following - value, 0)
 
     def back(later: jax.Array, error: jax.Array) -> tuple[jax.Array, jax.Array]:
-        now = error + discount * trace * later
+        now = error + discount * gae_lambda * later
         return now, now
 
     return lax.scan(back, jnp.zeros_like(error[0]), error, reverse=True)[1]
@@ -692,8 +702,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     _check(problem, hparams)
     seen = jax.eval_shape(problem.observe, jax.eval_shape(problem.reset, key))
     dtype, (size,), num_values = seen.dtype, seen.shape, 1 + (hparams.method == "cpo")
-    # Steps fold in their own numbers, which stay below this one.
-    mean_key, value_key, first_key = jax.random.split(jax.random.fold_in(key, 0xFFFFFFFF), 3)
+    mean_key, value_key, first_key = jax.random.split(learner.init_key(key), 3)
     mean = _mean_network(hparams, problem.num_actions, dtype).init(mean_key, jnp.zeros(size, dtype))
     log_deviation = jnp.full(problem.num_actions, jnp.log(hparams.initial_deviation), dtype)
     keys = jax.vmap(partial(jax.random.fold_in, value_key))(jnp.arange(num_values))
@@ -725,7 +734,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
 def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     """N trajectories, one step of the policy, and the value networks fitted to the same ones."""
     _check(problem, hparams)
-    draw_key, fit_key = jax.random.split(jax.random.fold_in(state.key, state.step))
+    draw_key, fit_key = jax.random.split(learner.step_key(state))
     batch = rollout(
         draw_key, state, problem, hparams, num_trajectories=hparams.num_trajectories
     )
@@ -745,7 +754,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     state = State(
         key=state.key, step=state.step + 1, parameters=parameters, values=values,
         value_moments=value_moments, optimizer=optimizer, moments=moments,
-        trajectories=state.trajectories + hparams.num_trajectories,
+        trajectories=learner.count(state.trajectories, hparams.num_trajectories),
     )
     left_out = _weighted_variance(found, batch.valid)
     return state, replace(
@@ -756,6 +765,8 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
 
 run = partial(learner.run, step)
 train = partial(learner.train, init, step)
+run_until = partial(learner.run_until, step)
+train_until = partial(learner.train_until, init, step)
 
 
 def _estimated(
@@ -768,10 +779,10 @@ def _estimated(
     reward = batch.reward
     if hparams.penalty is not None:
         reward = reward - hparams.penalty * batch.cost
-    parts = [advantages(reward, value[0], batch.valid, hparams.discount, hparams.trace)]
+    parts = [advantages(reward, value[0], batch.valid, hparams.discount, hparams.gae_lambda)]
     if hparams.method == "cpo":
         parts.append(advantages(
-            batch.cost, value[1], batch.valid, hparams.cost_discount, hparams.cost_trace
+            batch.cost, value[1], batch.valid, hparams.cost_discount, hparams.cost_gae_lambda
         ))
     return value, jnp.stack(parts)
 
@@ -858,16 +869,16 @@ def _direction(
         return found, damped(found)
 
     if hparams.method == "trpo":
-        natural, image = solved(jax.grad(lambda x: judged(x).reward)(flat))
-        q = natural @ image
+        natural, times_fisher = solved(jax.grad(lambda x: judged(x).reward)(flat))
+        q = natural @ times_fisher
         zero = jnp.zeros((), flat.dtype)
         dual = Dual(jnp.sqrt(q / (2 * delta)), zero, jnp.int32(Case.FREE))
         return natural * jnp.sqrt(_ratio(2 * delta, q)), dual
     gradients = jax.jacrev(lambda x: jnp.stack(judged(x)[:2]))(flat)
-    natural, image = jax.vmap(solved)(gradients)
+    natural, times_fisher = jax.vmap(solved)(gradients)
     # With H x for the gradients that conjugate gradients did not quite solve for, the step's
     # divergence is as promised.
-    gram = natural @ image.T
+    gram = natural @ times_fisher.T
     numbers = (gram[0, 0], (gram[0, 1] + gram[1, 0]) / 2, gram[1, 1], excess, delta)
     reward, cost = cpo_weights(*numbers)
     return reward * natural[0] + cost * natural[1], cpo_dual(*numbers)

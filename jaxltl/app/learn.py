@@ -6,13 +6,19 @@ import functools
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxltl.core.models.monitor import Verdict, make_monitor
+from jaxltl.core.models.product import Product, lift_policy, product, project_policy
+from jaxltl.core.models.restrict import restrict
+from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.types import Solution, Status
+from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
 
 import jaxltl
 from jaxltl.algos import learner, mlirl
@@ -24,15 +30,9 @@ from jaxltl.app.files.task import (
     read_task,
     synthetic_demonstrations,
 )
-from jaxltl.core.models.monitor import Verdict, make_monitor
-from jaxltl.core.models.product import Product, lift_policy, product, project_policy
-from jaxltl.core.models.restrict import restrict
-from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.types import Solution, Status
-from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
 
 __all__ = [
-    "STEPS", "Learned", "Outcome", "Setup", "describe", "fingerprint", "learn", "optimize",
+    "STEPS", "Learned", "Outcome", "Setup", "describe", "fingerprint", "history_of", "learn",
     "pictures", "prepare", "read_task", "save", "summary",
 ]
 
@@ -40,122 +40,6 @@ Report = Callable[[int, Mapping[str, np.ndarray]], None]
 
 STEPS = 500  # at most, unless the task says otherwise
 _TOLERANCE = 1e-6  # of the gradient's norm
-_ROWS = 10  # of the history, per chunk
-
-
-# --- the loop -------------------------------------------------------------------------------
-
-
-def _step_until_flat(
-    step: learner.Step, state: Any, problem: Any, settings: tuple[Any, jax.Array]
-) -> tuple[Any, dict[str, jax.Array]]:
-    """A learner's step that stays put where the gradient is no longer than the tolerance."""
-    hparams, tolerance = settings
-    after, metrics = step(state, problem, hparams)
-    flat = metrics.gradient_norm <= tolerance
-    kept = jax.tree.map(lambda new, old: jnp.where(flat, old, new), after, state)
-    figures = {name: getattr(metrics, name) for name in metrics.__dataclass_fields__}
-    return kept.replace(step=after.step), {"step": after.step, **figures}
-
-
-@functools.cache  # the loop is compiled once for each step function, so it must stay the same one
-def _lanes(step: learner.Step, num_lanes: int) -> learner.Step:
-    one = functools.partial(_step_until_flat, step)
-    if num_lanes > 1:
-        return jax.vmap(one, in_axes=(0, None, 0))
-
-    def alone(states: Any, problem: Any, settings: Any) -> tuple[Any, dict[str, jax.Array]]:
-        # Without vmap, whose loops and branches take several times as long to compile.
-        state, setting = jax.tree.map(lambda x: x[0], (states, settings))
-        return jax.tree.map(lambda x: x[None], one(state, problem, setting))
-
-    return alone
-
-
-def _strong(tree: Any) -> Any:
-    """Arrays whose type is not weak, so that the first chunk's program serves the others too."""
-
-    def one(x: jax.Array) -> jax.Array:
-        is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-        return x if is_key else jax.lax.convert_element_type(x, x.dtype)
-
-    return jax.tree.map(one, tree)
-
-
-def optimize(
-    step: learner.Step,
-    metrics: type[Any],
-    states: Any,
-    problem: Any,
-    hparams: Any,
-    *,
-    num_steps: int,
-    tolerance: float = _TOLERANCE,
-    chunk: int | None = None,
-    report: Report | None = None,
-    checkpoint: Path | None = None,
-    finished: Callable[[Any], bool] | None = None,
-) -> tuple[Any, dict[str, np.ndarray]]:
-    """Several runs of a learner side by side, until every gradient vanishes.
-
-    A run whose gradient is within the tolerance stays where it is, so no run depends on how
-    long the others take.
-
-    Args:
-      step: the learner's step.
-      metrics: the dataclass of its metrics, among them ``gradient_norm``.
-      states: N states, leading axis.
-      problem: shared by the runs.
-      hparams: numbers, shared, or arrays ``[N]``, one for each run.
-      num_steps: steps at most.
-      tolerance: of the gradient's Euclidean norm.
-      chunk: steps between reports; default 10, or a hundredth of `num_steps`.
-      report: called after each chunk with the steps made and the newest metrics ``[N]``.
-      checkpoint: a file that holds states and history after each chunk; the run goes on
-        from it if it exists, and ends with the same bits.
-      finished: whether the states after a chunk have nothing left to learn, for learners that
-        end otherwise than by their gradient.
-
-    Returns:
-      The states, and the history: metrics ``[T, N]`` of at most 10 steps per chunk; figures
-      of the parameters before the step.
-
-    Raises:
-      ValueError: the checkpoint is damaged or cannot be written.
-    """
-    chunk = chunk or max(_ROWS, -(-num_steps // 100))
-    num_lanes = len(states.step)
-    shape, spread = (num_lanes,), functools.partial(jnp.broadcast_to, shape=(num_lanes,))
-    dtype = states.value.dtype
-    settings = jax.tree.map(lambda x: spread(jnp.asarray(x, dtype)), (hparams, tolerance))
-    batched = _lanes(step, num_lanes)
-    names = ("step", *(field.name for field in fields(metrics)))
-    empty = np.zeros((-(-num_steps // chunk) * _ROWS, *shape))
-    saved = {"states": states, "rows": jnp.int32(0), "history": dict.fromkeys(names, empty)}
-    if checkpoint is not None and checkpoint.exists():
-        saved = learner.load(checkpoint, saved)
-    states, rows = _strong(saved["states"]), int(saved["rows"])
-    history = {name: np.array(column) for name, column in saved["history"].items()}
-    while (done := int(np.max(states.step))) < num_steps:
-        if rows and bool(np.all(history["gradient_norm"][rows - 1] <= tolerance)):
-            break
-        if finished is not None and finished(states):
-            break
-        states, figures = learner.run(
-            batched, states, problem, settings,
-            num_steps=min(chunk, num_steps - done), max_rows=_ROWS,
-        )
-        added = len(figures["step"])
-        for name, column in figures.items():
-            history[name][rows : rows + added] = column
-        rows += added
-        if checkpoint is not None:
-            learner.save(
-                checkpoint, {"states": states, "rows": jnp.int32(rows), "history": history}
-            )
-        if report is not None:
-            report(int(np.max(states.step)), {k: v[rows - 1] for k, v in history.items()})
-    return states, {name: column[:rows] for name, column in history.items()}
 
 
 # --- the learners ---------------------------------------------------------------------------
@@ -172,7 +56,7 @@ class Learned:
       status: ``int32[N]``, of the solver that yielded the policies.
       num_steps: ``int[N]``, until the gradient vanished, or all.
       converged: ``bool[N]``: the gradient vanished and the policy's solver converged.
-      history: metrics ``[T, N]``.
+      history: metrics ``[T, N]`` and ``step [T]``.
     """
 
     policy: jax.Array
@@ -212,30 +96,28 @@ def _mlirl(
         )
     problem = mlirl.make_problem(
         model.mdp if in_world else model, features.values, shown,
-        start=start, watched=spec.get("watched", "initial"),
+        start=start, satisfaction_over=spec.get("satisfaction_over", "initial"),
     )
     options = ("discount", "mu", "l2", "learning_rate", "start_scale", "policy", "adjoint",
                "optimizer")
     hparams = mlirl.Hparams(**{k: spec[k] for k in options if k in spec})
     num_steps, tolerance = spec.get("steps", STEPS), spec.get("tolerance", _TOLERANCE)
     states = jax.jit(jax.vmap(mlirl.init, (0, None, None)))(keys, problem, hparams)
-    states, history = optimize(
-        mlirl.step, mlirl.Metrics, states, problem, hparams, num_steps=num_steps,
-        tolerance=tolerance, report=report, checkpoint=checkpoint,
+    found = learner.run_in_chunks(
+        mlirl.step, states, problem, hparams, num_steps=num_steps, lanes=True, keep="before",
+        until=learner.gradient_vanishes(tolerance), report=by_name(report), checkpoint=checkpoint,
     )
+    states, history = found.state, history_of(found)
     evaluate = jax.jit(_policy_and_likelihood)
-    found = [evaluate(parameters, problem, hparams) for parameters in states.parameters]
-    policy, nll, codes = (jnp.stack(column) for column in zip(*found, strict=True))
+    each = [evaluate(parameters, problem, hparams) for parameters in states.parameters]
+    policy, nll, codes = (jnp.stack(column) for column in zip(*each, strict=True))
     gradient_norm, status = history["gradient_norm"][-1], np.asarray(codes)
-    flat = history["gradient_norm"] <= tolerance
-    first = np.where(flat.any(axis=0), np.argmax(flat, axis=0), len(flat) - 1)
-    steps = np.take_along_axis(history["step"], first[None], axis=0)[0]
     return Learned(
         policy=jax.vmap(lift_policy, (None, 0))(model, policy) if in_world else policy,
         weights=np.asarray(states.parameters), names=features.names, loss=history["loss"][-1],
         neg_log_likelihood=np.asarray(nll), gradient_norm=gradient_norm, status=status,
-        num_steps=steps.astype(int),
-        converged=flat[-1] & (status == Status.CONVERGED), history=history,
+        num_steps=np.asarray(states.step),
+        converged=found.done & (status == Status.CONVERGED), history=history,
     )
 
 
@@ -249,6 +131,16 @@ def _policy_and_likelihood(
 
 
 METHODS = {"mlirl": _mlirl}
+
+
+def by_name(report: Report | None) -> Callable[[int, Any], None] | None:
+    """A report of figures by name from one of a learner's metrics."""
+    return None if report is None else lambda step, metrics: report(step, vars(metrics))
+
+
+def history_of(found: learner.Chunks) -> dict[str, np.ndarray]:
+    """The figures of N runs side by side, ``[T, N]``, and ``step [T]``, by name."""
+    return {"step": found.step, **vars(found.metrics)}
 
 
 # --- the whole job --------------------------------------------------------------------------
@@ -499,7 +391,7 @@ def pictures(outcome: Outcome) -> list[tuple[str, str, bytes, str]]:
         found += _maps(outcome, setup.world.cells)
     history = outcome.learned.history
     curves = plot.curves(
-        {k: v.T for k, v in history.items()}, steps=history["step"][:, 0],
+        {k: v.T for k, v in history.items() if k != "step"}, steps=history["step"],
         show=("loss", "neg_log_likelihood", "satisfaction", "gradient_norm"),
     )
     found.append((

@@ -17,9 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-
-import jaxltl
-from jaxltl.algos import learner, todirl
 from jaxltl.app.files.task_todirl import (
     Scene,
     Task,
@@ -30,7 +27,6 @@ from jaxltl.app.files.task_todirl import (
     load_scenes,
     read_task,
 )
-from jaxltl.app.learn import Report, fingerprint, optimize, plain, short_name
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.models.batch import lift_memory, stack_products
@@ -49,6 +45,10 @@ from jaxltl.core.values.soft import soft_value
 from jaxltl.envs import temporal_gridworld
 from jaxltl.envs.gridworld import ACTIONS
 from jaxltl.io.learned_reward import LearnedReward, save_reward
+
+import jaxltl
+from jaxltl.algos import learner, todirl
+from jaxltl.app.learn import Report, by_name, fingerprint, history_of, plain, short_name
 
 __all__ = [
     "STEPS", "Outcome", "Setup", "describe", "fingerprint", "learn", "pictures", "prepare",
@@ -141,7 +141,7 @@ class Learned:
       best_step: ``int[N]``, after which the parameters were reached.
       stopped: ``bool[N]``, whether learning ended by patience.
       num_steps: ``int``, made until all had ended.
-      history: metrics ``[T, N]``.
+      history: metrics ``[T, N]`` and ``step [T]``.
     """
 
     parameters: Any
@@ -288,11 +288,11 @@ def learn(
     root = jax.random.fold_in(jax.random.key(seed), 1)
     keys = jax.vmap(partial(jax.random.fold_in, root))(jnp.arange(num_seeds))
     states = jax.jit(jax.vmap(todirl.init, (0, None, None)))(keys, problem, hparams)
-    states, history = optimize(
-        todirl.step, todirl.Metrics, states, problem, hparams,
-        num_steps=spec.get("steps", STEPS), tolerance=0.0, report=report, checkpoint=checkpoint,
-        finished=lambda found: bool(np.all(found.stopped)),
+    found = learner.run_in_chunks(
+        todirl.step, states, problem, hparams, num_steps=spec.get("steps", STEPS), lanes=True,
+        until=learner.has_stopped, report=by_name(report), checkpoint=checkpoint,
     )
+    states, history = found.state, history_of(found)
     best = states.best
     learned = Learned(
         parameters=best.parameters, held_out=np.asarray(best.neg_log_likelihood),
@@ -441,7 +441,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             "hyperparameters": {k: v for k, v in task.learner.items() if k != "method"},
         },
         "history": {
-            "step": history["step"][:, 0],
+            "step": history["step"],
             **{k: history[k][:, i] for k in ("loss", "per_pair", "held_out", "gradient_norm")},
         },
         "seeds": {
@@ -584,7 +584,7 @@ def pictures(outcome: Outcome) -> list[Picture]:
         ))
     curves = plot.curves(
         {k: history[k].T for k in ("per_pair", "held_out", "gradient_norm")},
-        steps=history["step"][:, 0],
+        steps=history["step"],
     )
     found.append((
         "learning.svg", "Learning", plot.to_bytes(curves),

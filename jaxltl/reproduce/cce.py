@@ -322,7 +322,7 @@ def _taught(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: Any) 
         wanted = apply(network, policy, seen)
 
         def loss(parameters: Any, chosen: jax.Array) -> jax.Array:
-            mean, _ = tr.policy(
+            mean, _ = tr.act(
                 replace(state, parameters=parameters), hparams, seen[chosen])
             return jnp.mean((mean - wanted[chosen]) ** 2)
 
@@ -349,10 +349,10 @@ def _by_network(network: Any, policy: jax.Array, seen: jax.Array, key: jax.Array
     return apply(network, policy, seen)
 
 
-def _by_chance(
+def _drawn(
     state: tr.State, hparams: tr.Hparams, seen: jax.Array, key: jax.Array
 ) -> jax.Array:
-    mean, deviation = tr.policy(state, hparams, seen)
+    mean, deviation = tr.act(state, hparams, seen)
     return mean + deviation * jax.random.normal(key, mean.shape, mean.dtype)
 
 
@@ -377,7 +377,7 @@ def _drive(
 @partial(jax.jit, static_argnums=(2, 3))
 def _driven(steps: Steps, policy: Any, number: int, horizon: int, key: jax.Array) -> Any:
     if isinstance(policy, tuple):
-        act = partial(_by_chance, *policy)
+        act = partial(_drawn, *policy)
     else:
         act = partial(_by_network, nav.policy_network(nav.navigation()), policy)
     _, path, scores = _drive(steps, act, key, number, horizon)

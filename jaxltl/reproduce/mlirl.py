@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.algos import learner
 from jaxltl.algos import mlirl as irl
-from jaxltl.app.learn import from_starts, optimize, plain
+from jaxltl.app.learn import from_starts, plain
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, lift_policy, product
 from jaxltl.core.models.restrict import restrict
@@ -94,12 +95,13 @@ def learn_cases(
     def begin(start: jax.Array) -> irl.State:
         return irl.init(jax.random.key(0), replace(problem, start=start), one)
 
-    states, history = optimize(
-        irl.step, irl.Metrics, jax.vmap(begin)(starts), problem, hparams,
-        num_steps=400, tolerance=1e-6,
+    learned = learner.run_in_chunks(
+        irl.step, jax.vmap(begin)(starts), problem, hparams, num_steps=400, lanes=True,
+        until=learner.gradient_vanishes(1e-6), keep="before",
     )
+    states, last = learned.state, jax.tree.map(lambda x: x[-1], learned.metrics)
     shape = (len(mus), len(STARTS))
-    gradient, loss = (history[k][-1].reshape(shape) for k in ("gradient_norm", "loss"))
+    gradient, loss = (x.reshape(shape) for x in (last.gradient_norm, last.loss))
     best = np.argmin(np.where(gradient <= 1e-6, loss, np.inf), axis=1)
     found = []
     for i, j in enumerate(best):

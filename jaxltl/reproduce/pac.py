@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.algos import pac, rmax
+from jaxltl.algos import learner, pac, rmax
 from jaxltl.app.learn import plain
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.winning import almost_sure_buchi
@@ -25,7 +25,7 @@ from jaxltl.envs.post_offices import Patrol, patrol, surveillance
 
 DISCOUNT, EPSILON, REWARD_BOUND, FAILURE = 0.6, 1e-4, 1.0, 0.1
 RESTART = 1 / 50  # before a move, with this probability, a run starts anew
-QUIET = 20_000  # moves without an update after which learning ends
+REST = 20_000  # moves without an update after which learning ends
 SEEDS = 10
 
 PUBLISHED = {"states": 144, "system_states": 72, "system_transitions": 192,
@@ -72,8 +72,8 @@ def figures(
     progress(f"learning with {seeds} seeds side by side, with and without restarts")
     keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
     anew = replace(_HPARAMS, restart=RESTART)
-    found, together = _timed(lambda: _learn_all(keys, problem, anew, QUIET))
-    straight = _learn_all(keys, problem, _HPARAMS, QUIET)
+    found, together = _timed(lambda: _learn_all(keys, problem, anew))
+    straight = _learn_all(keys, problem, _HPARAMS)
     learned, evidence = _judged(found, problem, anew)
     without, _ = _judged(straight, problem, _HPARAMS)
     progress("learning with one seed at a time, for the time that it takes")
@@ -160,17 +160,19 @@ def _summary(model: Patrol, value: jax.Array) -> dict[str, Any]:
 
 
 @jax.jit
-def _learn_all(
-    keys: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, quiet: int
-) -> rmax.Learned:
-    return jax.vmap(lambda key: rmax.train_until(key, problem, hparams, quiet=quiet))(keys)
+def _learn_all(keys: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams) -> learner.Learned:
+    return jax.vmap(lambda key: _learn(key, problem, hparams, jnp.int32(learner.MOST)))(keys)
 
 
 @jax.jit
 def _learn(
-    key: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, quiet: int, max_moves: jax.Array
-) -> rmax.Learned:
-    return rmax.train_until(key, problem, hparams, quiet=quiet, max_moves=max_moves)
+    key: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, most: jax.Array
+) -> learner.Learned:
+    """Until the strategy rests, or for so many moves."""
+    def rests(before: rmax.State, after: rmax.State, metrics: rmax.Metrics) -> jax.Array:
+        return (after.moves - after.last_update >= REST) | (after.moves >= most)
+
+    return rmax.train_until(key, problem, hparams, until=rests, num_steps=10**6)
 
 
 def _timed(job: Callable[[], Any]) -> tuple[Any, float]:
@@ -182,17 +184,17 @@ def _timed(job: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def _seconds_alone(
-    keys: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, found: rmax.Learned
+    keys: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, found: learner.Learned
 ) -> tuple[float, float]:
     """Medians over single runs: the seconds until they end, and until their last update.
 
     For the latter a run is stopped after so many moves; until then it is the same.
     """
-    most = jnp.full_like(found.state.last_update, np.iinfo(np.int32).max)
+    most = jnp.full_like(found.state.last_update, learner.MOST)
     medians = []
     for limits in (most, found.state.last_update):
         runs = [
-            _timed(partial(_learn, key, problem, hparams, QUIET, limit))[1]
+            _timed(partial(_learn, key, problem, hparams, limit))[1]
             for key, limit in zip(keys, limits, strict=True)
         ]
         medians.append(float(np.median(runs)))
@@ -200,7 +202,7 @@ def _seconds_alone(
 
 
 def _judged(
-    found: rmax.Learned, problem: rmax.Problem, hparams: rmax.Hparams
+    found: learner.Learned, problem: rmax.Problem, hparams: rmax.Hparams
 ) -> tuple[list[dict[str, Any]], rmax.Evidence]:
     """A row for each seed, and the evidence of the first one.
 

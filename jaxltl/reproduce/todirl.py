@@ -230,7 +230,7 @@ def _policies(method: str, parameters: Any, models: Product, seen: jax.Array) ->
     """Of each seed in its world: ``float[N, S, Q, A]``."""
     if method == "cloning":
         network = cloning.ConvolutionalPolicy(num_actions=models.num_actions)
-        return jax.vmap(partial(cloning.policy, network))(parameters, models, seen)
+        return jax.vmap(partial(cloning.policy_in_world, network))(parameters, models, seen)
     return jax.vmap(
         lambda p, m, o: todirl.plan(todirl.RewardNetwork(), p, m, o, _HPARAMS).policy
     )(parameters, models, seen)

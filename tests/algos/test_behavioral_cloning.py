@@ -54,7 +54,7 @@ def test_the_loss_is_cross_entropy_of_the_logits():
         total -= float(found.counts[w, s, q, a]) * np.log(probability[a])
     assert len(pairs) > 2 and float(found.counts.sum()) == 10
     np.testing.assert_allclose(
-        bc.likelihood(state.parameters, found, found.counts), total / 10, rtol=1e-10)
+        bc.neg_log_likelihood(state.parameters, found, found.counts), total / 10, rtol=1e-10)
 
 
 def test_minibatches_are_drawn_by_counts():
@@ -73,7 +73,7 @@ def test_what_was_demonstrated_is_learned():
     assert not state.stopped and state.best.step == 150
     for w in range(2):
         model = world(two_worlds(), w)
-        policy = bc.policy(SMALL, state.best.parameters, model, found.observation[w])
+        policy = bc.policy_in_world(SMALL, state.best.parameters, model, found.observation[w])
         np.testing.assert_allclose(policy.sum(-1), 1, rtol=1e-9)
         seen = np.asarray(found.counts[w]) > 0
         assert (np.asarray(policy)[seen] > 0.95).all()
@@ -104,7 +104,7 @@ def test_learning_stops_at_the_best_held_out_likelihood():
     assert best == int(np.argmin(curve)) < 100
     np.testing.assert_allclose(state.best.neg_log_likelihood, curve.min())
     np.testing.assert_allclose(
-        bc.likelihood(state.best.parameters, found, found.held_out), curve.min(), rtol=1e-9)
+        bc.neg_log_likelihood(state.best.parameters, found, found.held_out), curve.min(), rtol=1e-9)
     assert (curve[best + 21 :] == curve[best + 20]).all(), "it stays as it was"
     longer, _ = bc.run(state, found, hparams, num_steps=150)
     jax.tree.map(np.testing.assert_array_equal, longer.parameters, state.parameters)
@@ -136,7 +136,7 @@ def test_memory_enters_beside_what_is_seen():
     kernel = parameters["params"]["kernel"]
     both = jnp.concatenate([jnp.repeat(seen, 2, 1), jnp.repeat(memory, 3, 0)], -1)
     np.testing.assert_allclose(scores, both @ kernel, atol=1e-6)
-    conv = bc.ConvolutionalPolicy(image=(3, 3, 1), kernels=(2,), hidden=(4,))
+    conv = bc.ConvolutionalPolicy(observation_shape=(3, 3, 1), kernels=(2,), hidden=(4,))
     values = conv.init_with_output(jax.random.key(0), jnp.zeros((1, 9)), memory[0])[0]
     assert values.shape == (2, 4)
 
@@ -150,9 +150,9 @@ def test_unavailable_actions_have_no_probability():
     network = bc.DensePolicy(num_actions=2, hidden=())
     found = bc.make_problem(model, jnp.eye(2), runs((0, 1), (1, 0)), held_out=None, network=network)
     state = bc.init(jax.random.key(0), found, bc.Hparams())
-    policy = bc.policy(network, state.parameters, world(model, 0), jnp.eye(2))
+    policy = bc.policy_in_world(network, state.parameters, world(model, 0), jnp.eye(2))
     assert policy[1].tolist() == [[1, 0]] * 2
-    gradient = jax.grad(bc.likelihood)(state.parameters, found, found.counts)
+    gradient = jax.grad(bc.neg_log_likelihood)(state.parameters, found, found.counts)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(gradient))
 
 
@@ -179,7 +179,7 @@ make = partial(bc.make_problem, held_out=None, network=SMALL)
         (lambda: make(two_worlds(), [np.eye(6)] * 2, demonstrations(), network=Single()),
          r"scores have shape \(6, 1, 1\); expected \(6, 3, 4\)"),
         (lambda: make(two_worlds(), [np.eye(6)] * 2, demonstrations(),
-                      network=bc.ConvolutionalPolicy()), "6 numbers, which are no image"),
+                      network=bc.ConvolutionalPolicy()), "6 numbers, which are none of shape"),
     ],
 )
 def test_what_does_not_fit_is_refused(call, message):

@@ -1,8 +1,12 @@
-"""Laws that every learner keeps: one suite, parametrised over learners."""
+"""Laws that every learner keeps: one suite, parametrised over learners.
+
+What takes time is compiling, so each learner is compiled once alone and once as a batch, with runs
+of as many rows: their number of steps is an argument.
+"""
 
 from __future__ import annotations
 
-import os
+import inspect
 from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -12,11 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
+from jax.tree_util import Partial
 
 import jaxltl as jl
 from jaxltl.algos import (
     behavioral_cloning,
     cce,
+    checkpoint,
     learner,
     maximin_q,
     mlirl,
@@ -26,6 +32,8 @@ from jaxltl.algos import (
 )
 from jaxltl.algos.exponential_family import diagonal_gaussian
 from jaxltl.core.models.game import make_game
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.types import Status
 from tests.support import counted_traces
 
 
@@ -45,43 +53,62 @@ class ToyState:
     position: jax.Array
 
 
+@struct.dataclass
+class ToyMetrics:
+    at: jax.Array
+    x: jax.Array
+    status: jax.Array
+
+
 def toy_init(key, problem, hparams):
     return ToyState(key, jnp.int32(0), problem + jax.random.normal(key, problem.shape))
 
 
 def toy_step(state, problem, hparams):
     """A noisy descent, which uses its key as learners do."""
-    noise = jax.random.normal(jax.random.fold_in(state.key, state.step), problem.shape)
+    noise = jax.random.normal(learner.step_key(state), problem.shape)
     position = state.position - hparams * (state.position - problem + noise)
-    return ToyState(state.key, state.step + 1, position), {"at": state.step, "x": position.sum()}
+    metrics = ToyMetrics(state.step, position.sum(), jnp.int32(0))
+    return ToyState(state.key, state.step + 1, position), metrics
 
 
 TOY = SimpleNamespace(
-    init=toy_init, step=toy_step,
+    init=toy_init, step=toy_step, policy=lambda state, problem, hparams: state.position,
     run=partial(learner.run, toy_step), train=partial(learner.train, toy_init, toy_step),
+    run_until=partial(learner.run_until, toy_step),
+    train_until=partial(learner.train_until, toy_init, toy_step),
 )
 
 
-def grid():
-    world = jl.gridworld("b . r\n. . g", slip=0.1, absorbing=["g"])
-    runs = [[(0, 1), (3, 3), (4, 3)], [(0, 3), (1, 1), (4, 3)]]
-    return world, jl.make_trajectories(world, runs)
+def world():
+    """A start, a goal and a trap, which have one action; lists of successors with padding."""
+    mdp = jl.make_mdp(
+        [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
+        [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
+        available=[[True, True], [True, False], [True, False]], initial=[1, 0, 0],
+        label=[[False, False], [True, False], [False, True]], propositions=["g", "r"],
+    )
+    runs = [[(0, 1), (0, 0), (1, 0)], [(0, 0), (1, 0)]]
+    return mdp, jl.make_trajectories(mdp, runs)
+
+
+def numbers(*shape):
+    return np.random.default_rng(0).normal(size=shape)
 
 
 def mlirl_world():
-    world, demonstrations = grid()
-    features = mlirl.world_features(world, demonstrations, goal=["g"], avoid=["r"]).values
+    mdp, demonstrations = world()
     setting = partial(mlirl.Hparams, optimizer="adam")
     return Case(
-        mlirl, mlirl.make_problem(world, features, demonstrations),
+        mlirl, mlirl.make_problem(mdp, numbers(3, 2, 2), demonstrations),
         setting(discount=0.5), setting(discount=0.4, l2=1e-2, learning_rate=0.01),
     )
 
 
 def mlirl_product():
-    world, demonstrations = grid()
-    lazy = jl.product(world, "!r U g")
-    features = mlirl.task_features(lazy, demonstrations, avoid=["r"]).values
+    mdp, demonstrations = world()
+    lazy = jl.product(mdp, "!r U g")
+    features = numbers(*lazy.state_shape, 2, 2)
     return Case(
         mlirl, mlirl.make_problem(lazy, features, demonstrations),
         mlirl.Hparams(discount=0.5, mu=0.1), mlirl.Hparams(discount=0.6, mu=1.0, l2=1e-2),
@@ -89,9 +116,9 @@ def mlirl_product():
 
 
 def task_oriented():
-    world, demonstrations = grid()
+    mdp, demonstrations = world()
     problem = todirl.make_problem(
-        jl.product(world, "!r U g", label_on="exit"), np.eye(6), demonstrations,
+        jl.product(mdp, "!r U g", label_on="exit"), np.eye(3), demonstrations,
         network=todirl.RewardNetwork((3,)), held_out=0.5,
     )
     return Case(
@@ -102,10 +129,12 @@ def task_oriented():
 
 def alternating_game():
     """Two of the system's states between two of the environment's, where chance plays."""
-    successor = [[[2, 0], [3, 0]], [[3, 0], [2, 0]], [[0, 1], [1, 0]], [[1, 0], [0, 1]]]
+    successor = [[[2, 0], [3, 0]], [[3, 0], [0, 0]], [[0, 1], [1, 0]], [[1, 0], [0, 1]]]
     certain, fair = [[1, 0], [1, 0]], [[0.5, 0.5], [1, 0]]
-    mdp = jl.make_mdp(successor, [certain, certain, fair, fair])
-    reward = [[1.0, 0.0], [0.0, 0.5], [0.2, 0.0], [0.0, 0.3]]
+    mdp = jl.make_mdp(
+        successor, [certain, [[1, 0], [0, 0]], fair, fair],
+        available=[[True, True], [True, False], [True, True], [True, True]])
+    reward = [[1.0, 0.0], [0.3, 0.0], [0.2, 0.0], [0.0, 0.3]]
     return make_game(mdp, [True, True, False, False]), reward
 
 
@@ -171,10 +200,10 @@ def trust(method):
 
 
 def cloning():
-    world, demonstrations = grid()
-    network = behavioral_cloning.DensePolicy(hidden=(4,))
+    mdp, demonstrations = world()
+    network = behavioral_cloning.DensePolicy(num_actions=2, hidden=(4,))
     problem = behavioral_cloning.make_problem(
-        jl.product(world, "!r U g"), jnp.eye(6), demonstrations, held_out=0.5, network=network)
+        jl.product(mdp, "!r U g"), jnp.eye(3), demonstrations, held_out=0.5, network=network)
     setting = partial(behavioral_cloning.Hparams, batch=5)
     return Case(
         behavioral_cloning, problem, setting(), setting(learning_rate=0.1, l2=0.1, patience=3))
@@ -194,8 +223,7 @@ LEARNERS = {
     "cloning": cloning,
 }
 
-# What a state has learned, by name; the first that it has.
-LEARNED = ("parameters", "q", "counts", "family", "position")
+by_learner = pytest.mark.parametrize("name", LEARNERS)
 
 
 @cache
@@ -204,15 +232,45 @@ def case(name: str) -> Case:
 
 
 @cache
-def six_steps(name: str):
-    """The state and metrics after six steps; the runs below have the same seed."""
+def starts(name: str):
+    """Three runs side by side; the first and the last have the same key."""
     module, problem, hparams, _ = case(name)
-    return module.train(jax.random.key(0), problem, hparams, num_steps=6)
+    keys = jax.random.split(jax.random.key(0), 3)
+    init = jax.jit(jax.vmap(module.init, (0, None, None)))
+    return init(keys.at[2].set(keys[0]), problem, hparams)
 
 
-def start(name: str, seed: int = 0):
-    module, problem, hparams, _ = case(name)
-    return module.init(jax.random.key(seed), problem, hparams)
+def start(name: str, i: int = 0):
+    return lane(starts(name), i)
+
+
+def lane(tree, i):
+    """One of several, on the host; slices of arrays would each be compiled."""
+    def one(x):
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(np.asarray(jax.random.key_data(x))[i])
+        return jnp.asarray(np.asarray(x)[i])
+
+    return jax.tree.map(one, tree)
+
+
+def steps(name: str, state, num_steps, problem=None, hparams=None):
+    """A run in two rows, whatever its length: one program serves all."""
+    module, own, asked, _ = case(name)
+    return module.run(
+        state, own if problem is None else problem, asked if hparams is None else hparams,
+        num_steps=num_steps, max_rows=2)
+
+
+@cache
+def four_steps(name: str):
+    return steps(name, start(name), 4)
+
+
+@cache
+def lanes(name: str):
+    """Four steps of all three."""
+    return jax.jit(jax.vmap(partial(steps, name, num_steps=4)))(starts(name))
 
 
 def leaves(tree):
@@ -230,94 +288,132 @@ def assert_bitwise(one, other):
         np.testing.assert_array_equal(x, y)
 
 
-# To compile, which is done several times.
-SLOW = {"mlirl-product", "q-maximin", "trpo", "cpo", "todirl"}
-by_learner = pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=[pytest.mark.exhaustive] if n in SLOW else []) for n in LEARNERS],
-)
+def differ(one, other):
+    return sum((x != y).any() for x, y in zip(leaves(one), leaves(other), strict=True))
 
 
 @by_learner
 def test_a_run_split_in_two_is_the_run(name):
-    module, problem, hparams, _ = case(name)
-    state, first = module.run(start(name), problem, hparams, num_steps=3)
-    state, second = module.run(state, problem, hparams, num_steps=3)
-    whole, metrics = six_steps(name)
+    state, first = steps(name, start(name), 2)
+    state, second = steps(name, state, 2)
+    whole, metrics = four_steps(name)
     assert_bitwise(state, whole)
-    joined = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), first, second)
-    assert_bitwise(joined, metrics)
-    assert state.step == 6
+    ends = jax.tree.map(lambda x, y: np.stack([x[1], y[1]]), first, second)
+    assert_bitwise(ends, jax.tree.map(np.asarray, metrics))
+    assert state.step == 4
 
 
 @by_learner
 def test_a_lane_is_as_if_alone(name):
     """Up to rounding: a batch is compiled to other instructions, so the bits may differ."""
-    module, problem, hparams, _ = case(name)
-    keys = jax.random.split(jax.random.key(0), 3).at[0].set(jax.random.key(0))
-    states, _ = jax.vmap(lambda k: module.train(k, problem, hparams, num_steps=6))(keys)
-    alone, _ = six_steps(name)
-    for x, y in zip(leaves(states), leaves(alone), strict=True):
+    alone = four_steps(name)
+    for x, y in zip(leaves(lanes(name)), leaves(alone), strict=True):
         np.testing.assert_allclose(x[0], y, rtol=1e-8, atol=1e-8)
-    learned = leaves(next(getattr(states, x) for x in LEARNED if hasattr(states, x)))
-    assert any((x[0] != x[1]).any() for x in learned), "distinct keys give distinct runs"
 
 
 @by_learner
 def test_the_key_decides(name):
-    module, problem, hparams, _ = case(name)
-    again, _ = module.train(jax.random.key(0), problem, hparams, num_steps=6)
-    assert_bitwise(again, six_steps(name)[0])
-    other, _ = module.train(jax.random.key(1), problem, hparams, num_steps=6)
-    differs = [(x != y).any() for x, y in zip(leaves(other), leaves(again), strict=True)]
-    assert sum(differs) >= 2, "more than the key itself"
+    states, metrics = lanes(name)
+    assert_bitwise(lane(states, 0), lane(states, 2))
+    assert_bitwise(lane(metrics, 0), lane(metrics, 2))
+    assert differ(lane(states, 0), lane(states, 1)) >= 2, "more than the key itself"
 
 
 @by_learner
-def test_new_settings_do_not_retrace(name):
-    module, problem, hparams, other = case(name)
-    run = partial(module.run, start(name), problem)
-    one, _ = run(hparams, num_steps=3)
+def test_new_numbers_do_not_retrace(name):
+    four_steps(name)
     with counted_traces() as traced:
-        two, _ = run(other, num_steps=3)
+        state, _ = steps(name, start(name), 6, hparams=case(name).other)
     assert not traced
-    assert any((x != y).any() for x, y in zip(leaves(one), leaves(two), strict=True))
+    assert state.step == 6
+    short, _ = steps(name, start(name), 4, hparams=case(name).other)
+    assert differ(short, four_steps(name)[0])
+
+
+def nudged(tree, dtype=float):
+    """The same shapes, and one number a little different."""
+    flat, structure = jax.tree.flatten(tree)
+    i = next(i for i, x in enumerate(flat)
+             if np.size(x) and np.issubdtype(getattr(x, "dtype", type(x)), np.floating))
+    changed = np.array(flat[i], float)
+    changed.flat[0] = changed.flat[0] * 0.75 + 0.125
+    flat[i] = jnp.asarray(changed, getattr(flat[i], "dtype", None))
+    return jax.tree.unflatten(structure, flat)
 
 
 @by_learner
-def test_a_saved_state_goes_on_bitwise(name, tmp_path):
-    module, problem, hparams, _ = case(name)
-    state, _ = module.run(start(name), problem, hparams, num_steps=3)
-    learner.save(tmp_path / "state.npz", state)
-    loaded = learner.load(tmp_path / "state.npz", start(name, seed=7))
+def test_a_saved_state_goes_on_bitwise_and_with_nothing_else(name, tmp_path):
+    _, problem, hparams, other = case(name)
+    given = checkpoint.fingerprint(problem=problem, hparams=hparams)
+    state, _ = steps(name, start(name), 2)
+    checkpoint.save(tmp_path / "state.npz", state, given)
+    loaded = checkpoint.load(tmp_path / "state.npz", start(name, 1), given)
     assert_bitwise(loaded, state)
-    state, _ = module.run(loaded, problem, hparams, num_steps=3)
-    assert_bitwise(state, six_steps(name)[0])
+    state, _ = steps(name, loaded, 2)
+    assert_bitwise(state, four_steps(name)[0])
+    for changed in ({"problem": nudged(problem)}, {"hparams": other}):
+        now = checkpoint.fingerprint(**{"problem": problem, "hparams": hparams, **changed})
+        with pytest.raises(ValueError, match=f"not belong to this run: {next(iter(changed))}"):
+            checkpoint.load(tmp_path / "state.npz", start(name), now)
 
 
 @by_learner
-def test_an_interrupted_run_resumes_and_ends_bitwise_equal(name, tmp_path):
+def test_every_learner_is_called_alike(name):
     module, problem, hparams, _ = case(name)
-    checkpoint = tmp_path / "run.npz"
-    seen = []
+    for function, arguments in {
+        "init": ["key", "problem", "hparams"], "step": ["state", "problem", "hparams"],
+        "policy": ["state", "problem", "hparams"],
+    }.items():
+        assert list(inspect.signature(getattr(module, function)).parameters) == arguments
+    if name != "toy":
+        for kind in ("Problem", "Hparams", "State", "Metrics"):
+            assert inspect.isclass(getattr(module, kind))
+        assert isinstance(hparams, module.Hparams) and isinstance(problem, module.Problem)
+    for function in (module.run, module.train, module.run_until, module.train_until):
+        assert isinstance(function, partial) and function.func.__module__ == learner.__name__
+    state, metrics = four_steps(name)
+    assert_bitwise(state.key, start(name).key)
+    assert metrics.status.shape == (2,), "as many rows as were asked for, after any steps"
+    assert set(np.asarray(metrics.status).tolist()) <= set(Status)
 
-    def interrupt(done, metrics):
-        seen.append(done)
-        raise KeyboardInterrupt
 
-    run = partial(
-        learner.run_in_chunks, module.step, problem=problem, hparams=hparams,
-        num_steps=6, chunk=3, checkpoint=checkpoint,
-    )
-    with pytest.raises(KeyboardInterrupt):
-        run(state=start(name), report=interrupt)
-    state, metrics = run(state=start(name), report=lambda done, _: seen.append(done))
-    assert seen == [3, 6]
-    assert_bitwise(state, six_steps(name)[0])
-    assert jax.tree.leaves(metrics)[0].shape[0] == 3, "the metrics of this call's steps"
-    state, metrics = run(state=start(name))
-    assert metrics is None, "nothing is left to do"
-    assert_bitwise(state, six_steps(name)[0])
+# --- what does not exist does not matter ------------------------------------------------------
+
+
+def disturbed(tree):
+    """The same problem with other numbers wherever there is no action or no successor."""
+    def model(x):
+        if not isinstance(x, MDP):
+            return x
+        exists, used = np.asarray(x.available), np.asarray(x.probability) > 0
+        last = np.asarray(x.successor).max()
+        return x.replace(
+            successor=jnp.asarray(np.where(used, x.successor, last), jnp.int32),
+            probability=jnp.asarray(np.where(exists[..., None], x.probability, 0.7)),
+        )
+
+    return jax.tree.map(model, tree, is_leaf=lambda x: isinstance(x, MDP))
+
+
+REWARDS = {"mlirl-world": "features", "mlirl-product": "features", "rmax": "reward",
+           "q-generalized": "reward", "q-maximin": "reward"}
+
+
+@pytest.mark.parametrize("name", [*REWARDS, "todirl"])
+def test_what_is_not_available_changes_nothing(name):
+    """Bit for bit: what was learned, and all figures."""
+    module, problem, hparams, _ = case(name)
+    other = disturbed(problem)
+    if name in REWARDS:
+        model = problem.model if hasattr(problem, "model") else problem.game
+        values = np.array(getattr(problem, REWARDS[name]))
+        values[~np.asarray(model.available)] = -1e9
+        other = other.replace(**{REWARDS[name]: jnp.asarray(values)})
+    assert differ(other, problem)
+    assert_bitwise(steps(name, start(name), 4, problem=other)[1], four_steps(name)[1])
+    state, policy = four_steps(name)[0], jax.jit(module.policy)
+    found = steps(name, start(name), 4, problem=other)[0]
+    assert_bitwise(policy(found, other, hparams), policy(state, problem, hparams))
 
 
 # --- what the shared loop does, shown on the cheapest learner ----------------------------------
@@ -331,13 +427,13 @@ def test_metrics_are_thinned_and_end_with_the_last_step(num_steps, max_rows):
     state, metrics = module.run(
         start("toy"), problem, hparams, num_steps=num_steps, max_rows=max_rows
     )
-    rows = metrics["at"].tolist()
+    rows = metrics.at.tolist()
     assert len(rows) <= max_rows
     assert rows[-1] == num_steps - 1
     assert len(set(np.diff(rows).tolist())) <= 1, "evenly spaced"
     every, all_metrics = module.run(start("toy"), problem, hparams, num_steps=num_steps)
     assert_bitwise(state, every)
-    np.testing.assert_array_equal(metrics["x"], all_metrics["x"][metrics["at"]])
+    np.testing.assert_array_equal(metrics.x, np.asarray(all_metrics.x)[rows])
 
 
 @pytest.mark.parametrize("limits", [{"num_steps": 0}, {"num_steps": 5, "max_rows": 0}])
@@ -345,6 +441,62 @@ def test_runs_have_at_least_one_step_and_row(limits):
     module, problem, hparams, _ = case("toy")
     with pytest.raises(ValueError, match="both must be at least 1"):
         module.run(start("toy"), problem, hparams, **limits)
+
+
+def test_counters_stay_where_they_end():
+    most = np.iinfo(np.int32).max
+    total = jnp.asarray(np.array([0, most - 3, most - 2, most], np.int32))
+    assert learner.count(total, 3).tolist() == [3, most, most, most]
+
+
+def reaches(number, before, after, metrics):
+    return metrics.at >= number
+
+
+def test_a_run_ends_with_the_step_that_meets_the_condition():
+    module, problem, hparams, _ = case("toy")
+    run = partial(module.run_until, start("toy"), problem, hparams)
+    found = jl.check(run(until=Partial(reaches, 5), num_steps=20))
+    whole, metrics = module.run(start("toy"), problem, hparams, num_steps=6, max_rows=1)
+    assert_bitwise(found.state, whole)
+    assert (found.num_steps, found.metrics.at) == (6, 5)
+    assert found.metrics.x == metrics.x[0]
+    with counted_traces() as traced:
+        late = run(until=Partial(reaches, 50), num_steps=9)
+    assert not traced, "numbers are arguments"
+    assert (late.status, late.num_steps, late.state.step) == (Status.MAX_STEPS, 9, 9)
+    kept = run(until=Partial(reaches, 5), num_steps=20, keep="before")
+    assert (kept.num_steps, kept.state.step, kept.metrics.at) == (6, 5, 5)
+    windows = run(until=lambda before, after, _: after.step >= 4, num_steps=20, check_every=3)
+    assert windows.num_steps == 6
+    seen = run(until=lambda before, after, _: after.step - before.step == 3, num_steps=20,
+               check_every=3)
+    assert seen.num_steps == 3
+
+
+def test_lanes_end_each_for_itself():
+    module, problem, hparams, _ = case("toy")
+    most = jnp.array([3, 50, 7])
+    found = jax.vmap(lambda state, n: module.run_until(
+        state, problem, hparams, until=Partial(reaches, n), num_steps=20))(starts("toy"), most)
+    assert found.num_steps.tolist() == [4, 20, 8]
+    assert found.status.tolist() == [0, Status.MAX_STEPS, 0]
+    for i, number in enumerate([4, 20, 8]):
+        alone, _ = module.run(start("toy", i), problem, hparams, num_steps=number, max_rows=1)
+        np.testing.assert_allclose(found.state.position[i], alone.position, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"keep": "both"}, "keep='both'; choose"),
+    ({"check_every": 0}, "check_every=0; it must be at least 1"),
+    ({"num_steps": 0}, "num_steps=0; it must be at least 1"),
+    ({"idle": True, "keep": "before"}, "idle=True goes with"),
+])
+def test_runs_that_make_no_sense_are_refused(options, message):
+    module, problem, hparams, _ = case("toy")
+    with pytest.raises(ValueError, match=message):
+        module.run_until(start("toy"), problem, hparams,
+                         **{"until": Partial(reaches, 1), "num_steps": 3, **options})
 
 
 def test_a_loop_of_lanes_is_a_while_loop():
@@ -372,121 +524,67 @@ def test_a_loop_of_lanes_is_a_while_loop():
     assert (found["sum"][..., 1] == 0).all()
 
 
+# --- in chunks --------------------------------------------------------------------------------
+
+
 def test_a_run_in_chunks_is_the_run():
     module, problem, hparams, _ = case("toy")
     reports = []
-    state, metrics = learner.run_in_chunks(
+    found = learner.run_in_chunks(
         module.step, start("toy"), problem, hparams, num_steps=10, chunk=4,
-        report=lambda done, row: reports.append((done, int(row["at"]))),
+        report=lambda done, row: reports.append((done, int(row.at))),
     )
-    whole, all_metrics = module.run(start("toy"), problem, hparams, num_steps=10)
-    assert_bitwise(state, whole)
-    np.testing.assert_array_equal(metrics["x"], all_metrics["x"])
+    whole, metrics = module.run(start("toy"), problem, hparams, num_steps=10)
+    assert_bitwise(found.state, whole)
+    np.testing.assert_array_equal(found.metrics.x, metrics.x)
+    assert found.step.tolist() == list(range(1, 11)) and not found.done
     assert reports == [(4, 3), (8, 7), (10, 9)]
+    long = learner.run_in_chunks(module.step, start("toy"), problem, hparams, num_steps=3000)
+    assert len(long.step) == 1000, "rows do not grow with steps"
 
 
-def test_a_batch_of_seeds_runs_in_chunks():
-    module, problem, hparams, _ = case("toy")
-    keys = jax.random.split(jax.random.key(0), 3)
-    states = jax.vmap(lambda k: module.init(k, problem, hparams))(keys)
-    step = jax.vmap(toy_step, (0, None, None))
-    states, _ = learner.run_in_chunks(step, states, problem, hparams, num_steps=5, chunk=2)
-    alone, _ = module.train(keys[1], problem, hparams, num_steps=5)
-    np.testing.assert_allclose(states.position[1], alone.position, rtol=1e-12)
+def test_runs_side_by_side_in_chunks():
+    """Each with its own number and its own end."""
+    module, problem, _, _ = case("toy")
+    given = np.array([0.1, 0.2, 0.3])
+    chunks = partial(learner.run_in_chunks, module.step, problem=problem, num_steps=9, chunk=4)
+    found = chunks(
+        starts("toy"), hparams=given, lanes=True,
+        until=lambda before, after, metrics: metrics.at >= 20 * given[0] + 3 * (after.step == 4))
+    assert found.step.tolist() == [1, 2, 3, 4] and found.done.all()
+    assert found.state.step.tolist() == [3, 3, 3]
+    for i in range(3):
+        alone, metrics = module.run(start("toy", i), problem, given[i], num_steps=3)
+        np.testing.assert_allclose(found.state.position[i], alone.position, rtol=1e-12)
+        np.testing.assert_allclose(found.metrics.x[:3, i], metrics.x, rtol=1e-12)
+    assert_bitwise(found.metrics.x[2], found.metrics.x[3])
+    one = chunks(
+        jax.tree.map(lambda x: x[None], start("toy")), hparams=0.1, lanes=True, keep="before",
+        until=Partial(reaches, 2))
+    assert one.done.tolist() == [True] and one.state.step.tolist() == [2]
 
 
-def test_nested_states_with_keys_are_saved(tmp_path):
-    def state(seed):
-        key = jax.random.key(seed)
-        return {"a/b": (jnp.arange(3) + seed, key), "a": {"b": jnp.float32(seed)}, "c": seed > 1}
+@pytest.mark.parametrize("name", ["toy", "cloning"])
+def test_an_interrupted_run_resumes_and_ends_bitwise_equal(name, tmp_path):
+    module, problem, hparams, other = case(name)
+    path = tmp_path / "run.npz"
+    seen = []
 
-    learner.save(tmp_path / "state.npz", state(3))
-    assert_bitwise(learner.load(tmp_path / "state.npz", state(0)), state(3))
-
-
-def damaged(path, name):
-    if name == "empty":
-        path.write_bytes(b"")
-    elif name == "text":
-        path.write_text("not an archive")
-    else:
-        learner.save(path, start("toy"))
-        content = path.read_bytes()
-        path.write_bytes(content[: len(content) // 2])
-
-
-@pytest.mark.parametrize("name", ["empty", "text", "cut"])
-def test_damaged_files_are_refused(name, tmp_path):
-    path = tmp_path / "state.npz"
-    damaged(path, name)
-    with pytest.raises(ValueError, match=r"state\.npz' is not a saved state"):
-        learner.load(path, start("toy"))
-
-
-def test_missing_files_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"none\.npz' is not a saved state"):
-        learner.load(tmp_path / "none.npz", start("toy"))
-
-
-def test_a_changed_byte_is_noticed(tmp_path):
-    path = tmp_path / "state.npz"
-    learner.save(path, start("toy"))
-    content = bytearray(path.read_bytes())
-    place = content.find(np.asarray(start("toy").position).tobytes())
-    content[place] ^= 1
-    path.write_bytes(bytes(content))
-    with pytest.raises(ValueError, match="is not a saved state"):
-        learner.load(path, start("toy"))
-
-
-def test_states_of_another_run_are_refused(tmp_path):
-    path = tmp_path / "state.npz"
-    learner.save(path, start("toy"))
-    message = r"does not belong to this run: .*position is float64\[3\], expected float64\[4\]"
-    with pytest.raises(ValueError, match=message):
-        learner.load(path, toy_init(jax.random.key(0), jnp.zeros(4), 0.1))
-    with pytest.raises(ValueError, match=r"does not belong to this run: .* is missing"):
-        learner.load(path, start("mlirl-world"))
-    module, problem, hparams, _ = case("mlirl-world")
-    with pytest.raises(ValueError, match="Delete the file to start afresh"):
-        learner.run_in_chunks(
-            module.step, start("mlirl-world"), problem, hparams, num_steps=3, checkpoint=path
-        )
-
-
-def test_unwritable_places_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"cannot write .*none/state\.npz.*choose a directory"):
-        learner.save(tmp_path / "none" / "state.npz", start("toy"))
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match="cannot write"):
-        learner.save(tmp_path / "file" / "state.npz", start("toy"))
-
-
-def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "state.npz"
-    learner.save(path, start("toy"))
-    before = path.read_bytes()
-
-    def fail(file, **arrays):
-        file.write(b"half of it")
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr(learner.np, "savez", fail)
-    with pytest.raises(OSError, match="no space left"):
-        learner.save(path, start("toy", seed=1))
-    assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["state.npz"], "nothing half-written stays"
-
-
-def test_an_interrupted_write_leaves_the_old_file(tmp_path):
-    path = tmp_path / "file"
-    path.write_bytes(b"old")
-    with pytest.raises(KeyboardInterrupt), learner.atomic_write(path) as file:
-        file.write(b"new")
+    def interrupt(done, metrics):
+        seen.append(done)
         raise KeyboardInterrupt
-    assert path.read_bytes() == b"old"
-    assert os.listdir(tmp_path) == ["file"]
-    with learner.atomic_write(path) as file:
-        file.write(b"new")
-        assert path.read_bytes() == b"old", "not before it is complete"
-    assert path.read_bytes() == b"new"
+
+    run = partial(
+        learner.run_in_chunks, module.step, problem=problem, num_steps=6, chunk=3)
+    with pytest.raises(KeyboardInterrupt):
+        run(state=start(name), hparams=hparams, report=interrupt, checkpoint=path)
+    found = run(state=start(name), hparams=hparams, checkpoint=path,
+                report=lambda done, _: seen.append(done))
+    whole = run(state=start(name), hparams=hparams)
+    assert seen == [3, 6]
+    assert_bitwise(found, whole)
+    again = run(state=start(name), hparams=hparams, checkpoint=path)
+    assert_bitwise(again, whole)
+    for changed in ({"hparams": other}, {"hparams": hparams, "problem": nudged(problem)}):
+        with pytest.raises(ValueError, match="does not belong to this run"):
+            run(state=start(name), checkpoint=path, **changed)

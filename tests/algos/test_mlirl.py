@@ -1,5 +1,7 @@
 """Inverse RL: features by hand, gradients of the objective, and the optimum of a small problem."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -171,12 +173,12 @@ def test_the_objective_by_hand():
     loss, parts = mlirl.objective(weights, problem, hparams)
     policy = np.asarray(mlirl.solve(weights, problem, hparams).policy)
     counts = np.asarray(problem.counts)
-    likelihood = (counts[counts > 0] * np.log(policy[counts > 0])).sum()
+    log_likelihood = (counts[counts > 0] * np.log(policy[counts > 0])).sum()
     y = np.asarray(jl.satisfaction_probability(problem.model, jnp.asarray(policy)).value)
-    watched = np.asarray(problem.model.initial) > 0
-    np.testing.assert_allclose(parts.neg_log_likelihood, -likelihood, rtol=1e-10)
-    np.testing.assert_allclose(parts.satisfaction, y[watched].mean(), rtol=1e-7)
-    expected = -likelihood - 3.0 * y[watched].sum() + 0.05 * float(weights @ weights)
+    counted = np.asarray(problem.model.initial) > 0
+    np.testing.assert_allclose(parts.neg_log_likelihood, -log_likelihood, rtol=1e-10)
+    np.testing.assert_allclose(parts.satisfaction, y[counted].mean(), rtol=1e-7)
+    expected = -log_likelihood - 3.0 * y[counted].sum() + 0.05 * float(weights @ weights)
     np.testing.assert_allclose(loss, expected, rtol=1e-8)
 
 
@@ -204,18 +206,18 @@ def test_learning_reaches_the_optimum():
 # --- settings and errors -----------------------------------------------------------------------
 
 
-def test_watched_states():
+def test_states_whose_satisfaction_counts():
     world, demonstrations = grid()
     lazy = jl.product(world, TASK)
     features = jnp.zeros((*lazy.state_shape, 4, 1))
-    initial = mlirl.make_problem(lazy, features, demonstrations).watched
-    np.testing.assert_array_equal(initial, lazy.initial > 0)
-    every = mlirl.make_problem(lazy, features, demonstrations, watched="all").watched
+    problem = partial(mlirl.make_problem, lazy, features, demonstrations)
+    np.testing.assert_array_equal(problem().satisfaction_weight, lazy.initial > 0)
+    every = problem(satisfaction_over="all").satisfaction_weight
     assert every.shape == (6, 3)
     assert every.all()
     weights = np.arange(18.0).reshape(6, 3)
-    mine = mlirl.make_problem(lazy, features, demonstrations, watched=weights).watched
-    np.testing.assert_array_equal(mine, weights)
+    np.testing.assert_array_equal(
+        problem(satisfaction_over=weights).satisfaction_weight, weights)
 
 
 @pytest.mark.parametrize(
@@ -223,8 +225,8 @@ def test_watched_states():
     [
         ({"features": np.zeros((6, 3, 2))}, r"shape \(6, 3, 2\); expected \(6, 4, 'F'\)"),
         ({"features": np.full((6, 4, 1), np.nan)}, r"feature 0 at \(0, 0\) is not finite"),
-        ({"watched": "some"}, "watched='some'; choose"),
-        ({"watched": np.zeros(5)}, r"watched has shape \(5,\); expected \(6,\)"),
+        ({"satisfaction_over": "some"}, "satisfaction_over='some'; choose"),
+        ({"satisfaction_over": np.zeros(5)}, r"_over has shape \(5,\); expected \(6,\)"),
         ({"reward": lambda p, f: f}, r"the reward has shape \(6, 4, 2\); expected \(6, 4\)"),
     ],
 )

@@ -28,6 +28,12 @@ def settings(**changed):
         "discount": 0.6, "reward_bound": 1.0, "epsilon": 1e-4, "restart": 1 / 50, **changed})
 
 
+def learn(key, problem, hparams, moves, num_steps=100_000):
+    """Until the strategy has rested for so many moves."""
+    return rmax.train_until(
+        key, problem, hparams, until=rmax.strategy_rests(moves), num_steps=num_steps)
+
+
 def random_problem(seed, num_states=7, least=2):
     """A random stochastic game whose almost-sure region is neither empty nor all of it."""
     rng = np.random.default_rng(seed)
@@ -125,7 +131,7 @@ def test_observed_moves_are_kept_as_by_plain_bookkeeping(update):
         if n % 10 == 0:  # a new start, or some places would never be seen
             state = state.replace(position=jnp.int32(rng.choice(live)))
         s = int(state.position)
-        play = np.asarray(rmax.strategy(state, problem, hparams))[s]
+        play = np.asarray(rmax.policy(state, problem, hparams))[s]
         if not plain.system[s]:
             play = np.asarray(problem.environment)[s]
         a = int(rng.choice(len(play), p=play / play.sum()))
@@ -174,16 +180,16 @@ def test_a_walk_and_the_same_moves_observed_come_to_the_same():
 
 
 @partial(jax.jit, static_argnames="num_steps")
-def watched(key, problem, hparams, num_steps):
+def followed(key, problem, hparams, num_steps):
     """Whether every strategy of a run passes the graph check, and how many there were."""
     def body(carry, _):
         state, won = carry
         state, _ = rmax.step(state, problem, hparams)
-        play = rmax.strategy(state, problem, hparams)
+        play = rmax.policy(state, problem, hparams)
         return (state, won & rmax.wins_almost_surely(problem, play)), None
 
     state = rmax.init(key, problem, hparams)
-    won = rmax.wins_almost_surely(problem, rmax.strategy(state, problem, hparams))
+    won = rmax.wins_almost_surely(problem, rmax.policy(state, problem, hparams))
     (state, won), _ = jax.lax.scan(body, (state, won), None, length=num_steps)
     return state, won
 
@@ -191,7 +197,7 @@ def watched(key, problem, hparams, num_steps):
 @pytest.mark.parametrize("seeds", [8, pytest.param(100, marks=pytest.mark.exhaustive)])
 def test_every_strategy_on_the_example_wins_almost_surely(seeds):
     keys = jax.random.split(jax.random.key(0), seeds)
-    run = jax.vmap(lambda k: watched(k, example(), settings(), 300))
+    run = jax.vmap(lambda k: followed(k, example(), settings(), 300))
     states, won = run(keys)
     assert won.all() and states.always_almost_sure.all()
     assert (states.num_updates > 200).all()
@@ -202,7 +208,7 @@ def test_every_strategy_in_random_games_wins_almost_surely(games):
     problems = [random_problem(seed)[0] for seed in range(games)]
     keys = jax.random.split(jax.random.key(1), games)
     hparams = settings(known_after=5, moves_per_step=20)
-    states, won = jax.vmap(lambda k, p: watched(k, p, hparams, 150))(keys, stack(problems))
+    states, won = jax.vmap(lambda k, p: followed(k, p, hparams, 150))(keys, stack(problems))
     assert won.all() and states.always_almost_sure.all()
     assert (states.num_updates >= 2).all()
     for i, problem in enumerate(problems):
@@ -235,7 +241,7 @@ def test_the_graph_check_refuses_what_does_not_win():
 def test_with_restarts_nearly_all_states_become_optimal():
     problem, hparams = example(), settings()
     keys = jax.random.split(jax.random.key(7), 10)
-    learned = jax.vmap(lambda k: rmax.train_until(k, problem, hparams, quiet=10_000))(keys)
+    learned = jax.vmap(lambda k: learn(k, problem, hparams, 10_000))(keys)
     jl.check(learned)
     for i in range(10):
         found = rmax.evidence(lane(learned.state, i), problem, hparams)
@@ -251,7 +257,7 @@ def test_with_restarts_nearly_all_states_become_optimal():
 
 def test_without_restarts_what_recurs_becomes_optimal():
     problem, hparams = example(), settings(restart=0.0)
-    learned = rmax.train_until(jax.random.key(0), problem, hparams, quiet=10_000)
+    learned = learn(jax.random.key(0), problem, hparams, 10_000)
     found = rmax.evidence(learned.state, problem, hparams)
     mine = np.asarray(found.reachable & problem.game.system)
     assert 15 <= np.asarray(found.epsilon_optimal)[mine].sum() <= 35
@@ -264,7 +270,7 @@ def test_the_printed_update_fails_where_the_corrected_one_does_not():
     worth = {}
     for update in rmax.UPDATES:
         hparams = settings(known_after=50, update=update, restart=0.0)
-        learned = rmax.train_until(jax.random.key(0), problem, hparams, quiet=20_000)
+        learned = learn(jax.random.key(0), problem, hparams, 20_000)
         found = rmax.evidence(learned.state, problem, hparams)
         worth[update] = float(found.worst.value[0])
         assert float(found.optimal.value[0]) == pytest.approx(1.25)
@@ -278,7 +284,7 @@ def test_a_seldom_successor_seen_late_still_counts():
     mdp = jl.make_mdp([[[0, 1]], [[0, 0]]], [[[0.97, 0.03]], [[1, 0]]], initial=[1, 0])
     problem = rmax.make_problem(mdp, np.array([True, True]), np.array([[0.2], [0.6]]))
     hparams = settings(known_after=2, restart=0.0)
-    learned = rmax.train_until(jax.random.key(0), problem, hparams, quiet=5000)
+    learned = learn(jax.random.key(0), problem, hparams, 5000)
     assert learned.state.num_updates == 3
     assert (learned.state.reward[0, 0] == jnp.array([0.2, 0.2])).all()
     found = rmax.evidence(learned.state, problem, hparams)
@@ -295,7 +301,7 @@ def test_a_formula_on_a_markov_decision_process():
     problem = rmax.make_problem(world, "G !p & G F s", reward)
     assert (problem.base_state != 8).all() or not problem.region[problem.base_state == 8].any()
     hparams = settings(known_after=200, epsilon=0.2, restart=0.05)
-    learned = rmax.train_until(jax.random.key(0), problem, hparams, quiet=50_000)
+    learned = learn(jax.random.key(0), problem, hparams, 50_000)
     found = rmax.evidence(learned.state, problem, hparams)
     assert found.almost_sure
     assert found.epsilon_optimal[found.reachable].mean() > 0.8
@@ -310,7 +316,7 @@ def test_the_adversary_plays_the_minimax_answer():
     theirs = ~np.asarray(found.game.system)
     np.testing.assert_array_equal(
         np.asarray(problem.environment).argmax(1)[theirs], np.asarray(optimal.policy)[theirs])
-    learned = rmax.train_until(jax.random.key(0), problem, settings(), quiet=5000)
+    learned = learn(jax.random.key(0), problem, settings(), 5000)
     evidence = rmax.evidence(learned.state, problem, settings())
     mine = np.asarray(evidence.reachable & problem.game.system)
     assert np.asarray(evidence.epsilon_optimal_met)[mine].sum() >= 30
@@ -325,7 +331,7 @@ def test_the_constants_of_the_theorem_are_used():
     assert explore == pytest.approx(5.33333e-7, rel=1e-5)
     state = rmax.init(jax.random.key(0), example(), hparams)
     assert float(state.value.max()) == pytest.approx(1 / 0.4**2)
-    first = rmax.strategy(state, example(), hparams)
+    first = rmax.policy(state, example(), hparams)
     number = np.asarray(example().allowed.sum(1))
     mine = np.asarray(example().game.system)
     np.testing.assert_allclose(np.asarray(first).max(1)[mine], 1 / number[mine])
@@ -342,7 +348,7 @@ def test_lanes_of_different_settings_are_as_if_alone():
         discount=None, reward_bound=None, epsilon=0, failure=None, known_after=0, restart=None,
         moves_per_step=10)
     keys = jax.random.split(jax.random.key(0), 2)
-    train = partial(rmax.train_until, quiet=200, max_moves=2000)
+    train = partial(rmax.train_until, until=rmax.strategy_rests(200), num_steps=2000)
     nested = jax.vmap(jax.vmap(train, (None, None, axes)), (0, None, None))(keys, problem, hparams)
     for i in range(2):
         for j in range(3):
@@ -356,10 +362,10 @@ def test_lanes_of_different_settings_are_as_if_alone():
 
 def test_new_numbers_do_not_retrace():
     problem, _ = random_problem(5)
-    rmax.train_until(jax.random.key(0), problem, settings(known_after=3), quiet=50)
+    learn(jax.random.key(0), problem, settings(known_after=3), 50)
     with counted_traces() as traced:
-        rmax.train_until(
-            jax.random.key(1), problem, settings(known_after=9, epsilon=0.3), quiet=70)
+        learn(
+            jax.random.key(1), problem, settings(known_after=9, epsilon=0.3), 70)
     assert not traced
 
 
@@ -368,7 +374,7 @@ def test_single_precision():
     with jax.enable_x64(False):
         found = patrol()
         problem = rmax.make_problem(found.game, found.accepting, found.reward)
-        learned = rmax.train_until(jax.random.key(0), problem, settings(), quiet=10_000)
+        learned = learn(jax.random.key(0), problem, settings(), 10_000)
         assert learned.state.value.dtype == jnp.float32
         evidence = rmax.evidence(learned.state, problem, settings(epsilon=1e-3))
         mine = np.asarray(evidence.reachable & problem.game.system)
@@ -376,11 +382,12 @@ def test_single_precision():
 
 
 def test_how_a_run_ends():
-    done = rmax.train_until(jax.random.key(0), example(), settings(), quiet=500)
+    done = learn(jax.random.key(0), example(), settings(), 500)
     assert done.status == Status.CONVERGED
-    assert done.state.moves == done.state.last_update + 500
-    short = rmax.train_until(jax.random.key(0), example(), settings(), quiet=500, max_moves=100)
-    assert short.status == Status.MAX_STEPS and short.state.moves == 100
+    rested = done.state.moves - done.state.last_update
+    assert 500 <= rested < 500 + settings().moves_per_step
+    short = learn(jax.random.key(0), example(), settings(), 500, num_steps=3)
+    assert short.status == Status.MAX_STEPS and short.num_steps == short.state.step == 3
 
 
 # --- mistakes ---------------------------------------------------------------------------------
@@ -400,12 +407,12 @@ def test_a_start_outside_the_region_is_told():
 
 def test_rewards_out_of_bounds_are_told():
     problem = rmax.make_problem(*patrol()[:2], np.asarray(patrol().reward) * 3)
-    learned = rmax.train_until(jax.random.key(0), problem, settings(), quiet=100)
+    learned = learn(jax.random.key(0), problem, settings(), 100)
     s, a = divmod(int(learned.state.fault), 6)
     assert problem.reward[s, a] == 3
     with pytest.raises(ValueError, match=rf"state {s}, action {a}: a reward of 3 .*bound=1"):
         rmax.evidence(learned.state, problem, settings())
-    fine = rmax.train_until(jax.random.key(0), problem, settings(reward_bound=3.0), quiet=100)
+    fine = learn(jax.random.key(0), problem, settings(reward_bound=3.0), 100)
     assert fine.state.fault == -1
     for reward in (-0.1, 1.5, float("nan")):
         with pytest.raises(ValueError, match="was observed"):

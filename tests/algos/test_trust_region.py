@@ -414,27 +414,27 @@ def test_divergence_and_density_are_those_of_gaussians():
     np.testing.assert_allclose(one - two, exact[0] - exact[1], atol=1e-9)
 
 
-def plain_advantages(signal, value, length, discount, trace):
+def plain_advantages(signal, value, length, discount, gae_lambda):
     found = np.zeros_like(signal)
     for t in range(length):
         for k in range(t, length):
             after = value[k + 1] if k + 1 < length else 0.0
             error = signal[k] + discount * after - value[k]
-            found[t] += (discount * trace) ** (k - t) * error
+            found[t] += (discount * gae_lambda) ** (k - t) * error
     return found
 
 
-@pytest.mark.parametrize(("discount", "trace"), [(0.9, 0.8), (1.0, 1.0), (0.5, 0.0)])
-def test_advantages_are_their_sums(discount, trace):
+@pytest.mark.parametrize(("discount", "gae_lambda"), [(0.9, 0.8), (1.0, 1.0), (0.5, 0.0)])
+def test_advantages_are_their_sums(discount, gae_lambda):
     rng = np.random.default_rng(0)
     signal, value = rng.normal(size=(2, 6, 4))
     lengths = [6, 1, 3, 0]
     valid = np.arange(6)[:, None] < np.array(lengths)
     found = trust_region.advantages(
-        jnp.where(valid, signal, 0), jnp.asarray(value), jnp.asarray(valid), discount, trace
+        jnp.where(valid, signal, 0), jnp.asarray(value), jnp.asarray(valid), discount, gae_lambda
     )
     for i, length in enumerate(lengths):
-        plain = plain_advantages(signal[:, i], value[:, i], length, discount, trace)
+        plain = plain_advantages(signal[:, i], value[:, i], length, discount, gae_lambda)
         np.testing.assert_allclose(found[:, i], plain, atol=1e-12)
 
 
@@ -488,7 +488,7 @@ def test_trajectories_end_where_they_are_done():
     mean = trust_region.rollout(
         jax.random.key(1), state, problem, SMALL, num_trajectories=6, sampled=False
     )
-    expected, _ = trust_region.policy(state, SMALL, batch.observation[0])
+    expected, _ = trust_region.act(state, SMALL, batch.observation[0])
     np.testing.assert_allclose(mean.action[0], expected)
 
 
@@ -541,7 +541,7 @@ def end(state, problem, hparams, number=500, sampled=False):
 
 
 def chosen(state):
-    mean, _ = trust_region.policy(state, ONE, jnp.ones(1))
+    mean, _ = trust_region.act(state, ONE, jnp.ones(1))
     return float(mean[0])
 
 
@@ -655,7 +655,8 @@ def test_the_pendulum_swings_up():
     problem = trust_region.make_problem(
         pendulum_reset, pendulum_step, pendulum_observe, num_actions=1, horizon=200
     )
-    hparams = Hparams(discount=0.99, method="trpo", num_trajectories=32, delta=0.02, trace=0.95)
+    hparams = Hparams(
+        discount=0.99, method="trpo", num_trajectories=32, delta=0.02, gae_lambda=0.95)
     with jax.enable_x64(False):
         start = trust_region.init(jax.random.key(0), problem, hparams)
         assert end(start, problem, hparams)[0] < -1000
@@ -670,8 +671,8 @@ def test_new_worlds_limits_and_settings_do_not_retrace():
     start = trust_region.init(jax.random.key(0), counted(), SMALL)
     _, one = two_steps(start, counted())
     other = SMALL.replace(
-        discount=0.8, delta=0.02, trace=0.5, damping=0.1, backtrack=0.5, value_rate=0.1,
-        cost_discount=0.9, cost_trace=0.3, initial_deviation=0.5,
+        discount=0.8, delta=0.02, gae_lambda=0.5, damping=0.1, backtrack=0.5, value_rate=0.1,
+        cost_discount=0.9, cost_gae_lambda=0.3, initial_deviation=0.5,
     )
     problem = counted(last=2.0, limit=3.0)
     with counted_traces() as traced:

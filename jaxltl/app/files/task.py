@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-
 from jaxltl.app.files.tables import (
     COUNT,
     LEGEND,
@@ -124,7 +123,7 @@ _KEYS: dict[str, dict[str, Rule]] = {
         "tolerance": number_in(0),
         "start": Rule(lambda v: is_list(v, int | float), "a list of numbers, one per feature"),  # type: ignore[arg-type]
         "start_scale": number_in(0),
-        "watched": choice("initial", "all"),
+        "satisfaction_over": choice("initial", "all"),
         "avoid": NAMES,
         "goal": NAMES,
         "progress": Rule(
