@@ -18,6 +18,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.host.components import strong_components
+
 Integers: TypeAlias = NDArray[np.integer[Any]]
 Condition: TypeAlias = tuple[Any, ...]  # see `holds`
 
@@ -73,17 +75,6 @@ def parity_condition(num_priorities: int) -> Condition:
         else:
             condition = ("and", ("fin", color), condition)
     return condition
-
-
-def strong_components(source: Integers, target: Integers, count: int) -> Integers:
-    """The number of the strongly connected component of each of `count` nodes."""
-    from scipy import sparse
-    from scipy.sparse import csgraph
-
-    edges = sparse.csr_array(
-        (np.ones(len(source), np.int8), (source, target)), shape=(count, count)
-    )
-    return np.asarray(csgraph.connected_components(edges, connection="strong")[1])
 
 
 def to_parity(

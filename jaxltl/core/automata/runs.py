@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.host.components import reached, strong_components
 
 Lasso = tuple[list[frozenset[str]], list[frozenset[str]]]
 
@@ -282,11 +283,10 @@ def _graph(delta: NDArray[np.int32], allowed: NDArray[np.bool_]) -> Any:
     return graph
 
 
-def _components(delta: NDArray[np.int32], allowed: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """int32 `[N]`, the strongly connected component of each node by allowed transitions."""
-    from scipy.sparse.csgraph import connected_components
-
-    return connected_components(_graph(delta, allowed), connection="strong")[1]
+def _components(delta: NDArray[np.int32], allowed: NDArray[np.bool_]) -> NDArray[np.integer[Any]]:
+    """int `[N]`, the strongly connected component of each node by allowed transitions."""
+    source = np.repeat(np.arange(len(delta)), allowed.sum(axis=1))
+    return strong_components(source, delta[allowed], len(delta))
 
 
 def _path(
@@ -310,15 +310,5 @@ def _path(
 
 def _reaching(delta: NDArray[np.int32], goal: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """bool `[N]`, the nodes that have a path to a goal."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import breadth_first_order
-
-    # Backwards from one extra node, whose successors are the goals.
-    count, width = delta.shape
-    starts, sources = np.flatnonzero(goal), np.repeat(np.arange(count), width)
-    rows = np.concatenate([delta.ravel(), np.full(len(starts), count)])
-    columns = np.concatenate([sources, starts])
-    backward = csr_array((np.ones(len(rows)), (rows, columns)), shape=(count + 1, count + 1))
-    reached = np.zeros(count + 1, bool)
-    reached[breadth_first_order(backward, count, return_predecessors=False)] = True
-    return reached[:count]
+    sources = np.repeat(np.arange(len(delta)), delta.shape[1])
+    return reached(delta.ravel(), sources, goal)

@@ -8,16 +8,14 @@ for ever.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
 from jaxltl.core.games.objective import GR1
-from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.graphs.support import repeat
-from jaxltl.core.models.game import Game
-from jaxltl.core.models.operators import exists_successor, first_action, forall_successor
+from jaxltl.core.graphs.attractor import attract
+from jaxltl.core.graphs.graph import Graph
 
 
 class Reactive(NamedTuple):
@@ -47,117 +45,120 @@ class Layers(NamedTuple):
     round: jax.Array
 
 
-NEVER = jnp.iinfo(jnp.int32).max
+NEVER = np.iinfo(np.int32).max
 
 
-def solve_gr1(game: Game, objective: GR1, moves: jax.Array | None = None) -> Reactive:
+class _Arena(NamedTuple):
+    """Whose turn it is on a graph, and what the system is to achieve."""
+
+    graph: Graph
+    system: Any
+    objective: GR1
+
+
+def solve_gr1(graph: Graph, system: Any, objective: GR1, moves: Any = None) -> Reactive:
     """From where the system achieves a GR(1) objective, and winning strategies of both.
 
     Args:
-      game: the game.
+      graph: the game's graph.
+      system: ``bool[S]``, whose turn it is.
       objective: what the system is to achieve.
       moves: ``bool[S, A]``, those that there are; default the available ones.
 
     Returns:
       :class:`Reactive`.
     """
+    xp, arena = graph.xp, _Arena(graph, system, objective)
     num_guarantees, num_assumptions = len(objective.guarantees), len(objective.assumptions)
-    moves = game.available if moves is None else moves
-    _, first = first_action(moves)
-    actions = jnp.repeat(first[None], num_guarantees, axis=0)
-    counters = jnp.repeat(first[None], num_assumptions, axis=0)
+    moves = graph.available if moves is None else moves & graph.available
+    _, first = graph.first(moves)
 
     def body(carry):
         inside, actions, counters, _ = carry
-        before = inside
+        before, actions = inside, list(actions)
         for j in range(num_guarantees):
-            inside, counters = _keep(game, moves, inside, counters)
-            allowed = _within(game, moves, inside)
-            found, action = _pursue(game, objective, j, inside, allowed)
-            actions = actions.at[j].set(action)
-            against = _prevent(game, objective, inside, allowed, found)
-            counters = jnp.where(inside & ~found, against, counters)
+            inside, counters = _keep(arena, moves, inside, counters)
+            allowed = _within(arena, moves, inside)
+            found, actions[j] = _pursue(arena, j, inside, allowed)
+            against = _prevent(arena, inside, allowed, found)
+            counters = xp.where(inside & ~found, against, counters)
             inside = found
-        return inside, actions, counters, jnp.any(inside != before)
+        return inside, tuple(actions), counters, xp.any(inside != before)
 
-    start = (~objective.lost, actions, counters, jnp.bool_(True))
-    region, actions, counters, _ = repeat(body, start, (game, objective))
-    return Reactive(region, jnp.moveaxis(actions, 0, -1), jnp.moveaxis(counters, 0, -1))
+    counters = xp.stack([first] * num_assumptions)
+    start = (~objective.lost, (first,) * num_guarantees, counters, xp.asarray(True))
+    region, actions, counters, _ = graph.repeat(body, start)
+    return Reactive(region, xp.stack(actions, axis=-1), xp.moveaxis(counters, 0, -1))
 
 
-def _keep(
-    game: Game, moves: jax.Array, inside: jax.Array, counters: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _keep(arena: _Arena, moves: Any, inside: Any, counters: Any) -> tuple[Any, Any]:
     """The part of a set that the environment cannot force the play out of."""
-    out = attractor(game, ~inside, moves, rule=~game.system, among=inside)
-    return inside & ~out.region, jnp.where(inside & out.region, out.action, counters)
+    graph, system, _ = arena
+    out = attract(graph, ~inside, moves, rule=~system, among=inside)
+    return inside & ~out.region, graph.xp.where(inside & out.region, out.action, counters)
 
 
-def _within(game: Game, moves: jax.Array, inside: jax.Array) -> jax.Array:
+def _within(arena: _Arena, moves: Any, inside: Any) -> Any:
     """The system's moves that surely stay inside, and all of the environment's."""
-    return moves & (forall_successor(game, inside) | ~game.system[..., None])
+    return moves & (arena.graph.forall(inside) | ~arena.system[..., None])
 
 
-def _near(game: Game, found: jax.Array) -> jax.Array:
+def _near(arena: _Arena, found: Any) -> Any:
     """The environment's moves that may lead to a set: ``bool[S, A]``. They help the system."""
-    return exists_successor(game, found) & ~game.system[..., None]
+    return arena.graph.exists(found) & ~arena.system[..., None]
 
 
-def _pursue(
-    game: Game, objective: GR1, j: int, inside: jax.Array, allowed: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _pursue(arena: _Arena, j: int, inside: Any, allowed: Any) -> tuple[Any, Any]:
     """Where the system, without leaving a set, meets guarantee j or an assumption fails.
 
     Returns:
       ``bool[S]``, and the system's moves there, ``int32[S]``.
     """
-    goal = inside & objective.guarantees[j]
+    graph, system, objective = arena
+    xp = graph.xp
 
     def body(carry):
         found, action, _ = carry
-        near = attractor(game, found, allowed, rule=game.system, among=inside)
-        action = jnp.where(near.region & ~found, near.action, action)
+        near = attract(graph, found, allowed, rule=system, among=inside)
+        action = xp.where(near.region & ~found, near.action, action)
         grown = near.region
         for i in range(len(objective.assumptions)):
-            covered = _waiting(game, objective, i, inside, allowed, near.region, near.region)
-            stays = first_action(allowed & forall_successor(game, covered))[1]
-            action = jnp.where(covered & ~grown, stays, action)
+            covered = _waiting(arena, i, inside, allowed, near.region, near.region)
+            stays = graph.first(allowed & graph.forall(covered))[1]
+            action = xp.where(covered & ~grown, stays, action)
             grown = grown | covered
-        return grown, action, jnp.any(grown != near.region)
+        return grown, action, xp.any(grown != near.region)
 
-    _, first = first_action(allowed)
-    found, action, _ = repeat(body, (goal, first, jnp.bool_(True)), (game, objective, inside))
+    goal = inside & objective.guarantees[j]
+    start = (goal, graph.first(allowed)[1], xp.asarray(True))
+    found, action, _ = graph.repeat(body, start)
     return found, action
 
 
-def _waiting(
-    game: Game, objective: GR1, i: int, inside: jax.Array, allowed: jax.Array, near: jax.Array,
-    found: jax.Array,
-) -> jax.Array:
+def _waiting(arena: _Arena, i: int, inside: Any, allowed: Any, near: Any, found: Any) -> Any:
     """Where assumption i fails for as long as the play is not near to a set `found`."""
     missed = inside & ~near
-    forced = attractor(
-        game, ~inside | (missed & objective.assumptions[i]),
-        allowed & ~_near(game, found), rule=~game.system, among=missed,
+    forced = attract(
+        arena.graph, ~inside | (missed & arena.objective.assumptions[i]),
+        allowed & ~_near(arena, found), rule=~arena.system, among=missed,
     )
     return inside & ~forced.region
 
 
-def _prevent(
-    game: Game, objective: GR1, inside: jax.Array, allowed: jax.Array, found: jax.Array
-) -> jax.Array:
+def _prevent(arena: _Arena, inside: Any, allowed: Any, found: Any) -> Any:
     """The environment's moves, ``int32[M, S]``, that meet every assumption and avoid a set."""
+    graph, system, objective = arena
     missed = inside & ~found
-    allowed = allowed & ~_near(game, found)
+    allowed = allowed & ~_near(arena, found)
     moves = []
     for assumption in objective.assumptions:
         goal = missed & assumption
-        towards = attractor(game, ~inside | goal, allowed, rule=~game.system, among=missed)
-        moves.append(jnp.where(goal, first_action(allowed)[1], towards.action))
-    return jnp.stack(moves)
+        towards = attract(graph, ~inside | goal, allowed, rule=~system, among=missed)
+        moves.append(graph.xp.where(goal, graph.first(allowed)[1], towards.action))
+    return graph.xp.stack(moves)
 
 
-def gr1_layers(game: Game, objective: GR1) -> Layers:
+def gr1_layers(graph: Graph, system: Any, objective: GR1) -> Layers:
     """The rounds of the triple fixpoint, one step a round, in the region.
 
     In round r with Y what is covered before, layer (r, i) is the greatest X from which the
@@ -165,33 +166,35 @@ def gr1_layers(game: Game, objective: GR1) -> Layers:
     probability, or stays in X where assumption i does not hold.
 
     Args:
-      game: the game.
+      graph: the game's graph.
+      system: ``bool[S]``, whose turn it is.
       objective: the objective.
 
     Returns:
       :class:`Layers`.
     """
-    region = solve_gr1(game, objective).region
-    allowed = _within(game, game.available, region)
+    xp, arena = graph.xp, _Arena(graph, system, objective)
+    region = solve_gr1(graph, system, objective).region
+    allowed = _within(arena, graph.available, region)
     rows = []
     for j in range(len(objective.guarantees)):
         goal = region & objective.guarantees[j]
 
         def body(carry, goal=goal):
             found, rounds, n, _ = carry
-            leads = allowed & exists_successor(game, found)
-            some, all_ = first_action(leads)[0], ~first_action(allowed & ~leads)[0]
-            near = goal | (region & jnp.where(game.system, some, all_))
-            covered = jnp.stack([
-                _waiting(game, objective, i, region, allowed, near, found)
+            leads = allowed & graph.exists(found)
+            some, all_ = graph.first(leads)[0], ~graph.first(allowed & ~leads)[0]
+            near = goal | (region & xp.where(system, some, all_))
+            covered = xp.stack([
+                _waiting(arena, i, region, allowed, near, found)
                 for i in range(len(objective.assumptions))
             ])
-            rounds = jnp.where(covered & (rounds == NEVER), n, rounds)
+            rounds = xp.where(covered & (rounds == NEVER), n, rounds)
             grown = found | covered.any(0)
-            return grown, rounds, n + 1, jnp.any(grown != found)
+            return grown, rounds, n + 1, xp.any(grown != found)
 
-        none = jnp.zeros(game.state_shape, bool)
-        rounds = jnp.full((len(objective.assumptions), *game.state_shape), NEVER, jnp.int32)
-        start = (none, rounds, jnp.int32(0), jnp.bool_(True))
-        rows.append(repeat(body, start, (game, objective, region))[1])
-    return Layers(region, jnp.stack(rows))
+        none = xp.zeros(graph.state_shape, bool)
+        rounds = xp.full((len(objective.assumptions), *graph.state_shape), NEVER, np.int32)
+        start = (none, rounds, xp.int32(0), xp.asarray(True))
+        rows.append(graph.repeat(body, start)[1])
+    return Layers(region, xp.stack(rows))

@@ -12,12 +12,12 @@ from typing import Any, TypeAlias
 
 import chex
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models.concrete import is_traced, namespace, to_jax
 
 States: TypeAlias = chex.Array | Formula | str  # a set of states
 
@@ -76,46 +76,45 @@ def states_where(model: Any, condition: States, place: str = "condition") -> jax
       [True, False]
     """
     if isinstance(condition, str) and condition in ("true", "false"):
-        return jnp.full(model.state_shape, condition == "true")  # of traced games too
+        # Of traced games too.
+        return to_jax(np.full(model.state_shape, condition == "true"))
     if isinstance(condition, str | Formula):
         world = model
         while hasattr(world, "mdp"):
             world = world.mdp
         holds = satisfying(np.asarray(world.label), world.propositions, condition, place)
         extra = len(model.state_shape) - 1
-        return jnp.broadcast_to(holds.reshape(-1, *(1,) * extra), model.state_shape)
-    condition = jnp.asarray(condition)
+        holds = np.asarray(holds).reshape(-1, *(1,) * extra)
+        return to_jax(np.broadcast_to(holds, model.state_shape))
+    _, condition = namespace(condition if is_traced(condition) else np.asarray(condition))
     if condition.shape != model.state_shape or condition.dtype != bool:
         raise ValueError(
             f"{place} is {condition.dtype}{list(condition.shape)}; give "
             f"bool{list(model.state_shape)}, or a Boolean formula over propositions."
         )
-    return condition
+    return to_jax(condition)
 
 
 def safety(game: Any, safe: States) -> Parity:
     """Stay in `safe` for ever: ``G safe``."""
-    return _parity(game, 0, 1, lost=~states_where(game, safe, "safe"))
+    return _parity(game, 0, 1, safe)
 
 
 def reach(game: Any, goal: States, *, safe: States = "true") -> Parity:
     """Reach `goal`, through `safe` states until then: ``safe U goal``."""
-    goal = states_where(game, goal, "goal")
-    return _parity(game, 1, 2, won=goal, lost=~goal & ~states_where(game, safe, "safe"))
+    return _parity(game, 1, 2, safe, won=states_where(game, goal, "goal"))
 
 
 def buchi(game: Any, accepting: States, *, safe: States = "true") -> Parity:
     """Meet `accepting` infinitely often and stay in `safe`: ``G F accepting & G safe``."""
-    accepting = states_where(game, accepting, "accepting")
-    lost = ~states_where(game, safe, "safe")
-    return _parity(game, jnp.where(accepting, 0, 1), 2, lost=lost)
+    xp, accepting = namespace(states_where(game, accepting, "accepting"))
+    return _parity(game, xp.where(accepting, 0, 1), 2, safe)
 
 
 def cobuchi(game: Any, persistent: States, *, safe: States = "true") -> Parity:
     """Stay in `persistent` from some point on: ``F G persistent & G safe``."""
-    persistent = states_where(game, persistent, "persistent")
-    lost = ~states_where(game, safe, "safe")
-    return _parity(game, jnp.where(persistent, 2, 1), 3, lost=lost)
+    xp, persistent = namespace(states_where(game, persistent, "persistent"))
+    return _parity(game, xp.where(persistent, 2, 1), 3, safe)
 
 
 def parity(
@@ -143,15 +142,20 @@ def parity(
             raise ValueError(f"state {state.tolist()} has priority {values.min()}; "
                              "priorities start at 0.")
         num_priorities = int(values.max(initial=0)) + 1
-    return _parity(game, priority, num_priorities, lost=~states_where(game, safe, "safe"))
+    return _parity(game, priority, num_priorities, safe)
 
 
-def _parity(game, priority, num_priorities: int, *, won=None, lost=None) -> Parity:
-    none = jnp.zeros(game.state_shape, bool)
+def _parity(
+    game: Any, priority: Any, num_priorities: int, safe: States, won: jax.Array | None = None
+) -> Parity:
+    """Priorities, and what is won; unsafe states that are not won are lost."""
+    priority = priority if is_traced(priority) else np.asarray(priority)
+    won = np.zeros(game.state_shape, bool) if won is None else won
+    xp, priority, won, safe = namespace(priority, won, states_where(game, safe, "safe"))
     return Parity(
-        priority=jnp.broadcast_to(jnp.asarray(priority, jnp.int32), game.state_shape),
-        won=none if won is None else won,
-        lost=none if lost is None else lost,
+        priority=to_jax(xp.broadcast_to(priority.astype(np.int32), game.state_shape)),
+        won=to_jax(won),
+        lost=to_jax(~safe & ~won),
         num_priorities=num_priorities,
     )
 
@@ -183,10 +187,12 @@ def gr1(
         if isinstance(sets, str | Formula):
             raise ValueError(f"{name} is {str(sets)!r}; give a list of sets of states.")
         found = [states_where(game, x, f"{name}[{i}]") for i, x in enumerate(sets)]
-        return jnp.stack(found or [jnp.ones(game.state_shape, bool)])
+        xp, *found = namespace(*found or [np.ones(game.state_shape, bool)])
+        return to_jax(xp.stack(found))
 
+    _, inside = namespace(states_where(game, safe, "safe"))
     return GR1(
         assumptions=rows(assumptions, "assumptions"),
         guarantees=rows(guarantees, "guarantees"),
-        lost=~states_where(game, safe, "safe"),
+        lost=to_jax(~inside),
     )

@@ -7,27 +7,25 @@ its mask is therefore correct from the first move on.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import chex
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.games.gr1 import NEVER, gr1_layers
+from jaxltl.core.games.gr1 import NEVER, gr1_layers, solve_gr1
 from jaxltl.core.games.objective import GR1, Parity
-from jaxltl.core.games.winning import objective_at, on_states, solve
-from jaxltl.core.graphs.attractor import attractor
+from jaxltl.core.games.winning import objective_at, on_states, solve_parity
+from jaxltl.core.graphs.attractor import attract
+from jaxltl.core.graphs.graph import graph_of
+from jaxltl.core.host.graph import HostGraph
+from jaxltl.core.host.rows import first_action
 from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models import operators
+from jaxltl.core.models.concrete import namespace, to_jax
 from jaxltl.core.models.game import Game, as_game
-from jaxltl.core.models.operators import (
-    first_action,
-    forall_successor,
-    is_deterministic,
-    least_successor,
-)
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.restrict import Restriction, restrict
 
@@ -109,19 +107,23 @@ def permissive_strategy(
     if bound is not None and bound < 1:
         raise ValueError(f"bound={bound}; it must be at least 1.")
     game, objective = on_states(as_game(game), spec)
-    if isinstance(objective, Parity) and not _closed(game, objective.won):
+    graph = _concrete_graph(game, objective)
+    game, objective = jax.tree.map(np.asarray, (game, objective))
+    if isinstance(objective, Parity) and not _closed(graph, objective.won):
         game, objective, origin = _remember_won(game, objective)
         found = permissive_strategy(game, objective, method=method, bound=bound)
+        state = np.asarray(found.base_state)
         return replace(
-            found, base_state=origin.base_state[found.base_state],
-            automaton_state=origin.memory[found.base_state],
+            found, base_state=to_jax(origin.base_state[state]),
+            automaton_state=to_jax(origin.memory[state]),
         )
     if isinstance(objective, Parity):
         objective = _without_won(objective)
-    region = solve(game, objective).region
+    arena = _Arena(game, graph, objective)
+    region = _region(arena)
     _require_start(game, region)
-    stay = _staying(game, region)
-    maximal = _always_wins(game, objective, region, stay)
+    stay = _staying(graph, region)
+    maximal = _always_wins(arena, region, stay)
     if method == "auto":
         method = _choose(objective, maximal, bound)
     if method == "stay":
@@ -134,7 +136,7 @@ def permissive_strategy(
                    "maximal: every run that stays in the winning region wins, so it includes "
                    "every winning strategy")
     build = {"rank": _by_rank, "counter": _by_counter, "parity": _by_parity}[method]
-    return build(game, objective, region, stay, bound)
+    return build(arena, region, stay, bound)
 
 
 def apply_strategy(strategy: Permissive) -> Restriction:
@@ -147,7 +149,8 @@ def apply_strategy(strategy: Permissive) -> Restriction:
       A :class:`~jaxltl.core.models.restrict.Restriction`; ``base_state`` and ``memory`` number the
       states of ``strategy.game``.
     """
-    initial = jnp.where(strategy.region, strategy.game.initial, 0)
+    region, initial = np.asarray(strategy.region), np.asarray(strategy.game.initial)
+    initial = np.where(region, initial, 0)
     return restrict(strategy.game, initial / initial.sum(), allowed=strategy.mask)
 
 
@@ -171,37 +174,59 @@ def shield(policy: jax.Array, mask: jax.Array) -> jax.Array:
       >>> shield(jnp.array([[0.5, 0.25, 0.25]]), jnp.array([[False, True, True]])).tolist()
       [[0.0, 0.5, 0.5]]
     """
-    if not isinstance(mask, jax.core.Tracer) and not np.any(np.asarray(mask)):
+    xp, policy, mask = namespace(policy, mask)
+    if xp is np and not mask.any():
         raise ValueError("the mask allows no move in any state; the specification is "
                          "unrealizable, or the mask is of another game.")
-    some, first = first_action(mask)
-    if is_deterministic(policy):
-        if jnp.shape(policy) != mask.shape[:-1]:
-            raise ValueError(f"policy has shape {jnp.shape(policy)}; the mask's states have "
+    some, first = (first_action if xp is np else operators.first_action)(mask)
+    if operators.is_deterministic(policy):
+        if policy.shape != mask.shape[:-1]:
+            raise ValueError(f"policy has shape {policy.shape}; the mask's states have "
                              f"{mask.shape[:-1]}.")
-        allowed = jnp.take_along_axis(mask, policy[..., None], axis=-1)[..., 0]
-        return jnp.where(allowed | ~some, policy, first)
-    if jnp.shape(policy) != mask.shape:
-        raise ValueError(f"policy has shape {jnp.shape(policy)}; the mask has {mask.shape}.")
-    kept = jnp.where(mask, policy, 0)
+        allowed = xp.take_along_axis(mask, policy[..., None], axis=-1)[..., 0]
+        return to_jax(xp.where(allowed | ~some, policy, first.astype(policy.dtype)))
+    if policy.shape != mask.shape:
+        raise ValueError(f"policy has shape {policy.shape}; the mask has {mask.shape}.")
+    kept = xp.where(mask, policy, 0)
     total = kept.sum(-1, keepdims=True)
-    uniform = mask / jnp.maximum(mask.sum(-1, keepdims=True), 1)
-    shielded = jnp.where(total > 0, kept / jnp.where(total > 0, total, 1), uniform)
-    return jnp.where(some[..., None], shielded, policy)
+    uniform = (mask / xp.maximum(mask.sum(-1, keepdims=True), 1)).astype(policy.dtype)
+    shielded = xp.where(total > 0, kept / xp.where(total > 0, total, 1), uniform)
+    return to_jax(xp.where(some[..., None], shielded, policy))
 
 
 # --- what all methods share -------------------------------------------------------------------
 
 
-def _staying(game: Game, region: jax.Array) -> jax.Array:
-    return game.available & region[..., None] & forall_successor(game, region)
+class _Arena(NamedTuple):
+    """A game with NumPy's arrays, its graph, and what the system is to achieve."""
+
+    game: Game
+    graph: HostGraph
+    objective: Any
 
 
-def _wins_somewhere(game: Game, region: jax.Array) -> bool:
+def _concrete_graph(game: Game, objective: Any = None) -> HostGraph:
+    graph = graph_of(game, objective)
+    if not isinstance(graph, HostGraph):
+        raise ValueError("permissive strategies are built on the host: call permissive_strategy "
+                         "outside of jit and vmap, on an MDP, a DenseMDP or a Product.")
+    return graph
+
+
+def _region(arena: _Arena) -> np.ndarray:
+    solve = solve_gr1 if isinstance(arena.objective, GR1) else solve_parity
+    return solve(arena.graph, arena.game.system, arena.objective).region
+
+
+def _staying(graph: HostGraph, region: np.ndarray) -> np.ndarray:
+    return graph.available & region[..., None] & graph.forall(region)
+
+
+def _wins_somewhere(game: Game, region: np.ndarray) -> bool:
     return bool(np.asarray(region)[np.asarray(game.initial) > 0].any())
 
 
-def _require_start(game: Game, region: jax.Array) -> None:
+def _require_start(game: Game, region: np.ndarray) -> None:
     if not _wins_somewhere(game, region):
         state = np.argwhere(np.asarray(game.initial) > 0)[0].tolist()
         name = state[0] if len(state) == 1 else tuple(state)
@@ -212,13 +237,15 @@ def _require_start(game: Game, region: jax.Array) -> None:
         )
 
 
-def _always_wins(game: Game, objective: Any, region: jax.Array, mask: jax.Array) -> bool:
+def _always_wins(arena: _Arena, region: np.ndarray, mask: np.ndarray) -> bool:
     """Whether every run within a mask achieves the objective, whoever chooses."""
+    _, graph, objective = arena
     if isinstance(objective, Parity) and objective.num_priorities == 1:
         return True  # nothing but safety
-    hostile = Game(game.mdp, jnp.zeros(game.state_shape, bool))
     within = replace(objective, lost=objective.lost | ~region)
-    return bool(jnp.all(solve(hostile, within, mask).region | ~region))
+    solve = solve_gr1 if isinstance(objective, GR1) else solve_parity
+    hostile = np.zeros(graph.state_shape, bool)
+    return bool(np.all(solve(graph, hostile, within, mask).region | ~region))
 
 
 def _is_buchi(objective: Any) -> bool:
@@ -234,9 +261,10 @@ def _choose(objective: Any, maximal: bool, bound: int | None) -> str:
 
 
 def _on(game, region, mask, maximal: bool, reason: str, origin: Restriction | None = None):
-    base = jnp.arange(game.mdp.mdp.num_states if _is_lazy(game) else game.num_states)
-    state, memory = (base, jnp.zeros_like(base)) if origin is None else origin[1:]
-    return Permissive(game, region, mask, state, memory, maximal, reason)
+    """The strategy as it is handed out, with JAX's arrays."""
+    base = np.arange(game.mdp.mdp.num_states if _is_lazy(game) else game.num_states, dtype=np.int32)
+    state, memory = (base, np.zeros_like(base)) if origin is None else origin[1:]
+    return Permissive(*to_jax((game, region, mask, state, memory)), maximal, reason)
 
 
 def _is_lazy(game: Game) -> bool:
@@ -244,15 +272,21 @@ def _is_lazy(game: Game) -> bool:
 
 
 def _explicit(
-    game: Game, objective: Any, region: jax.Array, mask: jax.Array
-) -> tuple[Game, Any, Restriction | None]:
+    arena: _Arena, region: np.ndarray, mask: np.ndarray
+) -> tuple[_Arena, Restriction | None]:
     """A game that can be put beside memory: a product is first made explicit, in its region."""
+    game, _, objective = arena
     if not _is_lazy(game):
-        return game, objective, None
-    start = jnp.where(region, game.initial, 0)
-    found = restrict(game, start / start.sum(), allowed=mask)
+        return arena, None
+    start = np.where(region, game.initial, 0)
+    found = jax.tree.map(np.asarray, restrict(game, start / start.sum(), allowed=mask))
     origin = found.base_state * game.state_shape[1] + found.memory
-    return found.model, objective_at(objective, origin), found
+    model = found.model
+    return _Arena(model, _concrete_graph(model), _at(objective, origin)), found
+
+
+def _at(objective: Any, origin: np.ndarray) -> Any:
+    return jax.tree.map(np.asarray, objective_at(objective, origin))
 
 
 def _beside(
@@ -265,38 +299,37 @@ def _beside(
         priority=np.zeros(delta.shape, np.int32), letters=np.eye(num_letters, dtype=bool),
         propositions=tuple(f"letter_{i}" for i in range(num_letters)), acceptance="parity",
     )
-    tables = jax.tree.map(jnp.asarray, automaton)
-    joint = Product(game.mdp, tables, jnp.asarray(letter, jnp.int32), label_on)
-    return Game(joint, jnp.broadcast_to(game.system[:, None], joint.state_shape))
+    joint = Product(game.mdp, automaton, np.asarray(letter, np.int32), label_on)
+    return Game(joint, np.broadcast_to(game.system[:, None], joint.state_shape))
 
 
-def _closed(game: Game, region: jax.Array) -> bool:
-    return bool(jnp.all(~region[..., None] | ~game.available | forall_successor(game, region)))
+def _closed(graph: HostGraph, region: np.ndarray) -> bool:
+    return bool(np.all(~region[..., None] | ~graph.available | graph.forall(region)))
 
 
 def _without_won(objective: Parity) -> Parity:
     """The same objective where what is won is never left: the best priority from then on."""
     return replace(
-        objective, priority=jnp.where(objective.won, 0, objective.priority),
-        won=jnp.zeros_like(objective.won), lost=objective.lost & ~objective.won,
+        objective, priority=np.where(objective.won, 0, objective.priority),
+        won=np.zeros_like(objective.won), lost=objective.lost & ~objective.won,
     )
 
 
 def _remember_won(game: Game, objective: Parity) -> tuple[Game, Parity, Restriction]:
     """The game beside one bit that tells whether the run has been won already, made explicit."""
-    first = restrict(game)
+    first = jax.tree.map(np.asarray, restrict(game))
     width = game.state_shape[1] if _is_lazy(game) else 1
-    objective = objective_at(objective, first.base_state * width + first.memory)
+    objective = _at(objective, first.base_state * width + first.memory)
     game = first.model
     joint = _beside(game, np.array([[0, 1], [1, 1]]), 0, objective.won, "exit")
-    found = restrict(joint)
+    found = jax.tree.map(np.asarray, restrict(joint))
     origin = Restriction(
         found.model, first.base_state[found.base_state], first.memory[found.base_state]
     )
-    objective = objective_at(objective, found.base_state)
+    objective = _at(objective, found.base_state)
     won = found.memory == 1
     return found.model, Parity(
-        priority=jnp.where(won, 0, objective.priority),
+        priority=np.where(won, 0, objective.priority),
         won=won,
         lost=~won & objective.lost & ~objective.won,
         num_priorities=objective.num_priorities,
@@ -306,15 +339,16 @@ def _remember_won(game: Game, objective: Parity) -> tuple[Game, Parity, Restrict
 # --- the methods ------------------------------------------------------------------------------
 
 
-def _by_rank(game, objective, region, stay, bound) -> Permissive:
+def _by_rank(arena: _Arena, region, stay, bound) -> Permissive:
     del bound
+    game, graph, objective = arena
     if isinstance(objective, GR1):
-        return _by_layers(game, objective, region, stay)
+        return _by_layers(arena, region, stay)
     if not _is_buchi(objective):
         raise ValueError('method="rank" is for Buchi and GR(1) objectives; choose parity.')
     goal = region & (objective.priority == 0)
-    near = attractor(game, goal, stay, rule=game.system, among=region)
-    nearer = _some_nearer(game, near.rank, region) | goal[..., None]
+    near = attract(graph, goal, stay, rule=game.system, among=region)
+    nearer = _some_nearer(graph, near.rank, region) | goal[..., None]
     mask = stay & (nearer | ~game.system[..., None])
     return _on(game, region, mask, False,
                "not maximal: away from the accepting states it allows the moves that come nearer "
@@ -322,32 +356,33 @@ def _by_rank(game, objective, region, stay, bound) -> Permissive:
                "that stays in the winning region")
 
 
-def _some_nearer(game: Game, rank: jax.Array, region: jax.Array) -> jax.Array:
+def _some_nearer(graph: HostGraph, rank: np.ndarray, region: np.ndarray) -> np.ndarray:
     """Moves with a successor in the region that has a smaller rank: ``bool[S, A]``."""
-    rank = jnp.where(region, rank, NEVER)
-    return least_successor(game, rank) < rank[..., None]
+    rank = np.where(region, rank, NEVER)
+    return graph.least(rank) < rank[..., None]
 
 
-def _by_layers(game, objective: GR1, region, stay) -> Permissive:
-    game, objective, origin = _explicit(game, objective, region, stay)
-    layers = gr1_layers(game, objective)
+def _by_layers(arena: _Arena, region, stay) -> Permissive:
+    arena, origin = _explicit(arena, region, stay)
+    game, graph, objective = arena
+    layers = gr1_layers(graph, game.system, objective)
     region = layers.region
-    stay = _staying(game, region)
+    stay = _staying(graph, region)
     num_goals, num_assumptions = layers.round.shape[:2]
     masks = []
     for j in range(num_goals):
         rounds = layers.round[j]
         covered = rounds.min(0)  # the round of the first layer that covers a state
-        mask = stay & (objective.guarantees[j][:, None] | _some_nearer(game, covered, region))
+        mask = stay & (objective.guarantees[j][:, None] | _some_nearer(graph, covered, region))
         for i in range(num_assumptions):
             first = region & (rounds.argmin(0) == i) & ~objective.assumptions[i]
-            latest = -least_successor(game, -jnp.where(region, rounds[i], NEVER))
+            latest = -graph.least(-np.where(region, rounds[i], NEVER))
             mask |= stay & first[:, None] & (latest <= covered[:, None])
         masks.append(mask | (stay & ~game.system[:, None]))
     delta = np.array([[j, (j + 1) % num_goals] for j in range(num_goals)])
     joint = _beside_goals(game, objective, delta)
-    both = jnp.broadcast_to(region[:, None], joint.state_shape)
-    return _on(joint, both, jnp.stack(masks, 1), False,
+    both = np.broadcast_to(region[:, None], joint.state_shape)
+    return _on(joint, both, np.stack(masks, 1), False,
                "not maximal: towards each guarantee in turn it allows the moves that come nearer "
                "to it, and where an assumption does not hold those that wait for it", origin)
 
@@ -361,13 +396,13 @@ def _beside_goals(game: Game, objective: GR1, delta: np.ndarray) -> Game:
     return _beside(game, step, 0, letter.ravel(), "exit")
 
 
-def _by_counter(game, objective, region, stay, bound) -> Permissive:
-    if not _is_buchi(objective):
+def _by_counter(arena: _Arena, region, stay, bound) -> Permissive:
+    if not _is_buchi(arena.objective):
         raise ValueError('method="counter" is for Buchi objectives; choose parity.')
     if bound is None:
         raise ValueError('method="counter" needs bound=m, the system\'s moves within which the '
                          "accepting states are met again.")
-    game, objective, origin = _explicit(game, objective, region, stay)
+    (game, _, objective), origin = _explicit(arena, region, stay)
     accepting = objective.priority == 0
     # Memory 2 c + b: c moves since the last accepting state, and b whether the state that is
     # left is the system's; 2 m is too late. Letters tell both of the state that is entered.
@@ -382,7 +417,7 @@ def _by_counter(game, objective, region, stay, bound) -> Permissive:
     delta[-1] = 2 * bound
     letter = 2 * accepting + game.system
     joint = _beside(game, delta, 0, letter, "entry")
-    late = jnp.arange(2 * bound + 1) == 2 * bound
+    late = np.arange(2 * bound + 1) == 2 * bound
     return _safe_beside(
         joint, objective, late, bound, origin,
         f"not maximal: it includes every strategy that surely meets the accepting states again "
@@ -390,20 +425,20 @@ def _by_counter(game, objective, region, stay, bound) -> Permissive:
     )
 
 
-def _by_parity(game, objective, region, stay, bound) -> Permissive:
-    if not isinstance(objective, Parity):
+def _by_parity(arena: _Arena, region, stay, bound) -> Permissive:
+    if not isinstance(arena.objective, Parity):
         raise ValueError('method="parity" is for parity objectives; GR(1) has rank, and as a '
                          "formula it is a parity objective.")
-    game, objective, origin = _explicit(game, objective, region, stay)
-    inside = np.ones(game.num_states, bool) if origin is not None else np.asarray(region)
-    priority = np.asarray(objective.priority)
+    (game, _, objective), origin = _explicit(arena, region, stay)
+    inside = np.ones(game.num_states, bool) if origin is not None else region
+    priority = objective.priority
     odd = range(1, objective.num_priorities, 2)
     caps = [int((inside & (priority == p)).sum()) for p in odd]
     exact = bound is None or all(cap <= bound for cap in caps)
     caps = caps if bound is None else [bound] * len(caps)
     delta = budgets(caps, objective.num_priorities)
     joint = _beside(game, delta, len(delta) - 2, objective.priority, "exit")
-    spent = jnp.arange(len(delta)) == len(delta) - 1
+    spent = np.arange(len(delta)) == len(delta) - 1
     counts = ", ".join(f"{cap} of priority {p}" for p, cap in zip(odd, caps, strict=True))
     return _safe_beside(
         joint, objective, spent, bound, origin,
@@ -446,19 +481,20 @@ def budgets(caps: list[int], num_priorities: int) -> np.ndarray:
 
 
 def _safe_beside(
-    joint: Game, objective: Parity, spent: jax.Array, bound: int | None,
+    joint: Game, objective: Parity, spent: np.ndarray, bound: int | None,
     origin: Restriction | None, reason: str,
 ) -> Permissive:
     """The strategy that stays where the objective can be achieved without some memory states."""
     # The objective itself still counts: the environment may move for ever where the system
     # does not, and then no counter of the system's moves runs out.
     kept = Parity(
-        priority=jnp.broadcast_to(objective.priority[:, None], joint.state_shape),
-        won=jnp.zeros(joint.state_shape, bool),
+        priority=np.broadcast_to(objective.priority[:, None], joint.state_shape),
+        won=np.zeros(joint.state_shape, bool),
         lost=spent | objective.lost[:, None],
         num_priorities=objective.num_priorities,
     )
-    region = solve(joint, kept).region
+    graph = _concrete_graph(joint)
+    region = _region(_Arena(joint, graph, kept))
     if not _wins_somewhere(joint, region):
         if bound is None:
             raise ValueError(
@@ -470,4 +506,4 @@ def _safe_beside(
             f"bound={bound} is too small: the system wins, but not surely within it from any "
             "initial state; raise it."
         )
-    return _on(joint, region, _staying(joint, region), False, reason, origin)
+    return _on(joint, region, _staying(graph, region), False, reason, origin)

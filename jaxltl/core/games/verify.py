@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.games.objective import GR1, Parity
+from jaxltl.core.host.components import reached, strong_components
 from jaxltl.core.models.game import as_game
-from jaxltl.core.models.mdp import DenseMDP
+from jaxltl.core.models.mdp import DenseMDP, support
 
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.integer[Any]]
@@ -113,7 +114,7 @@ def _claim(winning: Any) -> _Claim:
     elif isinstance(objective, Parity):
         sets = (np.zeros((1, np.prod(shape, dtype=int)), bool),) * 2
         priority = np.asarray(objective.priority).ravel()
-        won = np.asarray(objective.won & ~objective.lost)
+        won = np.asarray(objective.won) & ~np.asarray(objective.lost)
     else:
         raise ValueError(f"objective is a {type(objective).__name__}; give a Parity or a GR1.")
 
@@ -279,8 +280,7 @@ def _edges(game: Any) -> tuple[Integers, Integers, Integers]:
     """The state, action and successor of every possible move, states numbered flat."""
     model = game.mdp
     world = getattr(model, "mdp", model)
-    used = np.asarray(world.successor_probability) > 0
-    s, a, k = (used & np.asarray(world.available)[..., None]).nonzero()
+    s, a, k = support(world).nonzero()
     t = k if isinstance(world, DenseMDP) else np.asarray(world.successor)[s, a, k].astype(int)
     if world is model:
         return s, a, t
@@ -303,42 +303,28 @@ def _component(play: _Play, inside: Booleans, meet: Booleans) -> int | None:
 
 
 def _end_components(play: _Play, inside: Booleans) -> Integers:
-    """The maximal end component of each node among some, numbered; -1 without one."""
-    from scipy.sparse import csgraph
-
+    """The smallest node of each node's maximal end component among some; -1 without one."""
     alive = _staying(play, inside, inside)
     while True:
         _trim(play, alive, inside)
         edge = alive[play.pair]
         source, target = play.source[edge], play.target[edge]
-        _, label = csgraph.connected_components(_matrix(play, source, target), connection="strong")
+        label = strong_components(source, target, play.nodes)
         leaving = label[source] != label[target]
         if not leaving.any():
             stuck = np.ones(play.nodes, bool)
             stuck[source] = False
-            return np.where(stuck, -1, label[:-1])
+            return np.where(stuck, -1, label)
         alive[play.pair[edge][leaving]] = False
 
 
 def _almost_surely(play: _Play, goal: Booleans, inside: Booleans) -> Booleans:
     """Nodes from which choices reach the goal with probability one, through inside nodes."""
-    from scipy.sparse import csgraph
-
     while True:
         alive = _staying(play, inside, inside | goal)
         _trim(play, alive, inside)
         edge = alive[play.pair]
-        # One search backwards from a node of its own that leads to every goal.
-        ends = np.flatnonzero(goal)
-        graph = _matrix(
-            play,
-            np.concatenate([play.target[edge], np.full(ends.size, play.nodes)]),
-            np.concatenate([play.source[edge], ends]),
-        )
-        reached = csgraph.breadth_first_order(graph, play.nodes, return_predecessors=False)
-        smaller = np.zeros(play.nodes + 1, bool)
-        smaller[reached] = True
-        smaller = smaller[:-1] & inside
+        smaller = reached(play.target[edge], play.source[edge], goal) & inside
         if (smaller == inside).all():
             return inside | goal
         inside = smaller
@@ -365,11 +351,3 @@ def _trim(play: _Play, alive: Booleans, inside: Booleans) -> None:
                 remaining[source] -= 1
                 if not remaining[source]:
                     stuck.append(source)
-
-
-def _matrix(play: _Play, source: Integers, target: Integers) -> Any:
-    from scipy.sparse import csr_array  # a tenth of a second that only host graphs need
-
-    # Repeated entries are merged; of Booleans they never add up to zero.
-    size = play.nodes + 1
-    return csr_array((np.ones(source.size, bool), (source, target)), shape=(size, size))

@@ -2,8 +2,8 @@
 
 In a stochastic game the system wins almost surely or the environment wins with positive
 probability; without chance both are sure. Regions are fixpoints of attractors
-(:mod:`jaxltl.core.graphs.attractor`), which work inside ``jit`` and ``vmap`` and, on concrete
-arrays, in time linear in the transitions.
+(:mod:`jaxltl.core.graphs.attractor`), which work inside ``jit`` and ``vmap``; on concrete
+arrays the host finds them in time linear in the transitions, and compiles nothing.
 """
 
 from __future__ import annotations
@@ -11,19 +11,18 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.gr1 import solve_gr1
 from jaxltl.core.games.objective import GR1, Parity, States, buchi
-from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.graphs.support import repeat
+from jaxltl.core.graphs.attractor import attract
+from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models.concrete import namespace, to_jax
 from jaxltl.core.models.game import Game, as_game
-from jaxltl.core.models.mdp import make_mdp
-from jaxltl.core.models.operators import exists_successor, first_action, forall_successor
+from jaxltl.core.models.mdp import make_mdp, support
 from jaxltl.core.models.product import product
 from jaxltl.core.models.restrict import restrict
 
@@ -56,7 +55,8 @@ class Winning:
     @property
     def realizable(self) -> jax.Array:
         """``bool[]``: whether the system wins from every initial state."""
-        return jnp.all(self.region | (self.game.initial <= 0))
+        xp, region, initial = namespace(self.region, self.game.initial)
+        return to_jax(xp.all(region | (initial <= 0)))
 
 
 def winning_region(
@@ -112,12 +112,13 @@ def solve(game: Game, objective: Parity | GR1, moves: jax.Array | None = None) -
       moves: ``bool[S, A]``; default the available ones. A state without any is won for the
         player who need not move there.
     """
+    graph = graph_of(game, objective, moves)
+    owner, goal, moves = take(graph, (game.system, objective, moves))
     if isinstance(objective, GR1):
-        return Winning(game, objective, *solve_gr1(game, objective, moves))
-    moves = game.available if moves is None else moves
-    start = _Found(objective.won & ~objective.lost, first_action(moves)[1])
-    found = _level(game, objective, 0, start, ~(objective.won | objective.lost), moves)
-    return Winning(game, objective, found.region, found.action, found.action)
+        found = solve_gr1(graph, owner, goal, moves)
+        return Winning(game, objective, *to_jax(found))
+    region, action = to_jax(solve_parity(graph, owner, goal, moves))
+    return Winning(game, objective, region, action, action)
 
 
 def almost_sure_buchi(game: Any, accepting: States) -> Winning:
@@ -151,29 +152,30 @@ def task_game(game: Game, spec: Automaton | Formula | str) -> tuple[Game, Parity
     """
     joint = product(game, spec, label_on="exit")
     automaton, letter = joint.mdp.automaton, joint.mdp.letter
-    none = jnp.zeros(joint.state_shape, bool)
+    none = to_jax(np.zeros(joint.state_shape, bool))
     if automaton.acceptance in ("cosafe", "safety"):
-        final = joint.mdp.final
+        xp, final = namespace(joint.mdp.final)
         cosafe = automaton.acceptance == "cosafe"
         return joint, Parity(
-            priority=jnp.full(joint.state_shape, int(cosafe), jnp.int32),
-            won=final if cosafe else none,
-            lost=none if cosafe else ~final,
+            priority=to_jax(np.full(joint.state_shape, int(cosafe), np.int32)),
+            won=to_jax(final) if cosafe else none,
+            lost=none if cosafe else to_jax(xp.logical_not(final)),
             num_priorities=1 + int(cosafe),
         )
-    priority = jnp.asarray(automaton.priority)[:, letter].T
-    return joint, Parity(priority, none, none, int(np.max(np.asarray(automaton.priority))) + 1)
+    _, priority, letter = namespace(automaton.priority, letter)
+    highest = int(np.max(np.asarray(automaton.priority)))
+    return joint, Parity(to_jax(priority[:, letter].T), none, none, highest + 1)
 
 
 def objective_at(objective: Parity | GR1, origin: jax.Array) -> Any:
     """The objective on states that each stand for an original one."""
+    _, arrays, origin = namespace(objective, origin)
     states = objective.lost.ndim
 
-    def take(x: jax.Array) -> jax.Array:
-        flat = x.reshape(*x.shape[: x.ndim - states], -1)
-        return flat[..., origin]
+    def pick(x: Any) -> jax.Array:
+        return to_jax(x.reshape(*x.shape[: x.ndim - states], -1)[..., origin])
 
-    return jax.tree.map(take, objective)
+    return jax.tree.map(pick, arrays)
 
 
 def adversarial_chance(game: Game) -> tuple[Game, jax.Array]:
@@ -194,7 +196,7 @@ def adversarial_chance(game: Game) -> tuple[Game, jax.Array]:
     """
     everywhere = np.full(game.num_states, 1 / game.num_states)
     explicit = restrict(game, everywhere).model
-    successor, used = np.asarray(explicit.mdp.successor), np.asarray(explicit.mdp.probability) > 0
+    successor, used = np.asarray(explicit.mdp.successor), support(explicit.mdp)
     num_states, num_actions, width = used.shape
     random = used.sum(-1) > 1
     s, a = np.nonzero(random)
@@ -215,7 +217,7 @@ def adversarial_chance(game: Game) -> tuple[Game, jax.Array]:
         label=label, propositions=explicit.propositions,
     )
     system = np.concatenate([np.asarray(game.system).ravel(), np.zeros(s.size, bool)])
-    return Game(mdp, jnp.asarray(system)), jnp.asarray(origin, jnp.int32)
+    return Game(mdp, to_jax(system)), to_jax(origin.astype(np.int32))
 
 
 # --- parity -----------------------------------------------------------------------------------
@@ -224,13 +226,34 @@ def adversarial_chance(game: Game) -> tuple[Game, jax.Array]:
 class _Found(NamedTuple):
     """A set that the system wins, with moves: its own inside, the environment's outside."""
 
-    region: jax.Array
-    action: jax.Array
+    region: Any
+    action: Any
 
 
-def _level(
-    game: Game, objective: Parity, p: int, won: _Found, open_: jax.Array, allowed: jax.Array
-) -> _Found:
+class _Arena(NamedTuple):
+    """Whose turn it is on a graph, and what the system is to achieve."""
+
+    graph: Graph
+    system: Any
+    objective: Parity
+
+
+def solve_parity(graph: Graph, system: Any, objective: Parity, moves: Any = None) -> _Found:
+    """Who wins a parity game, with the moves of both.
+
+    Args:
+      graph: the game's graph.
+      system: ``bool[S]``, whose turn it is.
+      objective: what the system is to achieve.
+      moves: ``bool[S, A]``; default the available ones.
+    """
+    moves = graph.available if moves is None else moves & graph.available
+    start = _Found(objective.won & ~objective.lost, graph.first(moves)[1])
+    open_ = ~(objective.won | objective.lost)
+    return _level(_Arena(graph, system, objective), 0, start, open_, moves)
+
+
+def _level(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Found:
     """The open states that the system wins, where it also wins on reaching `won`.
 
     Args:
@@ -240,51 +263,54 @@ def _level(
       allowed: ``bool[S, A]``; the environment's other moves help the system, since each
         brings it nearer, with positive probability, to what it seeks at a lower priority.
     """
-    if p == objective.num_priorities:
+    if p == arena.objective.num_priorities:
         return won
     solve = _even if p % 2 == 0 else _odd
-    return solve(game, objective, p, won, open_, allowed)
+    return solve(arena, p, won, open_, allowed)
 
 
-def _even(game, objective, p, won, open_, allowed) -> _Found:
+def _even(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Found:
     """The greatest set in which the system can remain, so that meeting p for ever is good."""
+    graph, system, objective = arena
+    xp = graph.xp
     here = open_ & (objective.priority == p)
 
     def body(carry):
         inside, found, _ = carry
         # Where the environment can force the play out, with positive probability.
-        left = attractor(game, ~inside, allowed, rule=~game.system, among=open_ & inside)
-        action = jnp.where(inside & left.region, left.action, found.action)
+        left = attract(graph, ~inside, allowed, rule=~system, among=open_ & inside)
+        action = xp.where(inside & left.region, left.action, found.action)
         inside = inside & ~left.region
         good = _Found(won.region | (here & inside), action)
-        deeper = _level(game, objective, p + 1, good, open_ & ~here & inside, allowed)
-        return deeper.region, deeper, jnp.any(deeper.region != inside)
+        deeper = _level(arena, p + 1, good, open_ & ~here & inside, allowed)
+        return deeper.region, deeper, xp.any(deeper.region != inside)
 
     inside = won.region | open_
-    inside, found, _ = repeat(body, (inside, won, jnp.bool_(True)), (game, objective, won, open_))
-    stays = first_action(allowed & forall_successor(game, inside))[1]
-    return _Found(inside, jnp.where(here & inside & game.system, stays, found.action))
+    inside, found, _ = graph.repeat(body, (inside, won, xp.asarray(True)))
+    stays = graph.first(allowed & graph.forall(inside))[1]
+    return _Found(inside, xp.where(here & inside & system, stays, found.action))
 
 
-def _odd(game, objective, p, won, open_, allowed) -> _Found:
+def _odd(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Found:
     """The least set from which the system can avoid meeting p for ever."""
+    graph, system, objective = arena
+    xp = graph.xp
     here = open_ & (objective.priority == p)
     # The system makes no move that may leave what an even priority above has it remain in.
-    keeps = forall_successor(game, won.region | open_)
-    allowed = allowed & (keeps | ~game.system[..., None])
+    allowed = allowed & (graph.forall(won.region | open_) | ~system[..., None])
 
     def body(carry):
         found, _ = carry
-        drawn = attractor(game, found.region, allowed, rule=game.system, among=open_)
-        new = drawn.region & ~found.region & game.system
-        near = _Found(drawn.region, jnp.where(new, drawn.action, found.action))
-        closer = exists_successor(game, near.region) & ~game.system[..., None]
-        deeper = _level(
-            game, objective, p + 1, near, open_ & ~here & ~near.region, allowed & ~closer
-        )
-        return deeper, jnp.any(deeper.region != near.region)
+        drawn = attract(graph, found.region, allowed, rule=system, among=open_)
+        new = drawn.region & ~found.region & system
+        near = _Found(drawn.region, xp.where(new, drawn.action, found.action))
+        remain = open_ & ~here & ~near.region
+        # The environment's other moves help the system.
+        closer = graph.exists(near.region) & ~system[..., None]
+        deeper = _level(arena, p + 1, near, remain, allowed & ~closer)
+        return deeper, xp.any(deeper.region != near.region)
 
-    found, _ = repeat(body, (won, jnp.bool_(True)), (game, objective, won, open_))
-    avoids = first_action(allowed & ~exists_successor(game, found.region))[1]
-    refused = here & ~found.region & ~game.system
-    return _Found(found.region, jnp.where(refused, avoids, found.action))
+    found, _ = graph.repeat(body, (won, xp.asarray(True)))
+    avoids = graph.first(allowed & ~graph.exists(found.region))[1]
+    refused = here & ~found.region & ~system
+    return _Found(found.region, xp.where(refused, avoids, found.action))

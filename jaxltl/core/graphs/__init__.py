@@ -1,1 +1,1 @@
-"""Exact questions about supports: attractors, end components, acceptance."""
+"""Exact questions about supports, on the host or traced: attractors, components, acceptance."""

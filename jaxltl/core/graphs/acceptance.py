@@ -6,17 +6,15 @@ infinitely often (de Alfaro 1997), so what it reads infinitely often is decided 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
-from jax import lax
 
-from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.graphs.end_components import bottom_components, end_components
-from jaxltl.core.graphs.support import is_traced
-from jaxltl.core.models.operators import first_action
-from jaxltl.core.models.product import Product, reads
+from jaxltl.core.graphs.attractor import attract
+from jaxltl.core.graphs.end_components import closed_components, components_within
+from jaxltl.core.graphs.graph import graph_of, take
+from jaxltl.core.models.concrete import to_jax
+from jaxltl.core.models.product import Product
 
 
 class Accepting(NamedTuple):
@@ -46,23 +44,25 @@ def accepting_end_components(model: Product) -> Accepting:
       :class:`Accepting`. A run is accepted with the largest probability of reaching its
       region.
     """
-    priority = jnp.asarray(model.automaton.priority)
-    _, first = first_action(model.available)
-    start = Accepting(jnp.zeros(model.state_shape, bool), first)
+    graph = graph_of(model)
+    xp, available = graph.xp, graph.available
+    priority = take(graph, model.automaton.priority)
+    everywhere = xp.ones(graph.state_shape, bool)
 
-    def body(half: jax.Array | int, found: Accepting) -> Accepting:
+    def body(half: Any, found: Accepting) -> Accepting:
         least = 2 * half
-        allowed = model.available & ~reads(model, priority < least)
-        components = end_components(model, jnp.ones(model.state_shape, bool), allowed)
-        hits = components.inside & reads(model, priority == least)
-        hit, action = first_action(hits)
-        wins = _anywhere(hit, components.component) & first_action(components.inside)[0]
-        towards = attractor(model, hit, components.inside).action
-        action = jnp.where(hit, action, towards)
+        allowed = available & ~graph.reads(priority < least)
+        components = components_within(graph, everywhere, allowed)
+        hits = components.inside & graph.reads(priority == least)
+        hit, action = graph.first(hits)
+        wins = graph.anywhere(hit, components.component) & graph.first(components.inside)[0]
+        towards = attract(graph, hit, components.inside).action
+        action = xp.where(hit, action, towards)
         new = wins & ~found.region
-        return Accepting(found.region | new, jnp.where(new, action, found.action))
+        return Accepting(found.region | new, xp.where(new, action, found.action))
 
-    return _repeat(priority.max() // 2 + 1, body, start, (model, priority))
+    start = Accepting(~everywhere, graph.first(available)[1])
+    return to_jax(graph.times(priority.max() // 2 + 1, body, start))
 
 
 def accepting_bottom_components(model: Product, policy: jax.Array) -> jax.Array:
@@ -75,33 +75,19 @@ def accepting_bottom_components(model: Product, policy: jax.Array) -> jax.Array:
     Returns:
       ``bool[S, Q]``. A run is accepted with the probability of reaching this region.
     """
-    allowed = model.available & (policy > 0)
-    priority = jnp.asarray(model.automaton.priority)
-    bottom = bottom_components(model, allowed)
+    graph = graph_of(model, policy)
+    xp = graph.xp
+    priority, policy = take(graph, (model.automaton.priority, policy))
+    bottom = closed_components(graph, policy > 0)
     inside = bottom.inside.any(-1)
-    start = jnp.full(model.state_shape, jnp.iinfo(jnp.int32).max)
 
-    def body(i: jax.Array | int, least: jax.Array) -> jax.Array:
+    def body(i: Any, least: Any) -> Any:
         # From the greatest down, so that the least stands last.
         p = priority.max() - i
-        met = _anywhere((bottom.inside & reads(model, priority == p)).any(-1), bottom.component)
-        return jnp.where(met & inside, p, least)
+        met = (bottom.inside & graph.reads(priority == p)).any(-1)
+        return xp.where(graph.anywhere(met, bottom.component) & inside, p, least)
 
-    least = _repeat(priority.max() + 1, body, start, (model, policy))
-    return inside & (least % 2 == 0)
-
-
-def _anywhere(mark: jax.Array, component: jax.Array) -> jax.Array:
-    """Whether a state of the same component is marked."""
-    label = component.ravel()
-    found = jax.ops.segment_max(mark.ravel().astype(jnp.int32), label, num_segments=label.size)
-    return (found[label] > 0).reshape(mark.shape)
-
-
-def _repeat(count, body, start, arguments):
-    """A loop, on the host where the arrays are concrete, so that the graph's host path serves."""
-    if is_traced(arguments):
-        return lax.fori_loop(0, count, body, start)
-    for i in range(int(count)):
-        start = body(i, start)
-    return start
+    # Nothing met is no acceptance.
+    start = xp.full(graph.state_shape, 1, priority.dtype)
+    least = graph.times(priority.max() + 1, body, start)
+    return to_jax(inside & (least % 2 == 0))

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
-import numpy as np
-from jax import lax
 
-from jaxltl.core.graphs.attractor import avoidable
-from jaxltl.core.graphs.support import _label_on, _support, is_traced
-from jaxltl.core.models.operators import forall_successor
+from jaxltl.core.graphs.attractor import avoid
+from jaxltl.core.graphs.graph import Graph, graph_of, take
+from jaxltl.core.models.concrete import to_jax
 
 
 class EndComponents(NamedTuple):
@@ -42,11 +38,17 @@ def end_components(
       region: ``bool[S]``.
       allowed: ``bool[S, A]``, the actions that count; default the available ones.
     """
+    graph = graph_of(model, region, allowed)
+    return to_jax(components_within(graph, *take(graph, (region, allowed))))
+
+
+def components_within(graph: Graph, region: Any, allowed: Any = None) -> EndComponents:
+    """:func:`end_components` of a graph."""
+    allowed = graph.available if allowed is None else allowed & graph.available
     # Only states that can remain in the region matter; usually there are few.
-    core = region & avoidable(model, ~region, allowed)
-    allowed = model.available if allowed is None else allowed
-    allowed = allowed & forall_successor(model, core) & core[..., None]
-    return _components(model, core, allowed, closed=False)
+    core = region & avoid(graph, ~region, allowed)
+    allowed = allowed & graph.forall(core) & core[..., None]
+    return EndComponents(*graph.components(core, allowed, closed=False))
 
 
 def bottom_components(model: Any, allowed: jax.Array) -> EndComponents:
@@ -56,73 +58,12 @@ def bottom_components(model: Any, allowed: jax.Array) -> EndComponents:
       model: the model.
       allowed: ``bool[S, A]``, the actions that are all taken, such as a policy's support.
     """
-    return _components(model, jnp.ones(model.state_shape, bool), allowed, closed=True)
+    graph = graph_of(model, allowed)
+    return to_jax(closed_components(graph, take(graph, allowed)))
 
 
-def _components(model: Any, core: jax.Array, allowed: jax.Array, closed: bool) -> EndComponents:
-    flat = int(np.prod(model.state_shape))
-    shapes = (
-        jax.ShapeDtypeStruct(model.state_shape, jnp.int32),
-        jax.ShapeDtypeStruct((*model.state_shape, model.num_actions), jnp.bool_),
-    )
-
-    def trivial():
-        number = jnp.arange(flat, dtype=jnp.int32).reshape(model.state_shape)
-        return number, jnp.zeros(shapes[1].shape, bool)
-
-    arguments = (*_support(model), core, allowed)
-    host = partial(_end_components, _label_on(model), closed)
-    if is_traced(arguments):
-        def callback():
-            return jax.pure_callback(host, shapes, *arguments, vmap_method="sequential")
-        return EndComponents(*lax.cond(core.any(), callback, trivial))
-    if not bool(core.any()):
-        return EndComponents(*trivial())
-    found = host(*(np.asarray(x) for x in arguments))
-    return EndComponents(*(jnp.asarray(x) for x in found))
-
-
-def _end_components(label_on, closed, successor, used, next_memory, core, allowed):
-    """Refines strongly connected components until no action leaves its own.
-
-    Or, if only closed components are asked for, keeps those that no action leaves.
-    """
-    from scipy import sparse
-    from scipy.sparse import csgraph
-
-    successor, used, next_memory = (np.asarray(x) for x in (successor, used, next_memory))
-    shape, num_memory = np.shape(core), next_memory.shape[1]
-    total = next_memory.size
-    states = np.flatnonzero(core)
-    s, q = np.divmod(states, num_memory)
-    read = successor[s] if label_on == "entry" else s[:, None, None]
-    flat = successor[s].astype(np.int64) * num_memory + next_memory[read, q[:, None, None]]
-    local = np.full(total, -1)
-    local[states] = np.arange(states.size)
-    target, real = local[flat], used[s]  # [N, A, K]
-    stay = np.asarray(allowed).reshape(total, -1)[states]
-    source = np.broadcast_to(np.arange(states.size)[:, None, None], target.shape)
-    while True:
-        edge = real & stay[:, :, None]
-        graph = sparse.csr_array(
-            (np.ones(edge.sum(), np.int8), (source[edge], target[edge])),
-            shape=(states.size, states.size),
-        )
-        _, label = csgraph.connected_components(graph, connection="strong")
-        leaves = edge & (label[target] != label[:, None, None])
-        kept = stay & ~leaves.any(-1)
-        if closed:
-            open_ = np.unique(label[(leaves.any(-1) & stay).any(-1)])
-            stay = stay & ~np.isin(label, open_)[:, None]
-            break
-        if (kept == stay).all():
-            break
-        stay = kept
-    component = np.arange(total, dtype=np.int32)
-    alive = stay.any(-1)
-    smallest = np.full(label.max(initial=0) + 1, total)
-    np.minimum.at(smallest, label, states)
-    component[states[alive]] = smallest[label[alive]]
-    inside = np.zeros((total, stay.shape[1]), bool)
-    inside[states] = stay
-    return component.reshape(shape), inside.reshape(*shape, -1)
+def closed_components(graph: Graph, allowed: Any) -> EndComponents:
+    """:func:`bottom_components` of a graph."""
+    everywhere = graph.xp.ones(graph.state_shape, bool)
+    return EndComponents(
+        *graph.components(everywhere, allowed & graph.available, closed=True))

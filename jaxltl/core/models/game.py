@@ -13,6 +13,8 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.models import operators
+from jaxltl.core.models.concrete import namespace, to_jax
+from jaxltl.core.models.mdp import support
 
 
 @struct.dataclass
@@ -90,7 +92,7 @@ def make_game(model: Any, system: Sequence[bool] | chex.Array) -> Game:
     """
     owner = _owners(system, model.state_shape)
     check_moves(np.asarray(model.available), owner)
-    return Game(model, jnp.asarray(owner))
+    return Game(model, to_jax(owner))
 
 
 def check_moves(available: np.ndarray, system: np.ndarray) -> None:
@@ -135,18 +137,21 @@ def as_game(model: Any) -> Game:
     """A game as it is; any other model as the game in which the system always moves."""
     if isinstance(model, Game):
         return model
-    return Game(model, jnp.ones(model.state_shape, bool))
+    return Game(model, to_jax(np.ones(model.state_shape, bool)))
 
 
 def is_deterministic(model: Any) -> bool:
     """Whether every move has one successor, so that chance plays no part; on the host."""
-    weights = np.asarray(model.successor_probability)
-    return bool(((weights > 0).sum(-1) <= 1).all())
+    world = model
+    while hasattr(world, "mdp"):
+        world = world.mdp
+    return not bool((support(world).sum(-1) > 1).any())
 
 
 def swap_players(game: Game) -> Game:
     """The same game with the players' names exchanged."""
-    return replace(game, system=~game.system)
+    xp, system = namespace(game.system)
+    return replace(game, system=to_jax(xp.logical_not(system)))
 
 
 # --- the primitives: those of the model -----------------------------------------------------

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core.models.concrete import is_traced, to_jax
+
 
 @struct.dataclass
 class MDP:
@@ -104,6 +106,15 @@ class DenseMDP:
         return self.transition.dtype
 
 
+def support(world: MDP | DenseMDP) -> np.ndarray:
+    """Which successors are possible, ``bool[S, A, K]``, on the host; none where unavailable."""
+    weight = world.transition if isinstance(world, DenseMDP) else world.probability
+    used, available = np.asarray(weight) > 0, np.asarray(world.available)
+    if not available.all():
+        used &= available[..., None]
+    return used
+
+
 def make_mdp(
     successor: chex.Array,
     probability: chex.Array,
@@ -168,11 +179,11 @@ def make_mdp(
     probability = np.where(used, probability * scale[:, :, None], 0).astype(dtype)
     label, names = _checked_label(label, propositions, num_states)
     return MDP(
-        successor=jnp.asarray(np.where(used, successor, 0).astype(np.int32)),
-        probability=jnp.asarray(probability),
-        available=jnp.asarray(available),
-        initial=jnp.asarray(_checked_initial(initial, num_states).astype(dtype)),
-        label=jnp.asarray(label),
+        successor=to_jax(np.where(used, successor, 0).astype(np.int32)),
+        probability=to_jax(probability),
+        available=to_jax(available),
+        initial=to_jax(_checked_initial(initial, num_states).astype(dtype)),
+        label=to_jax(label),
         propositions=names,
     )
 
@@ -221,11 +232,16 @@ def to_dense(mdp: MDP) -> DenseMDP:
       [[[0.5, 0.5]], [[0.0, 1.0]]]
     """
     num_states, num_actions = mdp.num_states, mdp.num_actions
-    s = jnp.arange(num_states)[:, None, None]
-    a = jnp.arange(num_actions)[None, :, None]
-    empty = jnp.zeros((num_states, num_actions, num_states), mdp.dtype)
+    shape = num_states, num_actions, num_states
+    place = np.arange(num_states)[:, None, None], np.arange(num_actions)[:, None]
+    if is_traced(mdp):
+        empty = jnp.zeros(shape, mdp.dtype)
+        transition = empty.at[*place, mdp.successor].add(mdp.probability)
+    else:
+        transition = np.zeros(shape, mdp.dtype)
+        np.add.at(transition, (*place, np.asarray(mdp.successor)), np.asarray(mdp.probability))
     return DenseMDP(
-        transition=empty.at[s, a, mdp.successor].add(mdp.probability),
+        transition=to_jax(transition),
         available=mdp.available,
         initial=mdp.initial,
         label=mdp.label,

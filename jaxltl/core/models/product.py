@@ -21,6 +21,7 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.labels import distinct_rows, require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.models import kernels, operators
+from jaxltl.core.models.concrete import namespace, to_jax
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.trajectories import Trajectories
@@ -87,32 +88,38 @@ class Product:
     @property
     def available(self) -> jax.Array:
         """``bool[S, Q, A]``."""
+        xp, available = namespace(self.mdp.available)
         shape = (*self.state_shape, self.num_actions)
-        return jnp.broadcast_to(self.mdp.available[:, None, :], shape)
+        return to_jax(xp.broadcast_to(available[:, None, :], shape))
 
     @property
     def next_memory(self) -> jax.Array:
         """``int32[S, Q]``: the memory after reading the label of a world state in memory q."""
-        return jnp.asarray(self.automaton.delta)[:, self.letter].T
+        _, delta, letter = namespace(self.automaton.delta, self.letter)
+        return to_jax(delta[:, letter].T)
 
     @property
     def initial_memory(self) -> jax.Array:
         """``int32[S]``: the memory in which a run starts at each world state."""
-        start = jnp.asarray(self.automaton.initial)
+        automaton = self.automaton
+        xp, start, delta, letter = namespace(automaton.initial, automaton.delta, self.letter)
         if self.label_on == "exit":
-            return jnp.full(self.letter.shape, start, jnp.int32)
-        return jnp.asarray(self.automaton.delta)[start, self.letter]
+            return to_jax(xp.full(letter.shape, start, np.int32))
+        return to_jax(delta[start, letter])
 
     @property
     def initial(self) -> jax.Array:
         """``float[S, Q]``, the initial distribution."""
-        memory = jax.nn.one_hot(self.initial_memory, self.num_memory, dtype=self.dtype)
-        return self.mdp.initial[:, None] * memory
+        xp, world, memory = namespace(self.mdp.initial, self.initial_memory)
+        starts = memory[:, None] == xp.arange(self.num_memory)
+        return to_jax(xp.where(starts, world[:, None], 0).astype(self.dtype))
 
     @property
     def final(self) -> jax.Array:
         """``bool[S, Q]``: the automaton is in a final state."""
-        return jnp.broadcast_to(jnp.asarray(self.automaton.final), self.state_shape)
+        xp, automaton = namespace(self.automaton)
+        final = automaton.final
+        return to_jax(xp.broadcast_to(final, self.state_shape))
 
 
 def letters(world: MDP | DenseMDP, propositions: Collection[str] | None = None) -> list[frozenset]:
@@ -163,7 +170,8 @@ def product(world: Any, task: Automaton | Formula | str, *, label_on: str = "ent
         raise ValueError(f'label_on={label_on!r}; it must be "entry" or "exit".')
     if isinstance(world, Game):
         model = product(world.mdp, task, label_on=label_on)
-        return Game(model, jnp.broadcast_to(world.system[:, None], model.state_shape))
+        xp, system = namespace(world.system)
+        return Game(model, to_jax(xp.broadcast_to(system[:, None], model.state_shape)))
     if isinstance(task, str | Formula):
         formula = parse_ltl(task) if isinstance(task, str) else task
         require_known(formula.propositions, world.propositions, "the task")
@@ -174,8 +182,8 @@ def product(world: Any, task: Automaton | Formula | str, *, label_on: str = "ent
     index = np.array(
         [_letter(task, row, int(np.argmax(letter == i))) for i, row in enumerate(rows)], np.int32
     )
-    automaton = jax.tree.map(jnp.asarray, task)
-    return Product(world, automaton, jnp.asarray(index[letter.ravel()]), label_on)
+    automaton = to_jax(task)
+    return Product(world, automaton, to_jax(index[letter.ravel()]), label_on)
 
 
 def _letter(automaton: Automaton, row: np.ndarray, state: int) -> int:
@@ -281,7 +289,7 @@ def _(model: Product, policy: jax.Array) -> MDP:
     q = jnp.arange(model.num_memory)[None, :, None]
     probability = model.mdp.successor_probability[s, policy]  # [S, Q, K]
     successor = _successor(model.mdp)[s, policy]
-    flat = _flat_successor(successor, model.next_memory, s[..., None], q, model.label_on)
+    flat = flat_successor(successor, model.next_memory, s[..., None], q, model.label_on)
     width = flat.shape[-1]
     return operators.make_chain(
         flat.reshape(-1, width).astype(jnp.int32), probability.reshape(-1, width),
@@ -294,7 +302,7 @@ def _(model: Product, policy: jax.Array) -> jax.Array:
     s = jnp.arange(model.mdp.num_states)[:, None, None, None]
     q = jnp.arange(model.num_memory)[None, :, None, None]
     successor = _successor(model.mdp)[:, None]
-    flat = _flat_successor(successor, model.next_memory, s, q, model.label_on)
+    flat = flat_successor(successor, model.next_memory, s, q, model.label_on)
     weight = policy[..., None] * model.successor_probability
     shape = (model.num_states, *weight.shape[2:])
     return operators.scatter_matrix(flat.reshape(shape), weight.reshape(shape))
@@ -370,7 +378,7 @@ def project_policy(model: Product, policy: jax.Array) -> FiniteMemoryPolicy:
     return FiniteMemoryPolicy(policy, model.initial_memory, model.next_memory, model.label_on)
 
 
-def _flat_successor(successor, next_memory, s, q, label_on):
+def flat_successor(successor, next_memory, s, q, label_on):
     """Numbers ``t * Q + q'`` of the product states that follow (s, q) when t follows s."""
     read = successor if label_on == "entry" else s
     return successor * next_memory.shape[1] + next_memory[read, q]

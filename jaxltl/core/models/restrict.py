@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import chex
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.game import Game
-from jaxltl.core.models.mdp import MDP, make_mdp
-from jaxltl.core.models.product import Product, _flat_successor
+from jaxltl.core.models.mdp import MDP, make_mdp, support
+from jaxltl.core.models.product import Product, flat_successor
 
 
 class Restriction(NamedTuple):
@@ -51,9 +51,10 @@ def restrict(
     initial = np.asarray(model.initial if initial is None else initial).ravel()
     if not (initial > 0).any():
         raise ValueError("the initial distribution is zero; give a state to start from.")
-    allowed = np.asarray(model.available if allowed is None else model.available & allowed)
+    available = np.asarray(model.available)
+    allowed = available if allowed is None else available & np.asarray(allowed)
     allowed = allowed.reshape(-1, model.num_actions)
-    successor, used = np.asarray(world.successor), np.asarray(world.probability) > 0
+    successor, used = np.asarray(world.successor), support(world)
     step, label_on = np.zeros((world.num_states, 1), np.int32), "entry"
     if isinstance(lazy, Product):
         step, label_on = np.asarray(lazy.next_memory), lazy.label_on
@@ -61,7 +62,7 @@ def restrict(
 
     def targets(states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         s, q = np.divmod(states, num_memory)
-        flat = _flat_successor(successor[s], step, *_columns(s, q), label_on)
+        flat = flat_successor(successor[s], step, *_columns(s, q), label_on)
         return flat, used[s] & allowed[states][:, :, None], s
 
     number = np.full(allowed.shape[0], -1)
@@ -94,11 +95,11 @@ def restrict(
         label=np.asarray(world.label)[s],
         propositions=world.propositions,
     )
-    memory = jnp.asarray(states - s * num_memory, jnp.int32)
-    base = jnp.asarray(s, jnp.int32)
+    memory = to_jax((states - s * num_memory).astype(np.int32))
+    base = to_jax(s.astype(np.int32))
     if not isinstance(model, Game):
         return Restriction(mdp, base, memory)
-    owner = jnp.asarray(np.asarray(model.system).ravel()[states])
+    owner = to_jax(np.asarray(model.system).ravel()[states])
     return Restriction(Game(mdp, owner), base, memory)
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.graphs.support import is_traced
+from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.game import Game, as_game, is_deterministic
 from jaxltl.core.models.operators import induced_chain
 from jaxltl.core.types import Solution, status_code

@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 
 from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.graphs.support import is_traced
+from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.game import Game, as_game
 from jaxltl.core.models.operators import (
     action_argmax,

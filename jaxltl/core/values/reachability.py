@@ -18,7 +18,7 @@ from jax import lax
 
 from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor, avoidable
 from jaxltl.core.graphs.end_components import EndComponents, end_components
-from jaxltl.core.graphs.support import is_traced
+from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.operators import (
     action_argmax,
     action_mean,

@@ -20,8 +20,8 @@ from jaxltl.core.games.objective import (
 )
 from jaxltl.core.games.verify import verify
 from jaxltl.core.games.winning import almost_sure_buchi, winning_region
-from jaxltl.core.graphs import attractor as attractors
 from jaxltl.core.graphs.attractor import attractor
+from jaxltl.core.host import attract as host_attract
 from jaxltl.core.models.game import Game, make_game, swap_players
 from jaxltl.core.models.mdp import to_dense
 from jaxltl.core.models.product import product
@@ -141,7 +141,7 @@ def check_paths(rng, play, kind, monkeypatch):
     game = as_game(play)
     objective = OBJECTIVES[kind](game, draw(rng, play.model.num_states))
     inside = compiled(game, objective)
-    monkeypatch.setattr(attractors, "_MAX_SWEEPS", 1)
+    monkeypatch.setattr(host_attract, "SWEEPS", 0)
     outside = winning_region(game, objective)
     np.testing.assert_array_equal(inside.region, outside.region)
     for found in (inside, outside):
@@ -188,7 +188,7 @@ def test_products_and_dense_worlds(kind, label_on, monkeypatch):
             game = Game(model, jnp.asarray(system.reshape(shape)))
             x = {k: v.reshape(*v.shape[:-1], *shape) for k, v in sets.items()}
             objective = OBJECTIVES[kind](game, x)
-            monkeypatch.setattr(attractors, "_MAX_SWEEPS", 1)
+            monkeypatch.setattr(host_attract, "SWEEPS", 0)
             solvers = (compiled, winning_region) if model is lazy else (winning_region,)
             for solve in solvers:
                 found = solve(game, objective)
@@ -512,7 +512,7 @@ def test_a_very_long_chain(length):
 
 def test_nested_depth_on_the_host(monkeypatch):
     """A chain of coins: each state falls back to the start or goes on, and the end is a trap."""
-    monkeypatch.setattr(attractors, "_MAX_SWEEPS", 8)
+    monkeypatch.setattr(host_attract, "SWEEPS", 0)
     length = 400
     states = np.arange(length)
     successor = np.stack([np.minimum(states + 1, length - 1), 0 * states], axis=1)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.core.graphs import attractor as attractors
-from jaxltl.core.graphs.attractor import _MAX_SWEEPS
+from jaxltl.core.host import attract as host_attract
+
 from tests import reference
 from tests.support import as_mdp, lane, random_representation, stack
 
@@ -120,8 +120,8 @@ def test_representations_hosts_and_traces_agree(kind, label_on, monkeypatch):
         goal_, allowed_ = jnp.asarray(goal_), jnp.asarray(allowed_)
         for rule in ("exists", "forall"):
             expected = reference.attractor(explicit, goal, allowed, rule)
-            for sweeps in (48, 1):
-                monkeypatch.setattr(attractors, "_MAX_SWEEPS", sweeps)
+            for sweeps in (48, 0):
+                monkeypatch.setattr(host_attract, "SWEEPS", sweeps)
                 found = jl.attractor(model, goal_, allowed_, rule=rule)
                 np.testing.assert_array_equal(found.region.ravel(), expected)
                 if rule == "exists":
@@ -131,8 +131,8 @@ def test_representations_hosts_and_traces_agree(kind, label_on, monkeypatch):
             np.testing.assert_array_equal(traced.region, found.region)
         small = kind != "product"  # brute force tries every policy and every set of states
         expected = reference.almost_surely_reaching(explicit, goal, allowed) if small else None
-        for sweeps in (48, 1):
-            monkeypatch.setattr(attractors, "_MAX_SWEEPS", sweeps)
+        for sweeps in (48, 0):
+            monkeypatch.setattr(host_attract, "SWEEPS", sweeps)
             found = jl.almost_surely_reaching(model, goal_, allowed_)
             if small:
                 np.testing.assert_array_equal(found.region, expected)
@@ -157,7 +157,7 @@ def long_chain(length):
 
 @pytest.mark.parametrize("rule", ["exists", "forall"])
 def test_a_long_chain_is_finished_on_the_host(rule):
-    length = 4 * _MAX_SWEEPS
+    length = 1024
     mdp = long_chain(length)
     goal = jnp.arange(length) == length - 1
     allowed = mdp.available.at[:, 1].set(False) if rule == "forall" else None

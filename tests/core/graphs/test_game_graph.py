@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.graphs import attractor as attractors
 from jaxltl.core.graphs.attractor import attractor
+from jaxltl.core.host import attract as host_attract
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import to_dense
 from tests import reference, reference_games
@@ -82,8 +82,8 @@ def test_sweeps_worklists_and_compiled_code_agree(kind, chance, monkeypatch):
         expected = expected_attractor(explicit, *case, chance)
         answers = [compiled(model, goal, allowed, rule, among)]
         # A game is seen through to its model.
-        for world, sweeps in ((model, 256), (Game(model, rule), 1)):
-            monkeypatch.setattr(attractors, "_MAX_SWEEPS", sweeps)
+        for world, sweeps in ((model, 12), (Game(model, rule), 0)):
+            monkeypatch.setattr(host_attract, "SWEEPS", sweeps)
             answers.append(attractor(world, goal, allowed, rule=rule, chance=chance, among=among))
         for found in answers:
             np.testing.assert_array_equal(np.ravel(found.region), expected)
@@ -96,8 +96,8 @@ def test_wide_frontiers_of_a_worklist(monkeypatch):
     """Frontiers both above and below the size up to which plain loops are used."""
     rng = np.random.default_rng(2)
     for limit in (0, 24, 10_000):
-        monkeypatch.setattr(attractors, "_SCALAR", limit)
-        monkeypatch.setattr(attractors, "_MAX_SWEEPS", 1)
+        monkeypatch.setattr(host_attract, "FEW", limit)
+        monkeypatch.setattr(host_attract, "SWEEPS", 0)
         for chance in CHANCE:
             for _ in range(5):
                 model = reference_games.random_game(rng, 40, 2, 3, local=6).model
@@ -111,10 +111,10 @@ def test_wide_frontiers_of_a_worklist(monkeypatch):
                 check_moves(model, case, found, chance)
 
 
-@pytest.mark.parametrize("sweeps", [1, 256])
+@pytest.mark.parametrize("sweeps", [0, 12])
 def test_parallel_edges_count_once_each(sweeps, monkeypatch):
     """A move with two entries for one successor surely leads there when that one joins."""
-    monkeypatch.setattr(attractors, "_MAX_SWEEPS", sweeps)
+    monkeypatch.setattr(host_attract, "SWEEPS", sweeps)
     model = reference.Model(
         np.array([[[1, 1]], [[2, 2]], [[2, 2]], [[2, 3]]]), np.full((4, 1, 2), 0.5),
         np.ones((4, 1), bool), np.full(4, 0.25),

@@ -1,0 +1,168 @@
+"""What the fixpoints ask of a model, answered by the host or inside ``jit``.
+
+An algorithm is written once, on a graph. On concrete arrays that is a
+:class:`~jaxltl.core.host.graph.HostGraph`, which compiles nothing; where anything is traced it
+is a :class:`TracedGraph`, made of the primitives. Both give the same answers, bit for bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxltl.core.host.graph import HostGraph
+from jaxltl.core.host.rows import rows_of, rows_of_matrix
+from jaxltl.core.models import kernels, operators
+from jaxltl.core.models.concrete import is_traced
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.mdp import MDP, DenseMDP, support
+from jaxltl.core.models.product import Product, reads
+
+
+@dataclass(frozen=True)
+class TracedGraph:
+    """The same questions as of a HostGraph, by the primitives; inside ``jit`` and ``vmap``.
+
+    Attributes:
+      model: a model.
+    """
+
+    model: Any
+
+    xp = jnp
+
+    @property
+    def state_shape(self) -> tuple[int, ...]:
+        return self.model.state_shape
+
+    @property
+    def num_actions(self) -> int:
+        return self.model.num_actions
+
+    @property
+    def available(self) -> jax.Array:
+        """``bool[S, A]``."""
+        return self.model.available
+
+    def exists(self, region: jax.Array) -> jax.Array:
+        """Whether some successor lies in a region: ``bool[S, A]``; False where unavailable."""
+        return self.available & operators.exists_successor(self.model, region)
+
+    def forall(self, region: jax.Array) -> jax.Array:
+        """Whether all successors lie in a region: ``bool[S, A]``; True where unavailable."""
+        return ~self.exists(~region)
+
+    def least(self, value: jax.Array) -> jax.Array:
+        """The smallest value among the successors: ``[S, A]``; the dtype's largest without any."""
+        found = operators.least_successor(self.model, value)
+        return jnp.where(self.available, found, kernels.largest(value.dtype))
+
+    def reads(self, marked: jax.Array) -> jax.Array:
+        """Whether an action can make the automaton read a marked transition: ``bool[S, Q, A]``."""
+        return self.available & reads(self.model, marked)
+
+    def first(self, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Whether a mask ``bool[S, A]`` holds for some action, and the first one (or 0)."""
+        return operators.first_action(mask)
+
+    def attract(self, goal, allowed, rule, among, chance: str):
+        """Region, action and rank of an attractor."""
+        return _sweeps(self, goal, allowed & self.available, rule, among, chance=chance)
+
+    def components(self, core, allowed, closed: bool):
+        """As of a HostGraph, by a callback to one."""
+        shape, flat = self.state_shape, int(np.prod(self.state_shape))
+        result = (
+            jax.ShapeDtypeStruct(shape, jnp.int32),
+            jax.ShapeDtypeStruct((*shape, self.num_actions), jnp.bool_),
+        )
+
+        def host(model, core, allowed):
+            return host_graph(model).components(np.asarray(core), np.asarray(allowed), closed)
+
+        def callback():
+            return jax.pure_callback(
+                host, result, self.model, core, allowed, vmap_method="sequential")
+
+        def trivial():
+            number = jnp.arange(flat, dtype=jnp.int32).reshape(shape)
+            return number, jnp.zeros(result[1].shape, bool)
+
+        return lax.cond(core.any(), callback, trivial)
+
+    def anywhere(self, mark: jax.Array, component: jax.Array) -> jax.Array:
+        """Whether a state of the same component is marked: ``bool[S]``."""
+        label = component.ravel()
+        return jnp.zeros(label.size, bool).at[label].max(mark.ravel())[component]
+
+    def repeat(self, body: Any, start: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Repeats while the last entry of what is carried is true."""
+        return lax.while_loop(lambda carry: carry[-1], body, start)
+
+    def times(self, count: Any, body: Any, start: Any) -> Any:
+        """``body(i, carry)`` for i below a count."""
+        return lax.fori_loop(0, count, body, start)
+
+
+jax.tree_util.register_dataclass(TracedGraph, data_fields=["model"], meta_fields=[])
+
+Graph = HostGraph | TracedGraph
+
+
+@partial(jax.jit, static_argnames=("chance",))
+def _sweeps(graph: TracedGraph, goal, allowed, rule, among, *, chance):
+    leads = graph.exists if chance == "some" else graph.forall
+
+    def body(carry):
+        region, action, rank, _, n = carry
+        hit = allowed & leads(region)
+        some, first = graph.first(hit)
+        joins = jnp.where(rule, some, ~graph.first(allowed & ~hit)[0])
+        new = joins & among & ~region
+        # Where every action leads nearer none is better than the first.
+        action = jnp.where(new, jnp.where(rule, first, graph.first(allowed)[1]), action)
+        return region | new, action, jnp.where(new, n + 1, rank), new.any(), n + 1
+
+    _, first = graph.first(graph.available)
+    start = (goal, first, jnp.zeros_like(first), jnp.bool_(True), jnp.int32(0))
+    return lax.while_loop(lambda carry: carry[3], body, start)[:3]
+
+
+def graph_of(model: Any, *arguments: Any) -> Graph:
+    """The graph of a model: the host's, unless the model or an argument is traced."""
+    lazy = model.mdp if isinstance(model, Game) else model
+    world = lazy.mdp if isinstance(lazy, Product) else lazy
+    if is_traced((model, arguments)) or not isinstance(world, MDP | DenseMDP):
+        return TracedGraph(model)
+    return host_graph(model)
+
+
+def host_graph(model: Any) -> HostGraph:
+    """The graph of a concrete model on the host; what its unavailable actions hold is not read."""
+    lazy = model.mdp if isinstance(model, Game) else model
+    world = lazy.mdp if isinstance(lazy, Product) else lazy
+    available, used = np.asarray(world.available), support(world)
+    if isinstance(world, DenseMDP):
+        rows = rows_of_matrix(used)
+    else:
+        rows = rows_of(np.asarray(world.successor), used, world.num_states)
+    if world is lazy:
+        letter = np.zeros(world.num_states, np.int32)
+        return HostGraph(rows, available, letter[:, None], letter, True, world.state_shape)
+    letter = np.asarray(lazy.letter)
+    memory = np.ascontiguousarray(np.asarray(lazy.automaton.delta)[:, letter].T)
+    return HostGraph(
+        rows, available, memory, letter, lazy.label_on == "entry",
+        lazy.state_shape,
+    )
+
+
+def take(graph: Graph, tree: Any) -> Any:
+    """Arrays as a graph computes with them: NumPy's on the host, else JAX's."""
+    return jax.tree.map(graph.xp.asarray, tree)
