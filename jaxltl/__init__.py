@@ -5,6 +5,7 @@ product of the world and the task's automaton; get every answer with its evidenc
 """
 
 import importlib
+import importlib.util
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
@@ -18,7 +19,9 @@ else:
     def __getattr__(name: str) -> Any:
         if name.startswith("_") and name != "__all__":
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        public = importlib.import_module("jaxltl._public")
+        if importlib.util.find_spec(f"{__name__}.{name}"):  # a module of ours
+            return importlib.import_module(f"{__name__}.{name}")
+        public = importlib.import_module(f"{__name__}._public")
         found = {"__all__": public.__all__, **{x: getattr(public, x) for x in public.__all__}}
         globals().update(found)
         if name not in globals():

@@ -61,10 +61,10 @@ from jaxltl.io.hoa import read_hoa, write_hoa
 
 @picture.register
 def _(value: Automaton) -> str:
-    # Deferred: matplotlib is for those who look.
-    from jaxltl import plot
+    # Deferred, and replaced when it is imported: matplotlib is for those who look.
+    from jaxltl.plot.automata import as_svg
 
-    return plot.to_bytes(plot.automaton(value), "svg").decode()
+    return as_svg(value)
 
 
 __all__ = [

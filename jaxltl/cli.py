@@ -1,16 +1,20 @@
 """The command line: learn, synthesize, translate formulas, reproduce published figures.
 
-Heavy modules are imported inside the commands, so that help is quick.
+Heavy modules are imported inside the commands, so that the first line comes at once.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
+import inspect
 import json
+import os
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -19,10 +23,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 import jaxltl
+from jaxltl.app.drawing import artist
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from jaxltl.app.drawing import Picture
     from jaxltl.core.automata.automaton import Automaton
 
 
@@ -66,6 +72,75 @@ def _float64() -> Iterator[None]:
         yield
 
 
+def _compiling(command: Callable[..., None]) -> Callable[..., None]:
+    """For commands that compile: the option that turns the cache of programs off."""
+
+    @click.option("--no-cache", is_flag=True,
+                  help="Compile anew, and keep no compiled programs for the next time.")
+    @functools.wraps(command)
+    def run(*args: Any, no_cache: bool, **options: Any) -> None:
+        _keep_programs(not no_cache)
+        command(*args, **options)
+
+    return run
+
+
+def _keep_programs(wanted: bool) -> None:
+    """Tells JAX to keep compiled programs for the next time, or not to.
+
+    By the environment, where what the user has set there stands; in a process that is not the
+    command's own, nothing is changed.
+    """
+    if not _is_alone():
+        return
+    if not wanted:
+        os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
+        return
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        place = cache_directory()
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            return
+        if not os.access(place, os.W_OK):
+            return
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(place)
+    # However small: a job has many programs, each of which takes longer to compile than to read.
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+    # XLA takes its own hints to the compiler for features that the processor lacks, and says so
+    # as an error for each program that it reads.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+
+def _is_alone() -> bool:
+    """Whether the process is the command's own, where nobody has imported JAX before."""
+    return "jax" not in sys.modules
+
+
+def cache_directory() -> Path:
+    """Where the command line keeps compiled programs: in the user's directory for caches."""
+    home = Path.home()
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
+    elif sys.platform == "darwin":
+        base = home / "Library" / "Caches"
+    else:
+        given = os.environ.get("XDG_CACHE_HOME", "")
+        base = Path(given) if os.path.isabs(given) else home / ".cache"
+    return base / "jaxltl" / "programs"
+
+
+def _say(text: str) -> None:
+    """A line on how far the work is, which is no part of the result."""
+    click.echo(text, err=True)
+
+
+def _begin(text: str) -> None:
+    """The first line, before anything is imported that takes long."""
+    _say(f"jaxltl {jaxltl.__version__}: {text}")
+
+
 def _print_json(result: Any) -> None:
     click.echo(json.dumps(result, allow_nan=False))
 
@@ -76,9 +151,6 @@ def main() -> None:
     """Learn policies that are known to do their task."""
 
 
-# --- learn and check ------------------------------------------------------------------------
-
-
 @main.command()
 @click.argument("task_file", metavar="TASK.toml", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="Directory for the results.  "
@@ -87,6 +159,7 @@ def main() -> None:
 @click.option("--seeds", default=1, show_default=True, type=click.IntRange(1),
               help="Learn with this many seeds side by side and keep the best.")
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
+@_compiling
 @_plain_errors
 def learn(task_file: Path, out: Path | None, seed: int, seeds: int, as_json: bool) -> None:
     """Learn a policy for a task, and say how well it does it.
@@ -95,13 +168,14 @@ def learn(task_file: Path, out: Path | None, seed: int, seeds: int, as_json: boo
     network.npz and the policies of the training worlds. An interrupted run goes on where it
     stopped when it is started again with the same task and options.
     """
+    _begin(f"learning from {task_file}")
+    alone = _is_alone()
     job = _job(task_file)
     task = job.read_task(task_file)
     out = _directory(out, task.name)
     with _float64():
-        outcome = _learn(job, task, out, seed, seeds)
-        result = _write(job, outcome, out, task_file)
-    click.echo(_table(result))
+        result = _learn(job, task, out, seed, seeds, alone)
+    click.echo(_report(result).table(result))
     click.echo(f"\nwrote {out}/report.html and the files beside it")
     if as_json:
         _print_json(result)
@@ -120,48 +194,78 @@ def _job(task_file: Path) -> Any:
     return learn
 
 
-def _learn(job: Any, task: Any, out: Path, seed: int, seeds: int) -> Any:
-    from tqdm import tqdm
+def _learn(job: Any, task: Any, out: Path, seed: int, seeds: int, alone: bool) -> dict[str, Any]:
+    """Does the whole job, shows how far it is, and returns what result.json holds."""
+    from jaxltl.algos.checkpoint import atomic_write
 
-    from jaxltl.algos.learner import atomic_write
-
-    begin = time.perf_counter()
+    start = time.perf_counter()
     setup = job.prepare(task, seed)
+    _say(job.describe(setup))
     checkpoint = out / f"checkpoint-{job.fingerprint(task, seed, seeds)}.npz"
     # A place that cannot be written to must be known before the work, not after.
     with atomic_write(out / "task.toml") as file:
         file.write(task.path.read_bytes())
     if checkpoint.exists():
-        click.echo(f"going on from {checkpoint}", err=True)
-    total = task.learner.get("steps", job.STEPS)
-    with tqdm(total=total, unit="step", leave=False, delay=0.5) as bar:
+        _say(f"going on from {checkpoint}")
+    steps = task.learner.get("steps", job.STEPS)
+    with artist(apart=alone) as begin, _learning(steps) as bar:
+        pictures = [(p, begin(p.drawing)) for p in job.task_pictures(setup)]
 
         def report(step: int, figures: Mapping[str, np.ndarray]) -> None:
+            bar.set_description_str("learning", refresh=False)
             bar.update(step - bar.n)
             bar.set_postfix(loss=f"{figures['loss'].min():.4f}",
                             gradient=f"{figures['gradient_norm'].max():.1e}")
 
         try:
-            parts = job.learn(setup, seed, seeds, report=report, checkpoint=checkpoint)
+            parts = job.learn(setup, seed, seeds, report=report, checkpoint=checkpoint,
+                              progress=bar.set_description_str)
         except KeyboardInterrupt:
             bar.close()
             kept = "; the same command goes on from the last checkpoint"
-            click.echo(f"interrupted{kept if checkpoint.exists() else ''}", err=True)
+            _say(f"interrupted{kept if checkpoint.exists() else ''}")
             raise SystemExit(130) from None
-    checkpoint.unlink(missing_ok=True)
-    return job.Outcome(setup, *parts, seed=seed, seconds=time.perf_counter() - begin)
+        checkpoint.unlink(missing_ok=True)
+        outcome = job.Outcome(setup, *parts, seed=seed, seconds=time.perf_counter() - start)
+        bar.set_description_str("drawing")
+        pictures += [(p, begin(p.drawing)) for p in job.pictures(outcome)]
+        return _write(job, outcome, out, pictures)
 
 
-def _write(job: Any, outcome: Any, out: Path, task_file: Path) -> dict[str, Any]:
-    from jaxltl.algos.learner import atomic_write
+@contextlib.contextmanager
+def _learning(total: int) -> Iterator[Any]:
+    """A progress bar that moves each second, whatever the work is at."""
+    from tqdm import tqdm
+
+    done = threading.Event()
+    with tqdm(total=total, unit="step", leave=False, desc="compiling") as bar:
+
+        def tick() -> None:
+            while not done.wait(1):
+                bar.refresh()
+
+        clock = threading.Thread(target=tick, daemon=True)
+        clock.start()
+        try:
+            yield bar
+        finally:
+            done.set()
+            clock.join()
+
+
+def _write(
+    job: Any, outcome: Any, out: Path, pictures: list[tuple[Picture, Callable[[], bytes]]]
+) -> dict[str, Any]:
+    from jaxltl.algos.checkpoint import atomic_write
 
     result = job.summary(outcome)
     job.save(out, outcome)
-    pictures = job.pictures(outcome)
-    for name, _, svg, _ in pictures:
-        with atomic_write(out / name) as file:
-            file.write(svg)
-    page = _report(result).page(result, [p[1:] for p in pictures], task_file.read_text())
+    shown = []
+    for picture, drawn in pictures:
+        shown.append((picture.title, drawn(), picture.caption))
+        with atomic_write(out / picture.name) as file:
+            file.write(shown[-1][1])
+    page = _report(result).page(result, shown, (out / "task.toml").read_text())
     with atomic_write(out / "report.html") as file:
         file.write(page.encode())
     # Last, so that its presence says that all the rest is there.
@@ -178,65 +282,17 @@ def _report(result: Mapping[str, Any]) -> Any:
     return report_todirl if result["method"] == "todirl" else report
 
 
-def _table(result: Mapping[str, Any]) -> str:
-    if result["method"] == "todirl":
-        return str(_report(result).table(result))
-    from jaxltl.app.reports.learn import certified, number, place, probability, spread, warnings
-
-    shown, training, seeds = result["demonstrations"], result["training"], result["seeds"]
-    dropped = f", {shown['dropped']} unfinished dropped" if shown["dropped"] else ""
-    lines = [
-        f"{result['task']}: {result['num_states']} states x {result['num_memory']} memory states, "
-        f"{shown['number']} {'synthetic ' * shown['synthetic']}demonstrations "
-        f"({shown['pairs']} pairs{dropped}), {result['method']} in the {result['in']}",
-        "",
-        "probability of doing the task, over "
-        f"{result['satisfaction']['num_starts']} initial states",
-    ]
-    for title, key in (("learned policy", "satisfaction"), ("best achievable", "best_achievable")):
-        for what in ("mean", "minimum"):
-            entry = result[key][what]
-            where = place(entry) if what == "minimum" else ""
-            lines.append(
-                f"  {title:16} {what:8} {probability(entry['value']):>9}   certified "
-                f"{certified(entry):15} {where}".rstrip()
-            )
-    weights = "  ".join(f"{k} {number(v)}" for k, v in result["weights"].items())
-    lines += [
-        "",
-        f"negative log-likelihood  {number(result['neg_log_likelihood'])}",
-        f"weights                  {weights}",
-    ]
-    if training["converged"]:
-        lines.append(
-            f"learning                 converged in {training['steps']} steps "
-            f"(gradient norm {training['gradient_norm']:.1e})"
-        )
-    if seeds["number"] > 1:
-        lines += [
-            "",
-            f"over {seeds['number']} seeds ({seeds['converged']} converged; the one of least loss "
-            "is above)",
-            f"  mean                    {spread(seeds['mean'])}",
-            f"  minimum                 {spread(seeds['minimum'])}",
-            f"  negative log-likelihood {spread(seeds['neg_log_likelihood'])}",
-        ]
-    lines += [f"\nwarning: {text}" for text in warnings(result)]
-    return "\n".join(lines)
-
-
 @main.command()
 @click.argument("task_file", metavar="TASK.toml", type=click.Path(path_type=Path))
+@_compiling
 @_plain_errors
 def check(task_file: Path) -> None:
     """Check a task file and all that it names, without learning."""
+    _begin(f"checking {task_file}")
     job = _job(task_file)
     with _float64():
         setup = job.prepare(job.read_task(task_file), seed=0)
     click.echo(f"ok: {job.describe(setup)}")
-
-
-# --- synthesize -----------------------------------------------------------------------------
 
 
 @main.command()
@@ -247,6 +303,7 @@ def check(task_file: Path) -> None:
               help="The cell of the environment's robot in moves.svg, from 1.  "
               "[default: where the strategy forbids most]")
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
+@_compiling
 @_plain_errors
 def synthesize(
     game_file: Path, out: Path | None, environment: tuple[int, int] | None, as_json: bool
@@ -261,12 +318,13 @@ def synthesize(
     The exit status is 0 whoever wins; 2 for mistakes, and for a task that is unrealizable from
     every initial state where the file demands a strategy by a table [strategy].
     """
-    from jaxltl.algos.learner import atomic_write
+    begin = time.perf_counter()
+    _begin(f"solving {game_file}")
+    from jaxltl.algos.checkpoint import atomic_write
     from jaxltl.app import synthesize as synthesis
     from jaxltl.app.files.game import read_game
     from jaxltl.app.reports import synthesize as report
 
-    begin = time.perf_counter()
     file = read_game(game_file)
     out = _directory(out, file.name)
     # A place that cannot be written to must be known before the work, not after.
@@ -316,7 +374,7 @@ def _stages(names: tuple[str, ...]) -> Iterator[Callable[[str], None]]:
 
 
 def _write_synthesis(found: Any, out: Path, place: int | None, begin: float) -> dict[str, Any]:
-    from jaxltl.algos.learner import atomic_write
+    from jaxltl.algos.checkpoint import atomic_write
     from jaxltl.app.reports import synthesize as report
 
     for stale in ("result.json", *report.FILES):
@@ -330,9 +388,6 @@ def _write_synthesis(found: Any, out: Path, place: int | None, begin: float) -> 
     with atomic_write(out / "result.json") as file:
         file.write((json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
     return result
-
-
-# --- automaton ------------------------------------------------------------------------------
 
 
 @main.command()
@@ -410,9 +465,6 @@ def _render(result: Automaton, form: str, formula: str) -> str:
     return plot.to_bytes(plot.automaton(result), "svg").decode()
 
 
-# --- reproduce ------------------------------------------------------------------------------
-
-
 _EXPERIMENTS = {
     "mlirl": "section 2.5, inverse reinforcement learning with a temporal-logic task",
     "todirl": "section 3.5, reward networks that plan in worlds never seen",
@@ -430,19 +482,18 @@ _EXPERIMENTS = {
               help="How often learning is repeated, in todirl, pac and cce.  [default: 10; in cce "
                    "50 for the regulator, 5 for the robot]")
 @click.option("--json", "as_json", is_flag=True, help="End with the figures as one JSON line.")
+@_compiling
 @_plain_errors
 def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> None:
     """Print published figures beside ours."""
-    import importlib
-    import inspect
-
+    _begin(f"reproducing {what}")
     experiment = importlib.import_module(f"jaxltl.reproduce.{what}")
     options = {} if seeds is None else {"seeds": seeds}
     if seeds is not None and "seeds" not in inspect.signature(experiment.figures).parameters:
         raise ValueError(f"reproduce {what} does not learn with several seeds; leave --seeds out.")
     with _float64():
         result = experiment.figures(
-            progress=lambda text: click.echo(text, err=True), **options)
+            progress=_say, **options)
         pictures = experiment.pictures(result) if hasattr(experiment, "pictures") else []
     click.echo(experiment.table(result))
     if pictures:
@@ -452,7 +503,7 @@ def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> 
 
 
 def _write_pictures(pictures: list[tuple[str, bytes]], out: Path) -> None:
-    from jaxltl.algos.learner import atomic_write
+    from jaxltl.algos.checkpoint import atomic_write
 
     out.mkdir(parents=True, exist_ok=True)
     for name, picture in pictures:

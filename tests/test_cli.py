@@ -2,17 +2,21 @@
 
 import doctest
 import json
+import os
 import re
 import shlex
 import subprocess
 import sys
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from jaxltl.cli import main
+import jaxltl
+from jaxltl.app.drawing import artist, draw, drawing
+from jaxltl.cli import cache_directory, main
 from jaxltl.core.automata.language import is_equivalent
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.io.hoa import read_hoa_stream
@@ -30,8 +34,10 @@ def failure(*arguments, input=None):
     """The message of a command that must fail plainly."""
     result = run(*arguments, input=input)
     assert result.exit_code == 2, result.output
-    assert result.stderr.startswith("error: ") and "Traceback" not in result.output
-    return result.stderr
+    assert "Traceback" not in result.output
+    _, start, message = result.stderr.rpartition("error: ")  # after what told of the progress
+    assert start
+    return start + message
 
 
 # --- automaton ------------------------------------------------------------------------------
@@ -264,25 +270,117 @@ def test_places_that_cannot_be_used(write, tmp_path):  # noqa: F811
 
 def test_check(write):  # noqa: F811
     result = run("check", write())
-    assert result.output == "ok: 6 states, 3 memory states, 1 demonstrations of 2 pairs\n"
+    assert result.stdout == "ok: 6 states, 3 memory states, 1 demonstrations of 2 pairs\n"
     assert "demonstration 1, step 1" in failure(
         "check", write(shown={"demonstrations": [{"cells": [[9, 9]], "actions": ["up"]}]}))
 
 
 def test_the_examples_are_sound():
     for name in ("two_goals", "slippery_delivery"):
-        assert run("check", f"examples/{name}.toml").output.startswith("ok: ")
+        assert run("check", f"examples/{name}.toml").stdout.startswith("ok: ")
 
 
-def test_help_does_not_load_the_pictures():
-    code = (
-        "import sys; from click.testing import CliRunner; from jaxltl.cli import main; "
-        "r = CliRunner().invoke(main, ['--help']); assert r.exit_code == 0; "
-        "print([m for m in ('matplotlib', 'tqdm', 'jaxltl.app.learn', 'jaxltl.plot') "
-        "if m in sys.modules])"
+def alone(code, tmp_path, **environment):
+    """What a fresh process prints, that has imported nothing yet."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XDG_", "TF_"))}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True,
+        env={**kept, "XDG_CACHE_HOME": str(tmp_path), **environment},
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    return done.stdout.strip()
+
+
+def test_the_first_line_comes_before_anything_heavy(tmp_path):
+    """When it is written, neither JAX nor NumPy has been imported; help needs neither, too."""
+    heavy = "[m for m in ('jax', 'numpy', 'matplotlib', 'tqdm', 'scipy') if m in sys.modules]"
+    code = f"""
+import sys, click
+from click.testing import CliRunner
+import jaxltl
+from jaxltl.app.drawing import artist, draw, drawing
+from jaxltl.cli import cache_directory, main
+assert CliRunner().invoke(main, ["--help"]).exit_code == 0
+def echo(text, **_):
+    print(text, {heavy})
+    raise SystemExit
+click.echo = echo
+main(["learn", "task.toml"])"""
+    assert alone(code, tmp_path) == f"jaxltl {jaxltl.__version__}: learning from task.toml []"
+
+
+def test_the_command_keeps_compiled_programs_and_the_library_does_not(tmp_path):
+    def cached(*arguments, **environment):
+        code = f"""
+import sys
+from jaxltl import cli
+cli._begin = lambda text: sys.exit()
+try:
+    cli.main({list(arguments)!r})
+except SystemExit:
+    import jax
+    print(jax.config.jax_enable_compilation_cache, jax.config.jax_compilation_cache_dir,
+          jax.config.jax_persistent_cache_min_compile_time_secs,
+          jax.config.jax_persistent_cache_min_entry_size_bytes)"""
+        return alone(code, tmp_path, **environment)
+
+    place = tmp_path / "jaxltl" / "programs"
+    assert cached("learn", "a.toml") == f"True {place} 0.0 -1"
+    assert place.is_dir()
+    assert cached("learn", "a.toml", "--no-cache").startswith("False None")
+    mine = {"JAX_COMPILATION_CACHE_DIR": "/mine", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "2"}
+    assert cached("check", "a.toml", **mine) == "True /mine 2.0 -1"
+    nowhere = tmp_path / "file"
+    nowhere.write_text("")
+    assert cached("learn", "a.toml", XDG_CACHE_HOME=str(nowhere)).startswith("True None")
+    library = "import jaxltl, jax; jaxltl.MDP; print(jax.config.jax_compilation_cache_dir)"
+    assert alone(library, tmp_path) == "None"
+
+
+@pytest.mark.parametrize(("platform", "environment", "place"), [
+    ("linux", {}, ".cache"), ("linux", {"XDG_CACHE_HOME": "relative"}, ".cache"),
+    ("linux", {"XDG_CACHE_HOME": "/caches"}, "/caches"), ("darwin", {}, "Library/Caches"),
+    ("win32", {}, "AppData/Local"), ("win32", {"LOCALAPPDATA": "/local"}, "/local"),
+])
+def test_where_programs_are_kept(monkeypatch, platform, environment, place):
+    for name in ("XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(sys, "platform", platform)
+    assert cache_directory() == Path.home() / place / "jaxltl" / "programs"
+
+
+def test_drawn_in_another_process_a_picture_is_the_same():
+    task = drawing("automaton", to_automaton("F a"), layout="matplotlib")
+    with artist(apart=True) as begin:
+        first = begin(task)
+        assert len(first()) == len(draw(task))  # the names in the file are drawn by lot
+        wrong = begin(drawing("automaton", None))
+        with pytest.raises(AttributeError):
+            wrong()
+
+
+def test_a_dead_process_draws_nothing_and_loses_nothing(monkeypatch):
+    class Pool:
+        def __init__(self, *_):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def submit(self, *_):
+            return self
+
+        def result(self):
+            raise BrokenExecutor
+
+    monkeypatch.setattr("jaxltl.app.drawing.ProcessPoolExecutor", Pool)
+    task = drawing("automaton", to_automaton("F a"), layout="matplotlib")
+    with artist(apart=True) as begin:
+        assert begin(task)().endswith(b"</svg>\n")
 
 
 # --- reproduce ------------------------------------------------------------------------------

@@ -13,15 +13,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core.models.monitor import Verdict, make_monitor
-from jaxltl.core.models.product import Product, lift_policy, product, project_policy
-from jaxltl.core.models.restrict import restrict
-from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.types import Solution, Status
-from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
 
 import jaxltl
 from jaxltl.algos import learner, mlirl
+from jaxltl.algos.checkpoint import atomic_write
+from jaxltl.app.drawing import Picture, drawing
 from jaxltl.app.files.task import (
     Task,
     World,
@@ -30,10 +26,16 @@ from jaxltl.app.files.task import (
     read_task,
     synthetic_demonstrations,
 )
+from jaxltl.core.models.monitor import Verdict, verdicts
+from jaxltl.core.models.product import Product, lift_policy, product, project_policy
+from jaxltl.core.models.restrict import restrict
+from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.types import Solution, Status
+from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
 
 __all__ = [
     "STEPS", "Learned", "Outcome", "Setup", "describe", "fingerprint", "history_of", "learn",
-    "pictures", "prepare", "read_task", "save", "summary",
+    "pictures", "prepare", "read_task", "save", "summary", "task_pictures",
 ]
 
 Report = Callable[[int, Mapping[str, np.ndarray]], None]
@@ -221,8 +223,11 @@ def learn(
     *,
     report: Report | None = None,
     checkpoint: Path | None = None,
+    progress: Callable[[str], None] = lambda stage: None,
 ) -> tuple[Learned, int, Solution, Solution, np.ndarray]:
     """Learns with N seeds, keeps the best, and evaluates it; see :class:`Outcome`.
+
+    What it is at is told to `report`, steps and figures, and to `progress`, the stage's name.
 
     Raises:
       ValueError: the learner cannot work on this task.
@@ -233,6 +238,7 @@ def learn(
     learned = METHODS[spec["method"]](
         spec, model, setup.demonstrations, keys, report, checkpoint
     )
+    progress("checking")
     loss = np.where(np.isfinite(learned.loss), learned.loss, np.inf)
     chosen = int(np.argmin(np.where(learned.converged, loss, loss + 1e12)))
     solution = satisfaction_probability(model, learned.policy[chosen])
@@ -256,7 +262,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, world, model = setup.task, setup.world, setup.model
     starts = np.flatnonzero(np.asarray(model.mdp.initial) > 0)
-    impossible = [int(s) for s in starts if from_starts(model, outcome.best.upper)[s] <= 0]
+    impossible = starts[from_starts(model, outcome.best.upper)[starts] <= 0].tolist()
     mean = outcome.satisfaction @ np.asarray(model.mdp.initial)
     least = outcome.satisfaction[:, starts].min(axis=1)
     pairs = int(np.sum(np.asarray(setup.demonstrations.length)))
@@ -371,67 +377,58 @@ def save_policy(path: Path, outcome: Outcome) -> None:
         "lower": outcome.solution.lower,
         "upper": outcome.solution.upper,
     }
-    with learner.atomic_write(path) as file:
+    with atomic_write(path) as file:
         np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
 
 
-def pictures(outcome: Outcome) -> list[tuple[str, str, bytes, str]]:
-    """The report's pictures: file name, title, SVG and caption of each."""
-    # Deferred: learning alone does not need matplotlib.
-    from jaxltl import plot
-
-    setup, model = outcome.setup, outcome.setup.model
-    task_graph = plot.automaton(model.automaton)
-    found = [(
-        "automaton.svg", "The task as an automaton", plot.to_bytes(task_graph),
+def task_pictures(setup: Setup) -> list[Picture]:
+    """The report's pictures that nothing has to be learned for."""
+    return [Picture(
+        "automaton.svg", "The task as an automaton", drawing("automaton", setup.model.automaton),
         "States with a double circle: the task is done, whatever follows. Grey: it has failed. "
         "Each state is named by the formula that is left to satisfy.",
     )]
-    if setup.world.cells is not None:
-        found += _maps(outcome, setup.world.cells)
-    history = outcome.learned.history
-    curves = plot.curves(
-        {k: v.T for k, v in history.items() if k != "step"}, steps=history["step"],
-        show=("loss", "neg_log_likelihood", "satisfaction", "gradient_norm"),
-    )
-    found.append((
-        "learning.svg", "Learning", plot.to_bytes(curves),
+
+
+def pictures(outcome: Outcome) -> list[Picture]:
+    """The report's pictures of what was learned."""
+    cells, history = outcome.setup.world.cells, outcome.learned.history
+    return [*([] if cells is None else _maps(outcome, cells)), Picture(
+        "learning.svg", "Learning",
+        drawing(
+            "curves", {k: v.T for k, v in history.items() if k != "step"}, steps=history["step"],
+            show=("loss", "neg_log_likelihood", "satisfaction", "gradient_norm"),
+        ),
         "Figures of the weights before each step"
         + ("; the line is the median over seeds, the band holds all of them."
            if len(outcome.learned.loss) > 1 else "."),
-    ))
-    return found
+    )]
 
 
-def _maps(outcome: Outcome, cells: np.ndarray) -> list[tuple[str, str, bytes, str]]:
-    from jaxltl import plot
-
+def _maps(outcome: Outcome, cells: np.ndarray) -> list[Picture]:
     model, actions = outcome.setup.model, outcome.setup.world.actions
     policy = np.asarray(outcome.learned.policy[outcome.chosen])
     value = np.array(outcome.solution.value)
     starts = np.asarray(model.mdp.initial) > 0
     at_start = np.where(starts, from_starts(model, value), np.nan)
-    values = plot.grid(cells, at_start, label="probability of doing the task")
     # Memory states where the policy still matters: not done, not failed, and reachable.
-    open_ = np.asarray(make_monitor(model.automaton).verdict) == Verdict.UNDECIDED
+    open_ = verdicts(model.automaton) == Verdict.UNDECIDED
     undecided = open_ & (value > 0).any(axis=0)
     met = _reached(model)
     shown = np.flatnonzero(undecided & met.any(axis=0))
     names = model.automaton.state_names or ("",) * model.num_memory
-    maps = [(
-        "values.svg", "From where it works", plot.to_bytes(values),
+    label = "probability of doing the task"
+    maps = [Picture(
+        "values.svg", "From where it works", drawing("grid", cells, at_start, label=label),
         "Probability that the learned policy does the task, from each initial state.",
     )]
     if shown.size:
         panels = np.where(met, value, np.nan).T[shown]
         arrows = np.where(met[..., None], policy, np.nan).transpose(1, 0, 2)[shown]
         titles = [short_name(f"memory {q}: {names[q]}") for q in shown]
-        picture = plot.grid(
-            cells, panels, arrows, titles=titles, label="probability of doing the task",
-            actions=actions,
-        )
-        maps.append((
-            "policy.svg", "What it does", plot.to_bytes(picture),
+        maps.append(Picture(
+            "policy.svg", "What it does",
+            drawing("grid", cells, panels, arrows, titles=titles, label=label, actions=actions),
             "One map for each state of the automaton, which is the policy's memory. An arrow is as "
             "long as its action is likely; colours are the probability of doing the task from "
             "there. Cells that cannot be met with that memory are blank.",

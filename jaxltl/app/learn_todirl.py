@@ -7,7 +7,7 @@ knows the task and one that moves at random.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+
+import jaxltl
+from jaxltl.algos import learner, todirl
+from jaxltl.algos.checkpoint import atomic_write
+from jaxltl.app.drawing import Picture, drawing
 from jaxltl.app.files.task_todirl import (
     Scene,
     Task,
@@ -27,10 +32,11 @@ from jaxltl.app.files.task_todirl import (
     load_scenes,
     read_task,
 )
+from jaxltl.app.learn import Report, by_name, fingerprint, history_of, plain, short_name
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.models.batch import lift_memory, stack_products
-from jaxltl.core.models.monitor import Verdict, make_monitor
+from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.operators import action_mean, expectation
 from jaxltl.core.models.product import Product, product, project_policy
 from jaxltl.core.models.trajectories import Trajectories
@@ -46,13 +52,9 @@ from jaxltl.envs import temporal_gridworld
 from jaxltl.envs.gridworld import ACTIONS
 from jaxltl.io.learned_reward import LearnedReward, save_reward
 
-import jaxltl
-from jaxltl.algos import learner, todirl
-from jaxltl.app.learn import Report, by_name, fingerprint, history_of, plain, short_name
-
 __all__ = [
     "STEPS", "Outcome", "Setup", "describe", "fingerprint", "learn", "pictures", "prepare",
-    "read_task", "save", "summary",
+    "read_task", "save", "summary", "task_pictures",
 ]
 
 STEPS = 300  # at most, unless the task says otherwise
@@ -267,8 +269,11 @@ def learn(
     *,
     report: Report | None = None,
     checkpoint: Path | None = None,
+    progress: Callable[[str], None] = lambda stage: None,
 ) -> tuple[Learned, int, Judged, Judged | None]:
     """Learns with N seeds, keeps one without looking at test worlds, and judges it.
+
+    What it is at is told to `report`, steps and figures, and to `progress`, the stage's name.
 
     Raises:
       ValueError: the learner cannot work on this task.
@@ -302,6 +307,7 @@ def learn(
     score = np.where(np.isfinite(learned.held_out), learned.held_out, np.inf)
     loss = np.where(np.isfinite(history["loss"][-1]), history["loss"][-1], np.inf)
     chosen = int(np.argmin(score if np.isfinite(score).any() else loss))
+    progress("checking")
     judged, count = _judge(setup, learned, network, hparams, chosen), setup.num_training
     test = judged.part(slice(count, None)) if count < len(judged.status) else None
     return learned, chosen, judged.part(slice(count)), test
@@ -541,7 +547,7 @@ def save(out: Path, outcome: Outcome) -> None:
             "actions": np.array(ACTIONS),
             "satisfaction": outcome.training.performance["learned"].value[w, :size],
         }
-        with learner.atomic_write(out / f"policy_{w + 1}.npz") as file:
+        with atomic_write(out / f"policy_{w + 1}.npz") as file:
             np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
 
 
@@ -562,39 +568,35 @@ def learned_reward(outcome: Outcome) -> LearnedReward:
 # --- pictures -------------------------------------------------------------------------------
 
 
-Picture = tuple[str, str, bytes, str]
-
-
-def pictures(outcome: Outcome) -> list[Picture]:
-    """The report's pictures: file name, title, SVG and caption of each."""
-    # Deferred: learning alone does not need matplotlib.
-    from jaxltl import plot
-
-    setup, history = outcome.setup, outcome.learned.history
-    found = [(
-        "automaton.svg", "The task as an automaton", plot.to_bytes(plot.automaton(setup.judge)),
+def task_pictures(setup: Setup) -> list[Picture]:
+    """The report's pictures that nothing has to be learned for."""
+    found = [Picture(
+        "automaton.svg", "The task as an automaton", drawing("automaton", setup.judge),
         "States with a double circle: the task is done, whatever follows. Grey: it has failed. "
         "Each state is named by the formula that is left to satisfy.",
     )]
     if setup.memory is not setup.judge:
-        found.append((
-            "memory.svg", "What the learner remembers",
-            plot.to_bytes(plot.automaton(setup.memory)),
+        found.append(Picture(
+            "memory.svg", "What the learner remembers", drawing("automaton", setup.memory),
             "The automaton whose state is the learner's memory; the task above judges it.",
         ))
-    curves = plot.curves(
-        {k: history[k].T for k in ("per_pair", "held_out", "gradient_norm")},
-        steps=history["step"],
-    )
-    found.append((
-        "learning.svg", "Learning", plot.to_bytes(curves),
+    return found
+
+
+def pictures(outcome: Outcome) -> list[Picture]:
+    """The report's pictures of what was learned."""
+    setup, history = outcome.setup, outcome.learned.history
+    found = [Picture(
+        "learning.svg", "Learning",
+        drawing("curves", {k: history[k].T for k in ("per_pair", "held_out", "gradient_norm")},
+                steps=history["step"]),
         "Negative log-likelihood of the average demonstrated pair, of the average held-out pair "
         "where there are any, and the gradient's length, before each step"
         + ("" if np.isnan(outcome.learned.held_out).any()
            else ". What is kept has the least held-out figure")
         + ("; the line is the median over seeds, the band holds all of them."
            if len(outcome.learned.held_out) > 1 else "."),
-    ))
+    )]
     for w, scene in list(enumerate(setup.training.scenes))[:_PICTURES]:
         found += _draw(outcome, setup.training, outcome.training, w, f"training_{w + 1}",
                        f"Training world: {scene.name}", True)
@@ -622,8 +624,6 @@ def _draw(
     arrows: bool,
 ) -> list[Picture]:
     """A world with runs of its policy and, if asked for, the policy itself."""
-    from jaxltl import plot
-
     setup, scene = outcome.setup, worlds.scenes[w]
     size = scene.mdp.num_states
     policy = judged.policy[w][..., :size, :, :]
@@ -644,23 +644,23 @@ def _draw(
         assert scene.cells is not None
         panels = np.broadcast_to(
             np.asarray(judged.performance["learned"].value[w])[:size], (len(shown), size))
-        drawn = plot.grid(
-            scene.cells, panels, moving.transpose(1, 0, 2)[shown], titles=titles,
+        drawn = drawing(
+            "grid", scene.cells, panels, moving.transpose(1, 0, 2)[shown], titles=titles,
             label="probability from a start there",
             wall=setup.task.world.get("wall", "#"),
         )
         caption += " Colours: the probability of doing the task if a run starts there."
-        return [(f"{stem}.svg", title, plot.to_bytes(drawn), caption)]
+        return [Picture(f"{stem}.svg", title, drawn, caption)]
     found: list[Picture] = []
     if arrows:
-        drawn = plot.temporal_gridworld(scene.colored, moving, memory=shown, title=titles)
-        found.append((f"{stem}.svg", title, plot.to_bytes(drawn), caption))
+        drawn = drawing("temporal_gridworld", _part(scene.colored, ...), moving, memory=shown,
+                        title=titles)
+        found.append(Picture(f"{stem}.svg", title, drawn, caption))
     if policy.ndim == 3:
         walks = _walks(outcome, worlds, w, judged.policy[w])
-        drawn = plot.temporal_gridworld(scene.colored, trajectories=walks)
-        found.append((
+        found.append(Picture(
             f"{stem}_runs.svg", title if not arrows else f"Runs in {scene.name}",
-            plot.to_bytes(drawn),
+            drawing("temporal_gridworld", _part(scene.colored, ...), trajectories=walks),
             f"{len(walks.length)} runs of the learned policy from random starts, each until the "
             "task is done or has failed.",
         ))
@@ -669,8 +669,7 @@ def _draw(
 
 def _memory_shown(setup: Setup) -> list[int]:
     """Memory states in which there is something left to do."""
-    verdict = np.asarray(make_monitor(setup.memory).verdict)
-    open_ = np.flatnonzero(verdict == Verdict.UNDECIDED)
+    open_ = np.flatnonzero(verdicts(setup.memory) == Verdict.UNDECIDED)
     return [int(q) for q in open_] or [0]
 
 

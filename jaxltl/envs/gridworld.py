@@ -9,40 +9,11 @@ import numpy as np
 
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.mdp import MDP, make_mdp
+from jaxltl.envs.text_map import parse_map
 
 ACTIONS = ("up", "down", "left", "right")
 _MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
 _SIDEWAYS = ((2, 3), (2, 3), (0, 1), (0, 1))
-
-
-def parse_map(text: str) -> np.ndarray:
-    """The cells of a text map, ``str[rows, columns]``.
-
-    One line per row. If any line has spaces inside, cells are words between spaces;
-    otherwise each character is a cell. Blank lines are ignored.
-
-    Raises:
-      ValueError: the map is empty or its rows differ in length.
-
-    Example:
-      >>> parse_map('''
-      ... ..y
-      ... b#.
-      ... ''').shape
-      (2, 3)
-    """
-    lines = [line.strip() for line in text.strip().splitlines() if line.strip()]
-    if not lines:
-        raise ValueError("the map is empty; give at least one row of cells.")
-    words = any(len(line.split()) > 1 for line in lines)
-    rows = [line.split() if words else list(line) for line in lines]
-    for i, row in enumerate(rows):
-        if len(row) != len(rows[0]):
-            raise ValueError(
-                f"map row {i + 1} has {len(row)} cells, row 1 has {len(rows[0])}: "
-                f"{lines[i]!r}. All rows must have the same length."
-            )
-    return np.array(rows)
 
 
 def gridworld(

@@ -100,7 +100,7 @@ def grid_game(
     ``system_turn``; and ``system_p`` and ``environment_p`` for each proposition p of the map.
 
     Args:
-      text: the map, see :func:`~jaxltl.envs.gridworld.parse_map`.
+      text: the map, see :func:`~jaxltl.envs.text_map.parse_map`.
       system_start, environment_start: where the robots start: a propositional formula over
         the map's propositions, or one cell's row and column, from 0 at the top left; default
         anywhere. Runs start uniformly in the pairs of two different cells, the system to move.
@@ -160,7 +160,7 @@ def places(text: str, *, wall: str = "#") -> np.ndarray:
     """Row and column of each place of a map, in the order of their numbers: ``int[C, 2]``.
 
     Args:
-      text: the map, see :func:`~jaxltl.envs.gridworld.parse_map`.
+      text: the map, see :func:`~jaxltl.envs.text_map.parse_map`.
       wall: the kind of cell that is not a place.
 
     Example:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.algos import todirl
-from jaxltl.algos.learner import atomic_write
+from jaxltl.algos.checkpoint import atomic_write
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import from_dict, to_dict
 from jaxltl.core.models.mdp import MDP

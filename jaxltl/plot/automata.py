@@ -15,18 +15,15 @@ from matplotlib.patches import Circle, FancyArrowPatch
 from matplotlib.path import Path
 from numpy.typing import NDArray
 
-from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.automaton import Automaton, picture
 from jaxltl.core.automata.text import edge_guards
 from jaxltl.plot import layout as drawing
-from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER
+from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER, to_bytes
 
 _NOTES = {
     "buchi": "●: accepting; a word is accepted if its run takes such arrows infinitely often",
     "parity": "a word is accepted if the least number that its run meets infinitely often is even",
 }
-
-
-# --- automata -------------------------------------------------------------------------------
 
 
 def automaton(
@@ -57,7 +54,7 @@ def automaton(
     """
     table = _on_the_host(automaton)
     doomed = drawing.rejecting(table)
-    texts = _edge_texts(table, doomed)
+    texts = edge_texts(table, doomed)
     graph = drawing.arrange(
         table.delta, int(table.initial), doomed, texts, _places(table, texts, layout)
     )
@@ -86,6 +83,12 @@ def automaton(
             color=MUTED, va="center", family="monospace", parse_math=False,
         )
     return figure
+
+
+@picture.register
+def as_svg(value: Automaton) -> str:
+    """What a notebook shows of an automaton."""
+    return to_bytes(automaton(value), "svg").decode()
 
 
 def _on_the_host(automaton: Automaton) -> Automaton:
@@ -126,7 +129,7 @@ def pretty_guard(text: str) -> str:
     )
 
 
-def _edge_texts(
+def edge_texts(
     table: Automaton, doomed: NDArray[np.bool_]
 ) -> dict[drawing.Key, drawing.Rows]:
     """The marks and guards on each curve.

@@ -1,31 +1,28 @@
-"""The cells of a map as places that can be filled, framed and moved between."""
+"""The cells of a map: places that are filled, framed and numbered, and arrows between them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Polygon, Rectangle
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.envs.gridworld import parse_map
-from jaxltl.plot.style import (
-    _STEPS,
-    FAINT,
-    INK,
-    MUTED,
-    PAPER,
-)
+from jaxltl.envs.text_map import parse_map
+from jaxltl.plot.style import FAINT, INK, MUTED, PAPER
 
-_TURNS = {**_STEPS, "stay": (0, 0)}
+STEPS = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)}
+DIRECTIONS = {**STEPS, "stay": (0, 0)}
 
-_ROBOT, _LOSES, _WALL = "#c2571a", "#ead0cb", "#55606c"
+ROBOT, LOSES, WALL = "#c2571a", "#ead0cb", "#55606c"
 
 
-class _Board(NamedTuple):
+class Board(NamedTuple):
     """The cells of a game's map, and where its C places lie."""
 
     cells: NDArray[np.str_]
@@ -33,16 +30,16 @@ class _Board(NamedTuple):
     wall: str
 
 
-def _board(board: int | str, wall: str) -> _Board:
+def board_of(board: int | str, wall: str) -> Board:
     if isinstance(board, str):
         cells = parse_map(board)
-        return _Board(cells, np.argwhere(cells != wall), wall)
+        return Board(cells, np.argwhere(cells != wall), wall)
     row, column = np.divmod(np.arange(board * board), board)  # numbered from the lower left
     places = np.stack([board - 1 - row, column], axis=-1)
-    return _Board(np.full((board, board), "."), places, wall)
+    return Board(np.full((board, board), "."), places, wall)
 
 
-def _fill(axes: Axes, world: _Board, colors: Sequence[str], lines: str = PAPER) -> None:
+def fill_cells(axes: Axes, world: Board, colors: Sequence[str], lines: str = PAPER) -> None:
     """A colour for each place, and the names of cells in their corners."""
     for (row, column), color in zip(world.places, colors, strict=True):
         axes.add_patch(Rectangle((column, row), 1, 1, facecolor=color, lw=0))
@@ -50,28 +47,35 @@ def _fill(axes: Axes, world: _Board, colors: Sequence[str], lines: str = PAPER) 
         if kind not in (".", world.wall) and max(world.cells.shape) <= 16:
             axes.text(column + 0.07, row + 0.07, kind, ha="left", va="top", fontsize=6.5,
                       color=MUTED, weight="bold", parse_math=False, zorder=5)
-    _frame(axes, world, lines)
+    frame_cells(axes, world, lines)
 
 
-def _frame(axes: Axes, world: _Board, color: str = PAPER) -> None:
+def frame_cells(axes: Axes, world: Board, color: str = PAPER) -> None:
     rows, columns = world.cells.shape
     for row, column in np.argwhere(world.cells == world.wall):
-        axes.add_patch(Rectangle((column, row), 1, 1, facecolor=_WALL, lw=0))
-    lines = [((0, r), (columns, r)) for r in range(rows + 1)]
-    lines += [((c, 0), (c, rows)) for c in range(columns + 1)]
-    axes.add_collection(LineCollection(lines, colors=color, linewidths=0.6, zorder=2))
+        axes.add_patch(Rectangle((column, row), 1, 1, facecolor=WALL, lw=0))
+    rule_cells(axes, rows, columns, color, zorder=2)
     axes.set(xlim=(0, columns), ylim=(rows, 0), aspect="equal", xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set(color=FAINT, lw=0.8)
 
 
-def _robot(axes: Axes, world: _Board, place: int) -> None:
+def rule_cells(
+    axes: Axes, rows: int, columns: int, color: str, width: float = 0.6, **options: Any
+) -> None:
+    """The lines between the cells."""
+    lines = [((0, r), (columns, r)) for r in range(rows + 1)]
+    lines += [((c, 0), (c, rows)) for c in range(columns + 1)]
+    axes.add_collection(LineCollection(lines, colors=color, linewidths=width, **options))
+
+
+def draw_robot(axes: Axes, world: Board, place: int) -> None:
     row, column = world.places[place]
-    axes.add_patch(Circle((column + 0.5, row + 0.5), 0.3, facecolor=_ROBOT, lw=0, zorder=5))
+    axes.add_patch(Circle((column + 0.5, row + 0.5), 0.3, facecolor=ROBOT, lw=0, zorder=5))
 
 
-def _moves(
-    axes: Axes, world: _Board, mask: NDArray[np.bool_], actions: Sequence[str],
+def draw_moves(
+    axes: Axes, world: Board, mask: NDArray[np.bool_], actions: Sequence[str],
     dark: NDArray[np.bool_] | None = None, *, hollow: bool = False, scale: float = 1.0,
 ) -> None:
     """A triangle towards each neighbour that a mask allows, and a dot for staying."""
@@ -80,12 +84,92 @@ def _moves(
         color = PAPER if dark is not None and dark[place] else INK
         face, edge = ("none", MUTED) if hollow else (color, "none")
         row, column = world.places[place]
-        center, step = np.array([column + 0.5, row + 0.5]), np.array(_TURNS[actions[a]], float)
+        center, step = np.array([column + 0.5, row + 0.5]), np.array(DIRECTIONS[actions[a]], float)
         if not step.any():
             axes.add_patch(Circle(tuple(center), 0.09 * scale, facecolor=face, edgecolor=edge,
                                   lw=0.7, zorder=6))
             continue
-        side = step[::-1] * 0.12 * scale
-        base, tip = center + step * 0.18, center + step * (0.18 + 0.24 * scale)
-        axes.add_patch(Polygon([base + side, tip, base - side], facecolor=face, edgecolor=edge,
-                               lw=0.7, zorder=6))
+        corners = _triangle(center, step, 0.18, 0.18 + 0.24 * scale, 0.12 * scale)
+        axes.add_patch(Polygon(corners, facecolor=face, edgecolor=edge, lw=0.7, zorder=6))
+
+
+def number_cells(axes: Axes, rows: int, columns: int) -> None:
+    for axis, count in ((axes.xaxis, columns), (axes.yaxis, rows)):
+        stride = max(1, count // 10)
+        axis.set_ticks(np.arange(0, count, stride) + 0.5, labels=[
+            str(i + 1) for i in range(0, count, stride)])
+    axes.xaxis.tick_top()
+    axes.tick_params(length=0, labelsize=6.5, labelcolor=MUTED, pad=2)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def draw_arrows(
+    axes: Axes, shape: tuple[int, int], policy: NDArray[np.float64],
+    values: NDArray[np.float64] | None, low: float, high: float, actions: Sequence[str],
+) -> None:
+    """Triangles from the centre of each cell, as long as the action is likely."""
+    shapes: list[Any] = []
+    colors: list[str] = []
+    for state, chances in enumerate(policy):
+        row, column = divmod(state, shape[1])
+        dark = values is not None and values[state] < low + 0.5 * (high - low)
+        for a, chance in enumerate(chances):
+            if not chance > 0.04:
+                continue
+            center, step = np.array([column + 0.5, row + 0.5]), np.array(STEPS[actions[a]], float)
+            tip, width = 0.1 + 0.34 * chance, 0.045 + 0.075 * chance
+            shapes.append(_triangle(center, step, 0.03, tip, width))
+            colors.append(PAPER if dark else INK)
+    axes.add_collection(PolyCollection(shapes, facecolors=colors, lw=0, alpha=0.92, zorder=4))
+
+
+def _triangle(
+    center: NDArray[np.float64], step: NDArray[np.float64], base: float, tip: float, width: float
+) -> list[NDArray[np.float64]]:
+    """The corners of an arrow's head, whose base and tip are so far from the centre."""
+    side = step[::-1] * width
+    return [center + step * base + side, center + step * tip, center + step * base - side]
+
+
+def cell_size(shape: tuple[int, ...]) -> float:
+    """The inches of a cell that holds arrows."""
+    return float(np.clip(5.2 / max(shape), 0.3, 0.6))
+
+
+def rows_of_maps(
+    shape: tuple[int, ...], count: int, across: int
+) -> tuple[Figure, NDArray[Any]]:
+    """A figure with so many axes of maps, in rows."""
+    (rows, columns), size = shape, cell_size(shape)
+    down = -(-count // across)
+    figure = Figure(
+        figsize=(max(across * (columns * size + 0.4), 3.4), down * (rows * size + 0.55) + 0.6),
+        layout=ConstrainedLayoutEngine(h_pad=0.1), facecolor=PAPER,
+    )
+    every = figure.subplots(down, across, squeeze=False).ravel()
+    for axes in every[count:]:
+        axes.axis("off")
+    return figure, every[:count]
+
+
+def keep_out_of_layout(axes: Axes) -> None:
+    """What lies in the cells sticks out nowhere, so that no layout has to measure it."""
+    for artist in (*axes.texts, *axes.patches, *axes.collections, *axes.images, *axes.lines):
+        artist.set_in_layout(False)
+
+
+def require_directions(
+    actions: Sequence[str], known: Mapping[str, tuple[int, int]] = DIRECTIONS
+) -> None:
+    for name in actions:
+        if name not in known:
+            raise ValueError(f"action {name!r} has no direction; use {', '.join(known)}.")
+
+
+def as_mask(policy: ArrayLike, num_actions: int) -> NDArray[np.bool_]:
+    given = np.asarray(policy)
+    if given.dtype.kind in "iu":
+        return np.asarray(given[:, None] == np.arange(num_actions))
+    return given.astype(bool)
+

@@ -1,6 +1,5 @@
 """Curves over steps, bands over seeds, and paths."""
 
-
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -14,19 +13,17 @@ from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.plot.style import (
-    _KINDS,
-    _SERIES,
     ACCENT,
     FAINT,
     INK,
+    KINDS,
     MUTED,
     PAPER,
-    _bottom_labels,
-    _panel_rows,
-    _plain_axes,
+    SERIES,
+    bottom_labels,
+    panel_rows,
+    plain_axes,
 )
-
-# --- curves ---------------------------------------------------------------------------------
 
 
 def curves(
@@ -60,7 +57,7 @@ def curves(
     for i, (name, axes) in enumerate(
         zip(chosen, figure.subplots(1, len(chosen), squeeze=False)[0], strict=True)
     ):
-        _curve(axes, series[name], steps, name.replace("_", " "), _SERIES[i % len(_SERIES)])
+        _curve(axes, series[name], steps, name.replace("_", " "), SERIES[i % len(SERIES)])
     return figure
 
 
@@ -79,7 +76,7 @@ def _curve(
         axes.set_yscale("log")
     axes.set_title(name, fontsize=9.5, color=INK, loc="left")
     axes.set_xlabel("step", fontsize=8.5, color=MUTED)
-    _plain_axes(axes)
+    plain_axes(axes)
 
 
 def bands(
@@ -99,18 +96,18 @@ def bands(
     Raises:
       ValueError: there is nothing to show.
     """
-    figure, panels = _panel_rows(rows, "bands", (3.6, 1.9))
+    figure, panels = panel_rows(rows, "bands", (3.6, 1.9))
     names = list(dict.fromkeys(n for row in rows.values() for cell in row.values() for n in cell))
     for (row, column), axes in panels.items():
         for name, (x, mean, spread) in rows[row][column].items():
-            color = _SERIES[names.index(name) % len(_SERIES)]
+            color = SERIES[names.index(name) % len(SERIES)]
             place, middle, width = (np.asarray(v, float) for v in (x, mean, spread))
             axes.fill_between(place, middle - width, middle + width, color=color, alpha=0.15, lw=0)
             axes.plot(place, middle, color=color, lw=1.4, label=name)
         if limits and column in limits.get(row, {}):
             axes.axhline(limits[row][column], color=INK, lw=1, ls="--")
-    _bottom_labels(panels, [label] * len(panels))
-    handles = [Line2D([], [], color=_SERIES[i % len(_SERIES)]) for i in range(len(names))]
+    bottom_labels(panels, [label] * len(panels))
+    handles = [Line2D([], [], color=SERIES[i % len(SERIES)]) for i in range(len(names))]
     figure.legend(handles, names, loc="outside lower center", ncols=len(names), frameon=False,
                   fontsize=8.5, labelcolor=INK)
     return figure
@@ -132,17 +129,17 @@ def lines(
     Raises:
       ValueError: there is nothing to show.
     """
-    figure, panels = _panel_rows(rows, "lines", (2.1, 1.5))
+    figure, panels = panel_rows(rows, "lines", (2.1, 1.5))
     for (row, column), axes in panels.items():
         runs, reference = rows[row][column]
         several = np.asarray(runs, float)
         axes.plot(several.T, color=ACCENT, lw=1.4 if len(several) == 1 else 0.7,
                   alpha=1 if len(several) == 1 else 0.35)
         if reference is not None:
-            axes.plot(np.asarray(reference, float), color=_SERIES[1], lw=1.3, ls="--")
-    _bottom_labels(panels, labels)
+            axes.plot(np.asarray(reference, float), color=SERIES[1], lw=1.3, ls="--")
+    bottom_labels(panels, labels)
     figure.legend(
-        [Line2D([], [], color=ACCENT), Line2D([], [], color=_SERIES[1], ls="--")], names,
+        [Line2D([], [], color=ACCENT), Line2D([], [], color=SERIES[1], ls="--")], names,
         loc="outside lower center", ncols=2, frameon=False, fontsize=8.5, labelcolor=INK)
     return figure
 
@@ -181,17 +178,17 @@ def paths(
         title, (x, y) = list(maps.items())[i]
         handles = []
         for j, (corner, end) in enumerate(np.asarray(list(boxes.values()), float)):
-            box = Rectangle(tuple(corner), *(end - corner), lw=0, color=_KINDS[(j + 2) % 6])
+            box = Rectangle(tuple(corner), *(end - corner), lw=0, color=KINDS[(j + 2) % 6])
             handles.append(axes.add_patch(box))
         axes.add_patch(Rectangle(tuple(low), *(high - low), fill=False, color=FAINT, lw=1.5))
         xs, ys = np.asarray(x, float), np.asarray(y, float)
         axes.plot(xs.T, ys.T, color=ACCENT, lw=0.9, alpha=0.75)
         axes.plot(xs[:, 0], ys[:, 0], "o", color=INK, ms=2.2)
-        axes.plot(xs[:, -1], ys[:, -1], "s", color=_SERIES[1], ms=2.6)
+        axes.plot(xs[:, -1], ys[:, -1], "s", color=SERIES[1], ms=2.6)
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         axes.set_title(title, fontsize=8.5, color=INK, loc="left", parse_math=False)
     ends = [Line2D([], [], ls="", marker=m, color=c, ms=4) for m, c in (
-        ("o", INK), ("s", _SERIES[1]))]
+        ("o", INK), ("s", SERIES[1]))]
     figure.legend([*handles, *ends], [*boxes, "first", "last"], loc="outside lower center",
                   ncols=len(boxes) + 2, frameon=False, fontsize=8.5, labelcolor=INK)
     return figure

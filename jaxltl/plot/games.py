@@ -1,6 +1,5 @@
 """Games of two robots: values, regions and moves."""
 
-
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -13,23 +12,37 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.plot.board import _LOSES, _ROBOT, _Board, _board, _fill, _frame, _moves, _robot
-from jaxltl.plot.maps import _as_mask, _cell_size, _number_cells, _require_directions, _rows_of_maps
+from jaxltl.plot.board import (
+    DIRECTIONS,
+    LOSES,
+    ROBOT,
+    Board,
+    as_mask,
+    board_of,
+    cell_size,
+    draw_moves,
+    draw_robot,
+    fill_cells,
+    frame_cells,
+    keep_out_of_layout,
+    number_cells,
+    require_directions,
+    rows_of_maps,
+)
 from jaxltl.plot.style import (
-    _SCALE,
-    _SERIES,
-    _STEPS,
     ACCENT,
     FAINT,
     INK,
     MUTED,
     PAPER,
-    _note,
-    _plain_axes,
+    SCALE,
+    SERIES,
+    head,
+    note,
+    plain_axes,
+    scale_bar,
+    value_limits,
 )
-
-# --- games of two robots --------------------------------------------------------------------
-
 
 _CELLS = "The cells of a map are those of the system's robot."
 
@@ -39,7 +52,7 @@ def game_values(
     board: int | str,
     *,
     policy: ArrayLike | None = None,
-    actions: Sequence[str] = (*_STEPS, "stay"),
+    actions: Sequence[str] = tuple(DIRECTIONS),
     environment: Sequence[int] | None = None,
     label: str = "",
     limits: tuple[float, float] | None = None,
@@ -65,30 +78,25 @@ def game_values(
     Raises:
       ValueError: values or policy do not fit the board, or an action has no direction.
     """
-    world = _board(board, wall)
+    world = board_of(board, wall)
     table = _of_turns(np.asarray(values, float), world, "values")
     allowed = None
     if policy is not None:
-        _require_directions(actions)
-        allowed = _of_turns(_as_mask(policy, len(actions)), world, "policy")
-    finite = table[np.isfinite(table)]
-    if limits is None:
-        limits = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-        limits = limits if limits[0] < limits[1] else (limits[0] - 1, limits[1])
+        require_directions(actions)
+        allowed = _of_turns(as_mask(policy, len(actions)), world, "policy")
+    limits = value_limits(table, limits)
     figure, maps, size = _small_multiples(world, environment, bar=0.75)
     image: Any = None
     for place, axes in maps.items():
         image = _shade(axes, world, table[place], limits)
-        _robot(axes, world, place)
+        draw_robot(axes, world, place)
         if allowed is not None:
-            _moves(axes, world, allowed[place], actions, table[place] < sum(limits) / 2)
+            draw_moves(axes, world, allowed[place], actions, table[place] < sum(limits) / 2)
         elif size >= 0.27:
             _figures(axes, world, table[place], place, sum(limits) / 2)
-    bar = figure.colorbar(image, ax=list(maps.values()), shrink=0.6, pad=0.015, aspect=28)
-    bar.set_label(label, fontsize=9, color=INK)
-    bar.outline.set_visible(False)
-    bar.ax.tick_params(labelsize=8, color=MUTED, labelcolor=INK, length=2)
-    _note(figure, [(_ROBOT, "the environment's robot", "o")], _CELLS)
+        keep_out_of_layout(axes)
+    scale_bar(figure, image, list(maps.values()), label, aspect=28)
+    note(figure, [(ROBOT, "the environment's robot", "o")], _CELLS)
     return figure
 
 
@@ -111,20 +119,21 @@ def game_region(
     Raises:
       ValueError: the region does not fit the board.
     """
-    world = _board(board, wall)
+    world = board_of(board, wall)
     table = _of_turns(np.asarray(region, bool), world, "region")
     figure, maps, _ = _small_multiples(world, environment)
     for place, axes in maps.items():
         _paint(axes, world, table[place])
-        _robot(axes, world, place)
-    _note(figure, _REGION_MARKS, _CELLS)
+        draw_robot(axes, world, place)
+        keep_out_of_layout(axes)
+    note(figure, _REGION_MARKS, _CELLS)
     return figure
 
 
 _REGION_MARKS = [
     ("#cfe6d6", "the system wins", "s"),
-    (_LOSES, "the environment wins", "s"),
-    (_ROBOT, "the environment's robot", "o"),
+    (LOSES, "the environment wins", "s"),
+    (ROBOT, "the environment's robot", "o"),
 ]
 
 
@@ -136,7 +145,7 @@ def game_moves(
     region: ArrayLike | None = None,
     available: ArrayLike | None = None,
     system: int | None = None,
-    actions: Sequence[str] = (*_STEPS, "stay"),
+    actions: Sequence[str] = tuple(DIRECTIONS),
     titles: Sequence[str] | str = "",
     wall: str = "#",
 ) -> Figure:
@@ -158,9 +167,9 @@ def game_moves(
     Raises:
       ValueError: an array does not fit the board, or an action has no direction.
     """
-    world = _board(board, wall)
+    world = board_of(board, wall)
     _require_place(world, environment)
-    _require_directions(actions)
+    require_directions(actions)
     panels = np.asarray(allowed, bool)
     panels = panels[None] if panels.ndim == 2 else panels
     regions = None if region is None else np.asarray(region, bool)
@@ -168,31 +177,32 @@ def game_moves(
         regions = np.broadcast_to(regions, (len(panels), *regions.shape))
     titles = [titles] * len(panels) if isinstance(titles, str) else list(titles)
     rows, columns = world.cells.shape
-    most = 3 if columns * _cell_size((rows, columns)) > 1.5 else 4
-    figure, every = _rows_of_maps((rows, columns), len(panels), min(len(panels), most))
+    most = 3 if columns * cell_size((rows, columns)) > 1.5 else 4
+    figure, every = rows_of_maps((rows, columns), len(panels), min(len(panels), most))
     for m, axes in enumerate(every):
         mask = _of_turns(panels[m], world, "allowed")[environment]
         wins = mask.any(-1)
         if regions is not None:
             wins = _of_turns(regions[m], world, "region")[environment]
         _paint(axes, world, wins)
-        _number_cells(axes, rows, columns)
+        number_cells(axes, rows, columns)
         if available is not None:
             can = _of_turns(np.asarray(available, bool), world, "available")[environment]
-            _moves(axes, world, can & ~mask & wins[:, None], actions, hollow=True)
-        _moves(axes, world, mask, actions)
-        _robot(axes, world, environment)
+            draw_moves(axes, world, can & ~mask & wins[:, None], actions, hollow=True)
+        draw_moves(axes, world, mask, actions)
+        draw_robot(axes, world, environment)
         if system is not None:
             row, column = world.places[system]
             axes.add_patch(Circle((column + 0.5, row + 0.5), 0.44, fill=False, lw=1.6,
                                   edgecolor=ACCENT, zorder=6))
-        axes.set_title(titles[m], fontsize=9.5, color=INK, pad=5, loc="left", parse_math=False)
+        head(axes, titles[m])
+        keep_out_of_layout(axes)
     marks = [*_REGION_MARKS, (INK, "allowed", "^")]
-    _note(figure, marks + ([(PAPER, "not allowed", "^")] if available is not None else []))
+    note(figure, marks + ([(PAPER, "not allowed", "^")] if available is not None else []))
     return figure
 
 
-def _require_place(world: _Board, number: int) -> int:
+def _require_place(world: Board, number: int) -> int:
     if not 0 <= number < len(world.places):
         raise ValueError(
             f"environment {number} is no place of the board, whose places are 0 to "
@@ -201,7 +211,7 @@ def _require_place(world: _Board, number: int) -> int:
     return int(number)
 
 
-def _of_turns(array: NDArray[Any], world: _Board, name: str) -> NDArray[Any]:
+def _of_turns(array: NDArray[Any], world: Board, name: str) -> NDArray[Any]:
     """An array over states as ``[environment, system, ...]``, where the system moves."""
     count = len(world.places)
     if array.ndim < 1 or len(array) != 2 * count**2:
@@ -213,7 +223,7 @@ def _of_turns(array: NDArray[Any], world: _Board, name: str) -> NDArray[Any]:
 
 
 def _small_multiples(
-    world: _Board, environment: Sequence[int] | None, bar: float = 0.0
+    world: Board, environment: Sequence[int] | None, bar: float = 0.0
 ) -> tuple[Figure, dict[int, Axes], float]:
     """A figure, its axes by the environment's place, and the inches of a cell."""
     rows, columns = world.cells.shape
@@ -244,38 +254,35 @@ def _small_multiples(
     return figure, maps, size
 
 
-def _on_board(world: _Board, values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _on_board(world: Board, values: NDArray[np.float64]) -> NDArray[np.float64]:
     shown: NDArray[np.float64] = np.full(world.cells.shape, np.nan)
     shown[tuple(world.places.T)] = values
     return shown
 
 
 def _shade(
-    axes: Axes, world: _Board, values: NDArray[np.float64], limits: tuple[float, float]
+    axes: Axes, world: Board, values: NDArray[np.float64], limits: tuple[float, float]
 ) -> Any:
     rows, columns = world.cells.shape
     image = axes.imshow(
-        np.ma.masked_invalid(_on_board(world, values)), cmap=_SCALE, vmin=limits[0],
+        np.ma.masked_invalid(_on_board(world, values)), cmap=SCALE, vmin=limits[0],
         vmax=limits[1], extent=(0, columns, rows, 0), interpolation="nearest",
     )
-    _frame(axes, world)
+    frame_cells(axes, world)
     return image
 
 
-def _paint(axes: Axes, world: _Board, wins: NDArray[np.bool_]) -> None:
-    _fill(axes, world, [_REGION_MARKS[0][0] if good else _LOSES for good in wins])
+def _paint(axes: Axes, world: Board, wins: NDArray[np.bool_]) -> None:
+    fill_cells(axes, world, [_REGION_MARKS[0][0] if good else LOSES for good in wins])
 
 
 def _figures(
-    axes: Axes, world: _Board, values: NDArray[np.float64], robot: int, middle: float
+    axes: Axes, world: Board, values: NDArray[np.float64], robot: int, middle: float
 ) -> None:
     for place, (row, column) in enumerate(world.places):
         if place != robot and np.isfinite(values[place]):
             axes.text(column + 0.5, row + 0.5, f"{values[place]:.3g}", ha="center", va="center",
                       fontsize=6.5, color=PAPER if values[place] < middle else INK, zorder=4)
-
-
-# --- values side by side --------------------------------------------------------------------
 
 
 def compare(
@@ -320,7 +327,7 @@ def compare(
     for i, (name, value) in reversed(list(enumerate(series.items()))):
         marker, size = styles[i % len(styles)]
         axes.plot(place, value[order], ls="", marker=marker, ms=size, label=name,
-                  color=_SERIES[i % len(_SERIES)], mew=1.4 if marker in "_x" else 0)
+                  color=SERIES[i % len(SERIES)], mew=1.4 if marker in "_x" else 0)
     for i, name in enumerate(kinds):
         here = place[group[order] == i]
         axes.text(here.mean(), 1.02, name, transform=axes.get_xaxis_transform(), ha="center",
@@ -329,7 +336,7 @@ def compare(
             axes.axvline(here[0] - 1.25, color=FAINT, lw=1)
     axes.set_ylabel(label, fontsize=9, color=INK)
     axes.set(xticks=[], ylim=(min(0, axes.get_ylim()[0]), None))
-    _plain_axes(axes)
+    plain_axes(axes)
     handles, texts = axes.get_legend_handles_labels()
     figure.legend(handles[::-1], texts[::-1], loc="outside lower left", ncols=len(series),
                   frameon=False, fontsize=8.5, labelcolor=INK, handletextpad=0.2)

@@ -59,14 +59,14 @@ class Graph(NamedTuple):
     size: tuple[float, float]
 
 
-class _Box(NamedTuple):
+class Box(NamedTuple):
     center: Points
     half: Points
 
     def holds(self, points: Points) -> int:
         return int(np.sum(np.all(np.abs(points - self.center) < self.half, axis=1)))
 
-    def overlaps(self, other: _Box) -> bool:
+    def overlaps(self, other: Box) -> bool:
         return bool(self.overlapped(np.array([other]))[0])
 
     def overlapped(self, others: Points) -> NDArray[np.bool_]:
@@ -111,7 +111,7 @@ def arrange(
     wishes = {k: _along(_curve(position[k[0]], position[k[1]], 0)) for k in keys}
     placed: list[Points] = [position[initial] - [[RADIUS + 0.2, 0]]]
     edges: list[Edge] = []
-    boxes: list[_Box] = []
+    boxes: list[Box] = []
     labels: list[Label] = []
     for key in sorted(k for k in texts if k[0] == k[1]):
         # A loop on a state that is never left says nothing, and its label would only crowd.
@@ -163,7 +163,7 @@ def graphviz_positions(count: int, initial: int, texts: Mapping[Key, Rows]) -> P
 
 
 def _framed(
-    position: Points, edges: list[Edge], labels: list[Label], boxes: list[_Box], initial: int
+    position: Points, edges: list[Edge], labels: list[Label], boxes: list[Box], initial: int
 ) -> Graph:
     points = [position - RADIUS, position + RADIUS, position[[initial]] - [RADIUS + 0.42, 0]]
     points += [_along(e.curve) for e in edges]
@@ -195,7 +195,7 @@ def _positions(
     for i, states in enumerate(order):
         if i:
             # Room for the widest label between this layer and the one before.
-            between = [_size(t)[0] for (a, b, _), t in texts.items()
+            between = [label_size(t)[0] for (a, b, _), t in texts.items()
                        if a != b and {place.get(a), place.get(b)} == {i - 1, i}]
             x += max(1.6, 2 * RADIUS + 0.75 + max(between, default=0.0))
         column[states] = x
@@ -268,7 +268,7 @@ def _along(curve: Points) -> Points:
 
 def _best_curve(
     position: Points, source: int, target: int, crowded: bool, placed: list[Points],
-    boxes: list[_Box],
+    boxes: list[Box],
 ) -> Points:
     bends = (0.22, -0.22, 0.4, -0.4) if crowded else (
         0, 0.12, -0.12, 0.25, -0.25, 0.4, -0.4, 0.6, -0.6)
@@ -280,7 +280,7 @@ def _best_curve(
         near, close = _reachable(inside, 0.1, drawn, boxes)
         gap = np.min(_distances(inside, others), initial=np.inf)
         hits = np.sum(_distances(inside, near).min(axis=1, initial=np.inf) < 0.07)
-        hits += 4 * sum(_Box(*box).holds(inside) for box in close)
+        hits += 4 * sum(Box(*box).holds(inside) for box in close)
         return 60 * max(0, RADIUS + 0.14 - gap) + 0.25 * hits + 3 * abs(bend) + 0.01 * (bend < 0)
 
     return _curve(position[source], position[target], min(bends, key=cost))
@@ -299,14 +299,14 @@ def _curve(start: Points, end: Points, bend: float) -> Points:
 
 
 def _best_loop(
-    position: Points, q: int, rows: Rows, placed: list[Points], boxes: list[_Box]
-) -> tuple[Points, _Box]:
-    half = _size(rows) / 2
+    position: Points, q: int, rows: Rows, placed: list[Points], boxes: list[Box]
+) -> tuple[Points, Box]:
+    half = label_size(rows) / 2
     drawn, others = np.concatenate(placed), np.delete(position, q, axis=0)
     reach = 4 * RADIUS + 2 * float(half.sum())
     drawn, near = _reachable(position[[q]], reach, drawn, boxes)
 
-    def candidate(angle: float) -> tuple[Points, _Box]:
+    def candidate(angle: float) -> tuple[Points, Box]:
         def rim(turn: float, reach: float) -> Points:
             return position[q] + reach * np.array([np.cos(angle + turn), np.sin(angle + turn)])
 
@@ -314,7 +314,7 @@ def _best_loop(
                           rim(-0.42, RADIUS + 0.02)])
         way = np.array([np.cos(angle), np.sin(angle)])
         tip = position[q] + 2.33 * RADIUS * way
-        return curve, _Box(tip + way * (half * np.abs(way) + 0.06), half)
+        return curve, Box(tip + way * (half * np.abs(way) + 0.06), half)
 
     at_rim = drawn[np.hypot(*(drawn - position[q]).T) < RADIUS + 0.12] - position[q]
     taken = np.arctan2(at_rim[:, 1], at_rim[:, 0])
@@ -335,9 +335,9 @@ def _best_loop(
 
 
 def _best_label(
-    position: Points, edge: Edge, rows: Rows, placed: list[Points], boxes: list[_Box]
-) -> _Box:
-    half = _size(rows) / 2
+    position: Points, edge: Edge, rows: Rows, placed: list[Points], boxes: list[Box]
+) -> Box:
+    half = label_size(rows) / 2
     own = _along(edge.curve)
     drawn = np.concatenate([p for p in placed if not np.array_equal(p, own)])
     drawn, near = _reachable(own, 2 * float(half.sum()) + 0.3, drawn, boxes)
@@ -347,7 +347,7 @@ def _best_label(
         normal = np.array([-along[1], along[0]]) / np.hypot(*along)
         clear = np.abs(normal) @ half + 0.05
         for shift in (0.0, clear, -clear, clear + 0.1, -clear - 0.1):
-            box = _Box(own[i] + shift * normal, half)
+            box = Box(own[i] + shift * normal, half)
             cost = _label_cost(box, position, drawn, near) + abs(i - 30) * 0.05
             # On its own line a label hides it, so beside the line is better, if it fits.
             cost += 6.0 if shift == 0 else 2.0 * box.holds(own) + 2.0 * (abs(shift) > clear)
@@ -358,7 +358,7 @@ def _best_label(
 
 
 def _reachable(
-    around: Points, reach: float, drawn: Points, boxes: list[_Box]
+    around: Points, reach: float, drawn: Points, boxes: list[Box]
 ) -> tuple[Points, Points]:
     """Of points and boxes, all that come so near to some points, for speed, and perhaps more.
 
@@ -366,14 +366,14 @@ def _reachable(
       ``float[N, 2]`` and, centres and halves, ``float[B, 2, 2]``.
     """
     low, high = around.min(axis=0) - reach, around.max(axis=0) + reach
-    region = _Box((low + high) / 2, (high - low) / 2)
+    region = Box((low + high) / 2, (high - low) / 2)
     near = np.all(np.abs(drawn - region.center) < region.half, axis=1)
     stacked = np.array(boxes).reshape(-1, 2, 2)
     return drawn[near], stacked[region.overlapped(stacked)]
 
 
-def _label_cost(box: _Box, nodes: Points, drawn: Points, boxes: Points) -> float:
-    grown = _Box(box.center, box.half + 0.03)
+def _label_cost(box: Box, nodes: Points, drawn: Points, boxes: Points) -> float:
+    grown = Box(box.center, box.half + 0.03)
     clashes = int(box.overlapped(boxes).sum())
     return 60 * box.near(nodes, RADIUS + 0.04) + 40 * clashes + 2.0 * grown.holds(drawn)
 
@@ -418,7 +418,7 @@ def is_marked(rows: Rows) -> bool:
     return any(mark for mark, _ in rows)
 
 
-def _size(rows: Rows) -> Points:
+def label_size(rows: Rows) -> Points:
     """Width and height of a drawn label."""
     if is_marked(rows):
         return np.array([text_width(rows) + MARK_WIDTH + 0.06, len(rows) * MARKED_HEIGHT + 0.02])

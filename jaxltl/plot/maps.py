@@ -1,6 +1,5 @@
 """Grid maps: values, policies and sets of moves."""
 
-
 from __future__ import annotations
 
 import re
@@ -9,30 +8,28 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.envs.gridworld import parse_map
-from jaxltl.plot.board import _TURNS, _Board, _fill, _moves
-from jaxltl.plot.style import (
-    _KINDS,
-    _SCALE,
-    _STEPS,
-    FAINT,
-    INK,
-    MUTED,
-    PAPER,
-    _note,
+from jaxltl.envs.text_map import parse_map
+from jaxltl.plot.board import (
+    STEPS,
+    WALL,
+    Board,
+    draw_arrows,
+    draw_moves,
+    fill_cells,
+    keep_out_of_layout,
+    number_cells,
+    require_directions,
+    rows_of_maps,
+    rule_cells,
 )
+from jaxltl.plot.style import FAINT, INK, KINDS, PAPER, SCALE, head, note, scale_bar, value_limits
 
 # Cells are often named for a colour, and then have it.
 _NAMED = {"r": "#f0b9b1", "y": "#f7e08e", "g": "#bfe3c4", "b": "#bcd3f2"}
-
-
-# --- grids ----------------------------------------------------------------------------------
 
 
 def grid(
@@ -49,7 +46,7 @@ def grid(
     """A map, with a value in each cell as a colour, and a policy as arrows.
 
     Args:
-      cells: a text map (see :func:`jaxltl.envs.gridworld.parse_map`) or its cells.
+      cells: a text map (see :func:`jaxltl.envs.text_map.parse_map`) or its cells.
       values: ``float[S]``, or ``float[M, S]`` for M panels; NaN leaves a cell blank.
       policy: ``float[S, A]`` or ``int[S]``, or with M panels first; arrows are as long as
         their action is likely, and a row of NaN has none.
@@ -67,9 +64,8 @@ def grid(
     """
     kinds = parse_map(cells) if isinstance(cells, str) else np.asarray(cells)
     panels, arrows = _panels(kinds, values, policy, len(actions))
-    for name in actions:
-        if policy is not None and name not in _STEPS:
-            raise ValueError(f"action {name!r} has no direction; use {', '.join(_STEPS)}.")
+    if policy is not None:
+        require_directions(actions, STEPS)
     count = next((len(x) for x in (panels, arrows) if x is not None), 1)
     titles = [titles] * count if isinstance(titles, str) else list(titles)
     rows, columns = kinds.shape
@@ -82,24 +78,18 @@ def grid(
         layout="constrained", facecolor=PAPER,
     )
     all_axes = np.atleast_1d(figure.subplots(down, across, squeeze=False)).ravel()
-    if limits is None and panels is not None:
-        limits = (float(np.nanmin(panels)), float(np.nanmax(panels)))
-    low, high = limits or (0.0, 1.0)
+    low, high = value_limits(np.zeros(0) if panels is None else panels, limits)
     for axes in all_axes[count:]:
         axes.axis("off")
     for m, axes in enumerate(all_axes[:count]):
         shown = None if panels is None else panels[m]
         image = _cells(axes, kinds, shown, low, high, wall, arrows is None)
         if arrows is not None:
-            _arrows(axes, kinds.shape, arrows[m], shown, low, high, actions)
-        axes.set_title(titles[m], fontsize=9.5, color=INK, pad=5, loc="left", parse_math=False)
+            draw_arrows(axes, kinds.shape, arrows[m], shown, low, high, actions)
+        head(axes, titles[m])
+        keep_out_of_layout(axes)
     if panels is not None:
-        bar = figure.colorbar(
-            image, ax=all_axes.tolist(), shrink=0.6, pad=0.015, aspect=24
-        )
-        bar.set_label(label, fontsize=9, color=INK)
-        bar.outline.set_visible(False)
-        bar.ax.tick_params(labelsize=8, color=MUTED, labelcolor=INK, length=2)
+        scale_bar(figure, image, all_axes.tolist(), label)
     return figure
 
 
@@ -143,18 +133,18 @@ def _cells(
     if values is not None:
         shown = values.reshape(kinds.shape)
     image = axes.imshow(
-        np.ma.masked_invalid(shown), cmap=_SCALE, vmin=low, vmax=high,
+        np.ma.masked_invalid(shown), cmap=SCALE, vmin=low, vmax=high,
         extent=(0, columns, rows, 0), interpolation="nearest",
     )
     tiny = max(rows, columns) > 16
     for (r, c), kind in np.ndenumerate(kinds):
         blank = np.isnan(shown[r, c])
         if kind == wall:
-            axes.add_patch(Rectangle((c, r), 1, 1, facecolor="#55606c", lw=0))
+            axes.add_patch(Rectangle((c, r), 1, 1, facecolor=WALL, lw=0))
         elif kind in special:
             color = _NAMED.get(
                 re.sub(r"\d+$", "", str(kind)).lower()[:1] if len(str(kind)) < 3 else "",
-                _KINDS[special.index(str(kind)) % len(_KINDS)],
+                KINDS[special.index(str(kind)) % len(KINDS)],
             )
             if blank:
                 axes.add_patch(Rectangle((c, r), 1, 1, facecolor=color, lw=0))
@@ -169,52 +159,15 @@ def _cells(
             dark = shown[r, c] < low + 0.5 * (high - low)
             axes.text(c + 0.5, r + 0.58, _short_number(float(shown[r, c])), ha="center",
                       va="center", fontsize=7, color=PAPER if dark else INK)
-    lines = [((0, r), (columns, r)) for r in range(rows + 1)]
-    lines += [((c, 0), (c, rows)) for c in range(columns + 1)]
-    axes.add_collection(LineCollection(lines, colors=FAINT, linewidths=0.6))
+    rule_cells(axes, rows, columns, FAINT)
     axes.set(xlim=(0, columns), ylim=(rows, 0), aspect="equal")
-    _number_cells(axes, rows, columns)
+    number_cells(axes, rows, columns)
     return image
 
 
 def _short_number(value: float) -> str:
     """Three places; a probability goes without its leading zero."""
     return f"{value:.3f}".removeprefix("0") if 0 <= value < 1 else f"{value:.3g}"
-
-
-def _number_cells(axes: Axes, rows: int, columns: int) -> None:
-    for axis, count in ((axes.xaxis, columns), (axes.yaxis, rows)):
-        stride = max(1, count // 10)
-        axis.set_ticks(np.arange(0, count, stride) + 0.5, labels=[
-            str(i + 1) for i in range(0, count, stride)])
-    axes.xaxis.tick_top()
-    axes.tick_params(length=0, labelsize=6.5, labelcolor=MUTED, pad=2)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-
-
-def _arrows(
-    axes: Axes, shape: tuple[int, int], policy: NDArray[np.float64],
-    values: NDArray[np.float64] | None, low: float, high: float, actions: Sequence[str],
-) -> None:
-    """Triangles from the centre of each cell, as long as the action is likely."""
-    shapes: list[Any] = []
-    colors: list[str] = []
-    for state, chances in enumerate(policy):
-        row, column = divmod(state, shape[1])
-        dark = values is not None and values[state] < low + 0.5 * (high - low)
-        for a, chance in enumerate(chances):
-            if not chance > 0.04:
-                continue
-            step = np.array(_STEPS[actions[a]], float)
-            side = step[::-1]
-            center = np.array([column + 0.5, row + 0.5])
-            tip = center + step * (0.1 + 0.34 * chance)
-            base = center + step * 0.03
-            width = 0.045 + 0.075 * chance
-            shapes.append([base + side * width, tip, base - side * width])
-            colors.append(PAPER if dark else INK)
-    axes.add_collection(PolyCollection(shapes, facecolors=colors, lw=0, alpha=0.92, zorder=4))
 
 
 def strategies(
@@ -234,7 +187,7 @@ def strategies(
     For strategies with moves so rare that :func:`grid` would not show them.
 
     Args:
-      cells: a text map (see :func:`jaxltl.envs.gridworld.parse_map`) or its cells.
+      cells: a text map (see :func:`jaxltl.envs.text_map.parse_map`) or its cells.
       play: ``float[S, A]``, or ``float[M, S, A]`` for M panels: the probability of each move;
         zero draws nothing, and a cell whose row is NaN is grey, since it is never reached.
       marked: ``bool[S]``, or with M panels first: cells with a coloured background.
@@ -251,9 +204,9 @@ def strategies(
     Raises:
       ValueError: an array does not fit the map, or an action has no direction.
     """
-    _require_directions(actions)
+    require_directions(actions)
     kinds = parse_map(cells) if isinstance(cells, str) else np.asarray(cells)
-    world = _Board(kinds, np.argwhere(np.ones(kinds.shape, bool)), wall)
+    world = Board(kinds, np.argwhere(np.ones(kinds.shape, bool)), wall)
     panels = np.asarray(play, float)
     panels = panels[None] if panels.ndim == 2 else panels
     if panels.ndim != 3 or panels.shape[1:] != (kinds.size, len(actions)):
@@ -269,58 +222,25 @@ def strategies(
         )
     colored = np.broadcast_to(colored, panels.shape[:2])
     titles = [titles] * len(panels) if isinstance(titles, str) else list(titles)
-    figure, every = _rows_of_maps(kinds.shape, len(panels), min(len(panels), across))
+    figure, every = rows_of_maps(kinds.shape, len(panels), min(len(panels), across))
     for axes, chance, here, title in zip(every, panels, colored, titles, strict=True):
         blank = np.isnan(chance).any(-1)
-        _fill(axes, world, [
-            _NEVER if never else _MARKED if good else PAPER
+        fill_cells(axes, world, [
+            NEVER if never else MARKED if good else PAPER
             for never, good in zip(blank, here, strict=True)
         ], FAINT)
-        _number_cells(axes, *kinds.shape)
-        _moves(axes, world, chance >= seldom, actions, scale=1.15)
-        _moves(axes, world, (chance > 0) & (chance < seldom), actions, scale=0.5)
-        axes.set_title(title, fontsize=9.5, color=INK, pad=5, loc="left", parse_math=False)
+        number_cells(axes, *kinds.shape)
+        draw_moves(axes, world, chance >= seldom, actions, scale=1.15)
+        draw_moves(axes, world, (chance > 0) & (chance < seldom), actions, scale=0.5)
+        head(axes, title)
+        keep_out_of_layout(axes)
     rare = ((panels > 0) & (panels < seldom)).any()
-    _note(figure, [
-        *([(_MARKED, mark, "s")] if mark else []),
-        *([(_NEVER, "never reached", "s")] if np.isnan(panels).any() else []),
+    note(figure, [
+        *([(MARKED, mark, "s")] if mark else []),
+        *([(NEVER, "never reached", "s")] if np.isnan(panels).any() else []),
         *([(INK, "often", "^", 7), (INK, "seldom", "^", 4)] if rare else []),
     ])
     return figure
 
 
-_MARKED, _NEVER = "#f9e69a", "#e4e7eb"
-
-
-def _cell_size(shape: tuple[int, ...]) -> float:
-    """The inches of a cell that holds arrows."""
-    return float(np.clip(5.2 / max(shape), 0.3, 0.6))
-
-
-def _rows_of_maps(
-    shape: tuple[int, ...], count: int, across: int
-) -> tuple[Figure, NDArray[Any]]:
-    """A figure with so many axes of maps, in rows."""
-    (rows, columns), size = shape, _cell_size(shape)
-    down = -(-count // across)
-    figure = Figure(
-        figsize=(max(across * (columns * size + 0.4), 3.4), down * (rows * size + 0.55) + 0.6),
-        layout=ConstrainedLayoutEngine(h_pad=0.1), facecolor=PAPER,
-    )
-    every = figure.subplots(down, across, squeeze=False).ravel()
-    for axes in every[count:]:
-        axes.axis("off")
-    return figure, every[:count]
-
-
-def _require_directions(actions: Sequence[str]) -> None:
-    for name in actions:
-        if name not in _TURNS:
-            raise ValueError(f"action {name!r} has no direction; use {', '.join(_TURNS)}.")
-
-
-def _as_mask(policy: ArrayLike, num_actions: int) -> NDArray[np.bool_]:
-    given = np.asarray(policy)
-    if given.dtype.kind in "iu":
-        return np.asarray(given[:, None] == np.arange(num_actions))
-    return given.astype(bool)
+MARKED, NEVER = "#f9e69a", "#e4e7eb"

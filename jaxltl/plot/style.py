@@ -6,24 +6,22 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from numpy.typing import NDArray
 
 INK, MUTED, FAINT = "#1f2a37", "#6b7785", "#d5dae0"
-
-
 ACCENT, GOOD, PAPER = "#1f6f8b", "#e4f1ea", "#ffffff"
-
+KINDS = ("#dfd0ea", "#f5d6b3", "#d3e6e8", "#e3ddd0", "#f0d3df", "#dbe3b8")
+SERIES = ("#1f6f8b", "#c2571a", "#5b7f2b", "#7a4f9a", "#a23b5b", "#4a5a6a")
 
 # What is well is light, so that the cells that are not stand out.
-_SCALE = LinearSegmentedColormap.from_list(
+SCALE = LinearSegmentedColormap.from_list(
     "probability", ["#2f2b57", "#4a5a92", "#7f9cc0", "#bfd3df", "#f6f8f4"]
 )
-
-
-_STEPS = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)}
 
 
 def to_bytes(figure: Figure, kind: str = "svg", dpi: int = 150) -> bytes:
@@ -41,7 +39,7 @@ def to_bytes(figure: Figure, kind: str = "svg", dpi: int = 150) -> bytes:
     return buffer.getvalue()
 
 
-def _note(figure: Figure, marks: Sequence[tuple[Any, ...]], title: str = "") -> None:
+def note(figure: Figure, marks: Sequence[tuple[Any, ...]], title: str = "") -> None:
     """What colours and marks mean, under the maps: colour, text, marker and, if not 7, its size."""
     handles = [
         Line2D([], [], ls="", marker=marker, color=color, markersize=size[0] if size else 7,
@@ -58,7 +56,34 @@ def _note(figure: Figure, marks: Sequence[tuple[Any, ...]], title: str = "") -> 
     legend.get_title().set(fontsize=8, color=MUTED)
 
 
-def _plain_axes(axes: Axes) -> None:
+def value_limits(
+    values: NDArray[np.float64], limits: tuple[float, float] | None
+) -> tuple[float, float]:
+    """The ends of a scale of values; if none are given, those of the finite values."""
+    if limits is not None:
+        return limits
+    finite = values[np.isfinite(values)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    return (low, high) if low < high else (low - 1, high)
+
+
+def scale_bar(
+    figure: Figure, image: Any, axes: Sequence[Axes], label: str, shrink: float = 0.6,
+    aspect: float = 24,
+) -> None:
+    """What the colours of values mean, beside the maps."""
+    bar = figure.colorbar(image, ax=list(axes), shrink=shrink, pad=0.015, aspect=aspect)
+    bar.set_label(label, fontsize=9, color=INK)
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(labelsize=8, color=MUTED, labelcolor=INK, length=2)
+
+
+def head(axes: Axes, text: str) -> None:
+    """The title of a map."""
+    axes.set_title(text, fontsize=9.5, color=INK, pad=5, loc="left", parse_math=False)
+
+
+def plain_axes(axes: Axes) -> None:
     axes.tick_params(labelsize=8, color=FAINT, labelcolor=INK, length=3)
     axes.grid(color=FAINT, lw=0.5)
     axes.set_axisbelow(True)
@@ -67,7 +92,7 @@ def _plain_axes(axes: Axes) -> None:
         spine.set_color(FAINT)
 
 
-def _panel_rows(
+def panel_rows(
     rows: Mapping[str, Mapping[str, Any]], name: str, size: tuple[float, float]
 ) -> tuple[Figure, dict[tuple[str, str], Axes]]:
     """Empty panels by the titles of row and column."""
@@ -82,7 +107,7 @@ def _panel_rows(
     for i, row in enumerate(rows):
         for j, column in enumerate(columns):
             axes = grid[i, j]
-            _plain_axes(axes)
+            plain_axes(axes)
             if i == 0:
                 axes.set_title(column, fontsize=9.5, color=INK, loc="left")
             if j == 0:
@@ -94,12 +119,8 @@ def _panel_rows(
     return figure, found
 
 
-def _bottom_labels(panels: Mapping[tuple[str, str], Axes], labels: Sequence[str]) -> None:
+def bottom_labels(panels: Mapping[tuple[str, str], Axes], labels: Sequence[str]) -> None:
     last, columns = list(panels)[-1][0], list(dict.fromkeys(column for _, column in panels))
     for column, label in zip(columns, labels, strict=False):
         if (last, column) in panels:
             panels[last, column].set_xlabel(label, fontsize=8.5, color=MUTED)
-
-_KINDS = ("#dfd0ea", "#f5d6b3", "#d3e6e8", "#e3ddd0", "#f0d3df", "#dbe3b8")
-
-_SERIES = ("#1f6f8b", "#c2571a", "#5b7f2b", "#7a4f9a", "#a23b5b", "#4a5a6a")

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -15,17 +14,21 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.envs.temporal_gridworld import World
-from jaxltl.plot.maps import _arrows, _number_cells
-from jaxltl.plot.style import _SCALE, _SERIES, _STEPS, ACCENT, INK, MUTED, PAPER, _note
+from jaxltl.plot.board import (
+    STEPS,
+    draw_arrows,
+    keep_out_of_layout,
+    number_cells,
+    require_directions,
+    rule_cells,
+)
+from jaxltl.plot.style import ACCENT, INK, PAPER, SCALE, SERIES, head, note, scale_bar, value_limits
 
-# --- coloured worlds ------------------------------------------------------------------------
-
+if TYPE_CHECKING:
+    from jaxltl.envs.temporal_gridworld import World
 
 # Of temporal_gridworld.COLORS: paler than their names, so that what is drawn on them shows.
-_TINTS = ("#e79a8c", "#f5db80", "#fdfcf8", "#c3add8", "#4a4f58")
-
-
+TINTS = ("#e79a8c", "#f5db80", "#fdfcf8", "#c3add8", "#4a4f58")
 _IS_LIGHT = np.array([1.0, 1.0, 1.0, 1.0, 0.0])
 
 
@@ -66,9 +69,8 @@ def temporal_gridworld(
     size, shape = int(np.prod(world.shape)), world.shape
     moves = _of_memory(policy, chosen, size, (len(actions),), "policy")
     values = _of_memory(value, chosen, size, (), "value")
-    for name in actions:
-        if policy is not None and name not in _STEPS:
-            raise ValueError(f"action {name!r} has no direction; use {', '.join(_STEPS)}.")
+    if policy is not None:
+        require_directions(actions, STEPS)
     titles = [title] * len(chosen) if isinstance(title, str) else list(title)
     lines = _walks(trajectories, world)
     wide = max(shape) + 2 * world.margin
@@ -84,14 +86,15 @@ def temporal_gridworld(
     for i, (axes, name) in enumerate(zip(every[0], titles, strict=True)):
         light = _color_cells(axes, world)
         if moves is not None:
-            _arrows(axes, shape, moves[i], light, 0.0, 1.0, actions)
+            draw_arrows(axes, shape, moves[i], light, 0.0, 1.0, actions)
         _draw_walks(axes, lines)
         _name_kinds(axes, world)
-        axes.set_title(name, fontsize=9.5, color=INK, pad=5, loc="left", parse_math=False)
+        head(axes, name)
+        keep_out_of_layout(axes)
     if values is not None:
         _value_panels(figure, every[1], world, values, moves, limits, label, actions)
     if lines:
-        _note(figure, [(ACCENT, "first cell", "o"), (ACCENT, "last cell", "s")])
+        note(figure, [(ACCENT, "first cell", "o"), (ACCENT, "last cell", "s")])
     return figure
 
 
@@ -121,7 +124,7 @@ def _color_cells(axes: Axes, world: World) -> NDArray[np.float64]:
     (rows, columns), margin = world.shape, world.margin
     colors = np.asarray(world.colors)
     axes.imshow(
-        np.array([to_rgb(tint) for tint in _TINTS])[colors],
+        np.array([to_rgb(tint) for tint in TINTS])[colors],
         extent=(-margin, columns + margin, rows + margin, -margin), interpolation="nearest",
     )
     for corner, width, height in (
@@ -131,11 +134,9 @@ def _color_cells(axes: Axes, world: World) -> NDArray[np.float64]:
     ):
         axes.add_patch(Rectangle(corner, width, height, facecolor=PAPER, alpha=0.62, lw=0))
     if max(rows, columns) <= 32:
-        grid = [((0, r), (columns, r)) for r in range(rows + 1)]
-        grid += [((c, 0), (c, rows)) for c in range(columns + 1)]
-        axes.add_collection(LineCollection(grid, colors=PAPER, linewidths=0.7))
+        rule_cells(axes, rows, columns, PAPER, 0.7)
     axes.add_patch(Rectangle((0, 0), columns, rows, fill=False, edgecolor=INK, lw=1.1))
-    _number_cells(axes, rows, columns)
+    number_cells(axes, rows, columns)
     axes.set(xlim=(-margin, columns + margin), ylim=(rows + margin, -margin), aspect="equal")
     inner = colors[margin : margin + rows, margin : margin + columns]
     return _IS_LIGHT[inner.ravel()]
@@ -151,14 +152,14 @@ def _name_kinds(axes: Axes, world: World) -> None:
         inset = 0.05
         axes.add_patch(Rectangle(
             (column + inset, row + inset), 1 - 2 * inset, 1 - 2 * inset, fill=False,
-            edgecolor=_SERIES[1], lw=0.9 if tiny else 1.6, zorder=5,
+            edgecolor=SERIES[1], lw=0.9 if tiny else 1.6, zorder=5,
         ))
         # Where cells are tiny, the name of what is rare stands beside it.
         if not tiny or kinds[:, number].sum() <= 3:
             x, y = (column + 1.2, row + 0.04) if tiny else (column + 0.04, row + 0.04)
             axes.text(x, y, name, ha="left", va="top", fontsize=6.5,
                       color=PAPER, weight="bold", parse_math=False, zorder=7,
-                      bbox={"facecolor": _SERIES[1], "edgecolor": "none", "pad": 0.9})
+                      bbox={"facecolor": SERIES[1], "edgecolor": "none", "pad": 0.9})
 
 
 def _walks(trajectories: Any, world: World) -> list[NDArray[np.float64]]:
@@ -197,23 +198,18 @@ def _value_panels(
     moves: NDArray[np.float64] | None, limits: tuple[float, float] | None, label: str,
     actions: Sequence[str],
 ) -> None:
-    if limits is None:
-        finite = values[np.isfinite(values)]
-        limits = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-        limits = limits if limits[0] < limits[1] else (limits[0] - 1, limits[1])
+    limits = value_limits(values, limits)
     rows, columns = world.shape
     image: Any = None
     for i, axes in enumerate(every):
         image = axes.imshow(
-            np.ma.masked_invalid(values[i].reshape(rows, columns)), cmap=_SCALE, vmin=limits[0],
+            np.ma.masked_invalid(values[i].reshape(rows, columns)), cmap=SCALE, vmin=limits[0],
             vmax=limits[1], extent=(0, columns, rows, 0), interpolation="nearest",
         )
         if moves is not None:
-            _arrows(axes, world.shape, moves[i], values[i], *limits, actions)
-        _number_cells(axes, rows, columns)
+            draw_arrows(axes, world.shape, moves[i], values[i], *limits, actions)
+        number_cells(axes, rows, columns)
         axes.set(xlim=(0, columns), ylim=(rows, 0), aspect="equal")
         _name_kinds(axes, world)
-    bar = figure.colorbar(image, ax=list(every), shrink=0.7, pad=0.015, aspect=24)
-    bar.set_label(label, fontsize=9, color=INK)
-    bar.outline.set_visible(False)
-    bar.ax.tick_params(labelsize=8, color=MUTED, labelcolor=INK, length=2)
+        keep_out_of_layout(axes)
+    scale_bar(figure, image, every, label, shrink=0.7)

@@ -335,7 +335,7 @@ def test_what_must_be_known_before_trusting_the_figures(learned):
 
 
 def test_text_maps_are_checked(write):
-    assert run("check", write(text=PLAIN)).output == (
+    assert run("check", write(text=PLAIN)).stdout == (
         "ok: 3 training and 3 test worlds, 3 memory states, 3 demonstrations of 14 pairs\n")
 
 

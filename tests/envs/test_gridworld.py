@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.envs.gridworld import ACTIONS, parse_map
+from jaxltl.envs.gridworld import ACTIONS
+from jaxltl.envs.text_map import parse_map
 
 UP, DOWN, LEFT, RIGHT = range(4)
 

@@ -10,7 +10,6 @@ from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.models import operators
 from jaxltl.core.models.game import is_deterministic
 from jaxltl.core.models.restrict import restrict
-from jaxltl.envs.gridworld import parse_map
 from jaxltl.envs.robots import (
     ACTIONS,
     CORNERS,
@@ -21,6 +20,7 @@ from jaxltl.envs.robots import (
     reward_against_task,
     robots,
 )
+from jaxltl.envs.text_map import parse_map
 
 STEPS = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1), "stay": (0, 0)}
 SIDES = {"up": ("left", "right"), "down": ("left", "right"),

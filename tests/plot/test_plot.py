@@ -16,6 +16,11 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.envs.temporal_gridworld import random_world, training_world
 from jaxltl.plot import layout as drawing
+from jaxltl.plot.automata import edge_texts
+from jaxltl.plot.board import WALL
+from jaxltl.plot.maps import MARKED, NEVER
+from jaxltl.plot.style import ACCENT, INK, MUTED, PAPER
+from jaxltl.plot.worlds import TINTS
 
 MAP = "b . r\n. # y"
 GOOD = [
@@ -39,7 +44,7 @@ GOOD = [
 def arranged(table):
     """The drawing that `plot.automaton` makes without graphviz."""
     doomed = drawing.rejecting(table)
-    texts = plot._edge_texts(table, doomed)
+    texts = edge_texts(table, doomed)
     return drawing.arrange(table.delta, int(table.initial), doomed, texts)
 
 
@@ -70,7 +75,7 @@ def test_an_automaton_is_drawn(formula):
 def test_labels_stand_clear_of_states_and_each_other(formula):
     table = to_automaton(formula)
     graph = arranged(table)
-    boxes = [drawing._Box(x.center, drawing._size(x.rows) / 2) for x in graph.labels]
+    boxes = [drawing.Box(x.center, drawing.label_size(x.rows) / 2) for x in graph.labels]
     if len(table.delta) <= 5:  # in a dense graph a label may touch its neighbour
         assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
     assert sum(box.near(graph.position, drawing.RADIUS) for box in boxes) == 0
@@ -88,29 +93,29 @@ def test_states_do_not_overlap():
 
 def test_the_longest_guard_says_else():
     table = to_automaton("!red U (goal & !red)")
-    texts = plot._edge_texts(table, drawing.rejecting(table))
+    texts = edge_texts(table, drawing.rejecting(table))
     assert (("", "else"),) in texts.values() and texts[0, 1, 0] != texts[0, 0, 0]
 
 
 def test_accepting_arrows_are_coloured_and_have_a_dot():
     figure = plot.automaton(to_automaton("F a & G F b"), layout="matplotlib")
     # One arrow comes from nowhere; 0 -> 0, 0 -> 1 and 1 -> 1 do not accept, the other 1 -> 1 does.
-    assert colors(figure) == {plot.INK: 4, plot.ACCENT: 1}
-    assert marks(figure) == [plot.ACCENT]
+    assert colors(figure) == {INK: 4, ACCENT: 1}
+    assert marks(figure) == [ACCENT]
     notes = " ".join(text.get_text() for text in figure.texts)
     assert "●: accepting" in notes
     finite = plot.automaton(to_automaton("F a"), layout="matplotlib")
-    assert marks(finite) == [] and colors(finite) == {plot.INK: 3}
+    assert marks(finite) == [] and colors(finite) == {INK: 3}
 
 
 def test_priorities_stand_before_their_guards():
     table = to_automaton("G F a -> G F b")
-    texts = plot._edge_texts(table, drawing.rejecting(table))
+    texts = edge_texts(table, drawing.rejecting(table))
     assert texts == {(0, 0, 0): (("0", "b"), ("1", "a ∧ ¬b"), ("2", "¬a ∧ ¬b"))}
     figure = plot.automaton(table, layout="matplotlib")
     shown = {text.get_text(): text.get_position()[1] for text in figure.axes[0].texts}
     assert shown["2"] == shown["¬a ∧ ¬b"] < shown["1"] == shown["a ∧ ¬b"]
-    assert marks(figure) == [plot.ACCENT, plot.PAPER, plot.ACCENT]
+    assert marks(figure) == [ACCENT, PAPER, ACCENT]
 
 
 def test_no_mark_counts_on_the_way_to_a_rejecting_state():
@@ -119,10 +124,10 @@ def test_no_mark_counts_on_the_way_to_a_rejecting_state():
         [[0, 1, 1], [1, 1, 1]], 0, [[True, False], [False, True], [False, False]], ["a", "b"],
         priority=[[2, 0, 1], [1, 3, 3]],
     )
-    texts = plot._edge_texts(table, drawing.rejecting(table))
+    texts = edge_texts(table, drawing.rejecting(table))
     assert texts == {(0, 0, 0): (("2", "a"),), (0, 1, 0): (("", "¬a"),), (1, 1, 0): (("", "⊤"),)}
     assert len(arranged(table).edges) == 2
-    assert colors(plot.automaton(table, layout="matplotlib")) == {plot.INK: 2, plot.MUTED: 1}
+    assert colors(plot.automaton(table, layout="matplotlib")) == {INK: 2, MUTED: 1}
 
 
 def test_rejecting_states_of_every_acceptance():
@@ -259,8 +264,8 @@ def test_rare_moves_have_small_arrows():
         {x.get_xy(): to_hex(x.get_facecolor()) for x in axes.patches if isinstance(x, Rectangle)}
         for axes in (first, second)
     ]
-    assert fills[0][2, 1] == plot._MARKED and fills[0][0, 0] == plot.PAPER
-    assert fills[1][0, 0] == plot._NEVER and fills[1][1, 1] == plot._WALL
+    assert fills[0][2, 1] == MARKED and fills[0][0, 0] == PAPER
+    assert fills[1][0, 0] == NEVER and fills[1][1, 1] == WALL
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["one", "two"]
     assert [t.get_text() for t in figure.legends[0].texts] == [
         "good", "never reached", "often", "seldom"]
@@ -350,7 +355,7 @@ def test_walls_have_no_map_of_their_own():
 
 def marks_of_moves(axes):
     """Where the filled triangles and dots of a map lie, as the places that they point to."""
-    ink = to_hex(plot.INK)
+    ink = to_hex(INK)
     return sorted(
         tuple(x.center if isinstance(x, Circle) else x.get_xy()[1]) for x in axes.patches
         if not isinstance(x, Rectangle) and x.get_facecolor()[3] > 0
@@ -471,12 +476,12 @@ def test_a_coloured_world_is_drawn_with_all_that_is_in_it():
     assert names == {"o1": 1, "o2": 1, "o3": 1, "ob": 5}
     shown = first.images[0].get_array()
     assert shown.shape == (14, 14, 3)
-    np.testing.assert_allclose(shown[5, 5], to_rgb(plot._TINTS[4]))  # cell (4, 4) is black
+    np.testing.assert_allclose(shown[5, 5], to_rgb(TINTS[4]))  # cell (4, 4) is black
     np.testing.assert_allclose(low.images[0].get_array().ravel(), np.arange(100))
     triangles = next(a for a in second.collections if isinstance(a, PolyCollection))
     assert len(triangles.get_paths()) == 100
     # What is drawn on black cells is light, and dark on all others.
-    light = [to_hex(c) == plot.PAPER for c in triangles.get_facecolor()]
+    light = [to_hex(c) == PAPER for c in triangles.get_facecolor()]
     np.testing.assert_array_equal(light, np.asarray(world.colors)[2:-2, 2:-2].ravel() == 4)
     walk = first.get_lines()[0].get_xydata()
     np.testing.assert_allclose(np.diff(walk, axis=0), [[1, 0], [1, 0]])

@@ -35,8 +35,8 @@ from jaxltl.core.games.permissive import METHODS
 from jaxltl.core.games.winning import task_game
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.product import Product
-from jaxltl.envs.gridworld import parse_map
 from jaxltl.envs.robots import ACTIONS, grid_game, places
+from jaxltl.envs.text_map import parse_map
 
 
 @dataclass(frozen=True)

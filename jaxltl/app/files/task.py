@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+
 from jaxltl.app.files.tables import (
     COUNT,
     LEGEND,
@@ -37,7 +38,8 @@ from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.mdp import MDP, from_dense, make_mdp
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
-from jaxltl.envs.gridworld import ACTIONS, gridworld, parse_map
+from jaxltl.envs.gridworld import ACTIONS, gridworld
+from jaxltl.envs.text_map import parse_map
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,8 @@ from jaxltl.core.logic.ltl import parse_ltl
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.envs import temporal_gridworld
-from jaxltl.envs.gridworld import ACTIONS, gridworld, parse_map
+from jaxltl.envs.gridworld import ACTIONS, gridworld
+from jaxltl.envs.text_map import parse_map
 
 
 @dataclass(frozen=True)

@@ -1,48 +1,22 @@
 """One self-contained page about a learned policy: its evidence, figures and pictures."""
 
+
 from __future__ import annotations
 
-import base64
 import html
-import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-_STYLE = """
-:root { color-scheme: light dark; --ink: #1f2a37; --muted: #5f6b78; --line: #dfe3e8;
-  --page: #f7f8f9; --card: #ffffff; --accent: #1f6f8b; --good: #2c7a4b; --bad: #a33a2a; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e4e8ec; --muted: #9aa6b2; --line: #333c46;
-  --page: #14181d; --card: #1c2229; --accent: #6db9d3; --good: #79c596; --bad: #ea8c7b; } }
-* { box-sizing: border-box; }
-body { margin: 0; background: var(--page); color: var(--ink);
-  font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
-main { max-width: 62rem; margin: 0 auto; padding: 2.5rem 1.25rem 4rem; }
-h1 { font-size: 1.7rem; margin: 0 0 .3rem; letter-spacing: -.01em; }
-h2 { font-size: 1.1rem; margin: 2.4rem 0 .7rem; }
-p { margin: .5rem 0; max-width: 46rem; }
-code { font: .9em ui-monospace, SFMono-Regular, Menlo, Consolas, monospace;
-  overflow-wrap: anywhere; }
-.muted, figcaption { color: var(--muted); }
-.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(11.5rem, 1fr)); gap: .8rem;
-  margin: 1.4rem 0; }
-.tile { background: var(--card); border: 1px solid var(--line); border-radius: 10px;
-  padding: .8rem 1rem; }
-.tile b { display: block; font-size: 1.65rem; font-weight: 600; letter-spacing: -.02em; }
-.tile small { color: var(--muted); display: block; line-height: 1.35; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; background: var(--card); border-radius: 10px;
-  border: 1px solid var(--line); font-variant-numeric: tabular-nums; }
-th, td { padding: .45rem .9rem; text-align: right; border-top: 1px solid var(--line);
-  white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; }
-thead th { border-top: 0; color: var(--muted); font-weight: 500; font-size: .85rem; }
-.good { color: var(--good); } .bad { color: var(--bad); font-weight: 600; }
-figure { margin: 0 0 1rem; }
-figure div { background: #fff; border: 1px solid var(--line); border-radius: 10px;
-  padding: .8rem; text-align: center; overflow-x: auto; }
-figure img { max-width: 100%; height: auto; }
-figcaption { font-size: .88rem; margin-top: .4rem; max-width: 46rem; }
-"""
+from jaxltl.app.reports.page import (
+    certified,
+    frame,
+    head,
+    number,
+    place,
+    probability,
+    spread,
+    tiles,
+)
 
 
 def page(
@@ -67,46 +41,48 @@ def page(
     return frame(result, parts, pictures, task_text)
 
 
-def head(result: Mapping[str, Any], sentence: str, warned: Iterable[str]) -> list[str]:
-    """What a page begins with: the task, what was done, and what a reader must know."""
-    return [
-        f"<h1>{html.escape(result['task'])}</h1>",
-        f"<p class=muted>{sentence}</p>",
-        f"<p><code>{html.escape(result['formula'])}</code></p>",
-        "".join(f"<p class=bad>{html.escape(w)}</p>" for w in warned),
+def table(result: Mapping[str, Any]) -> str:
+    """The result as text for the terminal."""
+    shown, training, seeds = result["demonstrations"], result["training"], result["seeds"]
+    dropped = f", {shown['dropped']} unfinished dropped" if shown["dropped"] else ""
+    lines = [
+        f"{result['task']}: {result['num_states']} states x {result['num_memory']} memory states, "
+        f"{shown['number']} {'synthetic ' * shown['synthetic']}demonstrations "
+        f"({shown['pairs']} pairs{dropped}), {result['method']} in the {result['in']}",
+        "",
+        "probability of doing the task, over "
+        f"{result['satisfaction']['num_starts']} initial states",
     ]
-
-
-def frame(
-    result: Mapping[str, Any], parts: Iterable[str], pictures: Iterable[tuple[str, bytes, str]],
-    task_text: str,
-) -> str:
-    """A whole page of its parts, the pictures and the task file.
-
-    Args:
-      result: what ``result.json`` holds; read are its task, versions and seconds.
-      parts: HTML.
-      pictures, task_text: as for :func:`page`.
-    """
-    name, parts = html.escape(result["task"]), list(parts)
-    for title, svg, caption in pictures:
-        image = base64.b64encode(svg).decode()
-        parts.append(
-            f"<h2>{html.escape(title)}</h2><figure><div><img alt=\"{html.escape(title)}\" "
-            f"src=\"data:image/svg+xml;base64,{image}\"></div>"
-            f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+    for title, key in (("learned policy", "satisfaction"), ("best achievable", "best_achievable")):
+        for what in ("mean", "minimum"):
+            entry = result[key][what]
+            where = place(entry) if what == "minimum" else ""
+            lines.append(
+                f"  {title:16} {what:8} {probability(entry['value']):>9}   certified "
+                f"{certified(entry):15} {where}".rstrip()
+            )
+    weights = "  ".join(f"{k} {number(v)}" for k, v in result["weights"].items())
+    lines += [
+        "",
+        f"negative log-likelihood  {number(result['neg_log_likelihood'])}",
+        f"weights                  {weights}",
+    ]
+    if training["converged"]:
+        lines.append(
+            f"learning                 converged in {training['steps']} steps "
+            f"(gradient norm {training['gradient_norm']:.1e})"
         )
-    parts.append(
-        f"<h2>The task file</h2><div class=scroll><pre><code>{html.escape(task_text)}</code></pre>"
-        f"</div><p class=muted>jaxltl {result['versions']['jaxltl']}, "
-        f"jax {result['versions']['jax']}, {result['seconds']:.1f} s</p>"
-    )
-    return (
-        "<!doctype html><html lang=en><head><meta charset=utf-8>"
-        '<meta name=viewport content="width=device-width, initial-scale=1">'
-        f"<title>{name} · jaxltl</title><style>{_STYLE}</style></head>"
-        f"<body><main>{''.join(parts)}</main></body></html>\n"
-    )
+    if seeds["number"] > 1:
+        lines += [
+            "",
+            f"over {seeds['number']} seeds ({seeds['converged']} converged; the one of least loss "
+            "is above)",
+            f"  mean                    {spread(seeds['mean'])}",
+            f"  minimum                 {spread(seeds['minimum'])}",
+            f"  negative log-likelihood {spread(seeds['neg_log_likelihood'])}",
+        ]
+    lines += [f"\nwarning: {text}" for text in warnings(result)]
+    return "\n".join(lines)
 
 
 def _sentence(result: Mapping[str, Any]) -> str:
@@ -117,13 +93,6 @@ def _sentence(result: Mapping[str, Any]) -> str:
         f"{result['num_memory']} memory states, {shown['number']} {kind} "
         f"({shown['pairs']} state-action pairs)"
     )
-
-
-def place(where: Mapping[str, int]) -> str:
-    """A state as people name it: row and column from 1 on a map, else its number from 0."""
-    if "row" in where:
-        return f"row {where['row']}, column {where['column']}"
-    return f"state {where['state']}"
 
 
 def warnings(result: Mapping[str, Any]) -> list[str]:
@@ -151,13 +120,6 @@ def warnings(result: Mapping[str, Any]) -> list[str]:
                 f"The solver for {what} ended with {result[key]['status']}; only its bounds hold."
             )
     return found
-
-
-def tiles(figures: Iterable[tuple[str, str]]) -> str:
-    """Figures to see first, each with its text, which is HTML."""
-    return "<div class=tiles>" + "".join(
-        f"<div class=tile><b>{value}</b><small>{text}</small></div>" for value, text in figures
-    ) + "</div>"
 
 
 def _tiles(result: Mapping[str, Any]) -> str:
@@ -214,40 +176,3 @@ def _seeds(result: Mapping[str, Any]) -> str:
         f"negative log-likelihood {spread(seeds['neg_log_likelihood'])}. The seed with the least "
         "loss is shown.</p>"
     )
-
-
-def spread(values: Iterable[float | None]) -> str:
-    """Mean, and standard deviation over seeds, of the finite values."""
-    known = [v for v in values if v is not None]
-    if not known:
-        return "unknown"
-    mean = sum(known) / len(known)
-    deviation = (sum((v - mean) ** 2 for v in known) / max(1, len(known) - 1)) ** 0.5
-    return f"{number(mean)} ± {deviation:.2g}"
-
-
-def probability(value: float | None) -> str:
-    """A probability to four places; a small one with its exponent."""
-    if value is None:
-        return "unknown"
-    return f"{value:.4f}" if value >= 0.00095 or value == 0 else f"{value:.1e}"
-
-
-def certified(entry: Mapping[str, Any]) -> str:
-    """What the bounds of a value say: exact, within so much, or the interval if it is wide."""
-    value, lower, upper = entry["value"], entry["lower"], entry["upper"]
-    if value is None or lower is None or upper is None:
-        return "no bounds"
-    width = max(value - lower, upper - value)
-    if width <= 0:
-        return "exact"
-    if width < 5e-4:
-        return f"within {width:.1e}"
-    return f"in [{math.floor(lower * 1e4) / 1e4:.4f}, {math.ceil(upper * 1e4) / 1e4:.4f}]"
-
-
-def number(value: float | None) -> str:
-    """A figure to four digits."""
-    if value is None:
-        return "unknown"
-    return f"{value:.1e}" if value != 0 and abs(value) < 1e-3 else f"{value:.4g}"

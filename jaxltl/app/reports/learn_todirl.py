@@ -6,7 +6,7 @@ import html
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from jaxltl.app.reports.learn import (
+from jaxltl.app.reports.page import (
     certified,
     frame,
     head,

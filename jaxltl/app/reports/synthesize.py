@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxltl
-from jaxltl.algos.learner import atomic_write
+from jaxltl.algos.checkpoint import atomic_write
 from jaxltl.app.files.game import World, task_text
 from jaxltl.app.learn import plain
 from jaxltl.app.synthesize import Play, Synthesis

@@ -64,10 +64,11 @@ def verdict(automaton: Automaton, word: Iterable[Letter]) -> Verdict:
       >>> verdict(to_automaton("F a"), [set(), {"a"}]).name, verdict(to_automaton("F a"), []).name
       ('SATISFIED', 'UNDECIDED')
     """
-    return Verdict(int(_verdicts(automaton)[run(automaton, word)[-1]]))
+    return Verdict(int(verdicts(automaton)[run(automaton, word)[-1]]))
 
 
-def _verdicts(automaton: Automaton) -> np.ndarray:
+def verdicts(automaton: Automaton) -> np.ndarray:
+    """``int32[Q]``: the verdict in each state of an automaton, on the host."""
     table = np.full(len(automaton.delta), Verdict.UNDECIDED, np.int32)
     table[universal_states(automaton)] = Verdict.SATISFIED
     table[~live_states(automaton)] = Verdict.VIOLATED
@@ -85,7 +86,7 @@ def make_monitor(automaton: Automaton) -> Monitor:
     return Monitor(
         delta=jnp.asarray(automaton.delta, jnp.int32),
         initial=jnp.asarray(automaton.initial, jnp.int32),
-        verdict=jnp.asarray(_verdicts(automaton)),
+        verdict=jnp.asarray(verdicts(automaton)),
     )
 
 

@@ -1,0 +1,80 @@
+"""Pictures drawn beside the work, so that nobody waits for matplotlib."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import Any, NamedTuple
+
+_PROCESSES = 2
+
+
+class Drawing(NamedTuple):
+    """A picture that is still to be drawn: a function of :mod:`jaxltl.plot` and what it takes."""
+
+    function: str
+    arguments: tuple[Any, ...]
+    options: Mapping[str, Any]
+
+
+class Picture(NamedTuple):
+    """A picture of a report: its file's name, title, caption, and how it is drawn."""
+
+    name: str
+    title: str
+    drawing: Drawing
+    caption: str
+
+
+Artist = Callable[[Drawing], Callable[[], bytes]]
+
+
+def drawing(function: str, *arguments: Any, **options: Any) -> Drawing:
+    """The call of a function of :mod:`jaxltl.plot`, to be made later and elsewhere."""
+    return Drawing(function, arguments, options)
+
+
+def draw(picture: Drawing) -> bytes:
+    """The SVG of a picture."""
+    # Deferred: learning alone does not need matplotlib.
+    from jaxltl import plot
+
+    return plot.to_bytes(getattr(plot, picture.function)(*picture.arguments, **picture.options))
+
+
+@contextlib.contextmanager
+def artist(apart: bool) -> Iterator[Artist]:
+    """What begins to draw a picture and returns how to get it.
+
+    Args:
+      apart: draw in processes of their own, which load matplotlib from now on; else when the
+        picture is asked for.
+    """
+    if not apart:
+        yield lambda picture: lambda: draw(picture)
+        return
+    # Spawned, since a process with threads, which JAX has, must not fork.
+    with ProcessPoolExecutor(_PROCESSES, get_context("spawn"), _prepare) as pool:
+        for _ in range(_PROCESSES):
+            pool.submit(int)
+
+        def begin(picture: Drawing) -> Callable[[], bytes]:
+            drawn = pool.submit(draw, picture)
+
+            def finish() -> bytes:
+                try:
+                    return drawn.result()
+                except BrokenExecutor:
+                    return draw(picture)
+
+            return finish
+
+        yield begin
+
+
+def _prepare() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command itself says what is to be done
+    import jaxltl.plot  # noqa: F401

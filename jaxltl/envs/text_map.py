@@ -1,0 +1,35 @@
+"""Text maps: one word or character for each cell."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def parse_map(text: str) -> np.ndarray:
+    """The cells of a text map, ``str[rows, columns]``.
+
+    One line per row. If any line has spaces inside, cells are words between spaces;
+    otherwise each character is a cell. Blank lines are ignored.
+
+    Raises:
+      ValueError: the map is empty or its rows differ in length.
+
+    Example:
+      >>> parse_map('''
+      ... ..y
+      ... b#.
+      ... ''').shape
+      (2, 3)
+    """
+    lines = [line.strip() for line in text.strip().splitlines() if line.strip()]
+    if not lines:
+        raise ValueError("the map is empty; give at least one row of cells.")
+    words = any(len(line.split()) > 1 for line in lines)
+    rows = [line.split() if words else list(line) for line in lines]
+    for i, row in enumerate(rows):
+        if len(row) != len(rows[0]):
+            raise ValueError(
+                f"map row {i + 1} has {len(row)} cells, row 1 has {len(rows[0])}: "
+                f"{lines[i]!r}. All rows must have the same length."
+            )
+    return np.array(rows)
