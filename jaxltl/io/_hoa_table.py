@@ -1,0 +1,215 @@
+"""Edges of an automaton in the Hanoi format as a table over its letters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.automata.automaton import letter_text
+from jaxltl.core.logic.ltl import Letter, as_letters
+from jaxltl.io._hoa_grammar import (
+    Edge,
+    State,
+    Tree,
+    error_at,
+)
+from jaxltl.io._hoa_header import Header, only_target, set_number
+
+MAX_FREE_PROPOSITIONS = 12  # 2^12 letters
+
+
+def alphabet_of(
+    names: tuple[str, ...], letters: Iterable[Letter] | None, line: int
+) -> NDArray[np.bool_]:
+    """The letters `[L, P]`, by the binary number with proposition p as bit p."""
+    if letters is None:
+        if len(names) > MAX_FREE_PROPOSITIONS:
+            raise error_at(
+                line,
+                f"the automaton has {len(names)} propositions, so 2^{len(names)} letters; the "
+                f"limit is 2^{MAX_FREE_PROPOSITIONS}. Pass letters=, the sets of propositions "
+                "that can hold at once.",
+            )
+        numbers = list(range(2 ** len(names)))
+    else:
+        bit = {name: 1 << p for p, name in enumerate(names)}
+        given = as_letters(letters, "read_hoa: letters")
+        numbers = sorted({sum(bit[name] for name in bit if name in letter) for letter in given})
+    if not numbers:
+        raise ValueError(
+            "read_hoa: letters is empty. Pass at least one letter, such as set(), or None for "
+            "all of them."
+        )
+    rows = [[bool(number >> p & 1) for p in range(len(names))] for number in numbers]
+    return np.array(rows, bool).reshape(len(rows), len(names))
+
+
+def by_number(header: Header, states: list[State]) -> list[State]:
+    """The states in the order of their numbers, each defined once; start and targets exist."""
+    defined: dict[int, State] = {}
+    for state in states:
+        number = int(state.number)
+        if header.states is not None and number >= header.states:
+            raise error_at(
+                state.line,
+                f"state {number} is out of range, since States: counts {header.states}. "
+                "Correct the one or the other.",
+            )
+        if number in defined:
+            raise error_at(
+                state.line,
+                f"state {number} is defined twice, first in line {defined[number].line}. "
+                "Keep one of them.",
+            )
+        for edge in state.edges:
+            only_target(edge.targets, f"the edge of state {number} to")
+        defined[number] = state
+    mentioned = [header.start, *[state.number for state in states]]
+    mentioned += [edge.targets[0] for state in states for edge in state.edges]
+    for token in mentioned:
+        if int(token) not in defined:
+            raise error_at(
+                token.line, f"state {token} is not defined. Add 'State: {token}' to the body."
+            )
+    count = max(defined) + 1 if header.states is None else header.states
+    if len(defined) < count:
+        number = next(q for q in range(count) if q not in defined)
+        raise error_at(
+            header.line,
+            f"state {number} of {count} is not defined. Add 'State: {number}' to the body, or "
+            "correct States:.",
+        )
+    return [defined[q] for q in range(count)]
+
+
+@dataclass(frozen=True)
+class Table:
+    """The edge that each state takes by each letter, `[Q, L]`, and all edges, by their number.
+
+    The last state is a rejecting one, added for missing edges, if `sink` is its number.
+    """
+
+    edge_of: NDArray[np.int64]
+    target: NDArray[np.int64]
+    marks: list[frozenset[int]]
+    names: tuple[str, ...]
+    sink: int | None
+
+
+def read_table(header: Header, states: list[State], columns: NDArray[np.bool_]) -> Table:
+    truth = _label_truth(header, columns)
+    edge_of = np.full((len(states), len(columns)), -1, np.int64)
+    edges: list[Edge] = []
+    marks: list[frozenset[int]] = []
+    for q, state in enumerate(states):
+        on_state = {set_number(number, header.sets) for number in state.marks}
+        for edge, taken in _guarded(state, columns, truth):
+            for letter in np.flatnonzero(taken & (edge_of[q] >= 0))[:1]:
+                raise _nondeterminism(header, q, edge, edges[edge_of[q, letter]], columns[letter])
+            edge_of[q, taken] = len(edges)
+            edges.append(edge)
+            own = {set_number(number, header.sets) for number in edge.marks}
+            marks.append(frozenset(on_state | own))
+    target = [int(edge.targets[0]) for edge in edges]
+    names = [state.name or "" for state in states]
+    sink = None
+    if (edge_of < 0).any():
+        sink = len(states)
+        edge_of = np.vstack([edge_of, np.full(len(columns), -1)])
+        edge_of[edge_of < 0] = len(edges)
+        target.append(sink)
+        marks.append(frozenset())
+        names.append("false")
+    named = any(state.name is not None for state in states)
+    return Table(edge_of, np.array(target, np.int64), marks, tuple(names) if named else (), sink)
+
+
+def _nondeterminism(
+    header: Header, q: int, edge: Edge, other: Edge, letter: NDArray[np.bool_]
+) -> ValueError:
+    return error_at(
+        edge.line,
+        f"state {q} has two edges for the letter {letter_text(header.propositions, letter)}, to "
+        f"state {other.targets[0]} and to state {edge.targets[0]}. Only deterministic automata are "
+        "read; determinise it first, in Spot with the options -D -G.",
+    )
+
+
+def _guarded(
+    state: State, columns: NDArray[np.bool_], truth: Callable[[Tree], NDArray[np.bool_]]
+) -> Iterator[tuple[Edge, NDArray[np.bool_]]]:
+    """Each edge of a state, and the letters `[L]` that take it."""
+    labelled = sum(edge.label is not None for edge in state.edges)
+    if state.label is not None:
+        if labelled:
+            raise error_at(
+                state.line,
+                f"state {state.number} has a label and so have its edges. Label only the state "
+                "or only the edges.",
+            )
+        common = truth(state.label)
+        yield from ((edge, common) for edge in state.edges)
+    elif labelled:
+        for edge in state.edges:
+            if edge.label is None:
+                raise error_at(
+                    edge.line,
+                    f"state {state.number} has edges with a label and edges without. "
+                    "Label all of them, or none.",
+                )
+            yield edge, truth(edge.label)
+    elif state.edges:
+        width = columns.shape[1]
+        if len(state.edges) != 2**width:
+            raise error_at(
+                state.line,
+                f"the number of edges without a label of state {state.number} is "
+                f"{len(state.edges)}, expected 2^{width}, one for each set of propositions "
+                f"(AP: counts {width}). Correct them, or label them.",
+            )
+        numbers = columns @ (1 << np.arange(width))
+        yield from ((edge, numbers == i) for i, edge in enumerate(state.edges))
+
+
+def _label_truth(
+    header: Header, columns: NDArray[np.bool_]
+) -> Callable[[Tree], NDArray[np.bool_]]:
+    """The function from a label to the letters `[L]` in which it holds."""
+    aliases: dict[str, NDArray[np.bool_]] = {}
+
+    def truth(label: Tree) -> NDArray[np.bool_]:
+        operator, *operands = label
+        if operator in ("true", "false"):
+            return np.full(len(columns), operator == "true")
+        if operator == "alias":
+            if operands[0] not in aliases:
+                raise error_at(
+                    operands[0].line,
+                    f"the alias {operands[0]} is not defined up to here. Define it by Alias:, "
+                    "before other aliases use it.",
+                )
+            return aliases[operands[0]]
+        if operator == "proposition":
+            if int(operands[0]) >= columns.shape[1]:
+                raise error_at(
+                    operands[0].line,
+                    f"proposition {operands[0]} is out of range, since AP: counts "
+                    f"{columns.shape[1]}. Correct the one or the other.",
+                )
+            return columns[:, int(operands[0])]
+        if operator == "not":
+            return ~truth(operands[0])
+        combine = np.logical_and if operator == "and" else np.logical_or
+        result = truth(operands[0])
+        for operand in operands[1:]:
+            result = combine(result, truth(operand))
+        return result
+
+    for name, label in header.aliases:
+        if name in aliases:
+            raise error_at(name.line, f"the alias {name} is defined twice. Keep one of them.")
+        aliases[str(name)] = truth(label)
+    return truth
