@@ -19,6 +19,10 @@ STOREYS = (
     "core.types", "core.logic", "core.host", "core.automata", "core.models", "core.graphs",
     ("core.values", "core.games"), "algos", "envs", "io", "plot", "app", "reproduce", "cli",
 )
+# What a private helper helps is one learner; these serve several.
+SHARED_BY_LEARNERS = (
+    "checkpoint", "exponential_family", "learner", "pac", "play", "schedules", "splitmix",
+)
 NO_JAX = ("core.logic", "core.host", "core.automata")
 
 
@@ -115,14 +119,22 @@ def test_logic_automata_and_host_never_import_jax(name):
 
 @pytest.mark.parametrize("name", [n for n in MODULES if n.startswith("jaxltl.algos.")])
 def test_learners_never_import_one_another(name):
-    shared = ("jaxltl.algos.learner", "jaxltl.algos.play", "jaxltl.algos.pac",
-              "jaxltl.algos.exponential_family")
     others = [
         found for found in imports_any(name, ("jaxltl.algos",))
-        if found != "jaxltl.algos" and not f"{found}.".startswith(tuple(f"{n}." for n in shared))
+        if found != "jaxltl.algos" and found.split(".")[2] not in SHARED_BY_LEARNERS
+        and not found.split(".")[2].startswith("_")
     ]
     assert not others
     assert not imports_any(name, ("jaxltl.cli", "jaxltl.plot", "jaxltl.reproduce", "matplotlib"))
+
+
+@pytest.mark.parametrize("name", [n for n in MODULES if n.startswith("jaxltl.algos._")])
+def test_a_private_helper_has_one_learner(name):
+    def learners(helper: str) -> set[str]:
+        users = {n for n in MODULES if helper in below(n)}
+        return {m for n in users for m in (learners(n) if "._" in n else {n})}
+
+    assert len(learners(name)) == 1, f"{sorted(learners(name))} import {name}"
 
 
 @pytest.mark.parametrize("name", [n for n in MODULES if n.startswith("jaxltl.envs.")])

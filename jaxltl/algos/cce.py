@@ -17,6 +17,7 @@ sample can owe its place to luck. :func:`result` evaluates both anew and names a
 only if it is feasible.
 """
 
+
 from __future__ import annotations
 
 import math
@@ -30,35 +31,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import lax
 
 from jaxltl.algos import exponential_family as families
 from jaxltl.algos import learner
+from jaxltl.algos._elites import Pool, Sample, better, elite_weights, num_elites, rows_of, select
+from jaxltl.algos._evaluation import evaluate_all, per_cost, scores, split
+from jaxltl.algos.schedules import SLACK, Polynomial, Schedule, at
 from jaxltl.core.types import Status, require_shape
 
 WEIGHTINGS = ("until_feasible", "literal", "uniform")
-
-# Products such as .07 * 100 come out a little above the integer that they are.
-_SLACK = 1e-9
-
-
-@struct.dataclass
-class Polynomial:
-    """The schedule ``scale * (l + offset) ** power`` of the steps l = 1, 2, ...
-
-    A negative power decays. Numbers are traced.
-
-    Example:
-      >>> [round(float(at(Polynomial(0.5, -1.0), step)), 3) for step in range(3)]
-      [0.5, 0.25, 0.167]
-    """
-
-    scale: jax.Array | float
-    power: jax.Array | float
-    offset: jax.Array | float = 0.0
-
-
-Schedule = Any  # a number, a Polynomial, or a pytree that is called with l = 1, 2, ...
 
 
 @struct.dataclass
@@ -129,30 +110,6 @@ class Hparams:
     noise: Schedule = None
     restart_below: jax.Array | float | None = None
     sharding: Any = struct.field(pytree_node=False, default=None)
-
-
-@struct.dataclass
-class Sample:
-    """One evaluated policy: ``float[D]``, its objective, costs ``float[C]``, and its excess.
-
-    `excess` is ``max_c (cost_c - limit_c) / scale_c``; `found` whether there is such a policy.
-    """
-
-    parameters: jax.Array
-    objective: jax.Array
-    cost: jax.Array
-    excess: jax.Array
-    found: jax.Array
-
-
-@struct.dataclass
-class Pool:
-    """Evaluated policies: ``float[n, D]``, ``float[n]``, ``float[n, C]`` and which count."""
-
-    parameters: jax.Array
-    objective: jax.Array
-    cost: jax.Array
-    active: jax.Array
 
 
 @struct.dataclass
@@ -256,14 +213,14 @@ def make_problem(
     if not isinstance(evaluate, jax.tree_util.Partial):
         evaluate = jax.tree_util.Partial(evaluate)
     point = families.center(family)
-    shapes = jax.eval_shape(lambda e, x, k: _split(e(x, k)), evaluate, point, jax.random.key(0))
+    shapes = jax.eval_shape(lambda e, x, k: split(e(x, k)), evaluate, point, jax.random.key(0))
     num_costs = shapes[1].shape[0]
     if num_costs == 0 and limit is not None:
         raise ValueError(
             f"limit={limit}, but evaluate returns no cost; return (objective, cost), or give no "
             "limit."
         )
-    limits = _per_cost("limit", math.inf if limit is None else limit, num_costs)
+    limits = per_cost("limit", math.inf if limit is None else limit, num_costs)
     if np.isnan(limits).any() or (limits == -np.inf).any():
         raise ValueError(
             f"limit={limits.tolist()}; no cost is at most NaN or minus infinity: give numbers, or "
@@ -272,296 +229,12 @@ def make_problem(
     if scale is None:
         size = np.abs(limits)
         scale = np.where((size > 0) & np.isfinite(size), size, 1.0)
-    scales = _per_cost("scale", scale, num_costs)
+    scales = per_cost("scale", scale, num_costs)
     if not ((scales > 0) & np.isfinite(scales)).all():
         raise ValueError(f"scale={scales.tolist()}; it must be positive and finite.")
     return Problem(
         evaluate, family, jnp.asarray(limits, point.dtype), jnp.asarray(scales, point.dtype)
     )
-
-
-def _per_cost(name: str, value: Any, num_costs: int) -> np.ndarray:
-    value = np.asarray(value, float)
-    if value.ndim:
-        require_shape(name, value, (num_costs,))
-    return np.broadcast_to(value, (num_costs,))
-
-
-def _split(value: Any) -> tuple[jax.Array, jax.Array]:
-    """The objective and ``[C]`` costs in whatever evaluate returned."""
-    if isinstance(value, tuple | list):
-        if len(value) != 2:
-            raise ValueError(
-                f"evaluate returned {len(value)} things; return (objective, cost), or the "
-                "objective alone."
-            )
-        objective, cost = map(jnp.asarray, value)
-    else:
-        objective, cost = jnp.asarray(value), jnp.zeros((0,))
-    if objective.shape != ():
-        raise ValueError(
-            f"evaluate returned an objective of shape {objective.shape}; it is called with one "
-            "policy at a time and returns one number, shape ()."
-        )
-    if cost.ndim > 1:
-        raise ValueError(
-            f"evaluate returned a cost of shape {cost.shape}; return a number or one axis of "
-            "costs, [C]."
-        )
-    return objective, jnp.atleast_1d(cost)
-
-
-# --- schedules ------------------------------------------------------------------------------
-
-
-def at(schedule: Schedule, step: jax.Array | int) -> Any:
-    """A schedule's number in the step after `step` steps, l = step + 1."""
-    l = jnp.asarray(step) + 1  # noqa: E741
-    if isinstance(schedule, Polynomial):
-        return schedule.scale * (l + jnp.asarray(schedule.offset)) ** jnp.asarray(schedule.power)
-    return schedule(l) if callable(schedule) else schedule
-
-
-def num_elites(rho: float, num_samples: int) -> int:
-    """``k = ceil(rho n)``, where a product that should be an integer is one.
-
-    Example:
-      >>> num_elites(0.07, 100), math.ceil(0.07 * 100)
-      (7, 8)
-    """
-    return math.ceil(rho * num_samples - _SLACK)
-
-
-class Condition(NamedTuple):
-    """One of theorem 1's conditions, whether it holds (None: cannot be told), and why."""
-
-    name: str
-    holds: bool | None
-    reason: str
-
-
-class Conditions(NamedTuple):
-    """What :func:`theorem_conditions` tells.
-
-    Attributes:
-      holds: True if all conditions hold, False if one fails, else None.
-      failing: the names of those that fail.
-      conditions: all, with reasons.
-      assumed: what the theorem assumes of the problem, which settings cannot show.
-    """
-
-    holds: bool | None
-    failing: tuple[str, ...]
-    conditions: tuple[Condition, ...]
-    assumed: tuple[str, ...]
-
-
-_ASSUMED = (
-    "(1) the covariance of the sufficient statistics is positive definite",
-    "(2a) the differential equation (4.12) is continuous with unique solutions",
-    "(2c) the quantiles of H and U are unique",
-    "(2d) policies and distributions lie in compact sets",
-    "(2e) G is bounded and bounded away from 0, and H is bounded",
-    "(2f) the distribution stays in the interior of its set",
-)
-
-
-def theorem_conditions(hparams: Hparams, *, num_steps: int | None = None) -> Conditions:
-    """Whether the settings meet the conditions of theorem 1, on the host.
-
-    They are (assumption 2b): ``n_l`` grows as ``l^beta`` with beta > 0; ``alpha_l`` is positive,
-    decreases to 0 and has an infinite sum; ``lambda_l = O(l^-lambda)`` for some lambda > 0 with
-    ``beta + 2 lambda > 1``; and that the method is algorithm 2 as printed.
-
-    Args:
-      hparams: concrete numbers.
-      num_steps: the length of the run. `population` bounds n_l, so that the samples can grow
-        only for so long; None asks for ever.
-
-    Example:
-      >>> theorem_conditions(Hparams(weighting="literal")).failing
-      ('samples grow', 'rate decreases', 'rate vanishes')
-      >>> hparams = Hparams(rate=Polynomial(0.5, -0.7), num_samples=Polynomial(10, 0.5),
-      ...                   weighting="literal")
-      >>> theorem_conditions(hparams, num_steps=90).holds
-      True
-    """
-    growth, samples = _samples_condition(hparams, num_steps)
-    decay, share = _share_condition(hparams.sample_share)
-    both = None if growth is None or decay is None else growth + 2 * decay > 1
-    found = (
-        samples,
-        *_rate_conditions(hparams.rate),
-        share,
-        Condition("beta + 2 lambda > 1", both, f"beta = {growth}, lambda = {decay}"),
-        Condition(
-            "weights are G", hparams.weighting == "literal", f"weighting={hparams.weighting!r}"),
-        *(
-            Condition(f"no {name}", getattr(hparams, name) in (None, False),
-                      "not part of algorithm 2")
-            for name in ("elite_reuse", "antithetic", "variance_floor", "noise", "restart_below")
-        ),
-    )
-    failing = tuple(c.name for c in found if c.holds is False)
-    unknown = any(c.holds is None for c in found)
-    return Conditions(False if failing else None if unknown else True, failing, found, _ASSUMED)
-
-
-def _polynomial(schedule: Schedule) -> tuple[float, float, float] | None:
-    """Scale, power and offset, or None of a function."""
-    if isinstance(schedule, Polynomial):
-        return float(schedule.scale), float(schedule.power), float(schedule.offset)
-    return None if callable(schedule) else (float(schedule), 0.0, 0.0)
-
-
-_FUNCTION = "it is a function; its limits cannot be told"
-
-
-def _samples_condition(
-    hparams: Hparams, num_steps: int | None
-) -> tuple[float | None, Condition]:
-    name = "samples grow"
-    if hparams.num_samples is None:
-        return 0.0, Condition(name, False, f"n_l is always {hparams.population}")
-    found = _polynomial(hparams.num_samples)
-    if found is None:
-        return None, Condition(name, None, f"num_samples: {_FUNCTION}")
-    scale, power, offset = found
-    if not (scale > 0 and power > 0):
-        return min(power, 0.0), Condition(name, False, f"n_l = {scale:g} l^{power:g}")
-    full = max(math.floor((hparams.population / scale) ** (1 / power) - offset + _SLACK), 0)
-    reason = f"n_l ~ l^{power:g} until step {full}, then population={hparams.population}"
-    return power, Condition(name, num_steps is not None and num_steps <= full, reason)
-
-
-def _rate_conditions(rate: Schedule) -> list[Condition]:
-    names = ("rate in (0, 1]", "rate decreases", "rate vanishes", "rate has an infinite sum")
-    found = _polynomial(rate)
-    if found is None:
-        return [Condition(name, None, f"rate: {_FUNCTION}") for name in names]
-    scale, power, offset = found
-    first = scale * (1 + offset) ** power if offset > -1 else math.nan
-    decays = power < 0 and scale > 0
-    holds = (0 < first <= 1 and power <= 0, decays, decays, power >= -1 and scale > 0)
-    reason = f"alpha_l = {scale:g} (l + {offset:g})^{power:g}"
-    return [Condition(name, held, reason) for name, held in zip(names, holds, strict=True)]
-
-
-def _share_condition(share: Schedule) -> tuple[float | None, Condition]:
-    name = "sample share decays"
-    found = (0.0, 0.0, 0.0) if share is None else _polynomial(share)
-    if found is None:
-        return None, Condition(name, None, f"sample_share: {_FUNCTION}")
-    scale, power, offset = found
-    if scale == 0:  # of any order
-        return math.inf, Condition(name, True, "lambda_l = 0")
-    first = scale * (1 + offset) ** power if offset > -1 else math.nan
-    reason = f"lambda_l = {scale:g} (l + {offset:g})^{power:g}"
-    return -power, Condition(name, power < 0 and 0 <= first <= 1, reason)
-
-
-# --- elites ---------------------------------------------------------------------------------
-
-
-@struct.dataclass
-class Elites:
-    """Who was chosen among n samples.
-
-    Attributes:
-      index: ``int32[num]``, the chosen ones, best first.
-      taken: ``bool[num]``, which of these count: the first k_l, if they can be used.
-      enough_feasible: whether at least k_l are feasible, so that the objective decided.
-      feasible, usable: ``bool[n]``.
-      excess: ``float[n]``, the largest normalised violation.
-    """
-
-    index: jax.Array
-    taken: jax.Array
-    enough_feasible: jax.Array
-    feasible: jax.Array
-    usable: jax.Array
-    excess: jax.Array
-
-
-def select(
-    objective: jax.Array,
-    cost: jax.Array,
-    limit: jax.Array,
-    *,
-    num: int,
-    count: jax.Array | int | None = None,
-    scale: jax.Array | float = 1.0,
-    active: jax.Array | bool = True,
-) -> Elites:
-    """The elites of algorithm 2, steps 7 to 10.
-
-    With at least k feasible samples the k of them with the highest objective; else the k with
-    the least ``max_c (cost_c - limit_c) / scale_c``, feasible or not. Of equals the earlier
-    sample is taken, so that there are always k, where the indicator of (4.4) takes all equals;
-    the two agree if there are none. A sample with an objective that is NaN or plus infinity,
-    or a cost that is NaN, comes last and is never taken.
-
-    Args:
-      objective: ``float[n]``.
-      cost: ``float[n, C]``.
-      limit: ``float[C]``.
-      num: how many are returned; static.
-      count: k_l, at most `num`; default `num`.
-      scale: ``float[C]`` or a number.
-      active: ``bool[n]``, which samples exist.
-
-    Example:
-      >>> cost = jnp.array([[0.0], [2.0], [1.0], [0.0]])
-      >>> objective = jnp.array([1.0, 9.0, 9.0, 2.0])
-      >>> select(objective, cost, jnp.zeros(1), num=2).index.tolist()
-      [3, 0]
-      >>> select(objective, cost, jnp.zeros(1), num=3).index.tolist()
-      [0, 3, 2]
-    """
-    count = num if count is None else count
-    usable = active & (objective < jnp.inf) & ~jnp.isnan(cost).any(-1)
-    feasible = usable & (cost <= limit).all(-1)
-    excess = jnp.max((cost - limit) / scale, axis=-1, initial=-jnp.inf)
-    enough = jnp.sum(feasible) >= count
-    rank = jnp.where(enough, objective, -excess)
-    # What cannot be used has to come after the worst that can, and -0 beside 0.
-    most = jnp.finfo(rank.dtype).max
-    rank = jnp.where(rank == 0, 0, jnp.clip(rank, -most, most))
-    rank = jnp.where(jnp.where(enough, feasible, usable), rank, -jnp.inf)
-    top, index = lax.top_k(rank, num)
-    taken = (top > -jnp.inf) & (jnp.arange(num) < count)
-    return Elites(index, taken, enough, feasible, usable, excess)
-
-
-def elite_weights(
-    objective: jax.Array,
-    taken: jax.Array,
-    enough_feasible: jax.Array,
-    *,
-    weighting: str = "until_feasible",
-    temperature: jax.Array | float = 1.0,
-) -> jax.Array:
-    """Weights of the elites, which sum to 1 (to 0 if none is taken).
-
-    Args:
-      objective: ``float[k]``, the elites'.
-      taken: ``bool[k]``.
-      enough_feasible: as :func:`select` tells.
-      weighting, temperature: see :class:`Hparams`.
-
-    Example:
-      >>> half = jnp.log(jnp.array([3.0, 1.0]))
-      >>> elite_weights(half, jnp.ones(2, bool), jnp.bool_(True)).tolist()
-      [0.75, 0.25]
-    """
-    least = jnp.finfo(objective.dtype).min
-    logit = jnp.clip(objective / temperature, least, -least)
-    if weighting != "literal":
-        by_objective = enough_feasible & (weighting == "until_feasible")
-        logit = jnp.where(by_objective, logit, 0)
-    top = jnp.max(jnp.where(taken, logit, least))
-    weight = jnp.where(taken, jnp.exp(jnp.where(taken, logit - top, 0)), 0)
-    return weight / jnp.maximum(jnp.sum(weight), 1)
 
 
 # --- the learner ----------------------------------------------------------------------------
@@ -604,7 +277,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     draw_key, evaluate_key = jax.random.split(learner.step_key(state))
     draw = families.sample_antithetic if hparams.antithetic else families.sample
     samples = draw(state.family, draw_key, hparams.population)
-    objective, cost = _evaluate(problem, hparams, samples, evaluate_key)
+    objective, cost = evaluate_all(problem, hparams, samples, evaluate_key)
     num_samples, count = _sizes(hparams, state.step)
     fresh = Pool(samples, objective, cost, jnp.arange(hparams.population) < num_samples)
     pool = fresh
@@ -615,7 +288,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
         pool.objective, pool.cost, limit, num=num_elites(hparams.rho, hparams.population),
         count=count, scale=problem.scale, active=pool.active,
     )
-    elites = replace(_rows(pool, chosen.index), active=chosen.taken)
+    elites = replace(rows_of(pool, chosen.index), active=chosen.taken)
     rate = jnp.asarray(at(hparams.rate, state.step), samples.dtype)
     family = _moved(state, hparams, fresh, elites, chosen.enough_feasible, rate)
     family, restarted = _restarted(family, problem, hparams)
@@ -629,8 +302,8 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
         fine &= jnp.isfinite(x).all()
     new = replace(
         state, step=state.step + 1, family=family,
-        best=_better(state.best, fresh, excess, feasible, objective, state.best.objective),
-        least=_better(state.least, fresh, excess, usable, -excess, -state.least.excess),
+        best=better(state.best, fresh, excess, feasible, objective, state.best.objective),
+        least=better(state.least, fresh, excess, usable, -excess, -state.least.excess),
         elites=elites if hparams.elite_reuse else None,
         num_evaluated=learner.count(state.num_evaluated, num_samples),
         num_invalid=learner.count(state.num_invalid, invalid),
@@ -650,8 +323,14 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
 
 
 run = partial(learner.run, step)
+
+
 train = partial(learner.train, init, step)
+
+
 run_until = partial(learner.run_until, step)
+
+
 train_until = partial(learner.train_until, init, step)
 
 
@@ -664,43 +343,15 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     return families.center(state.family)
 
 
-def _evaluate(
-    problem: Problem, hparams: Hparams, samples: jax.Array, key: chex.PRNGKey
-) -> tuple[jax.Array, jax.Array]:
-    """Objectives ``[n]`` and costs ``[n, C]`` of a population."""
-    keys = jax.random.split(key, len(samples))
-    sharding = hparams.sharding
-    if sharding is not None:
-        samples, keys = lax.with_sharding_constraint((samples, keys), sharding)
-    found = jax.vmap(partial(_scores, problem))(samples, keys)
-    if sharding is not None:  # every device ranks them all, in one order of operations
-        whole = jax.sharding.NamedSharding(sharding.mesh, jax.sharding.PartitionSpec())
-        found = lax.with_sharding_constraint(found, whole)
-    return found
-
-
-def _scores(
-    problem: Problem, parameters: jax.Array, key: chex.PRNGKey
-) -> tuple[jax.Array, jax.Array]:
-    objective, cost = _split(problem.evaluate(parameters, key))
-    require_shape("the cost that evaluate returned", cost, problem.limit.shape)
-    return objective.astype(parameters.dtype), cost.astype(parameters.dtype)
-
-
 def _sizes(hparams: Hparams, step: jax.Array) -> tuple[jax.Array, jax.Array]:
     """n_l and k_l."""
     most, rho = hparams.population, hparams.rho
     if hparams.num_samples is None:
         return jnp.int32(most), jnp.int32(num_elites(rho, most))
     asked = jnp.round(jnp.asarray(at(hparams.num_samples, step), float))
-    num_samples = jnp.clip(asked, math.ceil(1 / rho - _SLACK), most).astype(jnp.int32)
+    num_samples = jnp.clip(asked, math.ceil(1 / rho - SLACK), most).astype(jnp.int32)
     counts = jnp.asarray([num_elites(rho, n) for n in range(most + 1)], jnp.int32)
     return num_samples, counts[num_samples]
-
-
-def _rows(pool: Pool, index: jax.Array) -> Pool:
-    """The policies of an index; read as columns, for populations are computed that way round."""
-    return jax.tree.map(lambda x: x.T.at[..., index].get(mode="promise_in_bounds").T, pool)
 
 
 def _moved(
@@ -733,18 +384,6 @@ def _restarted(family: Any, problem: Problem, hparams: Hparams) -> tuple[Any, ja
         return family, jnp.bool_(False)
     narrow = jnp.all(families.standard_deviation(family) < hparams.restart_below)
     return jax.tree.map(lambda x, y: jnp.where(narrow, x, y), problem.family, family), narrow
-
-
-def _better(
-    old: Sample, fresh: Pool, excess: jax.Array, among: jax.Array, score: jax.Array,
-    record: jax.Array,
-) -> Sample:
-    """The old sample, or that of the highest score if it beats the record."""
-    i = jnp.argmax(jnp.where(among, score, -jnp.inf))
-    one = _rows(fresh, i)
-    new = Sample(one.parameters, one.objective, one.cost, excess[i], among[i])
-    beats = among[i] & (~old.found | (score[i] > record))
-    return jax.tree.map(lambda x, y: jnp.where(beats, x, y), new, old)
 
 
 # --- what was found -------------------------------------------------------------------------
@@ -809,7 +448,7 @@ def assess(
         raise ValueError(
             f"num_evaluations={num_evaluations}; a confidence interval needs at least 2.")
     keys = jax.random.split(key, num_evaluations)
-    objective, cost = jax.vmap(partial(_scores, problem), (None, 0))(parameters, keys)
+    objective, cost = jax.vmap(partial(scores, problem), (None, 0))(parameters, keys)
     objective, (mean, deviation) = _moments(objective)[0], _moments(cost)
     margin = float(stdtrit(num_evaluations - 1, 0.975)) / math.sqrt(num_evaluations) * deviation
     known = jnp.isfinite(mean)
@@ -902,7 +541,7 @@ def _check(problem: Problem, hparams: Hparams) -> None:
     if hparams.weighting not in WEIGHTINGS:
         raise ValueError(
             f"weighting={hparams.weighting!r}; choose {', '.join(map(repr, WEIGHTINGS))}.")
-    if not 0 < hparams.rho < 1 or hparams.rho * hparams.population < 1 - _SLACK:
+    if not 0 < hparams.rho < 1 or hparams.rho * hparams.population < 1 - SLACK:
         raise ValueError(
             f"rho={hparams.rho} of population={hparams.population} leaves no elite, or all; give "
             "rho in (0, 1) with rho * population at least 1."

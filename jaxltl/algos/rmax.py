@@ -12,11 +12,12 @@ only. Shapes are written for the S states of ``problem.game``; states outside th
 where they are and are never entered.
 """
 
+
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import chex
 import jax
@@ -26,23 +27,27 @@ from flax import struct
 from jax.tree_util import Partial
 
 from jaxltl.algos import learner, pac, splitmix
+from jaxltl.algos._joint_game import (
+    environment_rows,
+    joint_game,
+    merge_successors,
+    require_start,
+    shaped_reward,
+)
+from jaxltl.algos._walk import Rules, Seen, Walk, move, note_last, record, walk_from
 from jaxltl.algos.play import (
     check_distributions,
-    check_reward,
     cumulative,
     draw,
-    observed_reward,
-    successor_slot,
     take,
 )
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.objective import Parity, buchi
-from jaxltl.core.games.winning import objective_at, solve, task_game
+from jaxltl.core.games.winning import solve
 from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.game import Game, as_game
-from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.operators import forall_successor, sample_successor
+from jaxltl.core.models.operators import forall_successor
 from jaxltl.core.models.restrict import restrict
 from jaxltl.core.types import Solution, require_shape, status_code
 from jaxltl.core.values.minimax import minimax_value, strategy_value
@@ -250,123 +255,25 @@ def make_problem(
       (True, True)
     """
     game = as_game(game)
-    reward = _shaped_reward(game, reward)
+    reward = shaped_reward(game, reward)
     start = np.asarray(game.initial if start is None else start, float)
     require_shape("start", start, (game.num_states,))
     check_distributions("start", start[None], np.ones((1, game.num_states), bool))
-    played, accepting, origin = _joint(game, spec, start)
+    played, accepting, origin = joint_game(game, spec, start)
     base, memory = origin
-    played, reward = _merged(played, reward[base])
+    played, reward = merge_successors(played, reward[base])
     objective = buchi(played, jnp.asarray(accepting))
     region = solve(played, objective).region
-    _require_start(played, region, base, memory)
+    require_start(played, region, base, memory)
     closed = played.available & region[:, None]
     allowed = closed & (~played.system[:, None] | forall_successor(played, region))
-    rows = _environment(game, base, played, reward, allowed, environment, discount)
+    rows = environment_rows(game, base, played, reward, allowed, environment, discount)
     return Problem(
         game=played, reward=reward, accepting=jnp.asarray(accepting), region=region,
         allowed=allowed, environment=jnp.asarray(rows, played.dtype), start=played.initial,
         start_table=jnp.asarray(cumulative(np.asarray(played.initial, float))),
         base_state=jnp.asarray(base, jnp.int32), memory=jnp.asarray(memory, jnp.int32),
     )
-
-
-def _shaped_reward(game: Game, reward: Any) -> np.ndarray:
-    if not isinstance(game.mdp, MDP):
-        raise ValueError(
-            f"the game's model is a {type(game.mdp).__name__}; learning plays in an explicit MDP: "
-            "pass restrict(game).model, or convert it."
-        )
-    reward = np.asarray(reward, float)
-    shape = game.mdp.probability.shape
-    require_shape("reward", reward, shape if reward.ndim == 3 else shape[:2])
-    return reward
-
-
-def _joint(game: Game, spec: Any, start: np.ndarray):
-    """The explicit game of the task, its accepting states, and whose states they are."""
-    game = Game(game.mdp.replace(initial=jnp.asarray(start, game.dtype)), game.system)
-    own = np.arange(game.num_states)
-    if not isinstance(spec, Parity | Automaton | Formula | str):
-        accepting = np.asarray(spec)
-        require_shape("spec", accepting, (game.num_states,))
-        return game, accepting.astype(bool), (own, np.zeros_like(own))
-    if isinstance(spec, Parity):
-        return game, _accepting(spec), (own, np.zeros_like(own))
-    joint, objective = task_game(game, spec)
-    found = restrict(joint)
-    base, memory = np.asarray(found.base_state), np.asarray(found.memory)
-    number = base * joint.state_shape[1] + memory
-    accepting = _accepting(objective_at(objective, jnp.asarray(number)))
-    return found.model, accepting, (base, memory)
-
-
-def _accepting(objective: Parity) -> np.ndarray:
-    """States to be met infinitely often: those of priority 0, and those that have won."""
-    if objective.num_priorities > 2:
-        raise ValueError(
-            f"the task needs {objective.num_priorities} priorities, and only conditions met by "
-            "visiting states infinitely often can be learned; strengthen it, for example to G F."
-        )
-    won = np.asarray(objective.won)
-    return ((np.asarray(objective.priority) == 0) | won) & ~np.asarray(objective.lost)
-
-
-def _merged(game: Game, reward: np.ndarray) -> tuple[Game, jax.Array]:
-    """The game with each successor of a move once, for only successors are seen."""
-    observed = check_reward(game, reward)
-    successor, weight = np.asarray(game.mdp.successor), np.asarray(game.mdp.probability)
-    same = (successor[..., :, None] == successor[..., None, :]) & (weight[..., None, :] > 0)
-    first = same.argmax(-1) == np.arange(successor.shape[-1])
-    merged = np.where(first & (weight > 0), (same * weight[..., None, :]).sum(-1), 0)
-    mdp = game.mdp.replace(
-        successor=jnp.asarray(np.where(merged > 0, successor, 0), jnp.int32),
-        probability=jnp.asarray(merged, game.dtype),
-    )
-    return Game(mdp, game.system), observed
-
-
-def _require_start(game: Game, region: jax.Array, base: np.ndarray, memory: np.ndarray) -> None:
-    outside = np.flatnonzero((np.asarray(game.initial) > 0) & ~np.asarray(region))
-    if outside.size == 0:
-        return
-    named = ", ".join(
-        f"{base[i]}" + (f" (automaton state {memory[i]})" if memory.any() else "")
-        for i in outside[:5]
-    ) + (", ..." if outside.size > 5 else "")
-    raise ValueError(
-        f"{outside.size} of the states where runs start lie outside of the almost-surely winning "
-        f"region: {named}. From there the task is lost, or the environment can keep the accepting "
-        "states from being met again with positive probability (winning_region(...).counter_action "
-        "shows how); "
-        "start elsewhere, or weaken the task."
-    )
-
-
-def _environment(game, base, played, reward, allowed, environment, discount) -> np.ndarray:
-    """How the environment plays, one row a state; zero at the system's states."""
-    mask = np.asarray(played.available)
-    system = np.asarray(played.system)
-    if isinstance(environment, str):
-        if environment == "random":
-            rows = mask / np.maximum(mask.sum(-1, keepdims=True), 1)
-        elif environment == "adversarial" and discount is not None:
-            found = minimax_value(played, reward, discount, allowed=allowed)
-            rows = np.eye(mask.shape[1])[np.asarray(found.policy)]
-        else:
-            raise ValueError(
-                f"environment={environment!r}; choose random, adversarial (with discount=), or "
-                "give a policy."
-            )
-        return np.where(system[:, None], 0, rows)
-    environment = np.asarray(environment)
-    if environment.ndim == 1:
-        require_shape("environment", environment, (game.num_states,))
-        environment = np.eye(mask.shape[1])[environment]
-    require_shape("environment", environment, game.available.shape)
-    rows = environment[base]
-    check_distributions("environment", rows, mask, system)
-    return np.where(system[:, None], 0, rows)
 
 
 # --- the learner ----------------------------------------------------------------------------
@@ -419,8 +326,14 @@ def _step_if(
 
 
 run = partial(learner.run, step)
+
+
 train = partial(learner.train, init, step)
+
+
 run_until = partial(learner.run_until, _step_if, idle=True)
+
+
 train_until = partial(learner.train_until, init, _step_if, idle=True)
 
 
@@ -489,11 +402,11 @@ def observe(
 
 @jax.jit
 def _observe(state, problem, hparams, action, successor, reward) -> State:
-    walk = _walk_from(state, jnp.int32(1))
-    seen = _Seen(state.position, jnp.int32(action), jnp.int32(successor),
+    walk = walk_from(state, jnp.int32(1))
+    seen = Seen(state.position, jnp.int32(action), jnp.int32(successor),
                  jnp.asarray(reward, problem.game.dtype))
     rules = _rules(state, problem, hparams)
-    walk = _noted(_record(walk, seen, rules, jnp.bool_(True)), problem)
+    walk = note_last(record(walk, seen, rules, jnp.bool_(True)), problem)
     return _updated(state, walk, problem, hparams)
 
 
@@ -550,27 +463,9 @@ def wins_almost_surely(problem: Problem, play: jax.Array) -> jax.Array:
     return kept & jnp.all(moves | ~problem.region) & jnp.all(met | ~problem.region)
 
 
-# --- moves ----------------------------------------------------------------------------------
-
-
-class _Rules(NamedTuple):
-    """What the moves of one step need."""
-
-    problem: Problem
-    best: jax.Array
-    known_at: jax.Array
-    key: jax.Array
-    stream: tuple[jax.Array, jax.Array]
-    explore: jax.Array
-    enough: jax.Array
-    bound: jax.Array
-    restart: jax.Array
-    every: jax.Array
-
-
-def _rules(state: State, problem: Problem, hparams: Hparams) -> _Rules:
+def _rules(state: State, problem: Problem, hparams: Hparams) -> Rules:
     dtype, key = problem.game.dtype, learner.step_key(state)
-    return _Rules(
+    return Rules(
         problem, state.best, state.known_at, jax.random.fold_in(key, 1),
         splitmix.streams(jax.random.fold_in(key, 0)),
         _exploration(problem, hparams), _enough(problem, hparams),
@@ -579,128 +474,12 @@ def _rules(state: State, problem: Problem, hparams: Hparams) -> _Rules:
     )
 
 
-class _Seen(NamedTuple):
-    """A transition and its reward."""
-
-    state: jax.Array
-    action: jax.Array
-    successor: jax.Array
-    reward: jax.Array
-
-
-class _Walk(NamedTuple):
-    """What changes from move to move; `left` moves remain, none once there is something new.
-
-    Counts and rewards are flat. `pair` is of the last move, `seen` its reward, `known` whether
-    the pair has become known by it, and `fresh` whether a known pair has shown a transition
-    for the first time.
-    """
-
-    moves: jax.Array
-    left: jax.Array
-    position: jax.Array
-    counts: jax.Array
-    reward: jax.Array
-    pair: jax.Array
-    seen: jax.Array
-    known: jax.Array
-    fresh: jax.Array
-    fault: jax.Array
-
-
-def _walk_from(state: State, moves: jax.Array) -> _Walk:
-    zero, false = jnp.int32(0), jnp.bool_(False)
-    return _Walk(
-        state.moves, moves, state.position, state.counts.ravel(), state.reward.ravel(),
-        zero, jnp.zeros((), state.reward.dtype), false, false, state.fault,
-    )
-
-
 def _advance(state: State, problem: Problem, hparams: Hparams, moves: jax.Array) -> State:
     """At most so many moves, and the update that they lead to; none of them if that is zero."""
     rules = _rules(state, problem, hparams)
     walk = learner.while_active(
-        lambda w, _: w.left > 0, _move, _walk_from(state, moves), rules)
-    return _updated(state, _noted(walk, problem), problem, hparams)
-
-
-def _move(walk: _Walk, rules: _Rules) -> _Walk:
-    """One move, if any are left. It writes one entry of each array, so that they stay in place."""
-    active, game = walk.left > 0, rules.problem.game
-    dtype = game.dtype
-    count = walk.moves.astype(jnp.uint32)
-    words = [splitmix.words(rules.stream, 4 * count + i) for i in range(4)]
-    anew = splitmix.uniform(words[0], dtype) < rules.restart
-    s = jnp.where(anew, draw(rules.problem.start_table, words[1]), walk.position)
-    mine = jnp.where(
-        splitmix.uniform(words[2], dtype) < rules.explore,
-        take(rules.problem.allowed, s), take(rules.best, s),
-    )
-    weight = jnp.where(take(game.system, s), mine, take(rules.problem.environment, s))
-    action = _draw_action(weight, splitmix.uniform(words[3], dtype))
-    # Where chance plays no part the key is not worth making.
-    key = rules.key if game.num_successors == 1 else jax.random.fold_in(rules.key, walk.moves)
-    successor = sample_successor(game, key, s, action)
-    reward = observed_reward(game, rules.problem.reward, s, action, successor)
-    return _record(walk, _Seen(s, action, successor, reward), rules, active)
-
-
-def _draw_action(weight: jax.Array, uniform: jax.Array) -> jax.Array:
-    """An action with the probability of its weight; never one without any."""
-    total = jnp.cumsum(weight)
-    # The largest weight that rounding lets be drawn stays below the total.
-    drawn = jnp.minimum(uniform, 1 - jnp.finfo(weight.dtype).eps) * total[-1]
-    return jnp.argmax(total > drawn).astype(jnp.int32)
-
-
-def _record(walk: _Walk, seen: _Seen, rules: _Rules, active: jax.Array) -> _Walk:
-    """What a transition adds to the counts and rewards, and whether the model changes."""
-    game = rules.problem.game
-    width, pair = game.num_successors, seen.state * game.num_actions + seen.action
-    slot = successor_slot(game, seen.state, seen.action, seen.successor)
-    entry = pair * width + slot
-    # Written before it is read: the other way round whole arrays would be copied. Without
-    # chance a pair is known after one move, the last of a walk, which is noted after it.
-    counts = walk.counts if width == 1 else _counted(walk.counts, entry, active)
-    row = take(counts, pair * width + jnp.arange(width))
-    was_known, first = take(rules.known_at.ravel(), pair) >= 0, row[slot] == 1
-    alone = jnp.sum(take(game.mdp.probability.reshape(-1, width), pair) > 0) == 1
-    enough = alone | (jnp.sum(row).astype(game.dtype) >= rules.enough)
-    known = active & ~was_known & enough
-    fresh = active & was_known & first & rules.every & (width > 1)
-    wrong = active & ~((seen.reward >= 0) & (seen.reward <= rules.bound))
-    noted = active & jnp.where(rules.every, first, known)
-    return _Walk(
-        moves=walk.moves + active,
-        left=jnp.where(active, jnp.where(known | fresh, 0, walk.left - 1), walk.left),
-        position=jnp.where(active, seen.successor, walk.position),
-        counts=counts,
-        reward=walk.reward if width == 1 else _rewarded(walk.reward, entry, seen.reward, noted),
-        pair=jnp.where(active, pair, walk.pair),
-        seen=jnp.where(active, seen.reward, walk.seen),
-        known=known | (~active & walk.known), fresh=fresh | (~active & walk.fresh),
-        fault=jnp.where(wrong & (walk.fault < 0), pair, walk.fault),
-    )
-
-
-def _noted(walk: _Walk, problem: Problem) -> _Walk:
-    """In a game without chance, the last move of a walk if it made its pair known."""
-    if problem.game.num_successors > 1:
-        return walk
-    return walk._replace(
-        counts=_counted(walk.counts, walk.pair, walk.known),
-        reward=_rewarded(walk.reward, walk.pair, walk.seen, walk.known),
-    )
-
-
-def _counted(counts: jax.Array, entry: jax.Array, once: jax.Array) -> jax.Array:
-    return counts.at[entry].add(once.astype(counts.dtype), mode="promise_in_bounds")
-
-
-def _rewarded(reward, entry, seen, noted) -> jax.Array:
-    """A reward where none was noted, for which a larger number stands."""
-    least = jnp.where(noted, seen, jnp.inf).astype(reward.dtype)
-    return reward.at[entry].min(least, mode="promise_in_bounds")
+        lambda w, _: w.left > 0, move, walk_from(state, moves), rules)
+    return _updated(state, note_last(walk, problem), problem, hparams)
 
 
 def _write(array: jax.Array, place: jax.Array, entry: jax.Array) -> jax.Array:
@@ -709,7 +488,7 @@ def _write(array: jax.Array, place: jax.Array, entry: jax.Array) -> jax.Array:
 
 # --- the model and its solution -------------------------------------------------------------
 
-def _updated(state: State, walk: _Walk, problem: Problem, hparams: Hparams) -> State:
+def _updated(state: State, walk: Walk, problem: Problem, hparams: Hparams) -> State:
     """The state after a walk; with something new, the model and the strategy are too."""
     game = problem.game
     width, pair, news = game.num_successors, walk.pair, walk.known | walk.fresh

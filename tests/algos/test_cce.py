@@ -16,6 +16,7 @@ import pytest
 from jaxltl.algos import cce
 from jaxltl.algos import exponential_family as ef
 from jaxltl.algos.cce import Hparams, Polynomial
+from jaxltl.algos.schedules import theorem_conditions
 from jaxltl.core.types import Status
 from tests.support import counted_traces, lane
 
@@ -465,13 +466,13 @@ COMPLIANT = Hparams(
 
 
 def test_compliant_settings_meet_the_theorem():
-    report = cce.theorem_conditions(COMPLIANT, num_steps=10_000)
+    report = theorem_conditions(COMPLIANT, num_steps=10_000)
     assert report.holds is True
     assert not report.failing
     assert len(report.assumed) == 6
     assert "(2e) G is bounded" in " ".join(report.assumed)
     no_share = COMPLIANT.replace(sample_share=None)  # lambda_l = 0 is of any order
-    assert cce.theorem_conditions(no_share, num_steps=10_000).holds
+    assert theorem_conditions(no_share, num_steps=10_000).holds
 
 
 @pytest.mark.parametrize(("change", "failing"), [
@@ -492,22 +493,22 @@ def test_compliant_settings_meet_the_theorem():
     ({"restart_below": 0.1}, {"no restart_below"}),
 ])
 def test_settings_outside_the_theorem_are_named(change, failing):
-    report = cce.theorem_conditions(COMPLIANT.replace(**change), num_steps=10_000)
+    report = theorem_conditions(COMPLIANT.replace(**change), num_steps=10_000)
     assert report.holds is False
     assert set(report.failing) == failing
 
 
 def test_a_population_bounds_the_samples_for_ever():
-    assert cce.theorem_conditions(COMPLIANT).failing == ("samples grow",)
-    assert cce.theorem_conditions(COMPLIANT, num_steps=10_001).failing == ("samples grow",)
+    assert theorem_conditions(COMPLIANT).failing == ("samples grow",)
+    assert theorem_conditions(COMPLIANT, num_steps=10_001).failing == ("samples grow",)
 
 
 def test_what_a_function_does_cannot_be_told():
     hparams = COMPLIANT.replace(rate=jax.tree_util.Partial(lambda n: 1 / n))
-    report = cce.theorem_conditions(hparams, num_steps=100)
+    report = theorem_conditions(hparams, num_steps=100)
     assert report.holds is None
     assert next(c.name for c in report.conditions if c.holds is None) == "rate in (0, 1]"
-    assert cce.theorem_conditions(hparams.replace(noise=1.0), num_steps=100).holds is False
+    assert theorem_conditions(hparams.replace(noise=1.0), num_steps=100).holds is False
 
 
 # --- several devices --------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from jaxltl.algos import maximin_q
+from jaxltl.algos._chains import alias_table
 from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import make_mdp, to_dense
@@ -364,7 +365,7 @@ def test_alias_tables_hold_the_distribution():
     rows[:, 2] += 1e-3
     rows[0] = [0, 0, 1, 0, 0, 0, 0]
     rows /= rows.sum(-1, keepdims=True)
-    table = maximin_q._alias(rows)
+    table = alias_table(rows)
     threshold, alias = (table >> 8) / 2.0**24, table & 0xFF
     found = threshold / 7
     for a in range(7):
@@ -437,6 +438,22 @@ def test_values_that_are_not_numbers_are_told():
         jax.random.key(0), problem, hparams, until=maximin_q.value_rests(1e-3), num_steps=100)
     assert done.status == Status.NONFINITE
     assert done.num_steps < 100
+
+
+def test_visits_are_counted_up_to_a_limit():
+    """Step sizes stay numbers however often a move is made."""
+    game, reward = random_game(1, alternating=True)
+    problem = maximin_q.make_problem(game, reward)
+    hparams = maximin_q.Hparams(
+        discount=0.8, step_size=1.0, step_power=0.7, num_chains=8, moves_per_step=4)
+    state = maximin_q.init(jax.random.key(0), problem, hparams)
+    state = state.replace(visits=jnp.full_like(state.visits, 2**30 - 3))
+    state, _ = maximin_q.run(state, problem, hparams, num_steps=4)
+    assert state.visits.max() == 2**30 and state.visits.min() == 2**30 - 3
+    assert jnp.isfinite(state.value).all()
+    with pytest.raises(ValueError, match=r"num_chains=65536 times moves_per_step=32768"):
+        maximin_q.init(jax.random.key(0), problem,
+                       hparams.replace(num_chains=2**16, moves_per_step=2**15))
 
 
 def test_single_precision_learns_too():

@@ -390,6 +390,19 @@ def test_how_a_run_ends():
     assert short.status == Status.MAX_STEPS and short.num_steps == short.state.step == 3
 
 
+def test_a_run_is_over_when_no_more_moves_can_be_counted():
+    problem, hparams = example(), settings()
+    most = np.iinfo(np.int32).max
+    state = rmax.init(jax.random.key(0), problem, hparams)
+    state, metrics = rmax.run(state.replace(moves=jnp.int32(most - 5)), problem, hparams,
+                              num_steps=9, max_rows=9)
+    assert (np.diff(np.asarray(metrics.moves)) >= 0).all() and metrics.moves[-1] == most
+    assert metrics.status[-1] == Status.MAX_STEPS and metrics.status[0] == Status.CONVERGED
+    again, _ = rmax.run(state, problem, hparams, num_steps=9, max_rows=9)
+    assert again.moves == most and (again.counts == state.counts).all()
+    assert (state.known_at <= most).all() and (state.known_at >= -1).all()
+
+
 # --- mistakes ---------------------------------------------------------------------------------
 
 

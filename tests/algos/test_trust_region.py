@@ -13,8 +13,13 @@ import scipy.optimize
 from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 
+from jaxltl.algos import _policy_networks as nets
 from jaxltl.algos import trust_region
-from jaxltl.algos.trust_region import Case, Hparams, Moments
+from jaxltl.algos._cpo_dual import Case, Dual, cpo_dual, cpo_weights
+from jaxltl.algos._policy_networks import Moments
+from jaxltl.algos._trust_step import fisher_product, surrogate
+from jaxltl.algos._value_fit import advantages
+from jaxltl.algos.trust_region import Hparams
 from jaxltl.core.types import Status
 from tests.support import counted_traces
 
@@ -182,7 +187,7 @@ def random_problem(rng, size=None):
     return g, b, h, c, delta
 
 
-dual_of, weights_of = jax.jit(trust_region.cpo_dual), jax.jit(trust_region.cpo_weights)
+dual_of, weights_of = jax.jit(cpo_dual), jax.jit(cpo_weights)
 
 
 def numbers_of(g, b, h, c, delta):
@@ -193,7 +198,7 @@ def numbers_of(g, b, h, c, delta):
 def solved(*problem):
     numbers, x, y = numbers_of(*problem)
     reward, cost = map(float, weights_of(*numbers))
-    return trust_region.Dual(*map(float, dual_of(*numbers))), reward * x + cost * y
+    return Dual(*map(float, dual_of(*numbers))), reward * x + cost * y
 
 
 def by_slsqp(target, b, h, c, delta, start, *, limited=True):
@@ -287,8 +292,8 @@ def test_multipliers_certify_the_step():
     problems = [random_problem(rng, size=3) for _ in range(2000)]
     parts = [numbers_of(*p) for p in problems]
     numbers = tuple(jnp.array([p[0][i] for p in parts]) for i in range(5))
-    duals = jax.vmap(trust_region.cpo_dual)(*numbers)
-    weights = jax.vmap(trust_region.cpo_weights)(*numbers)
+    duals = jax.vmap(cpo_dual)(*numbers)
+    weights = jax.vmap(cpo_weights)(*numbers)
     for i, (g, b, h, c, delta) in enumerate(problems):
         trust, cost, case = (np.asarray(x[i]) for x in duals)
         step = np.asarray(weights[0][i]) * parts[i][1] + np.asarray(weights[1][i]) * parts[i][2]
@@ -329,19 +334,19 @@ def test_multipliers_certify_the_step():
     ((4.0, 1.0, 1.0, -2.0, 0.5), Case.FREE, (0.5, 0.0)),
 ])
 def test_boundary_cases(numbers, case, weights):
-    assert trust_region.cpo_dual(*numbers).case == case
-    np.testing.assert_allclose(trust_region.cpo_weights(*numbers), weights, atol=1e-12)
+    assert cpo_dual(*numbers).case == case
+    np.testing.assert_allclose(cpo_weights(*numbers), weights, atol=1e-12)
     single = [jnp.float32(x) for x in numbers]
-    assert trust_region.cpo_dual(*single).trust.dtype == jnp.float32
-    np.testing.assert_allclose(trust_region.cpo_weights(*single), weights, atol=1e-6)
-    assert np.isfinite(trust_region.cpo_dual(*numbers)[:2]).all()
+    assert cpo_dual(*single).trust.dtype == jnp.float32
+    np.testing.assert_allclose(cpo_weights(*single), weights, atol=1e-6)
+    assert np.isfinite(cpo_dual(*numbers)[:2]).all()
 
 
 # --- products and estimates ---------------------------------------------------------------------
 
 
 def samples_of(state, batch, hparams=SMALL):
-    inputs = trust_region._normalized(state.moments, hparams, batch.observation)
+    inputs = nets.normalized(state.moments, hparams, batch.observation)
     return inputs.reshape(-1, inputs.shape[-1]), batch.action.reshape(-1, batch.action.shape[-1])
 
 
@@ -349,21 +354,21 @@ def test_fisher_products_are_those_of_the_hessian(small):
     _, state, batch = small
     inputs, _ = samples_of(state, batch)
     flat, unravel = ravel_pytree(state.parameters)
-    old = trust_region._gaussian(state.parameters, SMALL, inputs)
+    old = nets.gaussian(state.parameters, SMALL, inputs)
 
     def divergence(x):
-        new = trust_region._gaussian(unravel(x), SMALL, inputs)
-        return trust_region._divergence(old, new).mean()
+        new = nets.gaussian(unravel(x), SMALL, inputs)
+        return nets.kl_divergence(old, new).mean()
 
     @jax.jit
     def products(x, directions):
-        return jax.vmap(trust_region.fisher_product(divergence, x))(directions)
+        return jax.vmap(fisher_product(divergence, x))(directions)
 
     hessian = jax.jit(jax.hessian(divergence))(flat)
     np.testing.assert_allclose(products(flat, jnp.eye(flat.size)), hessian, atol=1e-12)
     # The Fisher matrix as the mean square of the score, in closed form for a Gaussian.
     slope = jax.jit(jax.jacrev(
-        lambda x: trust_region._gaussian(unravel(x), SMALL, inputs)[0]))(flat)
+        lambda x: nets.gaussian(unravel(x), SMALL, inputs)[0]))(flat)
     spread = np.asarray(old[1])[0]
     fisher = np.einsum("bai,baj,a->ij", slope, slope, spread**-2.0) / len(inputs)
     where = ravel_pytree({"mean": jax.tree.map(jnp.zeros_like, state.parameters["mean"]),
@@ -381,18 +386,18 @@ def test_gradients_of_the_gains_are_finite_differences(small):
     _, state, batch = small
     inputs, action = samples_of(state, batch)
     flat, unravel = ravel_pytree(state.parameters)
-    old = trust_region._gaussian(state.parameters, SMALL, inputs)
+    old = nets.gaussian(state.parameters, SMALL, inputs)
     weighted = jax.random.normal(jax.random.key(3), (2, len(inputs))) / 7
     valid = batch.valid.reshape(-1)
 
     @jax.jit
     def gains(x):
-        return trust_region.surrogate(unravel(x), old, inputs, action, weighted, valid, SMALL)[0]
+        return surrogate(unravel(x), old, inputs, action, weighted, valid, SMALL)[0]
 
     np.testing.assert_allclose(gains(flat), 0, atol=1e-15)  # but for rounding in sums
     slope = jax.jit(jax.jacrev(gains))(flat)
-    score = jax.jit(jax.jacrev(lambda x: trust_region._log_density(
-        action, *trust_region._gaussian(unravel(x), SMALL, inputs))))(flat)
+    score = jax.jit(jax.jacrev(lambda x: nets.log_density(
+        action, *nets.gaussian(unravel(x), SMALL, inputs))))(flat)
     np.testing.assert_allclose(slope, weighted @ score, rtol=1e-10)
     for key in jax.random.split(jax.random.key(4), 3):
         direction = jax.random.normal(key, flat.shape)
@@ -405,9 +410,9 @@ def test_divergence_and_density_are_those_of_gaussians():
     mean, other = rng.normal(size=(2, 3))
     spread, wide = np.exp(rng.normal(size=(2, 3)))
     x = mean + spread * rng.normal(size=(200_000, 3))
-    one, two = (trust_region._log_density(jnp.asarray(x), jnp.asarray(m), jnp.asarray(s))
+    one, two = (nets.log_density(jnp.asarray(x), jnp.asarray(m), jnp.asarray(s))
                 for m, s in ((mean, spread), (other, wide)))
-    found = trust_region._divergence((mean, spread), (other, wide))
+    found = nets.kl_divergence((mean, spread), (other, wide))
     error = np.std(one - two) / np.sqrt(len(x))
     assert abs(np.mean(one - two) - found) < 4 * error
     exact = [scipy.stats.norm(m, s).logpdf(x).sum(1) for m, s in ((mean, spread), (other, wide))]
@@ -430,7 +435,7 @@ def test_advantages_are_their_sums(discount, gae_lambda):
     signal, value = rng.normal(size=(2, 6, 4))
     lengths = [6, 1, 3, 0]
     valid = np.arange(6)[:, None] < np.array(lengths)
-    found = trust_region.advantages(
+    found = advantages(
         jnp.where(valid, signal, 0), jnp.asarray(value), jnp.asarray(valid), discount, gae_lambda
     )
     for i, length in enumerate(lengths):
@@ -446,11 +451,11 @@ def test_moments_are_those_of_all_observations(small):
     more = rollout(state, problem, seed=5)
     more = more._replace(valid=more.valid.at[3:, 2].set(False))
     start = Moments(jnp.zeros(()), jnp.zeros(2), jnp.zeros(2))
-    found = trust_region._updated_moments(trust_region._updated_moments(start, batch), more)
+    found = nets.updated_moments(nets.updated_moments(start, batch), more)
     seen = np.concatenate([np.asarray(b.observation)[np.asarray(b.valid)] for b in (batch, more)])
     assert found.count == len(seen)
     np.testing.assert_allclose(found.mean, seen.mean(0), atol=1e-12)
-    np.testing.assert_allclose(trust_region._spread(found), seen.std(0), rtol=1e-10)
+    np.testing.assert_allclose(nets.scale_of(found), seen.std(0), rtol=1e-10)
 
 
 @pytest.mark.parametrize("hidden", [(), (5, 3)])
@@ -458,12 +463,12 @@ def test_new_moments_do_not_change_the_policy(hidden):
     hparams = Hparams(discount=0.9, hidden=hidden)
     old = Moments(jnp.float64(9.0), jnp.array([1.0, -2.0, 7.0]), jnp.array([4.0, 90.0, 0.0]))
     new = Moments(jnp.float64(20.0), jnp.array([0.5, 3.0, 6.0]), jnp.array([2e3, 1.0, 5.0]))
-    network = trust_region._mean_network(hparams, 2, jnp.float64)
+    network = nets.mean_network(hparams, 2, jnp.float64)
     points = 3 * jax.random.normal(jax.random.key(0), (10, 3))
     before = network.init(jax.random.key(1), points)["params"]
-    after = trust_region._refolded(before, old, new)
+    after = nets.refolded(before, old, new)
     values = [
-        network.apply({"params": p}, trust_region._normalized(m, hparams, points))
+        network.apply({"params": p}, nets.normalized(m, hparams, points))
         for p, m in ((before, old), (after, new))
     ]
     np.testing.assert_allclose(*values, rtol=1e-9, atol=1e-12)

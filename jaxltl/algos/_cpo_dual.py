@@ -1,0 +1,130 @@
+"""The step of CPO in closed form: multipliers and weights of its linear-quadratic problem."""
+
+from __future__ import annotations
+
+import enum
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+
+class Case(enum.IntEnum):
+    """Which part of the constrained problem decided a step."""
+
+    FREE = 0  # the whole trust region keeps to the limit (always so for TRPO)
+    INACTIVE = 1  # the best step of the trust region keeps to the limit (the paper's case b)
+    ACTIVE = 2  # the best step ends on the limit (the paper's case a)
+    RECOVERY = 3  # the whole trust region violates the limit: lower the cost alone
+
+
+class Dual(NamedTuple):
+    """Multipliers of the trust region and of the limit, and the :class:`Case`."""
+
+    trust: jax.Array
+    cost: jax.Array
+    case: jax.Array
+
+
+
+
+def cpo_dual(
+    q: chex.Numeric, r: chex.Numeric, s: chex.Numeric, c: chex.Numeric, delta: chex.Numeric
+) -> Dual:
+    """Multipliers ``(lambda, nu)`` of ``max g.x`` where ``c + b.x <= 0``, ``x.Hx / 2 <= delta``.
+
+    The dual is ``max over lambda, nu >= 0`` of (Achiam et al. 2017, equation 12, whose delta
+    is twice this one)::
+
+        -(q - 2 r nu + s nu^2) / (2 lambda) + nu c - lambda delta,
+
+    and the solution ``x = H^-1 (g - nu b) / lambda``. The paper compares the best multipliers
+    with ``nu = 0`` (its case b) with the best with ``nu > 0`` (case a). As the dual is concave,
+    one test decides: the limit is active if and only if the best step without it breaks it.
+
+    Where the limit cannot be kept in the trust region the dual is unbounded, and the multipliers
+    returned are those of the paper's recovery, ``max -b.x``: ``x = -H^-1 b / lambda``, nu = 1.
+
+    Args:
+      q, r, s: ``g.H^-1 g``, ``g.H^-1 b`` and ``b.H^-1 b``, where ``q s >= r^2``.
+      c: by how much the limit is exceeded now.
+      delta: positive.
+
+    Returns:
+      :class:`Dual`; lambda is 0 where `g` gives no direction to spend the trust region on.
+
+    Example:
+      >>> dual = cpo_dual(q=1.0, r=0.0, s=1.0, c=0.6, delta=0.5)
+      >>> [round(float(x), 3) for x in dual[:2]], Case(int(dual.case)).name
+      ([1.25, 0.75], 'ACTIVE')
+    """
+    q, r, s, c, delta = _floats(q, r, s, c, delta)
+    room, rest, _ = _plane(q, r, s, c, delta)
+    case = _case(q, r, s, c, delta)
+    free, recovery = jnp.sqrt(q / (2 * delta)), jnp.sqrt(s / (2 * delta))
+    active = jnp.sqrt(ratio(rest, room))
+    trust = jnp.where(case == Case.ACTIVE, active, free)
+    cost = jnp.where(case == Case.ACTIVE, ratio(jnp.maximum(active * c + r, 0), s), 0)
+    return Dual(
+        trust=jnp.where(case == Case.RECOVERY, recovery, trust),
+        cost=jnp.where(case == Case.RECOVERY, 1, cost), case=case,
+    )
+
+
+def cpo_weights(
+    q: chex.Numeric, r: chex.Numeric, s: chex.Numeric, c: chex.Numeric, delta: chex.Numeric
+) -> tuple[jax.Array, jax.Array]:
+    """``(u, w)`` of the step ``x = u H^-1 g + w H^-1 b`` that belongs to :func:`cpo_dual`.
+
+    They are ``1 / lambda`` and ``-nu / lambda``, also where `g` and `b` are parallel and lambda
+    is 0: then the step to the limit itself, ``w = -c / s``. Arguments as there.
+    """
+    q, r, s, c, delta = _floats(q, r, s, c, delta)
+    room, rest, _ = _plane(q, r, s, c, delta)
+    case = _case(q, r, s, c, delta)
+    # The step to the limit, and on along the limit to the edge of the trust region.
+    along = jnp.sqrt(ratio(jnp.maximum(room, 0), rest))
+    reward = jnp.where(case == Case.ACTIVE, along, jnp.sqrt(ratio(2 * delta, q)))
+    cost = jnp.where(case == Case.ACTIVE, -ratio(along * r + c, s), 0)
+    return (
+        jnp.where(case == Case.RECOVERY, 0, reward),
+        jnp.where(case == Case.RECOVERY, -jnp.sqrt(ratio(2 * delta, s)), cost),
+    )
+
+
+def _floats(*numbers: chex.Numeric) -> tuple[jax.Array, ...]:
+    dtype = jnp.result_type(float, *numbers) if not any(
+        isinstance(x, jax.Array) for x in numbers
+    ) else jnp.result_type(*numbers)
+    return tuple(jnp.asarray(x, dtype) for x in numbers)
+
+
+def ratio(x: jax.Array, y: jax.Array) -> jax.Array:
+    """Zero where `y` is not positive."""
+    return jnp.where(y > 0, x / jnp.where(y > 0, y, 1), 0)
+
+
+def _plane(
+    q: jax.Array, r: jax.Array, s: jax.Array, c: jax.Array, delta: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Squared lengths, in H: what of the trust region is left on the limit, and of H^-1 g on it.
+
+    The third is the distance to the limit, infinite if `b` is zero.
+    """
+    distance = jnp.where(s > 0, c / jnp.sqrt(jnp.where(s > 0, s, 1)),
+                         jnp.where(c == 0, 0, jnp.sign(c) * jnp.inf))
+    rest = q - ratio(r, jnp.sqrt(s)) ** 2
+    # What rounding leaves of parallel gradients has no direction.
+    rest = jnp.where(rest > 16 * jnp.finfo(q.dtype).eps * q, rest, 0)
+    return 2 * delta - distance**2, rest, distance
+
+
+def _case(
+    q: jax.Array, r: jax.Array, s: jax.Array, c: jax.Array, delta: jax.Array
+) -> jax.Array:
+    room, _, _ = _plane(q, r, s, c, delta)
+    breaks = c + r * jnp.sqrt(ratio(2 * delta, q)) > 0
+    inside = jnp.where(breaks, Case.ACTIVE, Case.INACTIVE)
+    outside = jnp.where(c > 0, Case.RECOVERY, Case.FREE)
+    return jnp.where(room > 0, inside, outside).astype(jnp.int32)

@@ -1,0 +1,68 @@
+"""What is asked of a policy in a search: one objective and the costs, for all of a population."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxltl.core.types import require_shape
+
+
+def per_cost(name: str, value: Any, num_costs: int) -> np.ndarray:
+    value = np.asarray(value, float)
+    if value.ndim:
+        require_shape(name, value, (num_costs,))
+    return np.broadcast_to(value, (num_costs,))
+
+
+def split(value: Any) -> tuple[jax.Array, jax.Array]:
+    """The objective and ``[C]`` costs in whatever evaluate returned."""
+    if isinstance(value, tuple | list):
+        if len(value) != 2:
+            raise ValueError(
+                f"evaluate returned {len(value)} things; return (objective, cost), or the "
+                "objective alone."
+            )
+        objective, cost = map(jnp.asarray, value)
+    else:
+        objective, cost = jnp.asarray(value), jnp.zeros((0,))
+    if objective.shape != ():
+        raise ValueError(
+            f"evaluate returned an objective of shape {objective.shape}; it is called with one "
+            "policy at a time and returns one number, shape ()."
+        )
+    if cost.ndim > 1:
+        raise ValueError(
+            f"evaluate returned a cost of shape {cost.shape}; return a number or one axis of "
+            "costs, [C]."
+        )
+    return objective, jnp.atleast_1d(cost)
+
+
+def evaluate_all(
+    problem: Any, hparams: Any, samples: jax.Array, key: chex.PRNGKey
+) -> tuple[jax.Array, jax.Array]:
+    """Objectives ``[n]`` and costs ``[n, C]`` of a population."""
+    keys = jax.random.split(key, len(samples))
+    sharding = hparams.sharding
+    if sharding is not None:
+        samples, keys = lax.with_sharding_constraint((samples, keys), sharding)
+    found = jax.vmap(partial(scores, problem))(samples, keys)
+    if sharding is not None:  # every device ranks them all, in one order of operations
+        whole = jax.sharding.NamedSharding(sharding.mesh, jax.sharding.PartitionSpec())
+        found = lax.with_sharding_constraint(found, whole)
+    return found
+
+
+def scores(
+    problem: Any, parameters: jax.Array, key: chex.PRNGKey
+) -> tuple[jax.Array, jax.Array]:
+    objective, cost = split(problem.evaluate(parameters, key))
+    require_shape("the cost that evaluate returned", cost, problem.limit.shape)
+    return objective.astype(parameters.dtype), cost.astype(parameters.dtype)

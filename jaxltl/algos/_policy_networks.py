@@ -1,0 +1,123 @@
+"""Gaussian policies and value networks of trust-region search, and the scale of what they read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+
+@struct.dataclass
+class Moments:
+    """Of the observations so far: their number, ``mean[O]``, and summed squares around it."""
+
+    count: jax.Array
+    mean: jax.Array
+    squares: jax.Array
+
+
+
+
+class Network(nn.Module):
+    """Tanh layers and a linear one, which starts at `last_scale` of the usual size."""
+
+    hidden: tuple[int, ...]
+    outputs: int
+    last_scale: float
+    dtype: Any
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        def layer(width: int, name: str, scale: float = 1.0) -> nn.Dense:
+            start = nn.initializers.variance_scaling(scale**2, "fan_in", "normal")
+            return nn.Dense(width, param_dtype=self.dtype, kernel_init=start, name=name)
+
+        for i, width in enumerate(self.hidden):
+            x = nn.tanh(layer(width, f"hidden_{i}")(x))
+        return layer(self.outputs, "out", self.last_scale)(x)
+
+
+def mean_network(hparams: Any, num_actions: int, dtype: Any) -> Network:
+    return Network(hparams.hidden, num_actions, 0.1, dtype)
+
+
+def value_network(hparams: Any, dtype: Any) -> Network:
+    return Network(hparams.value_hidden, 1, 0.1, dtype)
+
+
+def gaussian(
+    parameters: Any, hparams: Any, inputs: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    log_deviation = parameters["log_deviation"]
+    network = mean_network(hparams, log_deviation.shape[0], log_deviation.dtype)
+    mean = jnp.asarray(network.apply({"params": parameters["mean"]}, inputs))
+    return mean, jnp.broadcast_to(jnp.exp(log_deviation), mean.shape)
+
+
+def log_density(action: jax.Array, mean: jax.Array, deviation: jax.Array) -> jax.Array:
+    """Up to a constant."""
+    return -jnp.sum(((action - mean) / deviation) ** 2 / 2 + jnp.log(deviation), -1)
+
+
+def kl_divergence(old: tuple[jax.Array, jax.Array], new: tuple[jax.Array, jax.Array]) -> jax.Array:
+    """``KL(old || new)`` of Gaussians with independent entries."""
+    (mean, deviation), (other, spread) = old, new
+    ratio = deviation / spread
+    return jnp.sum((ratio**2 + ((mean - other) / spread) ** 2 - 1) / 2 - jnp.log(ratio), -1)
+
+
+def values_at(values: Any, hparams: Any, inputs: jax.Array) -> jax.Array:
+    """``float[V, ...]``, before it is scaled."""
+    network = value_network(hparams, inputs.dtype)
+    return jax.vmap(lambda p: jnp.asarray(network.apply({"params": p}, inputs))[..., 0])(values)
+
+
+def value_inputs(inputs: jax.Array) -> jax.Array:
+    """``float[T, N, O + 1]``: the time beside the normalised observations."""
+    time = jnp.linspace(-1, 1, inputs.shape[0], dtype=inputs.dtype)
+    time = jnp.broadcast_to(time[:, None, None], (*inputs.shape[:2], 1))
+    return jnp.concatenate([inputs, time], -1)
+
+
+
+
+def normalized(moments: Moments, hparams: Any, observation: jax.Array) -> jax.Array:
+    return (observation - moments.mean) / scale_of(moments) if hparams.normalize else observation
+
+
+def scale_of(moments: Moments) -> jax.Array:
+    """What has not varied is not scaled."""
+    spread = jnp.sqrt(moments.squares / jnp.maximum(moments.count, 1))
+    noise = 8 * jnp.finfo(spread.dtype).eps * jnp.abs(moments.mean)
+    return jnp.where(spread > noise, spread, 1)
+
+
+def updated_moments(moments: Moments, batch: Any) -> Moments:
+    """With a batch taken in (Chan et al. 1979)."""
+    weight = batch.valid.astype(batch.observation.dtype)[..., None]
+    count = weight.sum()
+    mean = jnp.sum(weight * batch.observation, (0, 1)) / jnp.maximum(count, 1)
+    squares = jnp.sum(weight * (batch.observation - mean) ** 2, (0, 1))
+    total = jnp.maximum(moments.count + count, 1)
+    shift = mean - moments.mean
+    return Moments(
+        count=moments.count + count, mean=moments.mean + shift * count / total,
+        squares=moments.squares + squares + shift**2 * moments.count * count / total,
+    )
+
+
+def refolded(network: Any, old: Moments, new: Moments) -> Any:
+    """A network's parameters that make of newly scaled inputs what they made of old ones.
+
+    Without this the policy would change with the moments, outside of any trust region.
+    """
+    first = "hidden_0" if "hidden_0" in network else "out"
+    kernel, bias = network[first]["kernel"], network[first]["bias"]
+    size, spread = old.mean.shape[0], scale_of(old)
+    head = kernel[:size]
+    bias = bias + ((new.mean - old.mean) / spread) @ head
+    head = head * (scale_of(new) / spread)[:, None]
+    return {**network, first: {"kernel": kernel.at[:size].set(head), "bias": bias}}

@@ -1,0 +1,171 @@
+"""Numbers that change from step to step, and the theorem's conditions on them (chapter 4)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+# Products such as .07 * 100 come out a little above the integer that they are.
+SLACK = 1e-9
+
+
+@struct.dataclass
+class Polynomial:
+    """The schedule ``scale * (l + offset) ** power`` of the steps l = 1, 2, ...
+
+    A negative power decays. Numbers are traced.
+
+    Example:
+      >>> [round(float(at(Polynomial(0.5, -1.0), step)), 3) for step in range(3)]
+      [0.5, 0.25, 0.167]
+    """
+
+    scale: jax.Array | float
+    power: jax.Array | float
+    offset: jax.Array | float = 0.0
+
+
+Schedule = Any  # a number, a Polynomial, or a pytree that is called with l = 1, 2, ...
+
+
+
+
+def at(schedule: Schedule, step: jax.Array | int) -> Any:
+    """A schedule's number in the step after `step` steps, l = step + 1."""
+    l = jnp.asarray(step) + 1  # noqa: E741
+    if isinstance(schedule, Polynomial):
+        return schedule.scale * (l + jnp.asarray(schedule.offset)) ** jnp.asarray(schedule.power)
+    return schedule(l) if callable(schedule) else schedule
+
+
+class Condition(NamedTuple):
+    """One of theorem 1's conditions, whether it holds (None: cannot be told), and why."""
+
+    name: str
+    holds: bool | None
+    reason: str
+
+
+class Conditions(NamedTuple):
+    """What :func:`theorem_conditions` tells.
+
+    Attributes:
+      holds: True if all conditions hold, False if one fails, else None.
+      failing: the names of those that fail.
+      conditions: all, with reasons.
+      assumed: what the theorem assumes of the problem, which settings cannot show.
+    """
+
+    holds: bool | None
+    failing: tuple[str, ...]
+    conditions: tuple[Condition, ...]
+    assumed: tuple[str, ...]
+
+
+_ASSUMED = (
+    "(1) the covariance of the sufficient statistics is positive definite",
+    "(2a) the differential equation (4.12) is continuous with unique solutions",
+    "(2c) the quantiles of H and U are unique",
+    "(2d) policies and distributions lie in compact sets",
+    "(2e) G is bounded and bounded away from 0, and H is bounded",
+    "(2f) the distribution stays in the interior of its set",
+)
+
+
+def theorem_conditions(hparams: Any, *, num_steps: int | None = None) -> Conditions:
+    """Whether the settings meet the conditions of theorem 1, on the host.
+
+    They are (assumption 2b): ``n_l`` grows as ``l^beta`` with beta > 0; ``alpha_l`` is positive,
+    decreases to 0 and has an infinite sum; ``lambda_l = O(l^-lambda)`` for some lambda > 0 with
+    ``beta + 2 lambda > 1``; and that the method is algorithm 2 as printed.
+
+    Args:
+      hparams: concrete numbers.
+      num_steps: the length of the run. `population` bounds n_l, so that the samples can grow
+        only for so long; None asks for ever.
+
+    Example:
+      >>> from jaxltl.algos.cce import Hparams
+      >>> theorem_conditions(Hparams(weighting="literal")).failing
+      ('samples grow', 'rate decreases', 'rate vanishes')
+      >>> hparams = Hparams(rate=Polynomial(0.5, -0.7), num_samples=Polynomial(10, 0.5),
+      ...                   weighting="literal")
+      >>> theorem_conditions(hparams, num_steps=90).holds
+      True
+    """
+    growth, samples = _samples_condition(hparams, num_steps)
+    decay, share = _share_condition(hparams.sample_share)
+    both = None if growth is None or decay is None else growth + 2 * decay > 1
+    found = (
+        samples,
+        *_rate_conditions(hparams.rate),
+        share,
+        Condition("beta + 2 lambda > 1", both, f"beta = {growth}, lambda = {decay}"),
+        Condition(
+            "weights are G", hparams.weighting == "literal", f"weighting={hparams.weighting!r}"),
+        *(
+            Condition(f"no {name}", getattr(hparams, name) in (None, False),
+                      "not part of algorithm 2")
+            for name in ("elite_reuse", "antithetic", "variance_floor", "noise", "restart_below")
+        ),
+    )
+    failing = tuple(c.name for c in found if c.holds is False)
+    unknown = any(c.holds is None for c in found)
+    return Conditions(False if failing else None if unknown else True, failing, found, _ASSUMED)
+
+
+def _polynomial(schedule: Schedule) -> tuple[float, float, float] | None:
+    """Scale, power and offset, or None of a function."""
+    if isinstance(schedule, Polynomial):
+        return float(schedule.scale), float(schedule.power), float(schedule.offset)
+    return None if callable(schedule) else (float(schedule), 0.0, 0.0)
+
+
+_FUNCTION = "it is a function; its limits cannot be told"
+
+
+def _samples_condition(
+    hparams: Any, num_steps: int | None
+) -> tuple[float | None, Condition]:
+    name = "samples grow"
+    if hparams.num_samples is None:
+        return 0.0, Condition(name, False, f"n_l is always {hparams.population}")
+    found = _polynomial(hparams.num_samples)
+    if found is None:
+        return None, Condition(name, None, f"num_samples: {_FUNCTION}")
+    scale, power, offset = found
+    if not (scale > 0 and power > 0):
+        return min(power, 0.0), Condition(name, False, f"n_l = {scale:g} l^{power:g}")
+    full = max(math.floor((hparams.population / scale) ** (1 / power) - offset + SLACK), 0)
+    reason = f"n_l ~ l^{power:g} until step {full}, then population={hparams.population}"
+    return power, Condition(name, num_steps is not None and num_steps <= full, reason)
+
+
+def _rate_conditions(rate: Schedule) -> list[Condition]:
+    names = ("rate in (0, 1]", "rate decreases", "rate vanishes", "rate has an infinite sum")
+    found = _polynomial(rate)
+    if found is None:
+        return [Condition(name, None, f"rate: {_FUNCTION}") for name in names]
+    scale, power, offset = found
+    first = scale * (1 + offset) ** power if offset > -1 else math.nan
+    decays = power < 0 and scale > 0
+    holds = (0 < first <= 1 and power <= 0, decays, decays, power >= -1 and scale > 0)
+    reason = f"alpha_l = {scale:g} (l + {offset:g})^{power:g}"
+    return [Condition(name, held, reason) for name, held in zip(names, holds, strict=True)]
+
+
+def _share_condition(share: Schedule) -> tuple[float | None, Condition]:
+    name = "sample share decays"
+    found = (0.0, 0.0, 0.0) if share is None else _polynomial(share)
+    if found is None:
+        return None, Condition(name, None, f"sample_share: {_FUNCTION}")
+    scale, power, offset = found
+    if scale == 0:  # of any order
+        return math.inf, Condition(name, True, "lambda_l = 0")
+    first = scale * (1 + offset) ** power if offset > -1 else math.nan
+    reason = f"lambda_l = {scale:g} (l + {offset:g})^{power:g}"
+    return -power, Condition(name, power < 0 and 0 <= first <= 1, reason)
