@@ -24,6 +24,7 @@ from jaxltl.core.models.product import Product, product
 from jaxltl.core.values.performance import task_performances
 from jaxltl.core.values.soft import policy_logits, soft_value
 from jaxltl.envs import temporal_gridworld as grid
+from jaxltl.envs.cell_kinds import many_objects
 
 _DISCOUNT = 0.95
 _SEEDS = 10
@@ -243,7 +244,7 @@ def ordered(num: int, then: tuple[int, ...] = ()) -> str:
 
 def large(num_steps: int = 300, num_new: int = 4, discount: float = 0.995) -> dict[str, Any]:
     """64 x 64 cells: five objects in order, and back to the fourth, third and second."""
-    objects = grid.many_objects(5)
+    objects = many_objects(5)
     automaton = _task(ordered(5, (4, 3, 2)), objects)
     worlds = grid.random_worlds(
         range(1 + num_new), automaton, shape=(64, 64), objects=objects, num_obstacles=60)

@@ -49,6 +49,7 @@ from jaxltl.core.values.performance import (
 )
 from jaxltl.core.values.soft import soft_value
 from jaxltl.envs import temporal_gridworld
+from jaxltl.envs.cell_kinds import COLORS
 from jaxltl.envs.gridworld import ACTIONS
 from jaxltl.io.learned_reward import LearnedReward, save_reward
 
@@ -555,7 +556,7 @@ def learned_reward(outcome: Outcome) -> LearnedReward:
     """The kept seed's reward, with all that planning with it needs."""
     task, i = outcome.setup.task, outcome.chosen
     spec = task.learner
-    kinds = (temporal_gridworld.COLORS if task.is_colored
+    kinds = (COLORS if task.is_colored
              else (*cell_kinds(task.world), "off the map"))
     return LearnedReward(
         parameters=_part(outcome.learned.parameters, i),

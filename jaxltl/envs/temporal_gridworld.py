@@ -11,12 +11,9 @@ pictures; the state of a cell is ``(row - 1) * columns + column - 1``, as in
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import chex
@@ -26,8 +23,8 @@ import numpy as np
 from flax import struct
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.core.automata.automaton import Automaton, letter_index
-from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.automata.automaton import letter_index
+from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.models import operators
@@ -35,24 +32,24 @@ from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories, rollout
 from jaxltl.core.values.soft import soft_value
+from jaxltl.envs.cell_kinds import (
+    COLORS,
+    FREE,
+    OBJECTS,
+    OBSTACLES,
+    Counts,
+    Kinds,
+    categories,
+    check_margin,
+    codes_of,
+    find_kinds,
+    make_kinds,
+)
 from jaxltl.envs.gridworld import gridworld
 
-COLORS = ("red", "yellow", "white", "purple", "black")
-LETTERS = "rywpb"  # of the colours, in text files
-OBJECTS: Mapping[str, Mapping[str, int]] = {
-    "o1": {"red": 5, "black": 4},
-    "o2": {"yellow": 5, "black": 4},
-    "o3": {"white": 5, "black": 4},
-}
-OBSTACLES: Mapping[str, Mapping[str, int]] = {"ob": {"black": 9}}
 COMPLETE = "(!o2 & !o3 & !ob) U (o1 & ((!o3 & !ob) U (o2 & (!ob U o3))))"
 INCOMPLETE = "(!o2 & !o3) U (o1 & ((!o3) U (o2 & F o3)))"
 
-Counts = Mapping[str, Mapping[str, int]]
-Task = Automaton | Formula | str
-Kinds = tuple[tuple[str, tuple[int, ...]], ...]
-
-_FREE = -1  # a cell whose colour is still to be drawn
 _ROUNDS = 10_000
 
 
@@ -76,130 +73,6 @@ class World:
     kinds: Kinds = struct.field(pytree_node=False, default=())
 
 
-# --- kinds of cells ---------------------------------------------------------------------------
-
-
-def many_objects(num: int) -> dict[str, dict[str, int]]:
-    """Counts of colours for objects ``o1``, ``o2``, ..., no two alike.
-
-    The first three are those of the dissertation. Each has an X of one colour on another.
-
-    Args:
-      num: how many, at most 16.
-
-    Example:
-      >>> many_objects(4)["o4"]
-      {'purple': 5, 'black': 4}
-    """
-    pairs = [
-        (inside, around) for around in reversed(COLORS) for inside in COLORS
-        if inside not in (around, "black")
-    ]
-    if not 0 <= num <= len(pairs):
-        raise ValueError(f"num={num}; there are colours for 0 to {len(pairs)} objects.")
-    return {f"o{i + 1}": {a: 5, b: 4} for i, (a, b) in enumerate(pairs[:num])}
-
-
-def _make_kinds(objects: Counts, obstacles: Counts) -> Kinds:
-    kinds: dict[str, tuple[int, ...]] = {}
-    for name, counts in [*objects.items(), *obstacles.items()]:
-        if name in kinds:
-            raise ValueError(f"{name!r} is both an object and an obstacle; rename one of them.")
-        for color, count in counts.items():
-            if color not in COLORS:
-                raise ValueError(f"{name}: {color!r} is no colour; use {', '.join(COLORS)}.")
-            if count < 0:
-                raise ValueError(f"{name}: {count} cells of {color}; give 0 or more.")
-        row = tuple(int(counts.get(color, 0)) for color in COLORS)
-        if sum(row) != 9:
-            raise ValueError(f"{name}: {dict(counts)} are {sum(row)} cells; a patch has 9.")
-        for other, same in kinds.items():
-            if same == row:
-                raise ValueError(f"{other} and {name} have the same colours; change one of them.")
-        kinds[name] = row
-    return tuple(kinds.items())
-
-
-def _code(counts: ArrayLike) -> NDArray[np.int64]:
-    """Counts of colours up to 9 as the digits of one number."""
-    return np.asarray(counts, np.int64) @ 10 ** np.arange(len(COLORS))
-
-
-_DIGIT = np.append(10 ** np.arange(len(COLORS)), 10 ** len(COLORS))  # the last: a free cell
-
-
-def _find(colors: NDArray[Any], codes: NDArray[np.int64]) -> NDArray[np.int32]:
-    """The kind of each cell that has a patch, -1 for none; free cells are of no colour."""
-    digit = _DIGIT[colors]
-    across = digit[:, :-2] + digit[:, 1:-1] + digit[:, 2:]
-    total = across[:-2] + across[1:-1] + across[2:]
-    kind = np.full(total.shape, -1, np.int32)
-    for i, code in enumerate(codes):
-        kind[total == code] = i
-    return kind
-
-
-def categories(
-    colors: ArrayLike,
-    *,
-    objects: Counts = OBJECTS,
-    obstacles: Counts = OBSTACLES,
-    margin: int = 1,
-) -> NDArray[np.int32]:
-    """What each cell is, by the colours of the 3 x 3 patch around it; on the host.
-
-    Args:
-      colors: ``int[rows + 2 * margin, columns + 2 * margin]``, indices into ``COLORS``.
-      objects, obstacles: the number of cells of each colour in the patch of each kind.
-      margin: rings of cells around the grid, at least one.
-
-    Returns:
-      ``int32[rows, columns]``: the place among the objects and then the obstacles, -1 for a
-      distractor.
-
-    Raises:
-      ValueError: no whole grid, a colour that does not exist, or ambiguous kinds.
-
-    Example:
-      >>> x = [[0, 4, 0], [4, 0, 4], [0, 4, 0]]  # red where an X is, black elsewhere
-      >>> categories(x).tolist(), categories(np.full((3, 3), 4)).tolist()
-      ([[0]], [[3]])
-    """
-    kinds = _make_kinds(objects, obstacles)
-    colors = _check_colors(colors, margin)
-    return _find(_crop(colors, margin - 1), _codes(kinds))
-
-
-def _codes(kinds: Kinds) -> NDArray[np.int64]:
-    return _code(np.array([row for _, row in kinds]).reshape(-1, len(COLORS)))
-
-
-def _crop(colors: NDArray[Any], width: int) -> NDArray[Any]:
-    return colors[width : colors.shape[0] - width, width : colors.shape[1] - width]
-
-
-def _check_margin(margin: int) -> None:
-    if margin < 1:
-        raise ValueError(f"margin={margin}; cells at the border need a ring of at least 1.")
-
-
-def _check_colors(colors: ArrayLike, margin: int) -> NDArray[np.int32]:
-    array = np.asarray(colors)
-    _check_margin(margin)
-    if array.ndim != 2 or min(array.shape) < 2 * margin + 1 or array.dtype.kind not in "iu":
-        raise ValueError(
-            f"colors have shape {array.shape} and type {array.dtype}; pass integers [rows, "
-            f"columns] with a margin of {margin} on each side and a cell inside."
-        )
-    for row, column in np.argwhere((array < 0) | (array >= len(COLORS)))[:1]:
-        raise ValueError(
-            f"colors[{row}, {column}] = {array[row, column]}; colours are 0 to {len(COLORS) - 1}."
-        )
-    return array.astype(np.int32)
-
-
-# --- worlds -----------------------------------------------------------------------------------
-
 
 def colored_world(
     colors: ArrayLike,
@@ -219,7 +92,7 @@ def colored_world(
       ValueError: see :func:`categories`; or no cell is a distractor, so that no run can start.
     """
     kind = categories(colors, objects=objects, obstacles=obstacles, margin=margin)
-    kinds = _make_kinds(objects, obstacles)
+    kinds = make_kinds(objects, obstacles)
     return _assemble(_blank(kind.shape, slip), np.asarray(colors), kind, kinds, margin)
 
 
@@ -275,19 +148,19 @@ def make_world(
       >>> world.mdp.label[1].tolist(), int(world.mdp.label.sum())
       ([True, False, False, False], 2)
     """
-    kinds = _make_kinds(objects, obstacles)
-    _check_margin(margin)
+    kinds = make_kinds(objects, obstacles)
+    check_margin(margin)
     _check_shape(shape)
     kind = _plan_map(plan, kinds, shape)
-    stamps, codes = _stamps(kinds), _codes(kinds)
-    colors = np.full((shape[0] + 2, shape[1] + 2), _FREE)
+    stamps, codes = _stamps(kinds), codes_of(kinds)
+    colors = np.full((shape[0] + 2, shape[1] + 2), FREE)
     for row, column in np.argwhere(kind >= 0).tolist():
         if not _stamp(colors, stamps[kind[row, column]], row, column):
             raise ValueError(
                 f"the patch of {kinds[kind[row, column]][0]} in cell {(row + 1, column + 1)} "
                 "overlaps with another that wants other colours; plan them 3 cells apart."
             )
-    found = _find(colors, codes)
+    found = find_kinds(colors, codes)
     for row, column in np.argwhere(found != kind)[:1]:
         raise ValueError(
             f"cell {(int(row) + 1, int(column) + 1)} would be {kinds[found[row, column]][0]}, "
@@ -352,7 +225,7 @@ def _stamps(kinds: Kinds) -> list[NDArray[np.int64]]:
 def _stamp(colors: NDArray[Any], stamp: NDArray[np.int64], row: int, column: int) -> bool:
     """Writes a patch around a cell, unless a cell there has another colour already."""
     patch = colors[row : row + 3, column : column + 3]
-    if ((patch != _FREE) & (patch != stamp)).any():
+    if ((patch != FREE) & (patch != stamp)).any():
         return False
     patch[:] = stamp
     return True
@@ -363,11 +236,11 @@ def _fill(
     codes: NDArray[np.int64], margin: int,
 ) -> NDArray[Any]:
     """Random colours for free cells that make nothing that is not planned, and outer rings."""
-    free = colors == _FREE
+    free = colors == FREE
     again = free
     for _ in range(_ROUNDS):
         colors[again] = random.integers(len(COLORS), size=int(again.sum()))
-        wrong = np.argwhere(_find(colors, codes) != kind)
+        wrong = np.argwhere(find_kinds(colors, codes) != kind)
         if not len(wrong):
             break
         again = np.zeros_like(free)
@@ -385,8 +258,6 @@ def _fill(
         colors = ring
     return colors
 
-
-# --- random worlds ----------------------------------------------------------------------------
 
 
 class _Generator(NamedTuple):
@@ -435,8 +306,8 @@ def random_worlds(
       ValueError: an unknown proposition, a task that no finite run fulfils, or no placement found
         in which the objects have room and the task can be done from everywhere.
     """
-    kinds = _make_kinds(objects, obstacles)
-    _check_margin(margin)
+    kinds = make_kinds(objects, obstacles)
+    check_margin(margin)
     _check_shape(shape)
     if num_obstacles < 0:
         raise ValueError(f"num_obstacles={num_obstacles}; give 0 or more.")
@@ -448,7 +319,7 @@ def random_worlds(
         (min_distance,) * len(objects) + (obstacle_distance,) * len(obstacles),
         step, final, initial,
     )
-    codes, stamps = _codes(kinds), _stamps(kinds)
+    codes, stamps = codes_of(kinds), _stamps(kinds)
     worlds = []
     for seed in seeds:
         random = np.random.default_rng(seed)
@@ -503,7 +374,7 @@ def _place(
 ) -> tuple[NDArray[Any], NDArray[np.int32]] | None:
     """Patches in random cells and the kinds of cells, or None if there is no room."""
     rows, columns = shape
-    colors = np.full((rows + 2, columns + 2), _FREE)
+    colors = np.full((rows + 2, columns + 2), FREE)
     kind = np.full(shape, -1, np.int32)
     objects: list[tuple[int, int]] = []
     for i, (count, distance) in enumerate(zip(family.counts, family.distance, strict=True)):
@@ -534,7 +405,7 @@ def _adds(colors, kind, number, stamp, codes, row: int, column: int) -> bool:
     # Only cells up to two away see the patch.
     top, left = max(row - 2, 0), max(column - 2, 0)
     planned = kind[top : row + 3, left : column + 3]
-    if np.array_equal(_find(colors[top : row + 5, left : column + 5], codes), planned):
+    if np.array_equal(find_kinds(colors[top : row + 5, left : column + 5], codes), planned):
         return True
     patch[:], kind[row, column] = before, -1
     return False
@@ -570,8 +441,6 @@ def _can_finish(
             return after
         can = after
 
-
-# --- what is seen -----------------------------------------------------------------------------
 
 
 def patches(world: World, radius: int = 1) -> jax.Array:
@@ -615,8 +484,6 @@ def observations(world: World, radius: int = 1) -> jax.Array:
     hot = jax.nn.one_hot(patches(world, radius), len(COLORS), dtype=world.mdp.dtype)
     return hot.reshape(hot.shape[0], -1)
 
-
-# --- the expert -------------------------------------------------------------------------------
 
 
 def _distance(automaton: Any) -> jax.Array:
@@ -715,131 +582,3 @@ def demonstrations(
         model, policy, key, num_trajectories=num, num_steps=horizon, stop=is_over(model)
     )
     return replace(runs, state=runs.state // model.num_memory)
-
-
-# --- text files -------------------------------------------------------------------------------
-
-
-def write_world(world: World) -> str:
-    """A world as text: its margin, slip and kinds of cells, then a letter for each colour."""
-    slip = 0.0
-    if world.mdp.num_successors > 1:
-        slip = 1 - float(world.mdp.probability[0, 0, 0])
-    head = [f"margin: {world.margin}", f"slip: {slip:.6g}"]
-    for name, counts in world.kinds:
-        shown = [f"{n} {c}" for c, n in zip(COLORS, counts, strict=True) if n]
-        head.append(f"{name}: {', '.join(shown)}")
-    letters = np.array(list(LETTERS))[np.asarray(world.colors)]
-    return "\n".join([*head, "", *("".join(row) for row in letters), ""])
-
-
-def read_world(text: str) -> World:
-    """The world of a text, such as :func:`write_world` makes.
-
-    Lines with a colon are settings: ``margin`` (default 1), ``slip`` (default 0), and the colours
-    of a kind of cell, such as ``o1: 5 red, 4 black``; if there are none of the latter, kinds are
-    those of the dissertation. All other lines are rows of the map with its margin, with a letter
-    for each cell: r, y, w, p or b.
-
-    Raises:
-      ValueError: naming the line, or the row and column of the map, and what is wrong.
-
-    Example:
-      >>> world = read_world('''
-      ... rbrp
-      ... brbp
-      ... rbry
-      ... ''')
-      >>> world.shape, world.mdp.label[:, 0].tolist()
-      ((1, 2), [True, False])
-    """
-    margin, slip = 1, 0.0
-    kinds: dict[str, dict[str, int]] = {}
-    rows = []
-    for i, line in enumerate(text.splitlines()):
-        name, colon, value = (part.strip() for part in line.partition(":"))
-        if not colon:
-            rows += [name] if name else []
-        elif name == "margin":
-            margin = int(_number(value, int, i, name))
-        elif name == "slip":
-            slip = _number(value, float, i, name)
-        elif name in kinds:
-            raise ValueError(f"line {i + 1}: {name} is given twice; remove one of the lines.")
-        else:
-            kinds[name] = _read_counts(value, i, name)
-    objects, obstacles = (kinds, {}) if kinds else (OBJECTS, OBSTACLES)
-    return colored_world(
-        _read_rows(rows), objects=objects, obstacles=obstacles, margin=margin, slip=slip
-    )
-
-
-def _number(text: str, kind: type, line: int, name: str) -> float:
-    try:
-        return kind(text)
-    except ValueError:
-        raise ValueError(f"line {line + 1}: {name} is {text!r}, which is no number.") from None
-
-
-def _read_counts(text: str, line: int, name: str) -> dict[str, int]:
-    counts = {}
-    for part in text.split(","):
-        words = part.split()
-        if len(words) != 2:
-            raise ValueError(
-                f"line {line + 1}: {name}: {part.strip()!r}; write it as: o1: 5 red, 4 black."
-            )
-        counts[words[1]] = int(_number(words[0], int, line, name))
-    return counts
-
-
-def _read_rows(rows: Sequence[str]) -> NDArray[np.int32]:
-    if not rows:
-        raise ValueError(f"the map is empty; write rows of the letters {', '.join(LETTERS)}.")
-    for i, row in enumerate(rows):
-        for j, letter in enumerate(row):
-            if letter not in LETTERS:
-                raise ValueError(
-                    f"map row {i + 1}, column {j + 1}: {letter!r} is no colour; use "
-                    f"{', '.join(f'{a} ({b})' for a, b in zip(LETTERS, COLORS, strict=True))}."
-                )
-        if len(row) != len(rows[0]):
-            raise ValueError(
-                f"map row {i + 1} has {len(row)} cells, row 1 has {len(rows[0])}; all rows must "
-                "have the same length."
-            )
-    return np.array([[LETTERS.index(letter) for letter in row] for row in rows], np.int32)
-
-
-def save_world(path: str | os.PathLike[str], world: World) -> None:
-    """Writes a world as text to a file, which appears only when complete.
-
-    Raises:
-      ValueError: the place cannot be written to.
-    """
-    path = Path(path)
-    try:
-        # A directory of its own, so that the file gets the usual permissions.
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as place:
-            draft = Path(place) / path.name
-            draft.write_text(write_world(world), encoding="utf-8")
-            os.replace(draft, path)
-    except OSError as error:
-        raise ValueError(
-            f"cannot write {str(path)!r}: {error.strerror}; choose a directory that exists and "
-            "is writable."
-        ) from error
-
-
-def load_world(path: str | os.PathLike[str]) -> World:
-    """The world of a text file, see :func:`read_world`.
-
-    Raises:
-      ValueError: the file cannot be read, or :func:`read_world` refuses it; naming the file.
-    """
-    try:
-        return read_world(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"cannot read {str(path)!r}: {error.strerror}.") from error
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error

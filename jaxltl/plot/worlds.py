@@ -27,7 +27,7 @@ from jaxltl.plot.style import ACCENT, INK, PAPER, SCALE, SERIES, head, note, sca
 if TYPE_CHECKING:
     from jaxltl.envs.temporal_gridworld import World
 
-# Of temporal_gridworld.COLORS: paler than their names, so that what is drawn on them shows.
+# Of cell_kinds.COLORS: paler than their names, so that what is drawn on them shows.
 TINTS = ("#e79a8c", "#f5db80", "#fdfcf8", "#c3add8", "#4a4f58")
 _IS_LIGHT = np.array([1.0, 1.0, 1.0, 1.0, 0.0])
 

@@ -23,6 +23,7 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.values.performance import task_performances
 from jaxltl.envs import temporal_gridworld as grid
+from jaxltl.io.colored_world import read_world, write_world
 
 METHODS = ("todirl", "incomplete", "patch5", "memoryless", "cloning")
 _MEMORY = {"incomplete": grid.INCOMPLETE, "memoryless": "true"}  # of the others, the task's
@@ -305,7 +306,7 @@ def _walks(setting: Setting, states: Any) -> list[dict[str, Any]]:
         runs = grid.demonstrations(jax.random.key(0), _lane(models, 0), policy, 6, horizon=60)
         pairs = np.stack([runs.state, runs.action], -1).tolist()
         cut = [row[:n] for row, n in zip(pairs, np.asarray(runs.length), strict=True)]
-        found.append({"title": title, "world": grid.write_world(world), "runs": cut})
+        found.append({"title": title, "world": write_world(world), "runs": cut})
     return found
 
 
@@ -413,7 +414,7 @@ def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
             {"probability of the task": learning}, label="share of all steps"))))
     for x in result["figure6"]:
         for place in x["worlds"]:
-            world = grid.read_world(place["world"])
+            world = read_world(place["world"])
             figure = plot.temporal_gridworld(
                 world, trajectories=make_trajectories(world.mdp, place["runs"]),
                 title=f"{place['title']}: runs of the learned policy")

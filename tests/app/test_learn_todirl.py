@@ -13,6 +13,7 @@ from jaxltl.app.reports import learn_todirl as report_todirl
 from jaxltl.core.models.batch import stack_products
 from jaxltl.core.models.mdp import from_dense
 from jaxltl.envs import temporal_gridworld
+from jaxltl.io.colored_world import save_world, write_world
 from jaxltl.io.learned_reward import load_reward, plan_in
 from tests.test_cli import failure, run
 
@@ -109,8 +110,8 @@ def write(tmp_path):
 
 
 def write_files(place):
-    temporal_gridworld.save_world(place / "world.txt", WORLD)
-    temporal_gridworld.save_world(place / "other.txt", OTHER)
+    save_world(place / "world.txt", WORLD)
+    save_world(place / "other.txt", OTHER)
     for name, text in MAPS.items():
         (place / name).write_text(text)
     for name, shown in SHOWN.items():
@@ -136,7 +137,7 @@ def test_a_task_is_read(write):
 
 
 def test_kinds_slip_and_maps_in_the_task_file(write):
-    rows = "\n".join(temporal_gridworld.write_world(WORLD).split("\n\n")[1].split())
+    rows = "\n".join(write_world(WORLD).split("\n\n")[1].split())
     path = write(
         (KINDS, ""), (MAPS_LINE, f'maps = ["""\n{rows}\n"""]\nslip = 0.2\n'
          "objects = { x = { red = 5, black = 4 }, y = { yellow = 5, black = 4 } }\n"

@@ -10,6 +10,8 @@ import pytest
 import jaxltl as jl
 from jaxltl.core.values.performance import infeasible_starts
 from jaxltl.envs import temporal_gridworld as tg
+from jaxltl.envs.cell_kinds import many_objects
+from jaxltl.io.colored_world import load_world, read_world, save_world
 
 PLAN = {
     "o1": [(1, 7)], "o2": [(7, 1)], "o3": [(10, 10)],
@@ -126,7 +128,7 @@ def test_random_worlds_are_what_they_say():
 
 
 def test_random_worlds_of_other_sizes_objects_and_tasks():
-    objects = tg.many_objects(5)
+    objects = many_objects(5)
     task = "!ob U (o5 & (!ob U o4))"
     world = tg.random_world(
         2, task, shape=(12, 17), objects=objects, num_obstacles=9, min_distance=5, margin=2,
@@ -147,11 +149,11 @@ def test_a_thousand_random_worlds():
 
 
 def test_many_objects_differ():
-    kinds = tg.many_objects(16)
+    kinds = many_objects(16)
     assert len({tuple(sorted(x.items())) for x in kinds.values()}) == 16
     assert {name: kinds[name] for name in ("o1", "o2", "o3")} == tg.OBJECTS
     with pytest.raises(ValueError, match="num=17; there are colours for 0 to 16 objects"):
-        tg.many_objects(17)
+        many_objects(17)
 
 
 # Obstacles wall off a corner: from there nothing can be reached.
@@ -279,20 +281,20 @@ def test_demonstrations_end_where_the_task_is_decided():
 
 def test_worlds_survive_a_file(tmp_path):
     world = tg.random_world(
-        1, "F o5", shape=(9, 12), objects=tg.many_objects(5), margin=2, slip=0.15
+        1, "F o5", shape=(9, 12), objects=many_objects(5), margin=2, slip=0.15
     )
     path = tmp_path / "world.txt"
     path.write_text("old")
-    tg.save_world(path, world)
+    save_world(path, world)
     assert [p.name for p in tmp_path.iterdir()] == ["world.txt"]
-    again = tg.load_world(path)
+    again = load_world(path)
     assert jax.tree.structure(again) == jax.tree.structure(world)
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-6), again, world)
     np.testing.assert_array_equal(again.mdp.label, world.mdp.label)
 
 
 def test_a_map_alone_has_the_dissertations_kinds():
-    world = tg.read_world("rbrpp\nbrbpp\nrbrpp\n")
+    world = read_world("rbrpp\nbrbpp\nrbrpp\n")
     assert world.shape == (1, 3) and world.mdp.propositions == ("o1", "o2", "o3", "ob")
     assert labelled(world)["o1"] == [(1, 1)]
     assert dict(tg.training_world().kinds) == dict(world.kinds)
@@ -311,14 +313,14 @@ def test_a_map_alone_has_the_dissertations_kinds():
 ])
 def test_bad_texts_are_named(text, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        tg.read_world(text)
+        read_world(text)
     (tmp_path / "bad.txt").write_text(text)
     with pytest.raises(ValueError, match=rf"bad\.txt: .*{message}"):
-        tg.load_world(tmp_path / "bad.txt")
+        load_world(tmp_path / "bad.txt")
 
 
 def test_places_that_cannot_be_used_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"cannot read .*nowhere\.txt"):
-        tg.load_world(tmp_path / "nowhere.txt")
+        load_world(tmp_path / "nowhere.txt")
     with pytest.raises(ValueError, match=r"cannot write .*none/world\.txt"):
-        tg.save_world(tmp_path / "none" / "world.txt", tg.training_world())
+        save_world(tmp_path / "none" / "world.txt", tg.training_world())

@@ -2,7 +2,7 @@
 
 Beside the tables of :mod:`jaxltl.app.files.task` there is ``[test]``, the worlds in which the
 learned reward is put to use; ``examples/in_order.toml`` shows every key. Worlds are coloured grids
-as :func:`jaxltl.envs.temporal_gridworld.read_world` reads them, or text maps with a legend.
+as :func:`jaxltl.io.colored_world.read_world` reads them, or text maps with a legend.
 """
 
 from __future__ import annotations
@@ -40,8 +40,10 @@ from jaxltl.core.logic.ltl import parse_ltl
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.envs import temporal_gridworld
+from jaxltl.envs.cell_kinds import COLORS
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
+from jaxltl.io.colored_world import read_world
 
 
 @dataclass(frozen=True)
@@ -371,11 +373,11 @@ def _counts(world: Mapping[str, Any], key: str) -> list[tuple[str, Mapping[str, 
 
 
 def _colored_scene(name: str, text: str, world: Mapping[str, Any], radius: int) -> Scene:
-    found = temporal_gridworld.read_world(_with_settings(text, world))
+    found = read_world(_with_settings(text, world))
     if _gives_kinds(world):
         given = dict([*_counts(world, "objects"), *_counts(world, "obstacles")])
         own = {
-            kind: {c: n for c, n in zip(temporal_gridworld.COLORS, row, strict=True) if n}
+            kind: {c: n for c, n in zip(COLORS, row, strict=True) if n}
             for kind, row in found.kinds
         }
         if own != {k: {c: n for c, n in row.items() if n} for k, row in given.items()}:

@@ -1,0 +1,141 @@
+"""Kinds of cells of coloured worlds: objects and obstacles, told by the colours around them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+COLORS = ("red", "yellow", "white", "purple", "black")
+OBJECTS: Mapping[str, Mapping[str, int]] = {
+    "o1": {"red": 5, "black": 4},
+    "o2": {"yellow": 5, "black": 4},
+    "o3": {"white": 5, "black": 4},
+}
+OBSTACLES: Mapping[str, Mapping[str, int]] = {"ob": {"black": 9}}
+
+Counts = Mapping[str, Mapping[str, int]]
+Kinds = tuple[tuple[str, tuple[int, ...]], ...]
+
+FREE = -1  # a cell whose colour is still to be drawn
+
+
+def many_objects(num: int) -> dict[str, dict[str, int]]:
+    """Counts of colours for objects ``o1``, ``o2``, ..., no two alike.
+
+    The first three are those of the dissertation. Each has an X of one colour on another.
+
+    Args:
+      num: how many, at most 16.
+
+    Example:
+      >>> many_objects(4)["o4"]
+      {'purple': 5, 'black': 4}
+    """
+    pairs = [
+        (inside, around) for around in reversed(COLORS) for inside in COLORS
+        if inside not in (around, "black")
+    ]
+    if not 0 <= num <= len(pairs):
+        raise ValueError(f"num={num}; there are colours for 0 to {len(pairs)} objects.")
+    return {f"o{i + 1}": {a: 5, b: 4} for i, (a, b) in enumerate(pairs[:num])}
+
+
+def make_kinds(objects: Counts, obstacles: Counts) -> Kinds:
+    kinds: dict[str, tuple[int, ...]] = {}
+    for name, counts in [*objects.items(), *obstacles.items()]:
+        if name in kinds:
+            raise ValueError(f"{name!r} is both an object and an obstacle; rename one of them.")
+        for color, count in counts.items():
+            if color not in COLORS:
+                raise ValueError(f"{name}: {color!r} is no colour; use {', '.join(COLORS)}.")
+            if count < 0:
+                raise ValueError(f"{name}: {count} cells of {color}; give 0 or more.")
+        row = tuple(int(counts.get(color, 0)) for color in COLORS)
+        if sum(row) != 9:
+            raise ValueError(f"{name}: {dict(counts)} are {sum(row)} cells; a patch has 9.")
+        for other, same in kinds.items():
+            if same == row:
+                raise ValueError(f"{other} and {name} have the same colours; change one of them.")
+        kinds[name] = row
+    return tuple(kinds.items())
+
+
+def _code(counts: ArrayLike) -> NDArray[np.int64]:
+    """Counts of colours up to 9 as the digits of one number."""
+    return np.asarray(counts, np.int64) @ 10 ** np.arange(len(COLORS))
+
+
+_DIGIT = np.append(10 ** np.arange(len(COLORS)), 10 ** len(COLORS))  # the last: a free cell
+
+
+def find_kinds(colors: NDArray[Any], codes: NDArray[np.int64]) -> NDArray[np.int32]:
+    """The kind of each cell that has a patch, -1 for none; free cells are of no colour."""
+    digit = _DIGIT[colors]
+    across = digit[:, :-2] + digit[:, 1:-1] + digit[:, 2:]
+    total = across[:-2] + across[1:-1] + across[2:]
+    kind = np.full(total.shape, -1, np.int32)
+    for i, code in enumerate(codes):
+        kind[total == code] = i
+    return kind
+
+
+def categories(
+    colors: ArrayLike,
+    *,
+    objects: Counts = OBJECTS,
+    obstacles: Counts = OBSTACLES,
+    margin: int = 1,
+) -> NDArray[np.int32]:
+    """What each cell is, by the colours of the 3 x 3 patch around it; on the host.
+
+    Args:
+      colors: ``int[rows + 2 * margin, columns + 2 * margin]``, indices into ``COLORS``.
+      objects, obstacles: the number of cells of each colour in the patch of each kind.
+      margin: rings of cells around the grid, at least one.
+
+    Returns:
+      ``int32[rows, columns]``: the place among the objects and then the obstacles, -1 for a
+      distractor.
+
+    Raises:
+      ValueError: no whole grid, a colour that does not exist, or ambiguous kinds.
+
+    Example:
+      >>> x = [[0, 4, 0], [4, 0, 4], [0, 4, 0]]  # red where an X is, black elsewhere
+      >>> categories(x).tolist(), categories(np.full((3, 3), 4)).tolist()
+      ([[0]], [[3]])
+    """
+    kinds = make_kinds(objects, obstacles)
+    colors = check_colors(colors, margin)
+    return find_kinds(_crop(colors, margin - 1), codes_of(kinds))
+
+
+def codes_of(kinds: Kinds) -> NDArray[np.int64]:
+    return _code(np.array([row for _, row in kinds]).reshape(-1, len(COLORS)))
+
+
+def _crop(colors: NDArray[Any], width: int) -> NDArray[Any]:
+    return colors[width : colors.shape[0] - width, width : colors.shape[1] - width]
+
+
+def check_margin(margin: int) -> None:
+    if margin < 1:
+        raise ValueError(f"margin={margin}; cells at the border need a ring of at least 1.")
+
+
+def check_colors(colors: ArrayLike, margin: int) -> NDArray[np.int32]:
+    array = np.asarray(colors)
+    check_margin(margin)
+    if array.ndim != 2 or min(array.shape) < 2 * margin + 1 or array.dtype.kind not in "iu":
+        raise ValueError(
+            f"colors have shape {array.shape} and type {array.dtype}; pass integers [rows, "
+            f"columns] with a margin of {margin} on each side and a cell inside."
+        )
+    for row, column in np.argwhere((array < 0) | (array >= len(COLORS)))[:1]:
+        raise ValueError(
+            f"colors[{row}, {column}] = {array[row, column]}; colours are 0 to {len(COLORS) - 1}."
+        )
+    return array.astype(np.int32)

@@ -1,0 +1,134 @@
+"""Coloured worlds as text files: a letter for each cell, and which kinds of cells there are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.algos.checkpoint import atomic_write
+from jaxltl.envs.cell_kinds import COLORS, OBJECTS, OBSTACLES
+from jaxltl.envs.temporal_gridworld import World, colored_world
+
+LETTERS = "rywpb"  # of the colours, in text files
+
+
+
+
+
+def write_world(world: World) -> str:
+    """A world as text: its margin, slip and kinds of cells, then a letter for each colour."""
+    slip = 0.0
+    if world.mdp.num_successors > 1:
+        slip = 1 - float(world.mdp.probability[0, 0, 0])
+    head = [f"margin: {world.margin}", f"slip: {slip:.6g}"]
+    for name, counts in world.kinds:
+        shown = [f"{n} {c}" for c, n in zip(COLORS, counts, strict=True) if n]
+        head.append(f"{name}: {', '.join(shown)}")
+    letters = np.array(list(LETTERS))[np.asarray(world.colors)]
+    return "\n".join([*head, "", *("".join(row) for row in letters), ""])
+
+
+def read_world(text: str) -> World:
+    """The world of a text, such as :func:`write_world` makes.
+
+    Lines with a colon are settings: ``margin`` (default 1), ``slip`` (default 0), and the colours
+    of a kind of cell, such as ``o1: 5 red, 4 black``; if there are none of the latter, kinds are
+    those of the dissertation. All other lines are rows of the map with its margin, with a letter
+    for each cell: r, y, w, p or b.
+
+    Raises:
+      ValueError: naming the line, or the row and column of the map, and what is wrong.
+
+    Example:
+      >>> world = read_world('''
+      ... rbrp
+      ... brbp
+      ... rbry
+      ... ''')
+      >>> world.shape, world.mdp.label[:, 0].tolist()
+      ((1, 2), [True, False])
+    """
+    margin, slip = 1, 0.0
+    kinds: dict[str, dict[str, int]] = {}
+    rows = []
+    for i, line in enumerate(text.splitlines()):
+        name, colon, value = (part.strip() for part in line.partition(":"))
+        if not colon:
+            rows += [name] if name else []
+        elif name == "margin":
+            margin = int(_number(value, int, i, name))
+        elif name == "slip":
+            slip = _number(value, float, i, name)
+        elif name in kinds:
+            raise ValueError(f"line {i + 1}: {name} is given twice; remove one of the lines.")
+        else:
+            kinds[name] = _read_counts(value, i, name)
+    objects, obstacles = (kinds, {}) if kinds else (OBJECTS, OBSTACLES)
+    return colored_world(
+        _read_rows(rows), objects=objects, obstacles=obstacles, margin=margin, slip=slip
+    )
+
+
+def _number(text: str, kind: type, line: int, name: str) -> float:
+    try:
+        return kind(text)
+    except ValueError:
+        raise ValueError(f"line {line + 1}: {name} is {text!r}, which is no number.") from None
+
+
+def _read_counts(text: str, line: int, name: str) -> dict[str, int]:
+    counts = {}
+    for part in text.split(","):
+        words = part.split()
+        if len(words) != 2:
+            raise ValueError(
+                f"line {line + 1}: {name}: {part.strip()!r}; write it as: o1: 5 red, 4 black."
+            )
+        counts[words[1]] = int(_number(words[0], int, line, name))
+    return counts
+
+
+def _read_rows(rows: Sequence[str]) -> NDArray[np.int32]:
+    if not rows:
+        raise ValueError(f"the map is empty; write rows of the letters {', '.join(LETTERS)}.")
+    for i, row in enumerate(rows):
+        for j, letter in enumerate(row):
+            if letter not in LETTERS:
+                raise ValueError(
+                    f"map row {i + 1}, column {j + 1}: {letter!r} is no colour; use "
+                    f"{', '.join(f'{a} ({b})' for a, b in zip(LETTERS, COLORS, strict=True))}."
+                )
+        if len(row) != len(rows[0]):
+            raise ValueError(
+                f"map row {i + 1} has {len(row)} cells, row 1 has {len(rows[0])}; all rows must "
+                "have the same length."
+            )
+    return np.array([[LETTERS.index(letter) for letter in row] for row in rows], np.int32)
+
+
+def save_world(path: str | os.PathLike[str], world: World) -> None:
+    """Writes a world as text to a file, which appears only when complete.
+
+    Raises:
+      ValueError: the place cannot be written to.
+    """
+    with atomic_write(path) as file:
+        file.write(write_world(world).encode())
+
+
+def load_world(path: str | os.PathLike[str]) -> World:
+    """The world of a text file, see :func:`read_world`.
+
+    Raises:
+      ValueError: the file cannot be read, or :func:`read_world` refuses it; naming the file.
+    """
+    try:
+        return read_world(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"cannot read {str(path)!r}: {error.strerror}.") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
