@@ -8,10 +8,9 @@ knows the task and one that moves at random.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +20,17 @@ from jax import lax
 import jaxltl
 from jaxltl.algos import learner, todirl
 from jaxltl.algos.checkpoint import atomic_write
-from jaxltl.app.drawing import Picture, drawing
+from jaxltl.app._todirl_parts import (
+    LENGTH,
+    Judged,
+    Learned,
+    Outcome,
+    Setup,
+    Worlds,
+    counted_worlds,
+    part_of,
+)
+from jaxltl.app._todirl_pictures import pictures, task_pictures
 from jaxltl.app.files.task_todirl import (
     Scene,
     Task,
@@ -32,14 +41,12 @@ from jaxltl.app.files.task_todirl import (
     load_scenes,
     read_task,
 )
-from jaxltl.app.learn import Report, by_name, fingerprint, history_of, plain, short_name
+from jaxltl.app.learn import Report, by_name, fingerprint, history_of, plain
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.models.batch import lift_memory, stack_products
-from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.operators import action_mean, expectation
 from jaxltl.core.models.product import Product, product, project_policy
-from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Status, status_code
 from jaxltl.core.values.performance import (
     Performance,
@@ -59,142 +66,12 @@ __all__ = [
 ]
 
 STEPS = 300  # at most, unless the task says otherwise
-_LENGTH = 100  # of a synthetic demonstration, at most
+
+
 _BATCH = 64  # worlds that are planned in at once
+
+
 _EXPERT_DISCOUNT = 0.99  # at most, where the file does not give one
-_PICTURES = 3  # worlds that are drawn, of each kind
-_WALKS = 3  # trajectories drawn in a world
-
-
-# --- the parts ------------------------------------------------------------------------------
-
-
-class Worlds(NamedTuple):
-    """Worlds beside the learner's memory, and beside what judges the learner.
-
-    Attributes:
-      scenes: W worlds.
-      model: their products with the learner's memory, stacked.
-      judged: their products with memory and task side by side, stacked.
-      observation: ``float[W, S, O]``.
-    """
-
-    scenes: list[Scene]
-    model: Product
-    judged: Product
-    observation: jax.Array
-
-    @property
-    def names(self) -> list[str]:
-        """Of the worlds."""
-        return [scene.name for scene in self.scenes]
-
-    def part(self, chosen: slice) -> Worlds:
-        """Some of the worlds."""
-        arrays = _part((self.model, self.judged, self.observation), chosen)
-        return Worlds(self.scenes[chosen], *arrays)
-
-
-def _part(tree: Any, chosen: Any) -> Any:
-    """A part of arrays along their first axis; as NumPy's, which has nothing to compile for it."""
-    return jax.tree.map(lambda x: np.asarray(x)[chosen], tree)
-
-
-@dataclass(frozen=True)
-class Setup:
-    """A task file's contents as the library's objects; see :func:`prepare`.
-
-    Attributes:
-      task: the file.
-      judge, memory: the automata of the task and of the learner's memory.
-      worlds: those to learn in, and then those to test in.
-      num_training: how many there are to learn in.
-      expert: ``float[W, S, Q, A]``, the policy of an expert in the judged products.
-      demonstrations: in each of the training worlds.
-    """
-
-    task: Task
-    judge: Automaton
-    memory: Automaton
-    worlds: Worlds
-    num_training: int
-    expert: jax.Array
-    demonstrations: list[Trajectories]
-
-    @property
-    def training(self) -> Worlds:
-        """The worlds to learn in."""
-        return self.worlds.part(slice(self.num_training))
-
-    @property
-    def test(self) -> Worlds | None:
-        """The worlds to test in."""
-        if len(self.worlds.scenes) == self.num_training:
-            return None
-        return self.worlds.part(slice(self.num_training, None))
-
-
-@dataclass(frozen=True)
-class Learned:
-    """What was learned, with N seeds side by side.
-
-    Attributes:
-      parameters: of the network, leading axis N.
-      held_out: ``float[N]``, negative log-likelihood of the average held-out pair.
-      best_step: ``int[N]``, after which the parameters were reached.
-      stopped: ``bool[N]``, whether learning ended by patience.
-      num_steps: ``int``, made until all had ended.
-      history: metrics ``[T, N]`` and ``step [T]``.
-    """
-
-    parameters: Any
-    held_out: np.ndarray
-    best_step: np.ndarray
-    stopped: np.ndarray
-    num_steps: int
-    history: Mapping[str, np.ndarray]
-
-
-class Judged(NamedTuple):
-    """Policies in some worlds, and how well they do.
-
-    Attributes:
-      policy: ``float[W, S, Q, A]`` with the learner's memory, of the kept seed.
-      status: ``int32[W]``, of the solver that found it.
-      performance: by the name of who acts: learned, expert, random; leading axis W.
-      seeds: ``float[N, W]``, L_phi of each seed's policy.
-    """
-
-    policy: np.ndarray
-    status: np.ndarray
-    performance: dict[str, Performance]
-    seeds: np.ndarray
-
-    def part(self, chosen: slice) -> Judged:
-        """In some of the worlds."""
-        each = _part(self.performance, chosen)
-        return Judged(self.policy[chosen], self.status[chosen], each, self.seeds[:, chosen])
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """A finished job: what was asked, learned and found out about it.
-
-    Attributes:
-      setup, learned: the parts.
-      chosen: the seed's position that is kept: the best held-out likelihood, or the least loss.
-      training, test: how the policies of the learned reward do; test is None without worlds.
-      seed: the first of the seeds.
-      seconds: spent.
-    """
-
-    setup: Setup
-    learned: Learned
-    chosen: int
-    training: Judged
-    test: Judged | None
-    seed: int
-    seconds: float
 
 
 def prepare(task: Task, seed: int) -> Setup:
@@ -221,7 +98,7 @@ def prepare(task: Task, seed: int) -> Setup:
                 # that, or in their test worlds, have the same demonstrations.
                 jax.random.fold_in(key, w), product(scene.mdp, judge, label_on=task.label_on),
                 expert[w, : scene.mdp.num_states], shown["synthetic"],
-                shown.get("length", _LENGTH),
+                shown.get("length", LENGTH),
             )
             for w, scene in enumerate(scenes)
         ]
@@ -258,9 +135,6 @@ def describe(setup: Setup) -> str:
         f"{setup.num_training} training and {tests} test worlds, "
         f"{setup.worlds.model.num_memory} memory states, {number} demonstrations of {pairs} pairs"
     )
-
-
-# --- learning -------------------------------------------------------------------------------
 
 
 def learn(
@@ -326,7 +200,7 @@ def _judge(
     worlds = setup.worlds
     performances, policies, codes = [], [], []
     for i in range(len(learned.held_out)):
-        parameters = _part(learned.parameters, i)
+        parameters = part_of(learned.parameters, i)
         policy, status = _plan(network, parameters, worlds.model, worlds.observation, hparams)
         lifted = policy if setup.memory is setup.judge else lift_memory(policy, setup.judge)
         performances.append(_probability(worlds.judged, lifted, hparams.horizon))
@@ -410,9 +284,6 @@ def _within(model: Product, policy: jax.Array) -> Performance:
     )
 
 
-# --- results --------------------------------------------------------------------------------
-
-
 def summary(outcome: Outcome) -> dict[str, Any]:
     """The outcome as numbers, lists and texts, for ``result.json``; NaN becomes None."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
@@ -458,7 +329,9 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             "held_out": learned.held_out,
             "best_step": learned.best_step,
             "training_mean": outcome.training.seeds.mean(axis=1),
-            "test_mean": outcome.test and outcome.test.seeds[:, _counted(setup)].mean(axis=1),
+            "test_mean": (
+                outcome.test and outcome.test.seeds[:, counted_worlds(setup)].mean(axis=1)
+            ),
         },
         "network": {
             "file": "network.npz",
@@ -469,12 +342,6 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "versions": {"jaxltl": jaxltl.__version__, "jax": jax.__version__},
     }
     return plain(result)
-
-
-def _counted(setup: Setup) -> np.ndarray:
-    """Which test worlds count."""
-    names = setup.worlds.names[setup.num_training :]
-    return np.array([name not in setup.task.test.get("leave_out", ()) for name in names])
 
 
 def _about_worlds(
@@ -501,7 +368,7 @@ def _about_worlds(
 
 
 def _about_world(scene: Scene, judged: Judged, w: int, infeasible: int) -> dict[str, Any]:
-    one = _part(judged.performance["learned"], w)
+    one = part_of(judged.performance["learned"], w)
     return {
         "name": scene.name,
         "mean": {"value": one.mean, "lower": one.lower, "upper": one.upper},
@@ -515,9 +382,6 @@ def _about_world(scene: Scene, judged: Judged, w: int, infeasible: int) -> dict[
         "num_starts": int(np.sum(np.asarray(scene.mdp.initial) > 0)),
         "infeasible_starts": infeasible,
     }
-
-
-# --- files ----------------------------------------------------------------------------------
 
 
 def save(out: Path, outcome: Outcome) -> None:
@@ -537,7 +401,7 @@ def save(out: Path, outcome: Outcome) -> None:
     save_reward(out / "network.npz", learned_reward(outcome))
     worlds = outcome.setup.training
     for w, scene in enumerate(worlds.scenes):
-        model, size = _part(worlds.model, w), scene.mdp.num_states
+        model, size = part_of(worlds.model, w), scene.mdp.num_states
         policy = outcome.training.policy[w]
         kept = project_policy(model, policy if policy.ndim == 3 else policy[0])
         arrays = {
@@ -559,130 +423,8 @@ def learned_reward(outcome: Outcome) -> LearnedReward:
     kinds = (COLORS if task.is_colored
              else (*cell_kinds(task.world), "off the map"))
     return LearnedReward(
-        parameters=_part(outcome.learned.parameters, i),
+        parameters=part_of(outcome.learned.parameters, i),
         hidden=tuple(spec.get("hidden", (80, 80))), memory=outcome.setup.memory,
         label_on=task.label_on, discount=spec["discount"], horizon=spec.get("horizon"),
         radius=task.radius, formula=task.formula, kinds=tuple(kinds),
     )
-
-
-# --- pictures -------------------------------------------------------------------------------
-
-
-def task_pictures(setup: Setup) -> list[Picture]:
-    """The report's pictures that nothing has to be learned for."""
-    found = [Picture(
-        "automaton.svg", "The task as an automaton", drawing("automaton", setup.judge),
-        "States with a double circle: the task is done, whatever follows. Grey: it has failed. "
-        "Each state is named by the formula that is left to satisfy.",
-    )]
-    if setup.memory is not setup.judge:
-        found.append(Picture(
-            "memory.svg", "What the learner remembers", drawing("automaton", setup.memory),
-            "The automaton whose state is the learner's memory; the task above judges it.",
-        ))
-    return found
-
-
-def pictures(outcome: Outcome) -> list[Picture]:
-    """The report's pictures of what was learned."""
-    setup, history = outcome.setup, outcome.learned.history
-    found = [Picture(
-        "learning.svg", "Learning",
-        drawing("curves", {k: history[k].T for k in ("per_pair", "held_out", "gradient_norm")},
-                steps=history["step"]),
-        "Negative log-likelihood of the average demonstrated pair, of the average held-out pair "
-        "where there are any, and the gradient's length, before each step"
-        + ("" if np.isnan(outcome.learned.held_out).any()
-           else ". What is kept has the least held-out figure")
-        + ("; the line is the median over seeds, the band holds all of them."
-           if len(outcome.learned.held_out) > 1 else "."),
-    )]
-    for w, scene in list(enumerate(setup.training.scenes))[:_PICTURES]:
-        found += _draw(outcome, setup.training, outcome.training, w, f"training_{w + 1}",
-                       f"Training world: {scene.name}", True)
-    if setup.test is not None and outcome.test is not None:
-        for n, (rank, w) in enumerate(_chosen_worlds(setup, outcome.test)):
-            title = f"Test world, {rank}: {setup.test.scenes[w].name}"
-            found += _draw(outcome, setup.test, outcome.test, w, f"test_{n + 1}", title, n == 0)
-    return found
-
-
-def _chosen_worlds(setup: Setup, judged: Judged) -> list[tuple[str, int]]:
-    """The test worlds where the learned policy does worst, middling and best."""
-    counted = np.flatnonzero(_counted(setup))
-    mean = np.asarray(judged.performance["learned"].mean)
-    order = counted[np.argsort(mean[counted], kind="stable")]
-    ranks = {"worst": order[0], "median": order[len(order) // 2], "best": order[-1]}
-    found: dict[int, str] = {}
-    for rank, w in ranks.items():
-        found.setdefault(int(w), rank)
-    return [(rank, w) for w, rank in found.items()]
-
-
-def _draw(
-    outcome: Outcome, worlds: Worlds, judged: Judged, w: int, stem: str, title: str,
-    arrows: bool,
-) -> list[Picture]:
-    """A world with runs of its policy and, if asked for, the policy itself."""
-    setup, scene = outcome.setup, worlds.scenes[w]
-    size = scene.mdp.num_states
-    policy = judged.policy[w][..., :size, :, :]
-    moving = policy if policy.ndim == 3 else policy[0]
-    mean = float(judged.performance["learned"].mean[w])
-    title = f"{title} ({mean:.4f})"
-    shown = _memory_shown(setup)
-    names = setup.memory.state_names or ("",) * len(setup.memory.delta)
-    # About as many characters as a panel is wide.
-    width = int(np.clip(5 * scene.shape[1], 9, 50))
-    titles = [short_name(f"memory {q}: {names[q]}", width) for q in shown]
-    when = "" if policy.ndim == 3 else " at the first step"
-    caption = (
-        f"One map for each state of the learner's memory; an arrow is as long as its action is "
-        f"likely{when}. In the title, the mean probability of doing the task."
-    )
-    if scene.colored is None:
-        assert scene.cells is not None
-        panels = np.broadcast_to(
-            np.asarray(judged.performance["learned"].value[w])[:size], (len(shown), size))
-        drawn = drawing(
-            "grid", scene.cells, panels, moving.transpose(1, 0, 2)[shown], titles=titles,
-            label="probability from a start there",
-            wall=setup.task.world.get("wall", "#"),
-        )
-        caption += " Colours: the probability of doing the task if a run starts there."
-        return [Picture(f"{stem}.svg", title, drawn, caption)]
-    found: list[Picture] = []
-    if arrows:
-        drawn = drawing("temporal_gridworld", _part(scene.colored, ...), moving, memory=shown,
-                        title=titles)
-        found.append(Picture(f"{stem}.svg", title, drawn, caption))
-    if policy.ndim == 3:
-        walks = _walks(outcome, worlds, w, judged.policy[w])
-        found.append(Picture(
-            f"{stem}_runs.svg", title if not arrows else f"Runs in {scene.name}",
-            drawing("temporal_gridworld", _part(scene.colored, ...), trajectories=walks),
-            f"{len(walks.length)} runs of the learned policy from random starts, each until the "
-            "task is done or has failed.",
-        ))
-    return found
-
-
-def _memory_shown(setup: Setup) -> list[int]:
-    """Memory states in which there is something left to do."""
-    open_ = np.flatnonzero(verdicts(setup.memory) == Verdict.UNDECIDED)
-    return [int(q) for q in open_] or [0]
-
-
-def _walks(outcome: Outcome, worlds: Worlds, w: int, policy: np.ndarray) -> Trajectories:
-    setup = outcome.setup
-    array = jnp.asarray(policy)
-    lifted = array if setup.memory is setup.judge else lift_memory(array, setup.judge)
-    key = jax.random.fold_in(jax.random.key(outcome.seed), 2)
-    shown = setup.task.demonstrations
-    # As many as there were demonstrations, for which the program is there already.
-    walks = temporal_gridworld.demonstrations(
-        key, _part(worlds.judged, w), lifted, shown.get("synthetic", _WALKS),
-        shown.get("length", _LENGTH),
-    )
-    return _part(walks, slice(_WALKS))

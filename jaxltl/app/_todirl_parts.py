@@ -1,0 +1,152 @@
+"""What a job of todirl is made of: its worlds, what was learned in them, and how well it does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxltl.app.files.task_todirl import Scene, Task
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.values.performance import Performance
+
+LENGTH = 100  # of a synthetic demonstration, at most
+
+
+class Worlds(NamedTuple):
+    """Worlds beside the learner's memory, and beside what judges the learner.
+
+    Attributes:
+      scenes: W worlds.
+      model: their products with the learner's memory, stacked.
+      judged: their products with memory and task side by side, stacked.
+      observation: ``float[W, S, O]``.
+    """
+
+    scenes: list[Scene]
+    model: Product
+    judged: Product
+    observation: jax.Array
+
+    @property
+    def names(self) -> list[str]:
+        """Of the worlds."""
+        return [scene.name for scene in self.scenes]
+
+    def part(self, chosen: slice) -> Worlds:
+        """Some of the worlds."""
+        arrays = part_of((self.model, self.judged, self.observation), chosen)
+        return Worlds(self.scenes[chosen], *arrays)
+
+
+def part_of(tree: Any, chosen: Any) -> Any:
+    """A part of arrays along their first axis; as NumPy's, which has nothing to compile for it."""
+    return jax.tree.map(lambda x: np.asarray(x)[chosen], tree)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A task file's contents as the library's objects; see :func:`prepare`.
+
+    Attributes:
+      task: the file.
+      judge, memory: the automata of the task and of the learner's memory.
+      worlds: those to learn in, and then those to test in.
+      num_training: how many there are to learn in.
+      expert: ``float[W, S, Q, A]``, the policy of an expert in the judged products.
+      demonstrations: in each of the training worlds.
+    """
+
+    task: Task
+    judge: Automaton
+    memory: Automaton
+    worlds: Worlds
+    num_training: int
+    expert: jax.Array
+    demonstrations: list[Trajectories]
+
+    @property
+    def training(self) -> Worlds:
+        """The worlds to learn in."""
+        return self.worlds.part(slice(self.num_training))
+
+    @property
+    def test(self) -> Worlds | None:
+        """The worlds to test in."""
+        if len(self.worlds.scenes) == self.num_training:
+            return None
+        return self.worlds.part(slice(self.num_training, None))
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What was learned, with N seeds side by side.
+
+    Attributes:
+      parameters: of the network, leading axis N.
+      held_out: ``float[N]``, negative log-likelihood of the average held-out pair.
+      best_step: ``int[N]``, after which the parameters were reached.
+      stopped: ``bool[N]``, whether learning ended by patience.
+      num_steps: ``int``, made until all had ended.
+      history: metrics ``[T, N]`` and ``step [T]``.
+    """
+
+    parameters: Any
+    held_out: np.ndarray
+    best_step: np.ndarray
+    stopped: np.ndarray
+    num_steps: int
+    history: Mapping[str, np.ndarray]
+
+
+class Judged(NamedTuple):
+    """Policies in some worlds, and how well they do.
+
+    Attributes:
+      policy: ``float[W, S, Q, A]`` with the learner's memory, of the kept seed.
+      status: ``int32[W]``, of the solver that found it.
+      performance: by the name of who acts: learned, expert, random; leading axis W.
+      seeds: ``float[N, W]``, L_phi of each seed's policy.
+    """
+
+    policy: np.ndarray
+    status: np.ndarray
+    performance: dict[str, Performance]
+    seeds: np.ndarray
+
+    def part(self, chosen: slice) -> Judged:
+        """In some of the worlds."""
+        each = part_of(self.performance, chosen)
+        return Judged(self.policy[chosen], self.status[chosen], each, self.seeds[:, chosen])
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A finished job: what was asked, learned and found out about it.
+
+    Attributes:
+      setup, learned: the parts.
+      chosen: the seed's position that is kept: the best held-out likelihood, or the least loss.
+      training, test: how the policies of the learned reward do; test is None without worlds.
+      seed: the first of the seeds.
+      seconds: spent.
+    """
+
+    setup: Setup
+    learned: Learned
+    chosen: int
+    training: Judged
+    test: Judged | None
+    seed: int
+    seconds: float
+
+
+def counted_worlds(setup: Setup) -> np.ndarray:
+    """Which test worlds count."""
+    names = setup.worlds.names[setup.num_training :]
+    return np.array([name not in setup.task.test.get("leave_out", ()) for name in names])
