@@ -64,7 +64,7 @@ def random_claim(rng, num_states):
 def test_verdicts_equal_brute_force():
     rng = np.random.default_rng(0)
     seen = set()
-    for _ in range(1500):
+    for _ in range(1000):
         game, priority, won, lost, *rest = random_claim(rng, int(rng.integers(1, 6)))
         expected = reference_games.claims(game, priority, won, lost, *rest)
         library = Game(as_mdp(game.model), game.system)
@@ -89,7 +89,7 @@ def test_verdicts_with_memory_equal_brute_force():
     """The strategies are written into the states, where they have no memory."""
     rng = np.random.default_rng(1)
     seen = set()
-    for _ in range(250):
+    for _ in range(150):
         game, sets, region, action, counter = random_memory_claim(rng)
         larger, priority, _ = reference_games.gr1_as_parity(game, *sets)
         # The larger game's states are (s, i, j): the system knows j, the environment i.

@@ -26,7 +26,7 @@ from jaxltl.core.models.game import Game, make_game, swap_players
 from jaxltl.core.models.mdp import to_dense
 from jaxltl.core.models.product import product
 from tests import reference, reference_games
-from tests.support import as_mdp, bit_labels, lane, random_product, stack
+from tests.support import as_mdp, bit_labels, random_product
 
 NUM_PRIORITIES = 5
 
@@ -85,25 +85,22 @@ REFERENCES = {
 fast_to_compile = partial(jax.jit, compiler_options={
     "xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True})
 compiled = fast_to_compile(winning_region)
-compiled_batch = fast_to_compile(jax.vmap(winning_region))
 
 
 def check_batch(seed, kind, shape, count):
-    """A batch of random games in one compiled call: regions by brute force, strategies checked."""
+    """Random games: regions by brute force, strategies checked."""
     rng = np.random.default_rng(seed)
-    plays = [reference_games.random_game(rng, *shape) for _ in range(count)]
-    games = [as_game(play) for play in plays]
-    sets = [draw(rng, shape[0]) for _ in plays]
-    objectives = [OBJECTIVES[kind](game, x) for game, x in zip(games, sets, strict=True)]
-    found = compiled_batch(stack(games), stack(objectives))
-    found = jax.tree.map(np.asarray, found)
-    for i, (play, x) in enumerate(zip(plays, sets, strict=True)):
+    total = 0
+    for i in range(count):
+        play, x = reference_games.random_game(rng, *shape), draw(rng, shape[0])
+        game = as_game(play)
+        found = winning_region(game, OBJECTIVES[kind](game, x))
         expected = REFERENCES[kind](play, x)
-        np.testing.assert_array_equal(found.region[i], expected, err_msg=f"game {i}")
-        verdict = verify(lane(found, i))
+        np.testing.assert_array_equal(found.region, expected, err_msg=f"game {i}")
+        verdict = verify(found)
         assert verdict, f"game {i}: {verdict.reason}"
-    mean = found.region.mean()
-    assert 0.05 < mean < 0.95, "both players win somewhere"
+        total += expected.mean()
+    assert 0.05 < total / count < 0.95, "both players win somewhere"
 
 
 PARITY_LIKE = ("safety", "reach", "buchi", "cobuchi", "parity")
@@ -137,17 +134,21 @@ def test_regions_with_memory_equal_parity_in_a_thousand_games(kind):
 
 
 def check_paths(rng, play, kind, monkeypatch):
-    """Sweeps, worklists and compiled code agree, and each one's strategies win."""
+    """Sweeps, worklists and compiled code agree, and their strategies win."""
     game = as_game(play)
     objective = OBJECTIVES[kind](game, draw(rng, play.model.num_states))
-    inside = compiled(game, objective)
+    monkeypatch.setattr(host_attract, "SWEEPS", 12)
+    found = winning_region(game, objective)
+    verdict = verify(found)
+    assert verdict, verdict.reason
     monkeypatch.setattr(host_attract, "SWEEPS", 0)
-    outside = winning_region(game, objective)
-    np.testing.assert_array_equal(inside.region, outside.region)
-    for found in (inside, outside):
-        verdict = verify(found)
-        assert verdict, verdict.reason
-    return np.asarray(inside.region)
+    others = [winning_region(game, objective)]
+    if kind in ("parity", "gr1"):  # the others are cases of these
+        others.append(compiled(game, objective))
+    for other in others:
+        for name in ("region", "action", "counter_action"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(other, name))
+    return np.asarray(found.region)
 
 
 def larger_games(rng, count, shapes=((60, 2, 2), (120, 3, 2), (300, 2, 3))):
@@ -165,8 +166,9 @@ def test_the_host_and_compiled_code_agree(kind, monkeypatch):
     assert any(0 < region.mean() < 1 for region in regions)
 
 
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("kind", OBJECTIVES)
+@pytest.mark.parametrize("kind", [
+    pytest.param(kind, marks=pytest.mark.exhaustive if kind in ("parity", "gr1") else ())
+    for kind in OBJECTIVES])
 def test_the_host_and_compiled_code_agree_on_hundreds_of_games(kind, monkeypatch):
     rng = np.random.default_rng(3)
     for play in larger_games(rng, 72):
@@ -189,15 +191,13 @@ def test_products_and_dense_worlds(kind, label_on, monkeypatch):
             x = {k: v.reshape(*v.shape[:-1], *shape) for k, v in sets.items()}
             objective = OBJECTIVES[kind](game, x)
             monkeypatch.setattr(host_attract, "SWEEPS", 0)
-            solvers = (compiled, winning_region) if model is lazy else (winning_region,)
-            for solve in solvers:
-                found = solve(game, objective)
-                assert found.region.shape == shape
-                region = np.ravel(found.region)
-                expected = region if expected is None else expected
-                np.testing.assert_array_equal(region, expected)
-                verdict = verify(found)
-                assert verdict, verdict.reason
+            found = winning_region(game, objective)
+            assert found.region.shape == shape
+            region = np.ravel(found.region)
+            expected = region if expected is None else expected
+            np.testing.assert_array_equal(region, expected)
+            verdict = verify(found)
+            assert verdict, verdict.reason
         if kind != "gr1":
             play = reference_games.Play(explicit, system)
             np.testing.assert_array_equal(expected, REFERENCES[kind](play, sets))
@@ -315,11 +315,11 @@ def test_exchanging_players_without_chance_exchanges_regions():
     for _ in range(30):
         game = as_game(reference_games.random_game(rng, 6, kind="deterministic"))
         sets = draw(rng, 6)
-        one = compiled(game, parity(game, sets["priority"], num_priorities=6))
-        other = compiled(
+        one = winning_region(game, parity(game, sets["priority"], num_priorities=6))
+        other = winning_region(
             swap_players(game), parity(game, sets["priority"] + 1, num_priorities=6)
         )
-        np.testing.assert_array_equal(one.region, ~other.region)
+        np.testing.assert_array_equal(one.region, np.logical_not(other.region))
 
 
 # --- sure winning -----------------------------------------------------------------------------
@@ -459,7 +459,7 @@ def test_corrupted_answers_are_refused():
     for _ in range(25):
         play = reference_games.random_game(rng, 5, kind="mixed")
         game, sets = as_game(play), draw(rng, 5)
-        found = compiled(game, OBJECTIVES["parity"](game, sets))
+        found = winning_region(game, OBJECTIVES["parity"](game, sets))
         found = jax.tree.map(np.asarray, found)
         for s in range(5):
             verdict = verify(found.replace(region=found.region ^ (np.arange(5) == s)))
@@ -489,7 +489,7 @@ def test_corrupted_answers_are_refused():
 
 
 @pytest.mark.parametrize(
-    "length", [100_000, pytest.param(1_000_000, marks=pytest.mark.exhaustive)]
+    "length", [30_000, pytest.param(1_000_000, marks=pytest.mark.exhaustive)]
 )
 def test_a_very_long_chain(length):
     """Every state leads on, the first may stay, and players take turns in moving."""

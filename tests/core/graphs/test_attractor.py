@@ -7,7 +7,6 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.host import attract as host_attract
-
 from tests import reference
 from tests.support import as_mdp, lane, random_representation, stack
 
