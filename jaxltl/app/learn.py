@@ -61,7 +61,7 @@ class Learned:
       history: metrics ``[T, N]`` and ``step [T]``.
     """
 
-    policy: jax.Array
+    policy: np.ndarray
     weights: np.ndarray
     names: tuple[str, ...]
     loss: np.ndarray
@@ -77,7 +77,7 @@ def _mlirl(
     spec: Mapping[str, Any],
     model: Product,
     shown: Trajectories,
-    keys: jax.Array,
+    seeds: tuple[int, int],
     report: Report | None,
     checkpoint: Path | None,
 ) -> Learned:
@@ -104,23 +104,36 @@ def _mlirl(
                "optimizer")
     hparams = mlirl.Hparams(**{k: spec[k] for k in options if k in spec})
     num_steps, tolerance = spec.get("steps", STEPS), spec.get("tolerance", _TOLERANCE)
-    states = jax.jit(jax.vmap(mlirl.init, (0, None, None)))(keys, problem, hparams)
+    states = first_states(mlirl.init, *seeds, problem, hparams)
     found = learner.run_in_chunks(
         mlirl.step, states, problem, hparams, num_steps=num_steps, lanes=True, keep="before",
         until=learner.gradient_vanishes(tolerance), report=by_name(report), checkpoint=checkpoint,
     )
     states, history = found.state, history_of(found)
     evaluate = jax.jit(_policy_and_likelihood)
-    each = [evaluate(parameters, problem, hparams) for parameters in states.parameters]
-    policy, nll, codes = (jnp.stack(column) for column in zip(*each, strict=True))
+    weights = np.asarray(states.parameters)
+    each = [jax.device_get(evaluate(one, problem, hparams)) for one in weights]
+    policy, nll, codes = (np.stack(column) for column in zip(*each, strict=True))
+    if in_world:
+        policy = jax.jit(jax.vmap(lift_policy, (None, 0)))(model, policy)
     gradient_norm, status = history["gradient_norm"][-1], np.asarray(codes)
     return Learned(
-        policy=jax.vmap(lift_policy, (None, 0))(model, policy) if in_world else policy,
-        weights=np.asarray(states.parameters), names=features.names, loss=history["loss"][-1],
+        policy=np.asarray(policy),
+        weights=weights, names=features.names, loss=history["loss"][-1],
         neg_log_likelihood=np.asarray(nll), gradient_norm=gradient_norm, status=status,
         num_steps=np.asarray(states.step),
         converged=found.done & (status == Status.CONVERGED), history=history,
     )
+
+
+@functools.partial(jax.jit, static_argnames=("init", "num_seeds"))
+def first_states(
+    init: Callable[..., Any], seed: int, num_seeds: int, problem: Any, hparams: Any
+) -> Any:
+    """A learner's N first states, each from a key of its own; one program."""
+    root = jax.random.fold_in(jax.random.key(seed), 1)
+    keys = jax.vmap(functools.partial(jax.random.fold_in, root))(jnp.arange(num_seeds))
+    return jax.vmap(init, (0, None, None))(keys, problem, hparams)
 
 
 def _policy_and_likelihood(
@@ -202,7 +215,7 @@ def prepare(task: Task, seed: int) -> Setup:
 
 def describe(setup: Setup) -> str:
     """What a task comes to, in one line."""
-    lengths = setup.demonstrations.length
+    lengths = np.asarray(setup.demonstrations.length)
     return (
         f"{setup.world.mdp.num_states} states, {setup.model.num_memory} memory states, "
         f"{len(lengths)} demonstrations of {int(lengths.sum())} pairs"
@@ -233,10 +246,8 @@ def learn(
       ValueError: the learner cannot work on this task.
     """
     model, spec = setup.model, setup.task.learner
-    root = jax.random.fold_in(jax.random.key(seed), 1)
-    keys = jax.vmap(functools.partial(jax.random.fold_in, root))(jnp.arange(num_seeds))
     learned = METHODS[spec["method"]](
-        spec, model, setup.demonstrations, keys, report, checkpoint
+        spec, model, setup.demonstrations, (seed, num_seeds), report, checkpoint
     )
     progress("checking")
     loss = np.where(np.isfinite(learned.loss), learned.loss, np.inf)

@@ -41,7 +41,7 @@ from jaxltl.app.files.task_todirl import (
     load_scenes,
     read_task,
 )
-from jaxltl.app.learn import Report, by_name, fingerprint, history_of, plain
+from jaxltl.app.learn import Report, by_name, fingerprint, first_states, history_of, plain
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.models.batch import lift_memory, stack_products
@@ -165,9 +165,7 @@ def learn(
         held_out=spec.get("held_out", 0.2), network=network, horizon=spec.get("horizon"),
     )
     hparams = _hparams(spec)
-    root = jax.random.fold_in(jax.random.key(seed), 1)
-    keys = jax.vmap(partial(jax.random.fold_in, root))(jnp.arange(num_seeds))
-    states = jax.jit(jax.vmap(todirl.init, (0, None, None)))(keys, problem, hparams)
+    states = first_states(todirl.init, seed, num_seeds, problem, hparams)
     found = learner.run_in_chunks(
         todirl.step, states, problem, hparams, num_steps=spec.get("steps", STEPS), lanes=True,
         until=learner.has_stopped, report=by_name(report), checkpoint=checkpoint,
