@@ -18,6 +18,8 @@ import numpy as np
 import optax
 from flax import struct
 from jax.flatten_util import ravel_pytree
+
+from jaxltl.algos import learner
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.operators import expectation
 from jaxltl.core.models.product import Product, lift_trajectories
@@ -26,8 +28,6 @@ from jaxltl.core.types import Solution, Status, require_shape
 from jaxltl.core.values.boltzmann import boltzmann_value
 from jaxltl.core.values.satisfaction import satisfaction_probability
 from jaxltl.core.values.soft import policy_logits, soft_value
-
-from jaxltl.algos import learner
 
 Reward = Callable[[Any, jax.Array], jax.Array]
 
@@ -151,9 +151,8 @@ def make_problem(
     features = jnp.asarray(features, model.dtype)
     if features.shape[:-1] != actions:
         raise ValueError(f"features have shape {features.shape}; expected {(*actions, 'F')}.")
-    if not bool(jnp.all(jnp.isfinite(features))):
-        place = np.argwhere(~np.isfinite(np.asarray(features)))[0]
-        *pair, feature = place.tolist()
+    if (wrong := ~np.isfinite(np.asarray(features))).any():
+        *pair, feature = np.argwhere(wrong)[0].tolist()
         raise ValueError(f"feature {feature} at {tuple(pair)} is not finite.")
     if isinstance(model, Product):
         demonstrations = lift_trajectories(model, demonstrations)
@@ -166,7 +165,7 @@ def make_problem(
         weight = np.ones(model.state_shape) if weight == "all" else starts
     weight = jnp.asarray(weight, model.dtype)
     require_shape("satisfaction_over", weight, model.state_shape)
-    start = jnp.zeros(features.shape[-1], model.dtype) if start is None else start
+    start = np.zeros(features.shape[-1]) if start is None else start
     start = jax.tree.map(lambda x: jnp.asarray(x, model.dtype), start)
     shape = jax.eval_shape(reward, start, features).shape
     if shape != actions:
@@ -177,6 +176,7 @@ def make_problem(
     )
 
 
+@jax.jit  # one program, where it is called alone
 def pair_counts(model: Any, trajectories: Trajectories) -> jax.Array:
     """How often each state-action pair occurs in trajectories of a model: ``float[S, A]``."""
     actions = (*model.state_shape, model.num_actions)
@@ -350,26 +350,36 @@ def task_features(
     """
     if model.automaton.acceptance != "cosafe":
         raise ValueError("task_features needs a co-safe task, which has final states.")
-    lifted = lift_trajectories(model, demonstrations)
     chosen = progress_states(model) if progress is None else tuple(progress)
-    num_memory = model.num_memory
     for q in chosen:
-        if not 0 <= q < num_memory:
+        if not 0 <= q < model.num_memory:
             raise ValueError(
-                f"progress: automaton state {q} does not exist; there are {num_memory}."
+                f"progress: automaton state {q} does not exist; there are {model.num_memory}."
             )
-    target = np.isin(np.arange(num_memory), chosen)
-    entering = []
-    for q in range(num_memory):
-        region = jnp.asarray(target & (np.arange(num_memory) != q), model.dtype)
-        entering.append(expectation(model, jnp.broadcast_to(region, model.state_shape))[:, q])
-    columns = {
-        "demonstrated": (pair_counts(model, lifted) > 0).astype(model.dtype),
-        "goal": expectation(model, model.final.astype(model.dtype)),
-        "progress": jnp.stack(entering, axis=1),
-    }
-    red = _shows(model.mdp, avoid, "avoid")
-    return _table1(model, columns, red[:, None] & jnp.ones(num_memory, bool), avoid, model.final)
+    _require_known(model.mdp, avoid, "avoid")
+    values = _task_values(model, demonstrations, avoid=tuple(avoid), progress=chosen)
+    return Features(values, _names(avoid))
+
+
+@partial(jax.jit, static_argnames=("avoid", "progress"))
+def _task_values(
+    model: Product, demonstrations: Trajectories, *, avoid: tuple[str, ...],
+    progress: tuple[int, ...],
+) -> jax.Array:
+    lifted, num_memory = lift_trajectories(model, demonstrations), model.num_memory
+    target, every = np.isin(np.arange(num_memory), progress), jnp.arange(num_memory)
+
+    def entering(q: jax.Array) -> jax.Array:
+        region = jnp.broadcast_to(target & (every != q), model.state_shape)
+        return expectation(model, region.astype(model.dtype))[:, q]
+
+    columns = [
+        (pair_counts(model, lifted) > 0).astype(model.dtype),
+        expectation(model, model.final.astype(model.dtype)),
+        jax.vmap(entering, out_axes=1)(every),
+    ]
+    red = _shows(model.mdp, avoid)[:, None] & jnp.ones(num_memory, bool)
+    return _table1(model, columns, red, avoid, model.final)
 
 
 def world_features(
@@ -388,33 +398,52 @@ def world_features(
     Raises:
       ValueError: a proposition does not exist.
     """
-    columns = {
-        "demonstrated": (pair_counts(world, demonstrations) > 0).astype(world.dtype),
-        "goal": expectation(world, _shows(world, goal, "goal").astype(world.dtype)),
-        "progress": expectation(world, _shows(world, progress, "progress").astype(world.dtype)),
-    }
-    return _table1(
-        world, columns, _shows(world, avoid, "avoid"), avoid, _shows(world, goal, "goal")
+    for names, argument in ((goal, "goal"), (progress, "progress"), (avoid, "avoid")):
+        _require_known(world, names, argument)
+    values = _world_values(
+        world, demonstrations, goal=tuple(goal), progress=tuple(progress), avoid=tuple(avoid)
     )
+    return Features(values, _names(avoid))
 
 
-def _table1(model, columns, red, avoid, done) -> Features:
+@partial(jax.jit, static_argnames=("goal", "progress", "avoid"))
+def _world_values(
+    world: MDP | DenseMDP, demonstrations: Trajectories, *, goal: tuple[str, ...],
+    progress: tuple[str, ...], avoid: tuple[str, ...],
+) -> jax.Array:
+    columns = [
+        (pair_counts(world, demonstrations) > 0).astype(world.dtype),
+        expectation(world, _shows(world, goal).astype(world.dtype)),
+        expectation(world, _shows(world, progress).astype(world.dtype)),
+    ]
+    return _table1(world, columns, _shows(world, avoid), avoid, _shows(world, goal))
+
+
+def _table1(
+    model: Any, columns: list[jax.Array], red: jax.Array, avoid: tuple[str, ...], done: jax.Array
+) -> jax.Array:
     if avoid:
-        columns["avoid"] = -expectation(model, red.astype(model.dtype))
-    columns["time"] = -jnp.ones_like(columns["demonstrated"])
-    values = jnp.stack(list(columns.values()), axis=-1)
-    return Features(jnp.where(done[..., None, None], 0, values), tuple(columns))
+        columns.append(-expectation(model, red.astype(model.dtype)))
+    columns.append(-jnp.ones_like(columns[0]))
+    return jnp.where(done[..., None, None], 0, jnp.stack(columns, axis=-1))
 
 
-def _shows(world: MDP | DenseMDP, names: Collection[str], argument: str) -> jax.Array:
+def _names(avoid: Collection[str]) -> tuple[str, ...]:
+    return ("demonstrated", "goal", "progress", *(("avoid",) if avoid else ()), "time")
+
+
+def _shows(world: MDP | DenseMDP, names: tuple[str, ...]) -> jax.Array:
+    """``bool[S]``: where any of the propositions holds."""
+    return jnp.any(world.label[:, [world.propositions.index(n) for n in names]], axis=1)
+
+
+def _require_known(world: MDP | DenseMDP, names: Collection[str], argument: str) -> None:
     for name in names:
         if name not in world.propositions:
             raise ValueError(
                 f"{argument}: {name!r} is not a proposition of the world; "
                 f"it has {', '.join(world.propositions) or '(none)'}."
             )
-    columns = [world.propositions.index(n) for n in names]
-    return jnp.any(world.label[:, columns], axis=1)
 
 
 def progress_states(model: Product) -> tuple[int, ...]:

@@ -11,10 +11,6 @@ from numpy.typing import NDArray
 
 from jaxltl.core.automata.automaton import Automaton
 
-# ---------------------------------------------------------------------------------------------
-# Minimal and complement automata
-# ---------------------------------------------------------------------------------------------
-
 
 def minimize(automaton: Automaton) -> Automaton:
     """The smallest automaton whose runs read the same priorities.

@@ -43,11 +43,6 @@ def universal_states(automaton: Automaton) -> NDArray[np.bool_]:
     return ~_states_that_may(automaton, ODD)
 
 
-# ---------------------------------------------------------------------------------------------
-# Operations
-# ---------------------------------------------------------------------------------------------
-
-
 def align(a: Automaton, b: Automaton) -> tuple[Automaton, Automaton]:
     """Two automata over the same propositions and letters.
 
@@ -128,7 +123,6 @@ def _reading(
         letters=rows,
         propositions=names,
     )
-
 
 
 class Runs(NamedTuple):
@@ -270,7 +264,6 @@ def _states_that_may(automaton: Automaton, parity: int) -> NDArray[np.bool_]:
     for inside, _ in _loops(runs, (parity,)):
         good |= inside.any(axis=1)
     return _reaching(delta, good)
-
 
 
 def _graph(delta: NDArray[np.int32], allowed: NDArray[np.bool_]) -> Any:
