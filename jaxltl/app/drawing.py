@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import Any, NamedTuple
 
 _PROCESSES = 2
@@ -77,4 +79,12 @@ def artist(apart: bool) -> Iterator[Artist]:
 
 def _prepare() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command itself says what is to be done
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     import jaxltl.plot  # noqa: F401
+
+
+def _end_with_parent() -> None:
+    """A process of a pool waits for work for ever, also where its parent was killed."""
+    if (parent := parent_process()) is not None:
+        parent.join()
+        os._exit(1)
