@@ -142,7 +142,6 @@ def test_random_worlds_of_other_sizes_objects_and_tasks():
     assert tg.random_world(0, "true", num_obstacles=0).mdp.label.sum() == 3
 
 
-@pytest.mark.exhaustive
 def test_a_thousand_random_worlds():
     for world in tg.random_worlds(range(1000)):
         check_random(world, KINDS, 5, 3)
