@@ -13,7 +13,7 @@ from benchmarks.timing import compare, once
 from jaxltl.algos import mlirl
 from jaxltl.core.models.operators import action_mean
 from jaxltl.core.models.product import product
-from jaxltl.core.values.evidence import action_value
+from jaxltl.core.values.discounted import action_value
 from jaxltl.core.values.soft import policy_logits
 from jaxltl.reproduce.mlirl import two_goals
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -11,13 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxltl.core.models.operators import (
-    action_mean,
-)
+from jaxltl.core.models.operators import action_mean
+from jaxltl.core.models.tables import action_columns, mean, table
 from jaxltl.core.types import Solution, Status, status_code
-from jaxltl.core.values.discounted import optimal_value
-from jaxltl.core.values.evidence import _attach, _Jacobian, _rounding, action_value, expected_reward
-from jaxltl.core.values.soft import _with_softmax, policy_logits
+from jaxltl.core.values import newton
+from jaxltl.core.values.discounted import (
+    action_value,
+    differentiable,
+    expected_reward,
+    gains,
+    optimal_value,
+)
+from jaxltl.core.values.evidence import rounding_unit
+from jaxltl.core.values.linear import System
+from jaxltl.core.values.soft import policy_logits, soft_maximum, with_softmax
 
 
 def boltzmann_expansion(num_actions: int) -> float:
@@ -93,82 +100,78 @@ def boltzmann_value(
         raise ValueError(f"method={method!r}; choose damped or newton.")
     reward = expected_reward(model, reward)
     discount = jnp.asarray(discount, model.dtype)
-    expansion = discount * boltzmann_expansion(model.num_actions)
+    given = _given(model, reward, discount, tolerance)
+    start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
+    damping = jnp.where(given.contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
+    value, image, n = newton.solve(
+        table(model), softmax_mean, _judge,
+        newton.Backup(gains(model, reward), discount, damping, given), start,
+        monotone=False, first_sweeps=4 if method == "damped" else 0, max_steps=max_steps)
+    bound = _error(value, image, given)
+    converged = bound <= given.goal
+    half = jnp.where(converged & given.contracts, bound, jnp.inf)
+    value, image = (x.reshape(model.state_shape) for x in (value, image))
+    solution = jax.tree.map(lax.stop_gradient, Solution(
+        value=value, policy=value, lower=value - half, upper=value + half,
+        residual=jnp.max(jnp.abs(image - value)), num_steps=n,
+        status=status_code(
+            converged, jnp.isfinite(bound) & (discount < 1), bound <= given.enough,
+            certified=given.contracts),
+    ))
 
-    def backup(v: jax.Array, constant_policy: bool = False) -> jax.Array:
+    def backup(v: jax.Array) -> jax.Array:
         policy = jax.nn.softmax(policy_logits(model, reward, discount, v), axis=-1)
-        if constant_policy:
+        if adjoint == "approximate":
             policy = lax.stop_gradient(policy)
         return action_mean(policy, action_value(model, reward, discount, v))
 
-    def jacobian(v: jax.Array, constant_policy: bool = False) -> _Jacobian:
-        policy = jax.nn.softmax(policy_logits(model, reward, discount, v), axis=-1)
-        if not constant_policy:
-            q = action_value(model, reward, discount, v)
+    def system() -> System:
+        policy = jax.nn.softmax(policy_logits(model, reward, discount, solution.value), axis=-1)
+        if adjoint == "exact":
+            q = action_value(model, reward, discount, solution.value)
             policy *= 1 + q - action_mean(policy, q)[..., None]
-        return lax.stop_gradient(_Jacobian(model, discount, policy))
+        return System(table(model), action_columns(model.num_actions, policy), discount)
 
+    solution = differentiable(solution, backup, system)
+    return with_softmax(model, reward, discount, solution)
+
+
+class _Given(NamedTuple):
+    """What decides when a Boltzmann value is good enough."""
+
+    contracts: jax.Array
+    gap: jax.Array
+    rounding: jax.Array
+    goal: jax.Array
+    enough: jax.Array  # the error below which there is little but rounding
+
+
+def _given(model: Any, reward: jax.Array, discount: jax.Array, tolerance: Any) -> _Given:
+    expansion = discount * boltzmann_expansion(model.num_actions)
     contracts = expansion < 1
-    damping = jnp.where(contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
     gap = jnp.where(contracts, 1 - expansion, 1)
-    magnitude = jnp.max(jnp.abs(jnp.where(model.available, reward, 0))) / (1 - discount)
-    rounding = _rounding(model, reward, magnitude, gap)
+    size = jnp.max(jnp.abs(reward))
+    rounding = rounding_unit(model) * (size + size / (1 - discount)) / gap
     goal = 4 * rounding if tolerance is None else jnp.asarray(tolerance, model.dtype)
-    enough = jnp.maximum(goal, 2 * rounding)  # below which there is little but rounding
+    return _Given(contracts, gap, rounding, goal, jnp.maximum(goal, 2 * rounding))
 
-    def error(value: jax.Array, image: jax.Array) -> jax.Array:
-        """Certified where the operator contracts; elsewhere the residual."""
-        return jnp.max(jnp.abs(image - value)) / gap + rounding
 
-    def damped(carry):
-        value, image, _, better, n = carry
-        value = value + (1 - damping) * (image - value)
-        image = backup(value)
-        return value, image, error(value, image), better, n + 1
+def _error(value: jax.Array, image: jax.Array, given: _Given) -> jax.Array:
+    """Certified where the operator contracts; elsewhere the residual."""
+    return jnp.max(jnp.abs(image - value), axis=0) / given.gap + given.rounding
 
-    def newton(carry):
-        value, image, before, _, n = carry
-        trial = jacobian(value).newton(value, image)
-        trial_image = backup(trial)
-        now = error(trial, trial_image)
-        better = now <= before / 2
-        keep = partial(jnp.where, better)
-        return keep(trial, value), keep(trial_image, image), keep(now, before), better, n + 1
 
-    def polish(carry):
-        value, image, bound, n = carry
-        # Newton's method early, but ever more damped steps where it does not take hold.
-        width = n + (0 if method == "newton" else 4 * (1 + n // 16))
-        again = (value, image, bound, jnp.bool_(True), n)
-        value, image, bound, _, n = lax.while_loop(
-            lambda c: (c[2] > enough) & (c[4] < jnp.minimum(width, max_steps)), damped, again
-        )
-        again = (value, image, bound, jnp.bool_(True), n)
-        value, image, bound, _, n = lax.while_loop(
-            lambda c: (c[2] > enough) & c[3] & (c[4] < max_steps), newton, again
-        )
-        return value, image, bound, n
+def _judge(value: jax.Array, image: jax.Array, given: _Given) -> tuple[jax.Array, jax.Array]:
+    error = _error(value, image, given)
+    return (error <= given.enough) | ~jnp.isfinite(error), error
 
-    def unfinished(carry):
-        _, _, bound, n = carry
-        return (bound > enough) & (n < max_steps) & jnp.isfinite(bound)
 
-    start = jnp.zeros(model.state_shape, model.dtype) if initial is None else initial
-    image = backup(start)
-    first = (start, image, error(start, image), jnp.int32(1))
-    value, image, bound, n = lax.stop_gradient(lax.while_loop(unfinished, polish, first))
-    converged = bound <= goal
-    half = jnp.where(converged & contracts, bound, jnp.inf)
-    solution = Solution(
-        value=value, policy=value, lower=value - half, upper=value + half,
-        residual=jnp.max(jnp.abs(image - value)), num_steps=n,
-        status=status_code(converged, jnp.isfinite(bound) & (discount < 1), bound <= enough),
-    )
-    constant = adjoint == "approximate"
-    solution = _attach(
-        solution, partial(backup, constant_policy=constant), jacobian(value, constant)
-    )
-    return _with_softmax(model, reward, discount, solution)
+def softmax_mean(q, given: Any) -> tuple[jax.Array, list[jax.Array]]:
+    """``sum_a softmax(q)_a q_a`` of columns, and its derivative."""
+    _, policy = soft_maximum(q, given)
+    finite = [jnp.where(jnp.isneginf(x), 0, x) for x in q]
+    value = mean(policy, finite)
+    return value, [p * (1 + x - value) for p, x in zip(policy, finite, strict=True)]
 
 
 def boltzmann_fixed_points(
@@ -189,7 +192,8 @@ def boltzmann_fixed_points(
       model, reward, discount: as in :func:`boltzmann_value`.
       key: a PRNG key, consumed.
       num_starts: starts for each of the two methods.
-      tolerance: fixed points nearer than this (sup norm) are one; also the residual allowed.
+      tolerance: fixed points nearer than this (sup norm) are one; the residual allowed is a tenth of
+        it times ``1 - discount``.
 
     Returns:
       Converged solutions, ordered by the sum of their values. Works on the host.
@@ -199,14 +203,16 @@ def boltzmann_fixed_points(
     weight = jax.random.uniform(key, (num_starts, *(1 for _ in best.shape)), best.dtype)
     weight = weight.at[0].set(0).at[-1].set(1)
     starts = worst + weight * (best - worst)
+    # A residual this small leaves a value within the tolerance, as far as the discount tells.
+    residual = tolerance * (1 - discount) / 10
     found: list[Solution] = []
     for method in ("damped", "newton"):
         run = jax.vmap(
             lambda v, method=method: boltzmann_value(
-                model, reward, discount, initial=v, method=method)
+                model, reward, discount, initial=v, method=method, tolerance=residual)
         )
         batch = run(starts)
-        for i in np.flatnonzero(np.asarray(batch.status) == Status.CONVERGED):
+        for i in np.flatnonzero(np.asarray(batch.status) <= Status.UNCERTIFIED):
             one = jax.tree.map(lambda x, i=i: x[i], batch)
             if all(jnp.max(jnp.abs(one.value - f.value)) > tolerance for f in found):
                 found.append(one)

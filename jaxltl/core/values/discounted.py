@@ -1,9 +1,18 @@
-"""Discounted values of a policy, and optimal ones."""
+"""Discounted values of a policy, and optimal ones.
+
+Every solver stops on a certified error, returns the enclosure that certifies it, and is
+differentiable by the implicit function theorem in the reward, the discount and the
+transition probabilities. A ``model`` is an MDP, a DenseMDP or a Product; shapes are
+written for an MDP, and a product's values have ``[S, Q]`` for ``[S]``.
+"""
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial, reduce
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,20 +24,149 @@ from jaxltl.core.models.operators import (
     action_mean,
     expectation,
     induced_chain,
-    policy_distribution,
+    require_policy,
+    valid_policy,
 )
-from jaxltl.core.types import Solution
-from jaxltl.core.values.evidence import (
-    _attach,
-    _certified,
-    _solution,
-    action_value,
-    expected_reward,
-)
-from jaxltl.core.values.fixed_point import solve_linear
+from jaxltl.core.models.tables import action_columns, mean, table
+from jaxltl.core.types import Solution, status_code
+from jaxltl.core.values import newton
+from jaxltl.core.values.evidence import Enclosure, enclose, refuse, rounding_unit
+from jaxltl.core.values.fixed_point import implicit
+from jaxltl.core.values.iterate import iterate
+from jaxltl.core.values.linear import DENSE_LIMIT, System, solver
+
+_METHODS = ("auto", "policy_iteration", "modified_policy_iteration", "value_iteration")
 
 
-@jax.jit
+def action_value(
+    model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
+) -> jax.Array:
+    """``Q(s, a) = R(s, a) + discount * sum_t P(t | s, a) V(t)``; zero at unavailable actions.
+
+    Args:
+      model: the model.
+      reward: ``float[S, A]``.
+      discount: scalar.
+      value: ``float[S]``.
+
+    Returns:
+      ``float[S, A]``.
+    """
+    q = reward + discount * expectation(model, value)
+    return jnp.where(model.available, q, 0)
+
+
+def expected_reward(model: Any, reward: jax.Array) -> jax.Array:
+    """A reward on pairs ``[S, A]`` or transitions ``[S, A, K]`` as its expectation ``[S, A]``.
+
+    Zero at unavailable actions; what stands there and in padding is not read.
+
+    Raises:
+      ValueError: the reward has another shape.
+    """
+    actions = (*model.state_shape, model.num_actions)
+    transitions = (*actions, model.num_successors)
+    reward = jnp.asarray(reward, model.dtype)
+    if reward.shape == actions:
+        return jnp.where(model.available, reward, 0)
+    if reward.shape == transitions:
+        weight = model.successor_probability
+        return jnp.sum(weight * jnp.where(weight > 0, reward, 0), axis=-1)
+    raise ValueError(f"reward has shape {reward.shape}; expected {actions} or {transitions}.")
+
+
+# --- what discounted solvers share -----------------------------------------------------------
+
+
+class Parameters(NamedTuple):
+    """What the parts of :mod:`jaxltl.core.values.newton` read of a discounted problem.
+
+    Attributes:
+      discount: a scalar.
+      size: the largest reward.
+      unit: relative rounding of a backup.
+      tolerance: certified error asked for, or None.
+      policy: columns of a policy's weights, or None.
+    """
+
+    discount: jax.Array
+    size: jax.Array
+    unit: jax.Array
+    tolerance: jax.Array | None
+    policy: Any = None
+
+
+def judge(value: jax.Array, image: jax.Array, given: Parameters) -> tuple[jax.Array, jax.Array]:
+    """Whether MacQueen's bounds are narrow enough or will not narrow, and half their width."""
+    found = _enclosed(value, image, given)
+    return found.ended, found.half
+
+
+def _enclosed(value: jax.Array, image: jax.Array, given: Parameters) -> Enclosure:
+    rounding = given.unit * (given.size + jnp.max(jnp.abs(image), axis=0))
+    return enclose(value, image, given.discount, rounding, given.tolerance)
+
+
+def parameters(model: Any, reward: jax.Array, discount: Any, tolerance: Any) -> Parameters:
+    """Of a problem with an expected reward ``[S, A]``."""
+    goal = None if tolerance is None else jnp.asarray(tolerance, model.dtype)
+    return Parameters(
+        jnp.asarray(discount, model.dtype), jnp.max(jnp.abs(reward)),
+        jnp.asarray(rounding_unit(model), model.dtype), goal)
+
+
+def gains(model: Any, reward: jax.Array) -> list[jax.Array]:
+    """The reward's columns, minus infinity at unavailable actions."""
+    return action_columns(model.num_actions, jnp.where(model.available, reward, -jnp.inf))
+
+
+def solution_of(
+    model: Any, given: Parameters, value: jax.Array, image: jax.Array, policy: jax.Array,
+    num_steps: jax.Array,
+) -> Solution:
+    """The solution that a value and its image certify, without derivatives.
+
+    Args:
+      model: the model.
+      given: the problem's parameters.
+      value, image: ``float[N]``.
+      policy: what belongs to it.
+      num_steps: applications of the operator.
+    """
+    found = _enclosed(value, image, given)
+    middle = (image + found.shift).reshape(model.state_shape)
+    # With a certificate the whole image is finite.
+    solution = Solution(
+        value=middle, policy=policy, lower=middle - found.half, upper=middle + found.half,
+        residual=jnp.max(jnp.abs(image - value)), num_steps=num_steps,
+        status=status_code(found.converged, found.finite, found.exhausted),
+    )
+    return jax.tree.map(lax.stop_gradient, solution)
+
+
+def differentiable(
+    solution: Solution, backup: Callable[[jax.Array], jax.Array], system: Callable[[], System]
+) -> Solution:
+    """The solution with the implicit derivatives of ``v = backup(v)`` on its value.
+
+    Args:
+      solution: without derivatives.
+      backup: closes over what it is differentiable in.
+      system: makes ``I - J``, with J the derivative of `backup` in v at the solution.
+    """
+    def solve(b: jax.Array) -> jax.Array:
+        return solver(system()).solve(b)
+
+    def transpose_solve(b: jax.Array) -> jax.Array:
+        return solver(system()).transpose_solve(b)
+
+    value = implicit(backup, solution.value, solve=solve, transpose_solve=transpose_solve)
+    return replace(solution, value=value)
+
+
+# --- a policy --------------------------------------------------------------------------------
+
+
 def policy_value(
     model: Any,
     policy: jax.Array,
@@ -40,8 +178,9 @@ def policy_value(
 ) -> Solution:
     """Expected discounted reward of a policy.
 
-    ``V = r_pi + discount * P_pi V`` (dissertation, section 2.2.1). Solved by BiCGSTAB with
-    successive approximation where that stalls; the enclosure holds for any iterate.
+    ``V = r_pi + discount * P_pi V`` (dissertation, section 2.2.1). Solved by BiCGSTAB, with
+    elimination on small models and sweeps on others where that stalls; the enclosure holds for
+    any iterate.
 
     Args:
       model: the model.
@@ -55,7 +194,8 @@ def policy_value(
       :class:`Solution`; `value` is ``float[S]``.
 
     Raises:
-      ValueError: policy or reward has the wrong shape.
+      ValueError: policy or reward has the wrong shape, or a row of the policy is no distribution
+        over available actions (under ``jit`` the status is then INVALID).
 
     Differentiable in the policy, the reward, the discount and the probabilities.
 
@@ -65,29 +205,38 @@ def policy_value(
       >>> round(policy_value(mdp, jnp.array([0]), jnp.ones((1, 1)), 0.5).value.item(), 4)
       2.0
     """
+    require_policy(model, policy)
+    return _policy_value(model, policy, reward, discount, tolerance, max_steps)
+
+
+@jax.jit
+def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solution:
     reward = expected_reward(model, reward)
-    discount = jnp.asarray(discount, model.dtype)
-    policy = policy_distribution(model, policy)
-    reward = jnp.where(model.available, reward, 0)
+    given = parameters(model, reward, discount, tolerance)
+    checked = valid_policy(model, policy)
+    weight = action_columns(model.num_actions, checked.distribution)
+    given = given._replace(policy=weight)
+    rows = table(model)
+
+    def combine(q, given: Parameters):
+        return mean(given.policy, q), given.policy
+
+    value, image, n = newton.solve(
+        rows, combine, judge, newton.Backup(
+            action_columns(model.num_actions, reward), given.discount,
+            jnp.zeros_like(given.discount), given),
+        jnp.zeros(model.num_states, model.dtype), max_steps=max_steps)
 
     def backup(v: jax.Array) -> jax.Array:
-        return action_mean(policy, action_value(model, reward, discount, v))
+        return action_mean(checked.distribution, action_value(model, reward, given.discount, v))
 
-    constant = action_mean(policy, reward)
-    scale = float(jnp.finfo(model.dtype).eps)
-    relative = scale if tolerance is None else jnp.maximum(
-        scale, tolerance * (1 - discount) / (4 * jnp.linalg.norm(constant.ravel()) + scale)
-    )
-    value = lax.stop_gradient(
-        solve_linear(
-            lambda v: v - (backup(v) - constant), constant,
-            tolerance=relative, max_steps=max_steps,
-        )
-    )
-    solution = _solution(
-        model, reward, discount, tolerance, value, backup(value), policy, jnp.int32(1)
-    )
-    return _attach(solution, backup)
+    solution = solution_of(model, given, value, image, checked.distribution, n)
+    solution = differentiable(
+        solution, backup, lambda: System(rows, weight, given.discount))
+    return refuse(replace(solution, policy=checked.distribution), checked.given, checked.valid)
+
+
+# --- optimal values --------------------------------------------------------------------------
 
 
 @partial(jax.jit, static_argnames=("method",))
@@ -96,25 +245,26 @@ def optimal_value(
     reward: jax.Array,
     discount: jax.Array | float,
     *,
-    method: str = "modified_policy_iteration",
+    method: str = "auto",
     tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int = 100_000,
     evaluation_sweeps: jax.Array | int = 24,
 ) -> Solution:
     """Largest expected discounted reward, ``V = max_a R + discount * P V``.
 
-    Modified policy iteration (Puterman and Shin 1978): after each sweep of the
-    optimality operator, `evaluation_sweeps` cheap sweeps under the greedy policy.
     Stops on MacQueen's bounds, so a tolerance met is a certified error.
 
     Args:
       model: the model.
       reward: ``float[S, A]`` or ``float[S, A, K]``.
       discount: scalar in [0, 1).
-      method: ``"modified_policy_iteration"`` or ``"value_iteration"``.
+      method: ``"policy_iteration"`` (Howard 1960, its systems solved to a hundredth),
+        ``"modified_policy_iteration"`` (Puterman and Shin 1978: after each sweep of the
+        optimality operator, `evaluation_sweeps` cheap ones under the greedy policy),
+        ``"value_iteration"``, or ``"auto"``, the first up to 512 states, then the second.
       tolerance: certified absolute error asked for; default: what the dtype allows.
-      max_steps: sweeps of the optimality operator at most.
-      evaluation_sweeps: sweeps between them under a fixed policy.
+      max_steps: applications of the optimality operator or of the linear one at most.
+      evaluation_sweeps: sweeps under a fixed policy, in modified policy iteration.
 
     Returns:
       :class:`Solution`; `value` is ``float[S]``, `policy` ``int32[S]`` is greedy and its
@@ -133,40 +283,67 @@ def optimal_value(
       >>> [round(v, 4) for v in best.value.tolist()], best.policy.tolist()
       ([1.0, 2.0], [1, 0])
     """
-    if method not in ("modified_policy_iteration", "value_iteration"):
-        raise ValueError(f"method={method!r}; choose modified_policy_iteration or value_iteration.")
+    if method not in _METHODS:
+        raise ValueError(f"method={method!r}; choose {', '.join(_METHODS[:-1])} or {_METHODS[-1]}.")
+    if method == "auto":
+        few = math.prod(model.state_shape) <= DENSE_LIMIT
+        method = "policy_iteration" if few else "modified_policy_iteration"
     reward = expected_reward(model, reward)
-    discount = jnp.asarray(discount, model.dtype)
+    given = parameters(model, reward, discount, tolerance)
+    zero = jnp.zeros(model.num_states, model.dtype)
+    if method == "modified_policy_iteration":
+        value, image, n = _modified_policy_iteration(
+            model, reward, given, max_steps, evaluation_sweeps)
+    else:
+        value, image, n = newton.solve(
+            table(model), best_action, judge,
+            newton.Backup(gains(model, reward), given.discount,
+                          jnp.zeros_like(given.discount), given),
+            zero, newton=method == "policy_iteration", max_steps=max_steps)
+    q = reward + given.discount * expectation(model, value.reshape(model.state_shape))
+    _, policy = action_argmax(q, model.available)
 
     def backup(v: jax.Array) -> jax.Array:
-        q = reward + discount * expectation(model, v)
-        return action_max(q, model.available)
+        return action_max(reward + given.discount * expectation(model, v), model.available)
 
+    def system() -> System:
+        chosen = jax.nn.one_hot(policy, model.num_actions, dtype=model.dtype)
+        return System(table(model), action_columns(model.num_actions, chosen), given.discount)
+
+    return differentiable(
+        solution_of(model, given, value, image, policy, n), backup, system)
+
+
+def best_action(q, given: Any) -> tuple[jax.Array, list[jax.Array]]:
+    """The largest action value, and weight one on the first action that attains it."""
+    best = reduce(jnp.maximum, q)
+    weight, free = [], jnp.ones(best.shape, bool)
+    for x in q:
+        here = free & (x >= best)
+        weight.append(here.astype(best.dtype))
+        free &= ~here
+    return best, weight
+
+
+def _modified_policy_iteration(model, reward, given: Parameters, max_steps, sweeps):
     def greedy(v: jax.Array) -> tuple[jax.Array, jax.Array]:
-        q = reward + discount * expectation(model, v)
-        return action_argmax(q, model.available)
+        q = reward + given.discount * expectation(model, v.reshape(model.state_shape))
+        image, policy = action_argmax(q, model.available)
+        return image.ravel(), policy
 
-    def evaluate(v: jax.Array, policy: jax.Array) -> jax.Array:
+    def step(_, carry, __):
+        _, image, policy = carry
         chain = induced_chain(model, policy)
-        gain = action_mean(policy, reward)
-        return lax.fori_loop(
-            0, evaluation_sweeps,
-            lambda _, v: gain + discount * expectation(chain, v.ravel())[:, 0].reshape(v.shape), v,
-        )
+        gain = action_mean(policy, reward).ravel()
+        value = lax.fori_loop(
+            0, sweeps, lambda _, v: gain + given.discount * expectation(chain, v)[:, 0], image)
+        return value, *greedy(value)
 
-    def body(carry):
-        _, image, policy, n, _ = carry
-        value = image if method == "value_iteration" else evaluate(image, policy)
-        image, policy = greedy(value)
-        *_, done, exhausted = _certified(model, reward, discount, tolerance, value, image)
-        return value, image, policy, n + 1, done | exhausted | ~jnp.isfinite(image.ravel()[0])
+    def finished(carry, _):
+        return judge(*carry[:2], given)[0]
 
-    def unfinished(carry):
-        *_, n, done = carry
-        return ~done & (n < max_steps)
-
-    zero = jnp.zeros(model.state_shape, model.dtype)
-    start = (zero, *greedy(zero), jnp.int32(1), jnp.bool_(False))
-    value, image, policy, n, _ = lax.stop_gradient(lax.while_loop(unfinished, body, start))
-    solution = _solution(model, reward, discount, tolerance, value, image, policy, n)
-    return _attach(solution, backup)
+    zero = jnp.zeros(model.num_states, model.dtype)
+    start = lax.stop_gradient((zero, *greedy(zero)))
+    (value, image, _), n = lax.stop_gradient(
+        iterate(step, finished, None, start, None, max_steps=max_steps, lanes="mapped"))
+    return value, image, n

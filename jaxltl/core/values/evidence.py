@@ -1,169 +1,140 @@
-"""What certifies a discounted value: MacQueen's bounds with the rounding contained in them."""
+"""What certifies a value: MacQueen's bounds, the M-matrix bound, and the rounding in both."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
-from jaxltl.core.models.operators import (
-    action_mean,
-    expectation,
-    pushforward,
-)
-from jaxltl.core.types import Solution, status_code
-from jaxltl.core.values.fixed_point import implicit, solve_linear
+from jaxltl.core.types import Solution, Status
 
 
-def action_value(
-    model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
-) -> jax.Array:
-    """``Q(s, a) = R(s, a) + discount * sum_t P(t | s, a) V(t)``; zero at unavailable actions.
-
-    Args:
-      model: the model.
-      reward: ``float[S, A]``.
-      discount: scalar.
-      value: ``float[S]``.
-
-    Returns:
-      ``float[S, A]``.
-    """
-    q = reward + discount * expectation(model, value)
-    return jnp.where(model.available, q, 0)
-
-
-def expected_reward(model: Any, reward: jax.Array) -> jax.Array:
-    """A reward on transitions, ``[S, A, K]``, as its expectation ``[S, A]``; ``[S, A]`` as it is.
-
-    Raises:
-      ValueError: the reward has another shape.
-    """
-    actions = (*model.state_shape, model.num_actions)
-    transitions = (*actions, model.num_successors)
-    reward = jnp.asarray(reward, model.dtype)
-    if reward.shape == actions:
-        return reward
-    if reward.shape == transitions:
-        return jnp.sum(model.successor_probability * reward, axis=-1)
-    raise ValueError(f"reward has shape {reward.shape}; expected {actions} or {transitions}.")
-
-
-def _rounding(
-    model: Any, reward: jax.Array, value: jax.Array, gap: jax.Array, axis: int | None = None
-) -> jax.Array:
-    """What rounding in one backup can add to an error, amplified by ``1 / gap``.
+def rounding_unit(model: Any) -> float:
+    """Rounding errors of one backup, relative to the magnitude of what it sums.
 
     A backup sums at most as many products as a state has successors, over which rows may
     also miss one by a rounding each, and takes a maximum or a mean over the actions.
     """
     terms = model.num_successors + model.num_actions + 4
-    magnitude = jnp.max(jnp.abs(reward), axis) + jnp.max(jnp.abs(value), axis)
-    return terms * jnp.finfo(value.dtype).eps * magnitude / gap
+    return terms * float(jnp.finfo(model.dtype).eps)
 
 
-def _macqueen(
-    model: Any, reward: jax.Array, discount: jax.Array, value: jax.Array, image: jax.Array,
-    axis: int | None = None,
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Bounds on the fixed point of a monotone T with ``T(v + c) = T(v) + discount * c``.
+def magnitude(reward: jax.Array, value: jax.Array) -> jax.Array:
+    """The size of what a backup sums: the largest reward and the largest value."""
+    return jnp.max(jnp.abs(reward)) + jnp.max(jnp.abs(value), axis=0)
 
-    ``T v + discount / (1 - discount) * [min, max](T v - v)`` (MacQueen 1966).
 
-    Returns:
-      The shifts (down, up) of `image` that enclose the fixed point, the rounding error
-      contained in them, and whether everything is finite.
+class Enclosure(NamedTuple):
+    """An enclosure seen from an image, and what it shows; a field may have lanes.
+
+    Attributes:
+      shift: from the image to the middle.
+      half: half of the width; infinite without a certificate.
+      converged: whether that is as narrow as asked.
+      exhausted: whether it is mostly rounding, so that further sweeps would not help.
+      finite: whether there is a certificate.
+    """
+
+    shift: jax.Array
+    half: jax.Array
+    converged: jax.Array
+    exhausted: jax.Array
+    finite: jax.Array
+
+    @property
+    def ended(self) -> jax.Array:
+        """Whether there is nothing left to gain."""
+        return self.converged | self.exhausted | ~self.finite
+
+
+def enclose(
+    value: jax.Array,
+    image: jax.Array,
+    discount: jax.Array,
+    rounding: jax.Array,
+    tolerance: jax.Array | None,
+) -> Enclosure:
+    """MacQueen's (1966) bounds on the fixed point of a monotone T with ``T(v + c) = T(v) + g c``.
+
+    ``T v + g / (1 - g) * [min, max](T v - v)`` for the discount g.
+
+    Args:
+      value, image: ``[N, ...]``, v and ``T v``.
+      discount: g; there are no bounds from 1 on.
+      rounding: what one backup can err by.
+      tolerance: half width asked for; None: what the dtype allows.
     """
     change = image - value
     gap = jnp.where(discount < 1, 1 - discount, jnp.nan)
-    rounding = _rounding(model, reward, image, gap, axis)
-    down = discount / gap * jnp.min(change, axis) - rounding
-    up = discount / gap * jnp.max(change, axis) + rounding
-    finite = jnp.isfinite(down) & jnp.isfinite(up)
-    return down, up, rounding, finite
+    rounding = rounding / gap
+    down = discount / gap * jnp.min(change, axis=0) - rounding
+    up = discount / gap * jnp.max(change, axis=0) + rounding
+    return _judged(down, up, rounding, tolerance)
 
 
-def _certified(
-    model: Any,
-    reward: jax.Array,
-    discount: jax.Array,
-    tolerance: jax.Array | float | None,
-    value: jax.Array,
-    image: jax.Array,
-    axis: int | None = None,
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Midpoint shift of the enclosure, its half width, whether that meets the tolerance, and
-    whether it is mostly rounding, so that further sweeps would not help."""
-    down, up, rounding, finite = _macqueen(model, reward, discount, value, image, axis)
+def _judged(down, up, rounding, tolerance) -> Enclosure:
     half = (up - down) / 2
+    finite = jnp.isfinite(half)
     goal = 4 * rounding if tolerance is None else tolerance
-    half = jnp.where(finite, half, jnp.inf)
-    return (up + down) / 2, half, half <= goal, half <= 2 * rounding
-
-
-def _solution(model, reward, discount, tolerance, value, image, policy, num_steps) -> Solution:
-    shift, half, converged, exhausted = _certified(
-        model, reward, discount, tolerance, value, image
-    )
-    finite = jnp.all(jnp.isfinite(image)) & (discount < 1)
-    # Without a certificate the shift is meaningless and the iterate itself is the answer.
-    middle = image + jnp.where(jnp.isfinite(half), shift, 0)
-    return Solution(
-        value=middle,
-        policy=policy,
-        lower=middle - half,
-        upper=middle + half,
-        residual=jnp.max(jnp.abs(image - value)),
-        num_steps=num_steps,
-        status=status_code(converged, finite, exhausted),
+    return Enclosure(
+        shift=jnp.where(finite, (up + down) / 2, 0), half=jnp.where(finite, half, jnp.inf),
+        converged=finite & (half <= goal), exhausted=finite & (half <= 2 * rounding),
+        finite=finite,
     )
 
 
-def _attach(solution: Solution, backup, jacobian: _Jacobian | None = None) -> Solution:
-    """The solution with implicit derivatives on its value, and none on its evidence."""
-    solution = jax.tree.map(lax.stop_gradient, solution)
-    if jacobian is None:
-        return replace(solution, value=implicit(backup, solution.value))
-    value = implicit(
-        backup, solution.value, solve=jacobian.solve, transpose_solve=jacobian.transpose_solve
-    )
-    return replace(solution, value=value)
+def m_matrix_error(
+    model: Any,
+    solve: Callable[[jax.Array], jax.Array],
+    onward: Callable[[jax.Array], jax.Array],
+    value: jax.Array,
+    undecided: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """A certified error of an approximate solution of ``y = P y`` where it is undecided.
 
+    If e >= 0 satisfies ``e - P e >= |r|`` there, where r is the residual of y and P leads nowhere
+    from elsewhere, then ``|y - y*| <= e``, because ``I - P`` is an M-matrix. So a second solve
+    certifies the first, and a check of that inequality, rounding included, is the proof.
 
-class _Jacobian(NamedTuple):
-    """A backup's derivative in the value, ``J x = discount * sum_a w(s, a) (P x)(s, a)``.
+    Args:
+      model: what P belongs to.
+      solve: approximately ``(I - P) x = b``.
+      onward: ``x -> P x``, zero where decided.
+      value: ``float[S]`` in [0, 1], exact where decided.
+      undecided: ``bool[S]``.
 
-    Written out with its weights w, a product with it is far cheaper than what
-    differentiating the backup gives. It only steers solvers: derivatives of any order
-    are those of the backup itself.
+    Returns:
+      The error ``float[S]``, zero where decided and one elsewhere if nothing is proven; the
+      largest residual; and whether it was proven.
     """
+    unit = rounding_unit(model)
+    residual = jnp.where(undecided, jnp.abs(onward(value) - value), 0)
+    claim = jnp.where(undecided, 2 * residual + 4 * unit * (value + 1e-3), 0)
+    error = solve(claim)
+    enough = error - onward(error) >= residual + unit * (value + error)
+    proven = jnp.all(jnp.where(undecided, enough, True) & (error >= 0))
+    error = jnp.where(undecided, jnp.where(proven, error, 1), 0)
+    return error, jnp.max(residual), proven
 
-    model: Any
-    discount: jax.Array
-    weight: jax.Array
 
-    def matvec(self, x: jax.Array) -> jax.Array:
-        return x - self.discount * action_mean(self.weight, expectation(self.model, x))
+def refuse(solution: Solution, policy: jax.Array, valid: jax.Array) -> Solution:
+    """The solution, or one that says that the policy it was asked for is none.
 
-    def solve(self, _, b: jax.Array) -> jax.Array:
-        return solve_linear(self.matvec, b)
+    Args:
+      solution: of whatever the policy was taken for.
+      policy: as it was given, NaN at unavailable actions.
+      valid: whether it is a policy.
+    """
+    def where(good: jax.Array, bad: float) -> jax.Array:
+        return jnp.where(valid, good, jnp.asarray(bad, good.dtype))
 
-    def transpose_solve(self, _, b: jax.Array) -> jax.Array:
-        def vecmat(x: jax.Array) -> jax.Array:
-            return x - self.discount * pushforward(self.model, self.weight * x[..., None])
-
-        return solve_linear(vecmat, b)
-
-    def newton(self, value: jax.Array, image: jax.Array) -> jax.Array:
-        """One inexact step of Newton's method from `value`, whose backup is `image`.
-
-        A plain sweep where the linear solver gets nowhere, as it can in single precision.
-        """
-        change = image - value
-        found = solve_linear(self.matvec, change, tolerance=1e-2, max_steps=48)
-        left = self.matvec(found) - change
-        solved = jnp.sum(left * left) <= jnp.sum(change * change) / 4
-        return value + jnp.where(solved, found, change)
+    return replace(
+        solution, value=where(solution.value, jnp.nan), policy=jnp.where(
+            valid, solution.policy, policy),
+        lower=where(solution.lower, -jnp.inf), upper=where(solution.upper, jnp.inf),
+        residual=where(solution.residual, jnp.nan),
+        status=jnp.where(valid, solution.status, Status.INVALID).astype(jnp.int32),
+    )

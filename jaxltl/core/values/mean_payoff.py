@@ -19,7 +19,7 @@ from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.game import Game, as_game, is_deterministic
 from jaxltl.core.models.operators import induced_chain
 from jaxltl.core.types import Solution, status_code
-from jaxltl.core.values.evidence import expected_reward
+from jaxltl.core.values.discounted import expected_reward
 
 
 def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> Solution:

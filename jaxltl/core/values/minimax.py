@@ -31,8 +31,9 @@ from jaxltl.core.models.operators import (
 )
 from jaxltl.core.models.operators import is_deterministic as is_one_action
 from jaxltl.core.types import Solution, require_shape, status_code
-from jaxltl.core.values.evidence import expected_reward
-from jaxltl.core.values.fixed_point import implicit, solve_linear
+from jaxltl.core.values.discounted import expected_reward
+from jaxltl.core.values.fixed_point import implicit
+from jaxltl.core.values.linear import solve_linear
 
 _METHODS = ("modified_policy_iteration", "value_iteration", "strategy_iteration")
 

@@ -8,12 +8,14 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxltl.core.models.operators import policy_distribution, pushforward
+from jaxltl.core.models.operators import pushforward, require_policy, valid_policy
+from jaxltl.core.models.tables import action_columns, table
 from jaxltl.core.types import Solution, status_code
-from jaxltl.core.values.fixed_point import implicit, solve_linear
+from jaxltl.core.values.evidence import refuse
+from jaxltl.core.values.fixed_point import implicit
+from jaxltl.core.values.linear import System, solver
 
 
-@jax.jit
 def occupancy_measure(
     model: Any,
     policy: jax.Array,
@@ -38,7 +40,7 @@ def occupancy_measure(
       :class:`Solution` whose `value`, `lower` and `upper` are ``float[S, A]``.
 
     Raises:
-      ValueError: policy has the wrong shape.
+      ValueError: policy has the wrong shape, or is none (under ``jit`` the status is INVALID).
 
     Differentiable in the policy, the discount, `initial` and the probabilities.
 
@@ -49,19 +51,26 @@ def occupancy_measure(
       >>> [round(v, 4) for v in x[:, 0].tolist()]
       [1.0, 1.0]
     """
-    policy = policy_distribution(model, policy)
-    discount = jnp.asarray(discount, model.dtype)
+    require_policy(model, policy)
     start = model.initial if initial is None else jnp.asarray(initial, model.dtype)
+    return _occupancy(model, policy, discount, start, tolerance)
+
+
+@jax.jit
+def _occupancy(model, policy, discount, start, tolerance) -> Solution:
+    checked = valid_policy(model, policy)
+    policy = checked.distribution
+    discount = jnp.asarray(discount, model.dtype)
+    start = jnp.broadcast_to(start, model.state_shape)
 
     def flow(d: jax.Array) -> jax.Array:
         return start + discount * pushforward(model, d[..., None] * policy)
 
-    visits = lax.stop_gradient(
-        solve_linear(
-            lambda d: d - (flow(d) - start), jnp.broadcast_to(start, model.state_shape),
-            tolerance=float(jnp.finfo(model.dtype).eps),
-        )
-    )
+    system = System(table(model), action_columns(model.num_actions, policy), discount)
+    linear = solver(system)
+    visits = lax.stop_gradient(linear.transpose_solve(start))
+    # One step more brings down what elimination has left.
+    visits = lax.stop_gradient(visits + linear.transpose_solve(flow(visits) - visits))
     residual = jnp.sum(jnp.abs(flow(visits) - visits))
     gap = jnp.where(discount < 1, 1 - discount, jnp.nan)
     # The operator is a contraction in the sum norm, and each state's inflow may sum up
@@ -74,18 +83,21 @@ def occupancy_measure(
     finite = jnp.isfinite(bound)
     bound = jnp.where(finite, bound, jnp.inf)
     goal = 4 * rounding if tolerance is None else tolerance
-    visits = implicit(flow, visits)
+    visits = implicit(
+        flow, visits, solve=linear.transpose_solve, transpose_solve=linear.solve)
     value = visits[..., None] * policy
     frozen = lax.stop_gradient(value)
-    return Solution(
+    solution = Solution(
         value=value,
         policy=policy,
         lower=lax.stop_gradient(jnp.maximum(frozen - bound, 0)),
         upper=lax.stop_gradient(frozen + bound),
         residual=lax.stop_gradient(residual),
-        num_steps=jnp.int32(1),
-        status=status_code(lax.stop_gradient(bound <= goal), lax.stop_gradient(finite)),
+        num_steps=jnp.int32(2),
+        status=status_code(
+            lax.stop_gradient(bound <= goal), lax.stop_gradient(finite), bound <= 8 * rounding),
     )
+    return refuse(solution, checked.given, checked.valid)
 
 
 def feature_expectation(occupancy: jax.Array, features: jax.Array) -> jax.Array:

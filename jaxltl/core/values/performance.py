@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import lax
-from jax.scipy.linalg import lu_factor, lu_solve
 
 from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.models.batch import is_stacked, num_worlds
@@ -30,6 +29,9 @@ from jaxltl.core.models.operators import (
 )
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Status, require_shape, status_code
+from jaxltl.core.values.evidence import m_matrix_error
+from jaxltl.core.values.linear import inverse
+from jaxltl.core.values.reachability import policy_sets
 from jaxltl.core.values.satisfaction import satisfaction_probability
 
 _BLOCK_LIMIT = 1024  # world states up to which a block is factored
@@ -157,33 +159,20 @@ def _reach(model: Product, target: jax.Array, policy: jax.Array) -> tuple[jax.Ar
 
     ``(I - P) y = b`` on the undecided states is solved block by block: between memory
     states by sweeps, which end exactly when the automaton's only cycles are loops, and
-    within each by its LU factors. The bound: if ``e - P e >= |r|`` for some e >= 0, where r
-    is the residual, then ``|y - y*| <= e``, because ``I - P`` is an M-matrix. That is
-    checked with the rounding of the check itself.
+    within each by its inverse; :func:`~jaxltl.core.values.evidence.m_matrix_error` certifies it.
     """
-    allowed = model.available & (policy > 0)
-    zero = ~attractor(model, target, allowed).region
-    doomed = attractor(model, zero, allowed, among=~target).region
-    undecided = doomed & ~zero
-    one = (~doomed).astype(model.dtype)
+    sets = policy_sets(model, target, policy)
+    undecided = ~(sets.one | sets.zero)
+    one = sets.one.astype(model.dtype)
     solve = _block_solver(model, policy, undecided)
 
-    def matvec(y: jax.Array) -> jax.Array:
-        return y - jnp.where(undecided, action_mean(policy, expectation(model, y)), 0)
+    def onward(y: jax.Array) -> jax.Array:
+        return jnp.where(undecided, action_mean(policy, expectation(model, y)), 0)
 
     value = jnp.where(undecided, solve(one), one)
     # Elimination can break down where rounding closes what leaves a set hardly ever.
     value = jnp.clip(jnp.where(jnp.isfinite(value), value, 0), 0, 1)
-    unit = (model.num_successors + model.num_actions + 4) * jnp.finfo(model.dtype).eps
-    residual = jnp.where(undecided, jnp.abs(matvec(value)), 0)
-    claim = jnp.where(undecided, 2 * residual + 4 * unit * (value + 1e-3), 0)
-    error = solve(claim)
-    proven = jnp.all(
-        jnp.where(undecided, matvec(error) >= residual + unit * (value + error), True)
-        & (error >= 0)
-    )
-    certain = jnp.where(undecided, 1, 0).astype(model.dtype)
-    return value, jnp.where(proven, error, certain)
+    return value, m_matrix_error(model, solve, onward, value, undecided)[0]
 
 
 def _block_solver(model: Product, policy: jax.Array, undecided: jax.Array):
@@ -194,7 +183,7 @@ def _block_solver(model: Product, policy: jax.Array, undecided: jax.Array):
     """
     stays = model.next_memory == jnp.arange(model.num_memory)  # [S, Q]
     inside = jnp.where(undecided.T[:, :, None], _within(model, policy, stays), 0)
-    factors = lu_factor(jnp.eye(inside.shape[-1], dtype=inside.dtype) - inside)
+    inverses = jax.vmap(inverse)(jnp.eye(inside.shape[-1], dtype=inside.dtype) - inside)
 
     def outside(x: jax.Array) -> jax.Array:
         if model.label_on == "exit":
@@ -207,7 +196,7 @@ def _block_solver(model: Product, policy: jax.Array, undecided: jax.Array):
         def sweep(carry):
             x, _, n = carry
             right = b + jnp.where(undecided, outside(x), 0)
-            new = lu_solve(factors, right.T[..., None])[..., 0].T
+            new = jnp.einsum("qst,tq->sq", inverses, right)
             return new, jnp.any(jnp.abs(new - x) > 0), n + 1  # false for NaN
 
         def unfinished(carry):

@@ -26,12 +26,15 @@ from jaxltl.core.models.operators import (
     first_action,
     forall_successor,
     induced_chain,
-    policy_distribution,
-    transition_matrix,
+    require_policy,
+    valid_policy,
 )
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.tables import action_columns, table
 from jaxltl.core.types import Solution, Status, require_shape, status_code
-from jaxltl.core.values.fixed_point import LinearSolver, factorize, implicit, solve_linear
+from jaxltl.core.values.evidence import m_matrix_error, refuse
+from jaxltl.core.values.fixed_point import implicit
+from jaxltl.core.values.linear import Inverse, System, solver
 from jaxltl.core.values.stiff import reachability_bounds
 
 _POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
@@ -46,7 +49,7 @@ _DENSE_LIMIT = 1024  # states up to which a linear system is solved by eliminati
 _PATIENCE = 20_000  # sweeps after which the optimum of a small model is, too
 
 
-class _Sets(NamedTuple):
+class Sets(NamedTuple):
     """What the graph decides: probability one, probability zero, and witnessing actions."""
 
     one: jax.Array
@@ -104,9 +107,8 @@ def reachability_probability(
     target = jnp.asarray(target, bool)
     require_shape("target", target, model.state_shape)
     if policy is not None:
-        policy = policy_distribution(model, policy)
-        sets = _policy_sets(model, target, policy)
-        return _evaluate(model, sets, policy, tolerance, method=method)
+        require_policy(model, policy)
+        return _evaluate(model, target, policy, tolerance, method=method)
     if objective not in ("max", "min"):
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
     sets = _max_sets(model, target) if objective == "max" else _min_sets(model, target)
@@ -127,7 +129,7 @@ def reachability_probability(
     return solution
 
 
-def _complement(reach: Solution) -> Solution:
+def complement(reach: Solution) -> Solution:
     return replace(
         reach, value=1 - reach.value, lower=1 - reach.upper, upper=1 - reach.lower
     )
@@ -136,85 +138,65 @@ def _complement(reach: Solution) -> Solution:
 # --- what the graph decides ----------------------------------------------------------------
 
 
-def _policy_sets(model: Any, target: jax.Array, policy: jax.Array) -> _Sets:
+def policy_sets(model: Any, target: jax.Array, policy: jax.Array) -> Sets:
     allowed = model.available & (policy > 0)
     zero = ~attractor(model, target, allowed).region
     doomed = attractor(model, zero, allowed, among=~target).region
-    return _Sets(~doomed, zero, jnp.zeros(target.shape, jnp.int32))
+    return Sets(~doomed, zero, jnp.zeros(target.shape, jnp.int32))
 
 
-def _max_sets(model: Any, target: jax.Array) -> _Sets:
+def _max_sets(model: Any, target: jax.Array) -> Sets:
     some = attractor(model, target)
     sure = almost_surely_reaching(model, target, reaching=some)
-    return _Sets(sure.region, ~some.region, jnp.where(sure.region, sure.action, some.action))
+    return Sets(sure.region, ~some.region, jnp.where(sure.region, sure.action, some.action))
 
 
-def _min_sets(model: Any, target: jax.Array) -> _Sets:
+def _min_sets(model: Any, target: jax.Array) -> Sets:
     zero = avoidable(model, target)
     doomed = attractor(model, zero, among=~target).region
     stay = model.available & forall_successor(model, zero)
     stays, action = first_action(stay)
-    return _Sets(~doomed, zero, jnp.where(stays, action, first_action(model.available)[1]))
+    return Sets(~doomed, zero, jnp.where(stays, action, first_action(model.available)[1]))
 
 
 # --- a fixed policy: a linear system with a certificate -----------------------------------
 
 
 @partial(jax.jit, static_argnames=("method",))
-def _evaluate(model: Any, sets: _Sets, policy: jax.Array, tolerance, *, method) -> Solution:
-    """Solves ``y = 1_one + (P_pi y) on the undecided states`` and encloses the answer.
-
-    If e > 0 satisfies ``e - P e >= |r|`` there, where r is the residual of y, then
-    ``|y - y*| <= e``, because ``I - P`` is an M-matrix. So a second solve certifies the
-    first, and a check of that inequality is the proof.
-    """
+def _evaluate(model: Any, target: jax.Array, policy: jax.Array, tolerance, *, method) -> Solution:
+    """Solves ``y = 1_one + (P_pi y) on the undecided states`` and encloses the answer."""
+    checked = valid_policy(model, policy)
+    policy = checked.distribution
+    sets = policy_sets(model, target, policy)
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
+    weight = action_columns(model.num_actions, policy)
+    system = lax.stop_gradient(
+        System(table(model), weight, undecided.ravel().astype(model.dtype)))
+    linear = solver(system, method)
 
-    def backup(y: jax.Array) -> jax.Array:
-        return jnp.where(undecided, action_mean(policy, expectation(model, y)), one)
+    def onward(y: jax.Array) -> jax.Array:
+        return jnp.where(undecided, action_mean(policy, expectation(model, y)), 0)
 
-    def matvec(y: jax.Array) -> jax.Array:
-        return y - jnp.where(undecided, action_mean(policy, expectation(model, y)), 0)
-
-    solve, transpose_solve = _linear_solvers(model, policy, undecided, method)
-    value = lax.stop_gradient(solve(matvec, one))
-    value = jnp.clip(jnp.where(undecided, value, one), 0, 1)
-    terms = model.num_successors + model.num_actions + 4
-    unit = terms * jnp.finfo(model.dtype).eps
-    residual = jnp.abs(backup(value) - value)
-    claim = jnp.where(undecided, 2 * residual + 4 * unit * (value + 1e-3), 0)
-    error = solve(matvec, claim)
-    proven = jnp.all(
-        jnp.where(undecided, matvec(error) >= residual + unit * (value + error), True)
-        & (error >= 0)
-    )
-    error = jnp.where(proven, error, 1)
+    still = lax.stop_gradient(policy)
+    value = jnp.where(undecided, lax.stop_gradient(linear.solve(one)), one)
+    # Elimination can break down where rounding closes what leaves a set hardly ever.
+    value = jnp.clip(jnp.where(jnp.isfinite(value), value, 0), 0, 1)
+    error, residual, _ = lax.stop_gradient(
+        m_matrix_error(model, linear.solve, onward, value, undecided))
     goal = jnp.sqrt(jnp.finfo(model.dtype).eps) if tolerance is None else tolerance
     solution = Solution(
-        value=value,
-        policy=policy,
-        lower=jnp.maximum(value - error, 0),
-        upper=jnp.minimum(value + error, 1),
-        residual=jnp.max(residual),
-        num_steps=jnp.int32(1),
-        status=status_code(jnp.max(error) <= goal, jnp.all(jnp.isfinite(policy))),
+        value=value, policy=still, lower=jnp.maximum(value - error, 0),
+        upper=jnp.minimum(value + error, 1), residual=residual, num_steps=jnp.int32(2),
+        # What elimination leaves is rounding.
+        status=status_code(
+            jnp.max(error) <= goal, jnp.isfinite(residual), isinstance(linear, Inverse)),
     )
-    solution = jax.tree.map(lax.stop_gradient, solution)
-    value = implicit(backup, solution.value, solve=solve, transpose_solve=transpose_solve)
-    return replace(solution, value=value, policy=policy)
-
-
-def _linear_solvers(
-    model: Any, policy: jax.Array, undecided: jax.Array, method: str
-) -> tuple[LinearSolver, LinearSolver]:
-    """Solvers of ``(I - P_pi) x = b`` on the undecided states, and of its transpose."""
-    num_states = math.prod(model.state_shape)
-    if method == "iterative" or (method == "auto" and num_states > _DENSE_LIMIT):
-        return solve_linear, solve_linear
-    rows = jnp.where(undecided.ravel()[:, None], transition_matrix(model, policy), 0)
-    dense = factorize(jnp.eye(num_states, dtype=rows.dtype) - rows)
-    return dense.solve, dense.transpose_solve
+    found = implicit(
+        lambda y: one + onward(y), lax.stop_gradient(value), solve=linear.solve,
+        transpose_solve=linear.transpose_solve)
+    solution = replace(lax.stop_gradient(solution), value=found, policy=policy)
+    return refuse(solution, checked.given, checked.valid)
 
 
 # --- optima: interval iteration -------------------------------------------------------------
@@ -222,7 +204,7 @@ def _linear_solvers(
 
 @partial(jax.jit, static_argnames=("objective",))
 def _optimize(
-    model, sets: _Sets, components, tolerance, max_steps, bounds=None, *, objective
+    model, sets: Sets, components, tolerance, max_steps, bounds=None, *, objective
 ) -> Solution:
     """Encloses an optimum between a bound that a policy attains and one that is proven.
 

@@ -16,7 +16,7 @@ from jaxltl.core.models.operators import (
 )
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Solution
-from jaxltl.core.values.reachability import _complement, reachability_probability
+from jaxltl.core.values.reachability import complement, reachability_probability
 
 
 def satisfaction_probability(
@@ -54,7 +54,7 @@ def satisfaction_probability(
     reach = reachability_probability(
         model, target, policy=policy, method=method, tolerance=tolerance
     )
-    return _complement(reach) if kind == "safety" else reach
+    return complement(reach) if kind == "safety" else reach
 
 
 def optimal_satisfaction(
@@ -92,12 +92,12 @@ def optimal_satisfaction(
         return reachability_probability(model, model.final, objective=objective, **limits)
     if kind == "safety":
         opposite = "min" if objective == "max" else "max"
-        return _complement(
+        return complement(
             reachability_probability(model, ~model.final, objective=opposite, **limits)
         )
     if objective == "min":
         negated = replace(model, automaton=_shifted(model.automaton))
-        return _complement(optimal_satisfaction(negated, **limits))
+        return complement(optimal_satisfaction(negated, **limits))
     accepting = accepting_end_components(model)
     reach = reachability_probability(model, accepting.region, objective="max", **limits)
     return replace(reach, policy=jnp.where(accepting.region, accepting.action, reach.policy))
