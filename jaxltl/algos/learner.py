@@ -164,8 +164,9 @@ def run_until(
       state: where to go on from.
       problem, hparams: arrays; new values do not recompile.
       until: ``(before, after, metrics) -> bool[]``: the states before and after some steps and
-        the metrics of the last of them. With ``jax.tree_util.Partial(function, *numbers)`` new
-        numbers do not recompile, with a new function they do.
+        the metrics of the last of them. Traced numbers go into
+        ``jax.tree_util.Partial(function, *numbers)``, with which new ones do not recompile; a new
+        function does.
       num_steps: steps at most; traced.
       check_every: steps between `before` and `after`; static.
       keep: which state a run ends with that met the condition, ``"after"`` or ``"before"``: the

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 
 from jaxltl.algos import learner, pac, rmax
 from jaxltl.app.learn import plain
@@ -169,10 +170,12 @@ def _learn(
     key: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, most: jax.Array
 ) -> learner.Learned:
     """Until the strategy rests, or for so many moves."""
-    def rests(before: rmax.State, after: rmax.State, metrics: rmax.Metrics) -> jax.Array:
-        return (after.moves - after.last_update >= REST) | (after.moves >= most)
+    return rmax.train_until(
+        key, problem, hparams, until=Partial(_rests, most), num_steps=10**6)
 
-    return rmax.train_until(key, problem, hparams, until=rests, num_steps=10**6)
+
+def _rests(most: Any, before: rmax.State, after: rmax.State, metrics: rmax.Metrics) -> jax.Array:
+    return (after.moves - after.last_update >= REST) | (after.moves >= most)
 
 
 def _timed(job: Callable[[], Any]) -> tuple[Any, float]:
