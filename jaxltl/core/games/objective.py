@@ -33,9 +33,9 @@ class Parity:
       num_priorities: priorities are below it; static.
     """
 
-    priority: jax.Array
-    won: jax.Array
-    lost: jax.Array
+    priority: jax.Array | np.ndarray
+    won: jax.Array | np.ndarray
+    lost: jax.Array | np.ndarray
     num_priorities: int = struct.field(pytree_node=False)
 
 
@@ -52,9 +52,9 @@ class GR1:
       lost: ``bool[S]``.
     """
 
-    assumptions: jax.Array
-    guarantees: jax.Array
-    lost: jax.Array
+    assumptions: jax.Array | np.ndarray
+    guarantees: jax.Array | np.ndarray
+    lost: jax.Array | np.ndarray
 
 
 def states_where(model: Any, condition: States, place: str = "condition") -> jax.Array:
@@ -146,7 +146,7 @@ def parity(
 
 
 def _parity(
-    game: Any, priority: Any, num_priorities: int, safe: States, won: jax.Array | None = None
+    game: Any, priority: Any, num_priorities: int, safe: States, won: Any = None
 ) -> Parity:
     """Priorities, and what is won; unsafe states that are not won are lost."""
     priority = priority if is_traced(priority) else np.asarray(priority)
@@ -186,7 +186,7 @@ def gr1(
     def rows(sets: Sequence[States], name: str) -> jax.Array:
         if isinstance(sets, str | Formula):
             raise ValueError(f"{name} is {str(sets)!r}; give a list of sets of states.")
-        found = [states_where(game, x, f"{name}[{i}]") for i, x in enumerate(sets)]
+        found: list[Any] = [states_where(game, x, f"{name}[{i}]") for i, x in enumerate(sets)]
         xp, *found = namespace(*found or [np.ones(game.state_shape, bool)])
         return to_jax(xp.stack(found))
 

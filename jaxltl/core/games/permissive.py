@@ -106,9 +106,10 @@ def permissive_strategy(
         raise ValueError(f"method={method!r}; choose one of {', '.join(METHODS)}.")
     if bound is not None and bound < 1:
         raise ValueError(f"bound={bound}; it must be at least 1.")
-    game, objective = on_states(as_game(game), spec)
-    graph = _concrete_graph(game, objective)
-    game, objective = jax.tree.map(np.asarray, (game, objective))
+    game, goal = on_states(as_game(game), spec)
+    graph = _concrete_graph(game, goal)
+    objective: Any
+    game, objective = jax.tree.map(np.asarray, (game, goal))
     if isinstance(objective, Parity) and not _closed(graph, objective.won):
         game, objective, origin = _remember_won(game, objective)
         found = permissive_strategy(game, objective, method=method, bound=bound)
@@ -171,14 +172,15 @@ def shield(policy: jax.Array, mask: jax.Array) -> jax.Array:
       ValueError: the mask allows nothing at all, or the shapes differ.
 
     Example:
-      >>> shield(jnp.array([[0.5, 0.25, 0.25]]), jnp.array([[False, True, True]])).tolist()
+      >>> shield(np.array([[0.5, 0.25, 0.25]]), np.array([[False, True, True]])).tolist()
       [[0.0, 0.5, 0.5]]
     """
     xp, policy, mask = namespace(policy, mask)
     if xp is np and not mask.any():
         raise ValueError("the mask allows no move in any state; the specification is "
                          "unrealizable, or the mask is of another game.")
-    some, first = (first_action if xp is np else operators.first_action)(mask)
+    first_of: Any = first_action if xp is np else operators.first_action
+    some, first = first_of(mask)
     if operators.is_deterministic(policy):
         if policy.shape != mask.shape[:-1]:
             raise ValueError(f"policy has shape {policy.shape}; the mask's states have "
@@ -200,7 +202,7 @@ def shield(policy: jax.Array, mask: jax.Array) -> jax.Array:
 class _Arena(NamedTuple):
     """A game with NumPy's arrays, its graph, and what the system is to achieve."""
 
-    game: Game
+    game: Any
     graph: HostGraph
     objective: Any
 
@@ -214,7 +216,7 @@ def _concrete_graph(game: Game, objective: Any = None) -> HostGraph:
 
 
 def _region(arena: _Arena) -> np.ndarray:
-    solve = solve_gr1 if isinstance(arena.objective, GR1) else solve_parity
+    solve: Any = solve_gr1 if isinstance(arena.objective, GR1) else solve_parity
     return solve(arena.graph, arena.game.system, arena.objective).region
 
 
@@ -264,7 +266,8 @@ def _on(game, region, mask, maximal: bool, reason: str, origin: Restriction | No
     """The strategy as it is handed out, with JAX's arrays."""
     base = np.arange(game.mdp.mdp.num_states if _is_lazy(game) else game.num_states, dtype=np.int32)
     state, memory = (base, np.zeros_like(base)) if origin is None else origin[1:]
-    return Permissive(*to_jax((game, region, mask, state, memory)), maximal, reason)
+    game, region, mask, state, memory = to_jax((game, region, mask, state, memory))
+    return Permissive(game, region, mask, state, memory, maximal, reason)
 
 
 def _is_lazy(game: Game) -> bool:
@@ -300,10 +303,11 @@ def _beside(
         propositions=tuple(f"letter_{i}" for i in range(num_letters)), acceptance="parity",
     )
     joint = Product(game.mdp, automaton, np.asarray(letter, np.int32), label_on)
-    return Game(joint, np.broadcast_to(game.system[:, None], joint.state_shape))
+    system: Any = np.broadcast_to(game.system[:, None], joint.state_shape)
+    return Game(joint, system)
 
 
-def _closed(graph: HostGraph, region: np.ndarray) -> bool:
+def _closed(graph: HostGraph, region: Any) -> bool:
     return bool(np.all(~region[..., None] | ~graph.available | graph.forall(region)))
 
 
@@ -347,7 +351,7 @@ def _by_rank(arena: _Arena, region, stay, bound) -> Permissive:
     if not _is_buchi(objective):
         raise ValueError('method="rank" is for Buchi and GR(1) objectives; choose parity.')
     goal = region & (objective.priority == 0)
-    near = attract(graph, goal, stay, rule=game.system, among=region)
+    near: Any = attract(graph, goal, stay, rule=game.system, among=region)
     nearer = _some_nearer(graph, near.rank, region) | goal[..., None]
     mask = stay & (nearer | ~game.system[..., None])
     return _on(game, region, mask, False,
@@ -365,7 +369,7 @@ def _some_nearer(graph: HostGraph, rank: np.ndarray, region: np.ndarray) -> np.n
 def _by_layers(arena: _Arena, region, stay) -> Permissive:
     arena, origin = _explicit(arena, region, stay)
     game, graph, objective = arena
-    layers = gr1_layers(graph, game.system, objective)
+    layers: Any = gr1_layers(graph, game.system, objective)
     region = layers.region
     stay = _staying(graph, region)
     num_goals, num_assumptions = layers.round.shape[:2]

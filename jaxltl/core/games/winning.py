@@ -132,7 +132,7 @@ def almost_sure_buchi(game: Any, accepting: States) -> Winning:
       >>> from jaxltl.core.models.mdp import from_dense
       >>> world = from_dense([[[1.0, 0, 0, 0]], [[0.5, 0.5, 0, 0]], [[0.5, 0, 0, 0.5]],
       ...                     [[0, 0, 0, 1.0]]])
-      >>> almost_sure_buchi(world, jnp.arange(4) == 0).region.tolist()
+      >>> almost_sure_buchi(world, np.arange(4) == 0).region.tolist()
       [True, True, False, False]
     """
     return winning_region(game, buchi(game, accepting))
@@ -167,7 +167,7 @@ def task_game(game: Game, spec: Automaton | Formula | str) -> tuple[Game, Parity
     return joint, Parity(to_jax(priority[:, letter].T), none, none, highest + 1)
 
 
-def objective_at(objective: Parity | GR1, origin: jax.Array) -> Any:
+def objective_at(objective: Parity | GR1, origin: jax.Array | np.ndarray) -> Any:
     """The objective on states that each stand for an original one."""
     _, arrays, origin = namespace(objective, origin)
     states = objective.lost.ndim

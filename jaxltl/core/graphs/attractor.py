@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.concrete import to_jax
@@ -38,7 +39,7 @@ def attractor(
     goal: jax.Array,
     allowed: jax.Array | None = None,
     *,
-    rule: str | jax.Array = "exists",
+    rule: str | jax.Array | np.ndarray = "exists",
     chance: str = "some",
     among: jax.Array | None = None,
 ) -> Attractor:
@@ -66,18 +67,20 @@ def attractor(
     Example:
       >>> from jaxltl.core.models.mdp import from_dense
       >>> mdp = from_dense([[[0, 1.0]], [[0, 1.0]]])
-      >>> attractor(mdp, jnp.array([True, False])).region.tolist()
+      >>> attractor(mdp, np.array([True, False])).region.tolist()
       [True, False]
     """
     if isinstance(rule, str):
         if rule not in ("exists", "forall"):
             raise ValueError(f"rule={rule!r}; choose exists or forall, or give bool[S].")
-        rule = rule == "exists"
+        exists: Any = rule == "exists"
+    else:
+        exists = rule
     if chance not in ("some", "all"):
         raise ValueError(f"chance={chance!r}; choose some or all.")
-    graph = graph_of(model, goal, allowed, rule, among)
-    goal, allowed, rule, among = take(graph, (goal, allowed, rule, among))
-    return to_jax(attract(graph, goal, allowed, rule=rule, chance=chance, among=among))
+    graph = graph_of(model, goal, allowed, exists, among)
+    goal, allowed, exists, among = take(graph, (goal, allowed, exists, among))
+    return to_jax(attract(graph, goal, allowed, rule=exists, chance=chance, among=among))
 
 
 def attract(

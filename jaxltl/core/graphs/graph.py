@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -112,7 +112,7 @@ class TracedGraph:
 
 jax.tree_util.register_dataclass(TracedGraph, data_fields=["model"], meta_fields=[])
 
-Graph = HostGraph | TracedGraph
+Graph: TypeAlias = Any  # a HostGraph with NumPy's arrays, or a TracedGraph with JAX's
 
 
 @partial(jax.jit, static_argnames=("chance",))

@@ -10,6 +10,7 @@ import numpy as np
 from jaxltl.core.host.rows import Booleans, Integers, first_action, some_action, spans
 
 SWEEPS = 12  # times the size of the graph that sweeps may cost, before a worklist takes over
+ALL: Any = slice(None)
 FEW = 24  # transitions into a frontier up to which Python's own loop beats NumPy's overhead
 
 
@@ -53,7 +54,7 @@ def _sweep(search: Search) -> bool:
     """Rounds over the states that are open; whether nothing joins any more."""
     graph, num_memory = search.graph, search.graph.num_memory
     forced = not search.rule.all()
-    rows, part = graph.rows, slice(None)
+    rows, part = graph.rows, ALL
     size, left = graph.rows.num_states, SWEEPS * (rows.successor.size + search.open.size)
     while True:
         world = np.flatnonzero(search.open.any(-1) if num_memory > 1 else search.open)
@@ -100,14 +101,11 @@ def _join(search: Search, part: Any, new: Booleans, first: Integers) -> None:
 def _work(search: Search) -> None:
     """Finishes by a worklist: each transition is touched once more."""
     worklist = _worklist(search)
-    frontier: Any = np.flatnonzero(search.region & (search.rank == search.round)).tolist()
-    while len(frontier):
+    frontier: Integers = np.flatnonzero(search.region & (search.rank == search.round))
+    while frontier.size:
+        frontier = _join_few(worklist, frontier)
         search.round += 1
-        few = _few_into(worklist, frontier)
-        if few is None:
-            frontier = _join_pairs(worklist, _into(worklist, np.asarray(frontier)))
-        else:
-            frontier = _join_few(worklist, few)
+        frontier = _join_pairs(worklist, _into(worklist, frontier))
 
 
 class _Worklist(NamedTuple):
@@ -182,48 +180,43 @@ def _join_pairs(worklist: _Worklist, pairs: Integers) -> Integers:
     return frontier
 
 
-def _few_into(worklist: _Worklist, frontier: Any) -> list[int] | None:
-    """As :func:`_into` by plain loops; None where there are too many.
+def _join_few(worklist: _Worklist, frontier: Integers) -> Integers:
+    """Rounds by plain loops while frontiers are small; the first one that is not.
 
     Along a chain every frontier is small, and there are very many.
     """
-    if len(frontier) > FEW:
-        return None
-    graph, view = worklist.search.graph, worklist.view
+    search, view = worklist.search, worklist.view
+    graph, few = search.graph, frontier.tolist() if frontier.size <= FEW else []
+    num_actions, num_memory, on_entry = graph.num_actions, graph.num_memory, graph.on_entry
     start, row, memory = view["start"], view["pair"], view["memory"]
-    num_actions, num_memory = graph.num_actions, graph.num_memory
-    found: list[int] = []
-    for state in frontier:
-        target, after = divmod(int(state), num_memory)
-        first, last = start[target], start[target + 1]
-        if len(found) + (last - first) * num_memory > FEW:
-            return None
-        if num_memory == 1:
-            found += row[first:last]
-            continue
-        for pair in row[first:last]:
-            s, a = divmod(pair, num_actions)
-            read = (target if graph.on_entry else s) * num_memory
-            found += [(s * num_memory + q) * num_actions + a
-                      for q in range(num_memory) if memory[read + q] == after]
-    return found
-
-
-def _join_few(worklist: _Worklist, pairs: list[int]) -> list[int]:
-    """As :func:`_join_pairs` by plain loops."""
-    view, num_actions = worklist.view, worklist.search.graph.num_actions
     missing, waiting, remaining = view["missing"], view["waiting"], view["remaining"]
-    rule, open_ = view["rule"], view["open"]
-    frontier = []
-    for pair in sorted(pairs):
-        missing[pair] -= 1
-        if missing[pair] > 0 or not waiting[pair]:
-            continue
-        waiting[pair] = False
-        state, a = divmod(pair, num_actions)
-        remaining[state] -= 1
-        if (rule[state] or not remaining[state]) and open_[state]:
-            open_[state], view["region"][state] = False, True
-            view["action"][state], view["rank"][state] = a, worklist.search.round
-            frontier.append(state)
-    return frontier
+    rule, open_, region = view["rule"], view["open"], view["region"]
+    while few:
+        pairs: list[int] = []
+        for state in few:
+            target, after = divmod(state, num_memory)
+            first, last = start[target], start[target + 1]
+            if len(pairs) + (last - first) * num_memory > FEW:
+                return np.array(few)
+            if num_memory == 1:
+                pairs += row[first:last]
+                continue
+            for pair in row[first:last]:
+                s, a = divmod(pair, num_actions)
+                read = (target if on_entry else s) * num_memory
+                pairs += [(s * num_memory + q) * num_actions + a
+                          for q in range(num_memory) if memory[read + q] == after]
+        search.round += 1
+        few = []
+        for pair in sorted(pairs):
+            missing[pair] -= 1
+            if missing[pair] > 0 or not waiting[pair]:
+                continue
+            waiting[pair] = False
+            state, a = divmod(pair, num_actions)
+            remaining[state] -= 1
+            if (rule[state] or not remaining[state]) and open_[state]:
+                open_[state], region[state] = False, True
+                view["action"][state], view["rank"][state] = a, search.round
+                few.append(state)
+    return frontier if frontier.size > FEW else np.array([], int)

@@ -120,8 +120,9 @@ class HostGraph:
             open=(among & ~goal).reshape(shape),
         )
         attract(search)
-        return tuple(x.reshape(self.state_shape)
-                     for x in (search.region, search.action, search.rank))
+        shape = self.state_shape
+        return search.region.reshape(shape), search.action.reshape(shape), (
+            search.rank.reshape(shape))
 
     def components(
         self, core: Booleans, allowed: Booleans, closed: bool

@@ -86,7 +86,7 @@ class Rows:
             part = self.matrix[rows]
             return Rows(part.indptr, part.indices, self.num_states)
         count = self.count[rows]
-        start = np.concatenate([[0], count.cumsum()])
+        start: Integers = np.concatenate([[0], count.cumsum()])
         return Rows(start, self.successor[spans(self.entry_start[rows], count)], self.num_states)
 
     @cached_property
@@ -122,11 +122,11 @@ def rows_of(successor: Integers, used: Booleans, num_states: int) -> Rows:
       ([0, 1, 3], [1, 0, 1])
     """
     width = used.shape[-1]
-    index = np.int32 if used.size < 2**31 else np.int64
+    index: Any = np.int32 if used.size < 2**31 else np.int64
     if used.all():
-        start = np.arange(0, used.size + 1, width, dtype=index)
-        return Rows(start, successor.reshape(-1), num_states)
-    start = np.zeros(used.size // width + 1, index)
+        every: Integers = np.arange(0, used.size + 1, width, dtype=index)
+        return Rows(every, successor.reshape(-1), num_states)
+    start: Integers = np.zeros(used.size // width + 1, index)
     start[1:] = np.cumsum(used.ravel(), dtype=index)[width - 1 :: width]
     return Rows(start, successor[used], num_states)
 
@@ -134,7 +134,7 @@ def rows_of(successor: Integers, used: Booleans, num_states: int) -> Rows:
 def rows_of_matrix(used: Booleans) -> Rows:
     """Rows from a full support, ``bool[..., S]``."""
     flat = used.reshape(-1, used.shape[-1])
-    start = np.concatenate([[0], flat.sum(-1).cumsum()])
+    start: Integers = np.concatenate([[0], flat.sum(-1).cumsum()])
     return Rows(start, np.nonzero(flat)[1].astype(np.int32), used.shape[-1])
 
 
@@ -144,8 +144,8 @@ def rows_of_matrix(used: Booleans) -> Rows:
 def some_action(mask: Booleans) -> Booleans:
     """Whether a mask ``bool[..., A]`` holds for some action."""
     if mask.shape[-1] > _FEW:
-        return mask.any(-1)
-    some = mask[..., 0].copy()
+        return np.any(mask, -1, keepdims=True)[..., 0]
+    some: Booleans = mask[..., 0].copy()
     for a in range(1, mask.shape[-1]):
         some |= mask[..., a]
     return some
@@ -154,9 +154,10 @@ def some_action(mask: Booleans) -> Booleans:
 def first_action(mask: Booleans) -> tuple[Booleans, Integers]:
     """Whether a mask ``bool[..., A]`` holds for some action, and the first one (or 0)."""
     if mask.shape[-1] > _FEW:
-        return mask.any(-1), mask.argmax(-1).astype(np.int32)
+        return np.any(mask, -1, keepdims=True)[..., 0], mask.argmax(-1).astype(np.int32)
     # Counting the actions before the first one is ten times faster than writing where it is.
-    some, action = mask[..., 0].copy(), np.zeros(mask.shape[:-1], np.int8)
+    some: Booleans = mask[..., 0].copy()
+    action = np.zeros(mask.shape[:-1], np.int8)
     for a in range(1, mask.shape[-1]):
         action += ~some
         some |= mask[..., a]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import chex
 import jax
@@ -234,6 +235,7 @@ def to_dense(mdp: MDP) -> DenseMDP:
     num_states, num_actions = mdp.num_states, mdp.num_actions
     shape = num_states, num_actions, num_states
     place = np.arange(num_states)[:, None, None], np.arange(num_actions)[:, None]
+    transition: Any
     if is_traced(mdp):
         empty = jnp.zeros(shape, mdp.dtype)
         transition = empty.at[*place, mdp.successor].add(mdp.probability)

@@ -51,7 +51,7 @@ class Product:
 
     mdp: MDP | DenseMDP
     automaton: Automaton
-    letter: jax.Array
+    letter: jax.Array | np.ndarray
     label_on: str = struct.field(pytree_node=False, default="entry")
 
     @property
