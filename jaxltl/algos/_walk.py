@@ -48,7 +48,7 @@ class Seen(NamedTuple):
 class Walk(NamedTuple):
     """What changes from move to move; `left` moves remain, none once there is something new.
 
-    Counts and rewards are flat. `pair` is of the last move, `seen` its reward, `known` whether
+    `pair` is of the last move, `seen` its reward, `known` whether
     the pair has become known by it, and `fresh` whether a known pair has shown a transition
     for the first time.
     """
@@ -68,7 +68,7 @@ class Walk(NamedTuple):
 def walk_from(state: Any, moves: jax.Array) -> Walk:
     zero, false = jnp.int32(0), jnp.bool_(False)
     return Walk(
-        state.moves, moves, state.position, state.counts.ravel(), state.reward.ravel(),
+        state.moves, moves, state.position, state.counts, state.reward,
         zero, jnp.zeros((), state.reward.dtype), false, false, state.fault,
     )
 
@@ -107,13 +107,15 @@ def record(walk: Walk, seen: Seen, rules: Rules, active: jax.Array) -> Walk:
     game = rules.problem.game
     width, pair = game.num_successors, seen.state * game.num_actions + seen.action
     slot = successor_slot(game, seen.state, seen.action, seen.successor)
-    entry = pair * width + slot
+    # Not flat: arrays that are reshaped in a loop are copied in every pass.
+    place = (seen.state, seen.action)
+    entry = (*place, slot)
     # Written before it is read: the other way round whole arrays would be copied. Without
     # chance a pair is known after one move, the last of a walk, which is noted after it.
     counts = walk.counts if width == 1 else _counted(walk.counts, entry, active)
-    row = take(counts, pair * width + jnp.arange(width))
-    was_known, first = take(rules.known_at.ravel(), pair) >= 0, row[slot] == 1
-    alone = jnp.sum(take(game.mdp.probability.reshape(-1, width), pair) > 0) == 1
+    row = take(counts, place)
+    was_known, first = take(rules.known_at, place) >= 0, row[slot] == 1
+    alone = jnp.sum(take(game.mdp.probability, place) > 0) == 1
     enough = alone | (jnp.sum(row).astype(game.dtype) >= rules.enough)
     known = active & ~was_known & enough
     fresh = active & was_known & first & rules.every & (width > 1)
@@ -136,13 +138,14 @@ def note_last(walk: Walk, problem: Any) -> Walk:
     """In a game without chance, the last move of a walk if it made its pair known."""
     if problem.game.num_successors > 1:
         return walk
+    entry = (*jnp.divmod(walk.pair, problem.game.num_actions), 0)
     return walk._replace(
-        counts=_counted(walk.counts, walk.pair, walk.known),
-        reward=_rewarded(walk.reward, walk.pair, walk.seen, walk.known),
+        counts=_counted(walk.counts, entry, walk.known),
+        reward=_rewarded(walk.reward, entry, walk.seen, walk.known),
     )
 
 
-def _counted(counts: jax.Array, entry: jax.Array, once: jax.Array) -> jax.Array:
+def _counted(counts: jax.Array, entry: Any, once: jax.Array) -> jax.Array:
     return counts.at[entry].add(once.astype(counts.dtype), mode="promise_in_bounds")
 
 

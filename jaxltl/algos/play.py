@@ -95,6 +95,6 @@ def successor_slot(
     return jnp.argmax(found, axis=-1).astype(jnp.int32)
 
 
-def take(x: jax.Array, index: jax.Array) -> jax.Array:
+def take(x: jax.Array, index: Any) -> jax.Array:
     """Entries at places that are known to exist, without checks of bounds."""
     return x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)

@@ -126,6 +126,7 @@ class State:
         whether it was.
       reward: ``float[S, A, K]``, the rewards seen; ``R_max / (1 - discount)`` at others.
       known_at: ``int32[S, A]``, the number of moves after which a pair was known; -1 before.
+      num_known: the pairs that are.
       probability, gain: ``float[S, A, K]`` and ``[S, A]``, transitions and expected rewards of
         the optimistic model.
       value: ``float[S]``, its value.
@@ -145,6 +146,7 @@ class State:
     counts: jax.Array
     reward: jax.Array
     known_at: jax.Array
+    num_known: jax.Array
     probability: jax.Array
     gain: jax.Array
     value: jax.Array
@@ -296,7 +298,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     return State(
         key=key, step=jnp.int32(0), moves=jnp.int32(0), position=draw(problem.start_table, word),
         counts=jnp.zeros(shape, jnp.int32), reward=jnp.full(shape, bound, game.dtype),
-        known_at=jnp.full(shape[:2], -1, jnp.int32),
+        known_at=jnp.full(shape[:2], -1, jnp.int32), num_known=jnp.int32(0),
         probability=listed / jnp.maximum(listed.sum(-1, keepdims=True), 1).astype(game.dtype),
         gain=gain, value=value.astype(game.dtype),
         best=problem.allowed & game.system[:, None], error=jnp.zeros((), game.dtype),
@@ -343,7 +345,7 @@ def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
     status = status_code(solved & (state.moves < learner.MOST), jnp.isfinite(state.error))
     return Metrics(
         moves=state.moves,
-        num_known=jnp.sum(state.known_at >= 0, dtype=jnp.int32),
+        num_known=state.num_known,
         last_update=state.last_update, num_updates=state.num_updates,
         value=jnp.sum(problem.start * state.value),
         always_almost_sure=state.always_almost_sure, fault=state.fault,
@@ -482,33 +484,28 @@ def _advance(state: State, problem: Problem, hparams: Hparams, moves: jax.Array)
     return _updated(state, note_last(walk, problem), problem, hparams)
 
 
-def _write(array: jax.Array, place: jax.Array, entry: jax.Array) -> jax.Array:
-    return array.ravel().at[place].set(entry, mode="promise_in_bounds").reshape(array.shape)
-
-
 # --- the model and its solution -------------------------------------------------------------
 
 def _updated(state: State, walk: Walk, problem: Problem, hparams: Hparams) -> State:
     """The state after a walk; with something new, the model and the strategy are too."""
-    game = problem.game
-    width, pair, news = game.num_successors, walk.pair, walk.known | walk.fresh
-    entries = pair * width + jnp.arange(width)
-    listed = take(game.mdp.probability.reshape(-1, width), pair) > 0
-    # Every listed successor is taken to have been seen once, which keeps the graph.
-    row = jnp.where(listed, jnp.maximum(take(walk.counts, entries), 1), 0)
-    share = row / jnp.sum(row).astype(game.dtype)
-    old = take(state.probability.reshape(-1, width), pair)
-    share = jnp.where(walk.known, share, old)
-    gain = jnp.sum(share * take(walk.reward, entries))
-    probability = state.probability.reshape(-1, width).at[pair].set(share)
+    game, news = problem.game, walk.known | walk.fresh
+    place = jnp.divmod(walk.pair, game.num_actions)
+    probability, share = state.probability, take(state.probability, place)
+    if game.num_successors > 1:
+        # Every listed successor is taken to have been seen once, which keeps the graph.
+        listed = take(game.mdp.probability, place) > 0
+        row = jnp.where(listed, jnp.maximum(take(walk.counts, place), 1), 0)
+        share = jnp.where(walk.known, row / jnp.sum(row).astype(game.dtype), share)
+        probability = probability.at[place].set(share, mode="promise_in_bounds")
+    gain = jnp.sum(share * take(walk.reward, place))
+    since = jnp.where(walk.known, walk.moves, take(state.known_at, place))
+    gain = jnp.where(news, gain, take(state.gain, place))
     state = replace(
         state, moves=walk.moves, position=walk.position, fault=walk.fault,
-        counts=walk.counts.reshape(state.counts.shape),
-        reward=walk.reward.reshape(state.reward.shape),
-        known_at=_write(state.known_at, pair, jnp.where(
-            walk.known, walk.moves, take(state.known_at.ravel(), pair))),
-        probability=probability.reshape(state.probability.shape),
-        gain=_write(state.gain, pair, jnp.where(news, gain, take(state.gain.ravel(), pair))),
+        counts=walk.counts, reward=walk.reward, probability=probability,
+        known_at=state.known_at.at[place].set(since, mode="promise_in_bounds"),
+        gain=state.gain.at[place].set(gain, mode="promise_in_bounds"),
+        num_known=state.num_known + walk.known,
         last_update=jnp.where(news, walk.moves, state.last_update),
         num_updates=state.num_updates + news,
     )
