@@ -172,7 +172,7 @@ def cross_entropy():
 
 
 def choice_reset(key):
-    return jax.random.normal(key, (2,))
+    return jax.random.uniform(key, (2,), minval=-1)
 
 
 def choice_step(world, action, key):
@@ -185,10 +185,10 @@ def choice_observe(world):
     return world
 
 
-def trust(method):
+def trust(method, **networks):
     setting = partial(
-        trust_region.Hparams, method=method, num_trajectories=6, hidden=(3,), value_hidden=(3,),
-        cg_steps=3, value_epochs=1, value_batches=2,
+        trust_region.Hparams, method=method, num_trajectories=6, value_hidden=(), cg_steps=3,
+        value_epochs=1, value_batches=2, **networks,
     )
     problem = trust_region.make_problem(
         choice_reset, choice_step, choice_observe, num_actions=2, horizon=4, limit=6.0
@@ -217,8 +217,8 @@ LEARNERS = {
     "q-generalized": partial(q_learning, "generalized"),
     "q-maximin": partial(q_learning, "maximin"),
     "rmax": pac_learning,
-    "trpo": partial(trust, "trpo"),
-    "cpo": partial(trust, "cpo"),
+    "trpo": partial(trust, "trpo", hidden=(), normalize=False),
+    "cpo": partial(trust, "cpo", hidden=(3,)),
     "cce": cross_entropy,
     "cloning": cloning,
 }
