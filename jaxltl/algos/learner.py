@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -227,7 +228,7 @@ def _run_until(step, state, problem, hparams, until, most, check_every, keep, id
         new = _Progress(last, metrics, jnp.where(going, number, now.count), done & going)
         if idle:  # `after` is as it was where nothing is to go on
             metrics = choose(going, metrics, now.metrics)
-            new = new.replace(metrics=metrics, done=new.done | now.done)
+            new = replace(new, metrics=metrics, done=new.done | now.done)
         else:
             new = choose(going, new, now)
         return new, None if window is None else choose(due, new.state, window)
@@ -363,7 +364,7 @@ def run_in_chunks(
     advance = _lane_steps(step, keep, num_lanes)
     while (made := int(np.max(now.count))) < num_steps and not np.all(now.done):
         now, fresh = run(
-            advance, _strong(now), problem, (hparams, until),
+            advance, strong(now), problem, (hparams, until),
             num_steps=min(chunk, num_steps - made), max_rows=max_rows,
         )
         rows = jax.tree.map(
@@ -399,8 +400,8 @@ def _lane_steps(step: Step, keep: str, num_lanes: int | None) -> Step:
         if until is not None:
             done = jnp.asarray(until(now.state, after, metrics))
             state = choose(done, now.state, after) if keep == "before" else after
-            new = choose(now.done, now, new.replace(state=state, done=done))
-            new = new.replace(count=now.count + 1)
+            new = choose(now.done, now, replace(new, state=state, done=done))
+            new = replace(new, count=now.count + 1)
         return new, (new.count, new.metrics)
 
     if num_lanes is None:
@@ -431,7 +432,7 @@ def _spread(hparams: Any, state: Any) -> Any:
     return jax.tree.map(one, hparams)
 
 
-def _strong(tree: Any) -> Any:
+def strong(tree: Any) -> Any:
     """Arrays whose type is not weak, so that the first chunk's program serves the others too."""
 
     def one(x: jax.Array) -> jax.Array:

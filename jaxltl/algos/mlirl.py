@@ -19,13 +19,15 @@ import optax
 from flax import struct
 from jax.flatten_util import ravel_pytree
 
+from jaxltl.algos import _line_search as line_search
 from jaxltl.algos import learner
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.operators import expectation
 from jaxltl.core.models.product import Product, lift_trajectories
 from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.types import Solution, Status, require_shape
+from jaxltl.core.types import Solution, Status, require_shape, worst
 from jaxltl.core.values.boltzmann import boltzmann_value
+from jaxltl.core.values.iterate import in_turn
 from jaxltl.core.values.satisfaction import satisfaction_probability
 from jaxltl.core.values.soft import policy_logits, soft_value
 
@@ -85,7 +87,14 @@ class Hparams:
 
 @struct.dataclass
 class State:
-    """Parameters on their way, with the value that the next solve starts from."""
+    """Parameters on their way, with the value that the next solve starts from.
+
+    Attributes:
+      key, step: the root key and the number of steps made.
+      parameters: of the reward.
+      value: ``float[S]``, of the reward at parameters that are near.
+      optimizer: optax's state, or that of the line search.
+    """
 
     key: jax.Array
     step: jax.Array
@@ -243,15 +252,14 @@ def objective(
     if hparams.mu is not None:
         if not isinstance(problem.model, Product):
             raise ValueError("mu weighs the satisfaction of a task: make the problem in a product.")
-        # Elimination would cost more than the rest; the residual tells if Krylov fails.
-        done = satisfaction_probability(
-            problem.model, jax.nn.softmax(logits, axis=-1), method="iterative"
-        )
+        done = satisfaction_probability(problem.model, jax.nn.softmax(logits, axis=-1))
         total = jnp.sum(problem.satisfaction_weight * done.value)
         loss -= hparams.mu * total
         satisfaction = total / jnp.sum(problem.satisfaction_weight)
+        # A policy that hardly ever leaves some states may have no certificate; what counts in
+        # learning is that its equation is solved.
         solved = done.residual <= jnp.sqrt(jnp.finfo(loss.dtype).eps)
-        status = jnp.where(solved, status, jnp.maximum(status, Status.MAX_STEPS))
+        status = worst(status, jnp.where(solved, Status.CONVERGED, done.status))
     return loss, Objective(-log_likelihood, satisfaction, solution.value, status)
 
 
@@ -260,39 +268,60 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     flat, unravel = ravel_pytree(problem.start)
     noise = jax.random.normal(learner.init_key(key), flat.shape, flat.dtype)
     parameters = unravel(flat + hparams.start_scale * noise)
-    return State(
-        key=key, step=jnp.int32(0), parameters=parameters,
-        value=jnp.zeros(problem.model.state_shape, problem.model.dtype),
-        # optax starts from weakly typed zeros, which a second run would compile anew for.
-        optimizer=jax.tree.map(
-            lambda x: jnp.asarray(x, jnp.result_type(x)), _optimizer(hparams).init(parameters)
-        ),
-    )
+    value = jnp.zeros(problem.model.state_shape, problem.model.dtype)
+    if hparams.optimizer == "lbfgs":
+        shapes = jax.eval_shape(_evaluate, parameters, problem, hparams, value)
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        point = nothing.replace(
+            parameters=parameters, loss=jnp.full_like(nothing.loss, jnp.inf))
+        optimizer = line_search.start(parameters, point)
+    else:
+        optimizer = learner.strong(_optimizer(hparams).init(parameters))
+    return State(key, jnp.int32(0), parameters, value, optimizer)
+
+
+@jax.jit  # so that it is traced once, wherever it stands
+def _evaluate(
+    parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array
+) -> line_search.Point:
+    (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
+        parameters, problem, hparams, initial)
+    return line_search.Point(parameters, loss, gradient, parts)
 
 
 def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """One step of the optimiser on :func:`objective`; deterministic given the state."""
+    """One step of the optimiser on :func:`objective`; deterministic given the state.
 
-    def loss_of(parameters: Any) -> jax.Array:
-        return objective(parameters, problem, hparams, state.value)[0]
+    Under ``vmap`` runs make their steps in turn: each takes as many evaluations as it needs.
+    """
+    return in_turn(_step, state, problem, hparams)
 
-    (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
-        state.parameters, problem, hparams, state.value
-    )
-    updates, optimizer = _optimizer(hparams).update(
-        gradient, state.optimizer, state.parameters, value=loss, grad=gradient, value_fn=loss_of
-    )
+
+@jax.jit
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    if hparams.optimizer == "lbfgs":
+        def evaluate(parameters: Any, before: line_search.Point) -> line_search.Point:
+            return _evaluate(parameters, problem, hparams, _usable(before.parts))
+
+        optimizer, before = line_search.step(evaluate, state.optimizer)
+        parameters, value = optimizer.point.parameters, _usable(optimizer.point.parts)
+    else:
+        before = _evaluate(state.parameters, problem, hparams, state.value)
+        updates, optimizer = _optimizer(hparams).update(
+            before.gradient, state.optimizer, state.parameters)
+        parameters, value = optax.apply_updates(state.parameters, updates), _usable(before.parts)
     metrics = Metrics(
-        loss=loss, neg_log_likelihood=parts.neg_log_likelihood, satisfaction=parts.satisfaction,
-        gradient_norm=optax.tree.norm(gradient), status=parts.status,
+        loss=before.loss, neg_log_likelihood=before.parts.neg_log_likelihood,
+        satisfaction=before.parts.satisfaction, gradient_norm=optax.tree.norm(before.gradient),
+        status=before.parts.status,
     )
-    # A solve that failed would poison the next one's start.
-    usable = parts.status != Status.NONFINITE
-    return State(
-        key=state.key, step=state.step + 1,
-        parameters=optax.apply_updates(state.parameters, updates),
-        value=jnp.where(usable, parts.value, 0), optimizer=optimizer,
-    ), metrics
+    after = State(state.key, state.step + 1, parameters, value, optimizer)
+    return after, metrics
+
+
+def _usable(parts: Objective) -> jax.Array:
+    """The value, or zero where a solve failed, which would poison the next one's start."""
+    return jnp.where(parts.status < Status.NONFINITE, parts.value, 0)
 
 
 def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:

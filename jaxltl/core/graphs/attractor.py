@@ -135,8 +135,14 @@ def almost_surely_reaching(
       :class:`Attractor`: the region and, outside the goal, the actions of such a policy.
     """
     graph = graph_of(model, goal, allowed, reaching)
-    xp = graph.xp
-    goal, allowed, found = take(graph, (goal, allowed, reaching))
+    goal, allowed, reaching = take(graph, (goal, allowed, reaching))
+    return to_jax(surely(graph, goal, allowed, reaching=reaching))
+
+
+def surely(
+    graph: Graph, goal: Any, allowed: Any = None, *, reaching: Attractor | None = None
+) -> Attractor:
+    """:func:`almost_surely_reaching` on a graph."""
     allowed = graph.available if allowed is None else allowed & graph.available
 
     def inner(region: Any) -> Attractor:
@@ -147,8 +153,8 @@ def almost_surely_reaching(
     def body(carry):
         found, _ = carry
         smaller = inner(found.region)
-        return smaller, xp.any(smaller.region != found.region)
+        return smaller, graph.xp.any(smaller.region != found.region)
 
-    found = attract(graph, goal, allowed) if found is None else found
+    found = attract(graph, goal, allowed) if reaching is None else reaching
     # A state that cannot reach the goal at all is what removes others.
-    return to_jax(graph.repeat(body, (found, ~xp.all(found.region)))[0])
+    return graph.repeat(body, (found, ~graph.xp.all(found.region)))[0]

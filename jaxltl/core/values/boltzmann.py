@@ -192,8 +192,8 @@ def boltzmann_fixed_points(
       model, reward, discount: as in :func:`boltzmann_value`.
       key: a PRNG key, consumed.
       num_starts: starts for each of the two methods.
-      tolerance: fixed points nearer than this (sup norm) are one; the residual allowed is a tenth of
-        it times ``1 - discount``.
+      tolerance: fixed points nearer than this (sup norm) are one; the residual allowed is a
+        tenth of it times ``1 - discount``.
 
     Returns:
       Converged solutions, ordered by the sum of their values. Works on the host.

@@ -20,6 +20,7 @@ from flax import struct
 from jax import lax
 
 from jaxltl.core.graphs.attractor import attractor
+from jaxltl.core.graphs.graph import TracedGraph
 from jaxltl.core.models.batch import is_stacked, num_worlds
 from jaxltl.core.models.operators import (
     action_mean,
@@ -161,7 +162,7 @@ def _reach(model: Product, target: jax.Array, policy: jax.Array) -> tuple[jax.Ar
     states by sweeps, which end exactly when the automaton's only cycles are loops, and
     within each by its inverse; :func:`~jaxltl.core.values.evidence.m_matrix_error` certifies it.
     """
-    sets = policy_sets(model, target, policy)
+    sets = policy_sets(TracedGraph(model), target, policy)
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
     solve = _block_solver(model, policy, undecided)

@@ -14,18 +14,22 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
-from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor, avoidable
-from jaxltl.core.graphs.end_components import EndComponents, end_components
-from jaxltl.core.models.concrete import is_traced
+from jaxltl.core.graphs.attractor import attract, avoid, surely
+from jaxltl.core.graphs.end_components import EndComponents, components_within
+from jaxltl.core.graphs.graph import Graph, TracedGraph, graph_of, take
+from jaxltl.core.host import reach as host
+from jaxltl.core.models.concrete import is_traced, namespace, to_jax
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.mdp import DenseMDP, support
 from jaxltl.core.models.operators import (
     action_argmax,
     action_mean,
     expectation,
-    first_action,
-    forall_successor,
     induced_chain,
+    is_deterministic,
     require_policy,
     valid_policy,
 )
@@ -35,18 +39,10 @@ from jaxltl.core.types import Solution, Status, require_shape, status_code
 from jaxltl.core.values.evidence import m_matrix_error, refuse
 from jaxltl.core.values.fixed_point import implicit
 from jaxltl.core.values.linear import Inverse, System, solver
-from jaxltl.core.values.stiff import reachability_bounds
 
 _POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
-
-
 _FAR_SWEEPS = 6  # sweeps of a guess, or of interval iteration after one that failed
-
-
-_DENSE_LIMIT = 1024  # states up to which a linear system is solved by elimination
-
-
-_PATIENCE = 20_000  # sweeps after which the optimum of a small model is, too
+_HOST_LIMIT = 1024  # states up to which a concrete model is solved on the host, by elimination
 
 
 class Sets(NamedTuple):
@@ -71,9 +67,10 @@ def reachability_probability(
 
     The least solution of ``y = 1`` on the target, ``y = sum_a pi(s, a) (P y)(s, a)``
     elsewhere (2.5); for optima with a maximum or minimum over available actions
-    (Baier and Katoen 2008, section 10.6). Optima: interval iteration (Haddad and
-    Monmege 2018) with maximal end components collapsed and each bound rounded outwards;
-    where that makes hardly any progress on a small model, policy iteration, proven.
+    (Baier and Katoen 2008, section 10.6). Small concrete models are solved on the host by
+    elimination and policy iteration, and nothing is compiled. Other optima: interval iteration
+    (Haddad and Monmege 2018) with maximal end components collapsed and each bound rounded
+    outwards.
 
     Args:
       model: the model.
@@ -81,7 +78,7 @@ def reachability_probability(
       policy: ``float[S, A]`` or ``int32[S]``: evaluate this policy. Default: optimise.
       objective: ``"max"`` or ``"min"``; ignored when a policy is given.
       method: for a given policy: ``"direct"`` (elimination, however slowly the policy
-        makes progress), ``"iterative"`` (Krylov), or ``"auto"``, direct up to 1024 states.
+        makes progress), ``"iterative"`` (Krylov), or ``"auto"``, direct for small models.
       tolerance: half the width of the enclosure asked for; default the square root of
         the dtype's precision.
       max_steps: sweeps at most.
@@ -104,70 +101,158 @@ def reachability_probability(
     """
     if method not in ("auto", "direct", "iterative"):
         raise ValueError(f"method={method!r}; choose auto, direct or iterative.")
-    target = jnp.asarray(target, bool)
-    require_shape("target", target, model.state_shape)
-    if policy is not None:
-        require_policy(model, policy)
-        return _evaluate(model, target, policy, tolerance, method=method)
     if objective not in ("max", "min"):
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
-    sets = _max_sets(model, target) if objective == "max" else _min_sets(model, target)
+    require_shape("target", target, model.state_shape)
+    traced = is_traced((model, target, policy, tolerance, max_steps))
+    small = not traced and math.prod(model.state_shape) <= _HOST_LIMIT
+    if policy is not None:
+        require_policy(model, policy)
+        found = None
+        if small and method != "iterative":
+            found = _policy_on_host(model, target, policy, tolerance)
+        if found is None:
+            found = _evaluate(model, target, policy, tolerance, max_steps, method=method)
+        return found
+    graph = graph_of(model, target)
+    target = take(graph, target)
+    sets = (max_sets if objective == "max" else min_sets)(graph, target)
     components = None
     if objective == "max":
-        components = end_components(model, ~(sets.one | sets.zero))
-        if not is_traced(components) and not bool(components.inside.any()):
+        components = components_within(graph, ~(sets.one | sets.zero))
+        if not traced and not components.inside.any():
             components = None
-    solve = partial(_optimize, model, sets, components, tolerance, objective=objective)
-    small = math.prod(model.state_shape) <= _DENSE_LIMIT
-    if is_traced((model, sets, tolerance, max_steps)) or not small:
-        return solve(max_steps)
-    solution = solve(jnp.minimum(max_steps, _PATIENCE))
-    if int(solution.status) != Status.CONVERGED and int(max_steps) > _PATIENCE:
-        undecided = ~(sets.one | sets.zero)
-        bounds = reachability_bounds(model, sets.one, undecided, components, objective)
-        solution = solve(max_steps, bounds or (solution.lower, solution.upper))
-    return solution
+    if small:
+        found = _optimum_on_host(model, graph, sets, components, tolerance, objective)
+        if found is not None:
+            return found
+    arguments = to_jax((sets, components))
+    return _optimize(model, *arguments, tolerance, max_steps, objective=objective)
 
 
 def complement(reach: Solution) -> Solution:
-    return replace(
-        reach, value=1 - reach.value, lower=1 - reach.upper, upper=1 - reach.lower
-    )
+    """Of the opposite event, whose probability is one minus this one."""
+    xp, value, lower, upper = namespace(reach.value, reach.lower, reach.upper)
+    one = xp.ones((), value.dtype)
+    found = to_jax((one - value, one - upper, one - lower))
+    return replace(reach, value=found[0], lower=found[1], upper=found[2])
 
 
 # --- what the graph decides ----------------------------------------------------------------
 
 
-def policy_sets(model: Any, target: jax.Array, policy: jax.Array) -> Sets:
-    allowed = model.available & (policy > 0)
-    zero = ~attractor(model, target, allowed).region
-    doomed = attractor(model, zero, allowed, among=~target).region
-    return Sets(~doomed, zero, jnp.zeros(target.shape, jnp.int32))
+def policy_sets(graph: Graph, target: Any, policy: Any) -> Sets:
+    """What a policy's support decides."""
+    allowed = graph.available & (policy > 0)
+    zero = ~attract(graph, target, allowed).region
+    doomed = attract(graph, zero, allowed, among=~target).region
+    return Sets(~doomed, zero, graph.xp.zeros(target.shape, np.int32))
 
 
-def _max_sets(model: Any, target: jax.Array) -> Sets:
-    some = attractor(model, target)
-    sure = almost_surely_reaching(model, target, reaching=some)
-    return Sets(sure.region, ~some.region, jnp.where(sure.region, sure.action, some.action))
+def max_sets(graph: Graph, target: Any) -> Sets:
+    """Where the largest probability is 1 or 0, with actions that attain it."""
+    some = attract(graph, target)
+    sure = surely(graph, target, reaching=some)
+    action = graph.xp.where(sure.region, sure.action, some.action)
+    return Sets(sure.region, ~some.region, action)
 
 
-def _min_sets(model: Any, target: jax.Array) -> Sets:
-    zero = avoidable(model, target)
-    doomed = attractor(model, zero, among=~target).region
-    stay = model.available & forall_successor(model, zero)
-    stays, action = first_action(stay)
-    return Sets(~doomed, zero, jnp.where(stays, action, first_action(model.available)[1]))
+def min_sets(graph: Graph, target: Any) -> Sets:
+    """Where the smallest probability is 1 or 0, with actions that attain it."""
+    zero = avoid(graph, target)
+    doomed = attract(graph, zero, among=~target).region
+    stays, action = graph.first(graph.available & graph.forall(zero))
+    first = graph.first(graph.available)[1]
+    return Sets(~doomed, zero, graph.xp.where(stays, action, first))
+
+
+# --- small concrete models: the host ---------------------------------------------------------
+
+
+def _rows(model: Any) -> np.ndarray:
+    """``float64[A, N, N]``, the transitions of a concrete model."""
+    model = model.mdp if isinstance(model, Game) else model
+    world = model.mdp if isinstance(model, Product) else model
+    dense = isinstance(world, DenseMDP)
+    weight = np.where(support(world), np.asarray(world.transition if dense else world.probability),
+                      0)
+    memory = np.zeros((world.num_states, 1), np.int32)
+    if world is not model:
+        memory = np.asarray(model.next_memory)
+    on_entry = getattr(model, "label_on", "entry") == "entry"
+    return host.transition_rows(
+        None if dense else np.asarray(world.successor), weight, memory, on_entry)
+
+
+def _unit(model: Any) -> float:
+    """Rounding of a backup in double precision."""
+    terms = model.num_successors + model.num_actions + 4
+    return terms * float(np.finfo(np.float64).eps)
+
+
+def _host_solution(model: Any, found: host.Bounds, policy: Any, tolerance: Any) -> Solution | None:
+    """The bounds in the model's precision, rounded outwards; None if wider than asked."""
+    dtype, shape = np.dtype(model.dtype), model.state_shape
+    exact = found.lower == found.upper
+    low, high = (
+        np.where(exact, x, np.nextafter(x.astype(dtype), end)).clip(0, 1).astype(dtype)
+        for x, end in ((found.lower, dtype.type(-1)), (found.upper, dtype.type(2)))
+    )
+    goal = np.sqrt(np.finfo(dtype).eps) if tolerance is None else float(tolerance)
+    if not (high - low <= 2 * goal).all():
+        return None
+    value = found.value.astype(dtype).clip(low, high)
+    arrays = (value.reshape(shape), policy, low.reshape(shape), high.reshape(shape),
+              np.asarray(found.residual, dtype), np.int32(found.rounds),
+              np.int32(Status.CONVERGED))
+    return Solution(*to_jax(arrays))
+
+
+def _policy_on_host(model: Any, target: Any, policy: Any, tolerance: Any) -> Solution | None:
+    table = np.asarray(policy)
+    if is_deterministic(table):
+        table = np.eye(model.num_actions, dtype=model.dtype)[table]
+    graph = graph_of(model)
+    sets = policy_sets(graph, np.asarray(target), table)
+    rows = _rows(model)
+    weight = table.reshape(len(rows[0]), -1).astype(float)
+    chain = np.einsum("sa,ast->st", weight, rows)
+    one, zero = sets.one.ravel(), sets.zero.ravel()
+    found = host.of_policy(chain, one, ~(one | zero), _unit(model))
+    return None if found is None else _host_solution(model, found, table, tolerance)
+
+
+def _optimum_on_host(
+    model: Any, graph: Graph, sets: Sets, components: EndComponents | None, tolerance: Any,
+    objective: str,
+) -> Solution | None:
+    allowed, group = graph.available, np.arange(sets.one.size)
+    if components is not None:
+        allowed, group = allowed & ~components.inside, components.component.ravel()
+    undecided = ~(sets.one | sets.zero)
+    found = host.optimum(
+        _rows(model), allowed.reshape(len(group), -1), group, sets.one.ravel(), undecided.ravel(),
+        1 if objective == "max" else -1, _unit(model))
+    if found is None:
+        return None
+    exits, action = (x.reshape(sets.one.shape) for x in (found.exits, found.action))
+    if components is not None:
+        towards = attract(graph, exits, components.inside).action
+        action = np.where(exits, action, towards)
+    policy = np.where(undecided, action, sets.action).astype(np.int32)
+    return _host_solution(model, found, policy, tolerance)
 
 
 # --- a fixed policy: a linear system with a certificate -----------------------------------
 
 
 @partial(jax.jit, static_argnames=("method",))
-def _evaluate(model: Any, target: jax.Array, policy: jax.Array, tolerance, *, method) -> Solution:
+def _evaluate(model, target, policy, tolerance, max_steps, *, method) -> Solution:
     """Solves ``y = 1_one + (P_pi y) on the undecided states`` and encloses the answer."""
+    target = jnp.asarray(target, bool)
     checked = valid_policy(model, policy)
     policy = checked.distribution
-    sets = policy_sets(model, target, policy)
+    sets = policy_sets(TracedGraph(model), target, policy)
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
     weight = action_columns(model.num_actions, policy)
@@ -203,9 +288,7 @@ def _evaluate(model: Any, target: jax.Array, policy: jax.Array, tolerance, *, me
 
 
 @partial(jax.jit, static_argnames=("objective",))
-def _optimize(
-    model, sets: Sets, components, tolerance, max_steps, bounds=None, *, objective
-) -> Solution:
+def _optimize(model, sets: Sets, components, tolerance, max_steps, *, objective) -> Solution:
     """Encloses an optimum between a bound that a policy attains and one that is proven.
 
     The attained bound ("near") is the lower one of a maximum and the upper one of a
@@ -279,15 +362,14 @@ def _optimize(
         return (jnp.max(jnp.abs(far - near)) > 2 * goal) & (n < max_steps) & moved
 
     top = jnp.where(undecided, 1, one)
-    lower, upper = (one, top) if bounds is None else bounds
-    near, far = (lower, upper) if objective == "max" else (upper, lower)
+    near, far = (one, top) if objective == "max" else (top, one)
     start = (near, far, jnp.bool_(False), jnp.int32(0), jnp.bool_(True))
     near, far, _, n, _ = lax.stop_gradient(lax.while_loop(unfinished, body, start))
     action = best(near)[1]
     if components is not None:
         own = action_argmax(expectation(model, near), leaving)[0]
         exits = undecided & (own >= _collapse(components, own))
-        towards = attractor(model, exits, components.inside).action
+        towards = attract(TracedGraph(model), exits, components.inside).action
         action = jnp.where(exits, action, towards)
     lower, upper = (near, far) if objective == "max" else (far, near)
     value = (lower + upper) / 2

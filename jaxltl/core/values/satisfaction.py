@@ -6,14 +6,12 @@ from dataclasses import replace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.graphs.acceptance import accepting_bottom_components, accepting_end_components
-from jaxltl.core.models.operators import (
-    policy_distribution,
-)
+from jaxltl.core.models.concrete import namespace, to_jax
+from jaxltl.core.models.operators import is_deterministic, require_policy
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Solution
 from jaxltl.core.values.reachability import complement, reachability_probability
@@ -49,8 +47,11 @@ def satisfaction_probability(
     if kind in ("cosafe", "safety"):
         target = model.final if kind == "cosafe" else ~model.final
     else:
-        policy = policy_distribution(model, policy)
-        target = accepting_bottom_components(model, lax.stop_gradient(policy))
+        require_policy(model, policy)
+        support = policy
+        if is_deterministic(policy):
+            support = _one_hot(policy, model.num_actions)
+        target = accepting_bottom_components(model, lax.stop_gradient(support))
     reach = reachability_probability(
         model, target, policy=policy, method=method, tolerance=tolerance
     )
@@ -100,9 +101,15 @@ def optimal_satisfaction(
         return complement(optimal_satisfaction(negated, **limits))
     accepting = accepting_end_components(model)
     reach = reachability_probability(model, accepting.region, objective="max", **limits)
-    return replace(reach, policy=jnp.where(accepting.region, accepting.action, reach.policy))
+    xp, (region, action), chosen = namespace(tuple(accepting), reach.policy)
+    return replace(reach, policy=to_jax(xp.where(region, action, chosen).astype(xp.int32)))
 
 
 def _shifted(automaton: Automaton) -> Automaton:
     """The automaton of the negation; unlike `complement`, for traced tables too."""
     return replace(automaton, priority=automaton.priority + 1, acceptance="parity", state_names=())
+
+
+def _one_hot(policy: Any, num_actions: int) -> Any:
+    xp, table = namespace(policy)
+    return table[..., None] == xp.arange(num_actions)

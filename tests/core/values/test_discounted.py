@@ -241,7 +241,7 @@ def test_a_fixed_point_that_plain_iteration_misses():
     np.testing.assert_allclose(pair, [[-3.273, -2.809], [-1.817, -4.320]], atol=1e-3)
 
     solution = jl.boltzmann_value(CYCLE, jnp.asarray(CYCLE_REWARD), 0.9)
-    with pytest.raises(jl.NotConverged, match="UNCERTIFIED.*certified=False"):
+    with pytest.raises(jl.NotConverged, match=r"UNCERTIFIED.*certified=False"):
         jl.check(solution, certified=False)
     jl.check(solution, certified=False)
     np.testing.assert_allclose(solution.value, [-2.46366, -3.49686], atol=1e-5)

@@ -1,14 +1,13 @@
-"""Optimal reachability where sweeps make hardly any progress, against exact fractions."""
+"""Reachability of small concrete models on the host: exact numbers, and the traced engine."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.graphs.end_components import end_components
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.types import Status
 from jaxltl.core.values.reachability import reachability_probability
-from jaxltl.core.values.stiff import reachability_bounds
 
 RARE = 1e-3
 
@@ -41,8 +40,10 @@ def test_a_loop_that_is_hardly_left(objective, exact):
     assert float(jnp.max(found.upper - found.lower)) <= 2e-8
     assert int(found.policy[1]) == (objective == "max")
     assert found.value[2:].tolist() == [1, 0]
-    few = reachability_probability(sticky_loop(), goal, objective=objective, max_steps=100)
+    few = jax.jit(lambda m, n: reachability_probability(
+        m, goal, objective=objective, max_steps=n))(sticky_loop(), 100)
     assert int(few.status) == Status.MAX_STEPS
+    assert int(few.num_steps) == 100
 
 
 def random_case(rng, size):
@@ -57,21 +58,30 @@ def random_case(rng, size):
     return model, jnp.arange(size) == size - 1
 
 
-@pytest.mark.parametrize("objective", ["max", "min"])
-def test_bounds_hold_those_of_sweeps(objective):
+@pytest.mark.parametrize("objective", ["max", "min", "policy"])
+def test_both_engines_give_the_same_bounds_and_regions(objective):
     rng = np.random.default_rng(3)
+
+    def solve(model, goal, policy):
+        given = {"policy": policy} if objective == "policy" else {"objective": objective}
+        return reachability_probability(model, goal, tolerance=1e-7, **given)
+
+    traced = jax.jit(solve)
     compared = 0
     for _ in range(40):
         model, goal = random_case(rng, 7)
-        plain = reachability_probability(model, goal, objective=objective, tolerance=1e-9)
-        undecided = (plain.lower < 1) & (plain.upper > 0) & ~goal
-        undecided &= plain.lower != plain.upper
-        components = end_components(model, undecided) if objective == "max" else None
-        bounds = reachability_bounds(model, plain.lower == 1, undecided, components, objective)
-        assert bounds is not None
-        compared += int(undecided.any())
-        assert (bounds[0] <= plain.upper).all() and (plain.lower <= bounds[1]).all()
-        assert float(jnp.max(bounds[1] - bounds[0])) < 1e-6
+        policy = jnp.asarray(rng.dirichlet(np.ones(2), 7))
+        one, other = solve(model, goal, policy), traced(model, goal, policy)
+        assert int(one.status) == Status.CONVERGED
+        assert (one.lower <= other.upper).all() and (other.lower <= one.upper).all()
+        for certain in (0, 1):
+            np.testing.assert_array_equal(one.value == certain, other.value == certain)
+        assert float(jnp.max(one.upper - one.lower)) < 1e-6
+        compared += int(((one.lower < one.upper) & (one.value > 1e-3)).any())
+        if objective != "policy":
+            attained = reachability_probability(model, goal, policy=one.policy)
+            reached = attained.upper >= one.lower - 1e-12
+            assert (reached if objective == "max" else attained.lower <= one.upper + 1e-12).all()
     assert compared > 10
 
 
@@ -81,11 +91,7 @@ def test_end_components_choose_together():
         [[[1, 1], [1, 1]], [[0, 0], [2, 3]], [[2, 2]] * 2, [[3, 3]] * 2],
         [[[1, 0]] * 2, [[1, 0], [0.25, 0.75]], [[1, 0]] * 2, [[1, 0]] * 2], initial=[1, 0, 0, 0],
     )
-    undecided = jnp.array([True, True, False, False])
-    bounds = reachability_bounds(
-        model, jnp.arange(4) == 2, undecided, end_components(model, undecided), "max"
-    )
-    assert bounds is not None
-    for bound in bounds:
-        np.testing.assert_allclose(bound, [0.25, 0.25, 1, 0], atol=1e-13)
-    assert (bounds[0] <= bounds[1]).all()
+    found = reachability_probability(model, jnp.arange(4) == 2)
+    np.testing.assert_allclose(found.value, [0.25, 0.25, 1, 0], atol=1e-13)
+    assert (found.lower <= found.upper).all()
+    assert found.policy[1] == 1
