@@ -73,9 +73,10 @@ def save(
     Raises:
       ValueError: the place cannot be written to.
     """
-    arrays: dict[str, Any] = {name: np.asarray(_data(leaf)) for name, leaf in _named(state)}
+    arrays: dict[str, Any] = {_GIVEN: np.array(json.dumps(dict(given or {})))}
+    arrays |= {name: np.asarray(_data(leaf)) for name, leaf in _named(state)}
     with atomic_write(path) as file:
-        np.savez(file, **{_GIVEN: np.array(json.dumps(dict(given or {})))}, **arrays)
+        np.savez(file, **arrays)
 
 
 def load(
