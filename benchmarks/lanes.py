@@ -21,12 +21,8 @@ _TASK = "F (a & X F (b & X F c)) & (!o U c)"
 _MAP = """
 . . . . b .
 . o . . . .
-. . . o . .
-a . . . . .
-. . o . . c
-. . . . . .
-. o . s . .
-. . . . . .
+a . . o . c
+. . s . . .
 """
 
 
@@ -40,7 +36,7 @@ class Case(NamedTuple):
 
 
 def delivery() -> Any:
-    """48 cells beside a task of four memory states: 192 product states."""
+    """24 cells beside a task of eight memory states: 192 product states."""
     world = jl.gridworld(_MAP, slip=0.1, absorbing=["o"], initial="s")
     return jl.product(world, _TASK)
 

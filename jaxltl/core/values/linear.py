@@ -71,10 +71,10 @@ class System(NamedTuple):
                 found = mean(self.weight, self.table.expectation(eye))
             return eye - jnp.broadcast_to(self.scale, (n,))[:, None] * found
         rows = jnp.arange(n)
-        for targets, weights, w in zip(*self.table, self.weight, strict=True):
-            for target, probability in zip(targets, weights, strict=True):
-                eye = eye.at[rows, target].add(-self.scale * w * probability)
-        return eye
+        target = jnp.stack([jnp.stack(x) for x in self.table.successor])  # [A, K, N]
+        weight = jnp.stack([w * jnp.stack(x) for w, x in zip(
+            self.weight, self.table.probability, strict=True)])
+        return eye.at[jnp.broadcast_to(rows, target.shape), target].add(-self.scale * weight)
 
 
 class Inverse(NamedTuple):
@@ -174,6 +174,7 @@ def inverse(matrix: jax.Array) -> jax.Array:
     padded = -(-n // block) * block
     work = jnp.eye(padded, dtype=matrix.dtype).at[:n, :n].set(matrix)
     number = jnp.arange(padded) // block
+    smallest = float(jnp.finfo(matrix.dtype).tiny) ** 0.5
 
     def step(i: jax.Array, a: jax.Array) -> jax.Array:
         start = i * block
@@ -183,6 +184,8 @@ def inverse(matrix: jax.Array) -> jax.Array:
         pivot = _small_inverse(lax.dynamic_slice(rows, (0, start), (block, block)))
         rows = pivot @ jnp.where(inside, 0, rows)
         a = jnp.where(inside, 0, a) - columns @ rows
+        # Products of numbers this small would be denormal, which are slow, and weigh nothing.
+        a = jnp.where(jnp.abs(a) < smallest, 0, a)
         a = lax.dynamic_update_slice(a, -columns @ pivot, (0, start))
         rows = lax.dynamic_update_slice(rows, pivot, (0, start))
         return lax.dynamic_update_slice(a, rows, (start, 0))

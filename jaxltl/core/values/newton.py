@@ -60,7 +60,7 @@ class _Search(NamedTuple):
     z: jax.Array
     value: jax.Array  # the best so far, with its image and the weights of the derivative there
     image: jax.Array
-    weight: list[jax.Array]
+    weight: jax.Array  # [A, N]
     error: jax.Array
     done: jax.Array
     newton: jax.Array  # whether z is a step of Newton's, to be judged
@@ -126,7 +126,7 @@ def solve(
     scalar, none, no = zero[0], jnp.int32(0), jnp.bool_(False)
     start = _Search(
         phase=jnp.int32(_LOOK), z=value, value=value, image=value,
-        weight=[zero] * len(backup.reward), error=jnp.full_like(scalar, jnp.inf), done=no,
+        weight=jnp.stack([zero] * len(backup.reward)), error=jnp.full_like(scalar, jnp.inf), done=no,
         newton=no, plain=jnp.int32(first_sweeps), pause=none, solved=no,
         krylov=start_bicgstab(zero, zero),
         target=scalar, inner=none,
@@ -147,6 +147,7 @@ def _look(
     if not newton:
         sweep = k.z + (1 - given.damping) * (image - k.z)
         return k._replace(z=sweep, value=k.z, image=image, error=error, done=done)
+    weight = jnp.stack(weight)
     kept = ~k.newton | (error <= k.error / 2)  # false for NaN
     if monotone:
         kept |= k.solved & jnp.isfinite(error)
@@ -168,7 +169,7 @@ def _look(
 
 
 def _applied(given: Backup, k: _Search, ahead: Columns) -> jax.Array:
-    return k.z - given.scale * mean(k.weight, ahead)
+    return k.z - given.scale * mean(list(k.weight), ahead)
 
 
 def _first(given: Backup, k: _Search, ahead: Columns) -> _Search:
@@ -190,6 +191,6 @@ def _second(small: bool, given: Backup, k: _Search, ahead: Columns) -> _Search:
 
 def _direct(table: Any, given: Backup, k: _Search, ahead: Columns) -> _Search:
     del ahead
-    matrix = System(table, k.weight, given.scale).matrix()
+    matrix = System(table, list(k.weight), given.scale).matrix()
     z = k.value + inverse(matrix) @ (k.image - k.value)
     return k._replace(phase=jnp.full_like(k.phase, _LOOK), z=z, solved=jnp.ones_like(k.solved))
