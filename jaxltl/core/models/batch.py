@@ -225,7 +225,8 @@ def stack_models(models: Product | Sequence[Product]) -> Product:
     for i, other in enumerate(models):
         if other.mdp.propositions != first.mdp.propositions:
             _like_first(other.mdp, i, first.mdp)
-        if not _equal(other.automaton, first.automaton) or other.label_on != first.label_on:
+        same = _equal(other.automaton, first.automaton)
+        if not same or other.label_on != first.label_on:
             raise ValueError(
                 f"world {i} has another automaton than world 0, so that memory would mean "
                 "another thing; build the products with one, or by stack_products."
@@ -238,7 +239,9 @@ def stack_models(models: Product | Sequence[Product]) -> Product:
     return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(y) for y in x]), *models)
 
 
-def _equal(one: Any, other: Any) -> bool:
+def _equal(one: Automaton, other: Automaton) -> bool:
+    if one.propositions != other.propositions:
+        return False
     kinds: list[Any] = [jax.tree.structure(x) for x in (one, other)]
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=False)
     return bool(kinds[0] == kinds[1]) and all(np.array_equal(x, y) for x, y in pairs)

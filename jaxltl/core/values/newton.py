@@ -126,7 +126,8 @@ def solve(
     scalar, none, no = zero[0], jnp.int32(0), jnp.bool_(False)
     start = _Search(
         phase=jnp.int32(_LOOK), z=value, value=value, image=value,
-        weight=jnp.stack([zero] * len(backup.reward)), error=jnp.full_like(scalar, jnp.inf), done=no,
+        weight=jnp.stack([zero] * len(backup.reward)),
+        error=jnp.full_like(scalar, jnp.inf), done=no,
         newton=no, plain=jnp.int32(first_sweeps), pause=none, solved=no,
         krylov=start_bicgstab(zero, zero),
         target=scalar, inner=none,
