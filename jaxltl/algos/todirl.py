@@ -21,6 +21,8 @@ import optax
 from flax import linen as nn
 from flax import struct
 from jax import lax
+
+from jaxltl.algos import learner
 from jaxltl.core.models.batch import stack_models, stack_observations, training_counts
 from jaxltl.core.models.batch import world as lane
 from jaxltl.core.models.product import Product
@@ -28,8 +30,6 @@ from jaxltl.core.models.tables import Predecessors, predecessors
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values.soft import policy_logits, soft_policy_adjoint, soft_value
-
-from jaxltl.algos import learner
 
 # --- reward networks ---------------------------------------------------------------------------
 

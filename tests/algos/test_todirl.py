@@ -12,8 +12,8 @@ from jax.flatten_util import ravel_pytree
 
 import jaxltl as jl
 from jaxltl.algos import todirl
-from jaxltl.core.models.kernels import predecessors, successors
 from jaxltl.core.models.operators import expectation, pushforward
+from jaxltl.core.models.tables import predecessors, successors
 from tests import reference
 from tests.support import random_representation, stack
 
