@@ -7,7 +7,6 @@ states ``[S]``; a game on a Product has ``[S, Q]``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -18,24 +17,28 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.models.concrete import is_traced
+from jaxltl.core.graphs.attractor import attract
+from jaxltl.core.graphs.graph import Graph, graph_of, take
+from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.game import Game, as_game
 from jaxltl.core.models.operators import (
-    action_argmax,
     action_max,
     action_mean,
-    exists_successor,
     expectation,
-    induced_chain,
+    is_deterministic,
+    require_policy,
+    valid_policy,
 )
-from jaxltl.core.models.operators import is_deterministic as is_one_action
+from jaxltl.core.models.tables import action_columns, mean, table
 from jaxltl.core.types import Solution, require_shape, status_code
-from jaxltl.core.values.discounted import expected_reward
+from jaxltl.core.values import newton
+from jaxltl.core.values.discounted import best_action, expected_reward
+from jaxltl.core.values.evidence import refuse, rounding_unit
 from jaxltl.core.values.fixed_point import implicit
-from jaxltl.core.values.linear import solve_linear
+from jaxltl.core.values.iterate import iterate
+from jaxltl.core.values.linear import DENSE_LIMIT, System, solver
 
-_METHODS = ("modified_policy_iteration", "value_iteration", "strategy_iteration")
+_METHODS = ("policy_iteration", "value_iteration", "strategy_iteration")
 
 
 def minimax_value(
@@ -44,11 +47,10 @@ def minimax_value(
     discount: chex.Numeric,
     *,
     per: str = "move",
-    method: str = "modified_policy_iteration",
+    method: str = "policy_iteration",
     allowed: chex.Array | None = None,
     tolerance: chex.Numeric | None = None,
     max_steps: chex.Numeric = 100_000,
-    evaluation_sweeps: chex.Numeric = 24,
 ) -> Solution:
     """Discounted reward that the system can secure against every environment.
 
@@ -59,23 +61,25 @@ def minimax_value(
 
     The bounds rest on a function h with ``h >= 1 + g P h`` for all moves of both players, the
     discounted time that is left at most: ``|T v - v| <= e`` puts the value within ``e * h`` of
-    v. Each sweep touches every transition once.
+    v. It is what :func:`~jaxltl.core.values.evidence.m_matrix_error` asks of an error, for all
+    choices at once, and found by policy iteration too.
 
     Args:
       game: a Game; any other model is the game in which the system always moves.
       reward: ``float[S, A]`` or ``float[S, A, K]``; what is paid at environment states counts.
       discount: scalar in [0, 1).
       per: ``"move"`` or ``"system_move"``, which moves are discounted.
-      method: ``"modified_policy_iteration"``: between sweeps of the operator, cheap sweeps
-        under both players' greedy choices, kept where they bring the residual down;
-        ``"value_iteration"``; or ``"strategy_iteration"`` (Hoffman and Karp 1966): linear
-        solves, the environment answering best before the system improves.
+      method: ``"policy_iteration"``: linear solves for both players' greedy choices (Pollatschek
+        and Avi-Itzhak 1969), kept where they halve the error, and sweeps where they do not;
+        ``"value_iteration"``, sweeps alone; or ``"strategy_iteration"`` (Hoffman and Karp 1966),
+        the environment answering best before the system improves, which always ends.
       allowed: ``bool[S, A]``, the moves that may be made, such as a permissive strategy's;
         default the available ones. A play that reaches a state without any is worth minus
         infinity, so the system keeps away, and that is the value where it cannot.
       tolerance: certified absolute error asked for; default: what the dtype allows.
-      max_steps: sweeps of the operator at most.
-      evaluation_sweeps: sweeps between them under fixed choices.
+      max_steps: applications of the operator, or of the linear one of fixed choices, at most;
+        in strategy iteration, choices that are looked at. As many again may go into h where
+        not every move is discounted; they are not counted.
 
     Returns:
       :class:`Solution`; `policy` is ``int32[S]``, greedy for both players: the system's part
@@ -107,9 +111,18 @@ def minimax_value(
     moves = game.available
     if allowed is not None:
         require_shape("allowed", allowed, moves.shape)
-        moves = moves & jnp.asarray(allowed, bool)
-    play = _make_play(game, reward, discount, per, moves)
-    return _solve(play, tolerance, max_steps, evaluation_sweeps, method=method)
+    graph = graph_of(game, allowed)
+    xp = graph.xp
+    system, moves = take(graph, (game.system, moves))
+    if allowed is not None:
+        moves = moves & xp.asarray(allowed, bool)
+    # Chance and the environment may lead to where play gets stuck.
+    lost = attract(graph, ~moves.any(axis=-1), moves, rule=~system).region
+    moves = moves & ~lost[..., None] & ~graph.exists(lost)
+    defined = _returns(graph, per, system | lost, moves, xp.zeros_like(lost))
+    moves, live = to_jax((moves, ~lost))
+    return _solve(game, None, moves, live, defined, reward, discount, tolerance, max_steps,
+                  per=per, method=method)
 
 
 def strategy_value(
@@ -120,10 +133,9 @@ def strategy_value(
     *,
     per: str = "move",
     environment: chex.Array | str = "adversarial",
-    method: str = "modified_policy_iteration",
+    method: str = "policy_iteration",
     tolerance: chex.Numeric | None = None,
     max_steps: chex.Numeric = 100_000,
-    evaluation_sweeps: chex.Numeric = 24,
 ) -> Solution:
     """Discounted reward of a strategy of the system, in the worst case or against a policy.
 
@@ -132,21 +144,19 @@ def strategy_value(
     policy. Discounts, methods and bounds are those of :func:`minimax_value`.
 
     Args:
-      game, reward, discount, per, method, tolerance, max_steps, evaluation_sweeps: as in
-        :func:`minimax_value`.
-      strategy: ``int32[S]`` or ``float[S, A]``, read at the system's states only. The rows of
-        a stochastic strategy sum to one. A play that reaches a state where an action is
-        chosen that is not available (-1, say), or none, is worth minus infinity, and so is
-        each state from which it can get there.
+      game, reward, discount, per, method, tolerance, max_steps: as in :func:`minimax_value`.
+      strategy: ``int32[S]`` or ``float[S, A]``, distributions over available moves; read at
+        the system's states only.
       environment: ``"adversarial"``, or a policy ``int32[S]`` or ``float[S, A]``, read at the
         environment's states only.
 
     Returns:
-      :class:`Solution`; `policy` holds both players' choices: ``int32[S]``, or ``float[S, A]``
-      if one of those given is stochastic.
+      :class:`Solution`; `policy` is ``float[S, A]``, both players' choices.
 
     Raises:
-      ValueError: as :func:`minimax_value`; or the strategy has a wrong shape.
+      ValueError: as :func:`minimax_value`; or a row of the strategy or of the environment's
+        policy that is read is no distribution over available moves (under ``jit`` the status is
+        then INVALID).
 
     Differentiable in the reward, the discount, the probabilities and stochastic strategies,
     wherever the environment's best answer is unique.
@@ -169,33 +179,56 @@ def strategy_value(
     game = as_game(game)
     if isinstance(environment, str):
         _require("environment", environment, ("adversarial",))
-        given = [(strategy, game.system, "strategy")]
-    else:
-        given = [(strategy, game.system, "strategy"), (environment, ~game.system, "environment")]
-    moves, fixed, weight = game.available, None, None
-    for policy, states, name in given:
-        moves, fixed, weight = _follow(game, policy, states, name, moves, fixed, weight)
-    play = _make_play(game, reward, discount, per, moves, fixed, weight, follows=len(given))
-    return _solve(play, tolerance, max_steps, evaluation_sweeps, method=method)
+        environment = None
+    given = [("strategy", strategy, game.system)]
+    if environment is not None:
+        given.append(("environment", environment, ~game.system))
+    for name, policy, states in given:
+        kind, shape = "stochastic", game.available.shape
+        if is_deterministic(policy):
+            kind, shape = "of integers", game.state_shape
+        require_shape(f"{name} ({kind})", policy, shape)
+        require_policy(game, policy, states)
+    checked = _joint(game, strategy, environment)
+    graph = graph_of(game, checked)
+    system, used = take(graph, (game.system, checked.used))
+    drawn = graph.xp.ones_like(system) if environment is not None else system
+    moves = graph.available & graph.xp.where(drawn[..., None], used, True)
+    defined = _returns(graph, per, system, moves, drawn)
+    moves, drawn = to_jax((moves, drawn))
+    return _solve(game, checked._replace(used=drawn), moves, None, defined, reward, discount,
+                  tolerance, max_steps, per=per, method=method)
 
 
-def _follow(game, policy, states, name, moves, fixed, weight):
-    """Moves left by a player who plays a policy; with `weight` where they are drawn."""
-    policy = jnp.asarray(policy)
-    deterministic = is_one_action(policy)
-    if deterministic:
-        require_shape(f"{name} (of integers)", policy, game.state_shape)
-        used = policy[..., None] == jnp.arange(game.num_actions)
+class _Drawn(NamedTuple):
+    """Moves of players whose policies are given.
+
+    Attributes:
+      weight: ``float[S, A]``, distributions.
+      given: as they were, NaN at moves that are not available.
+      valid: whether they are distributions.
+      used: ``bool[S, A]``, the moves of positive weight; later ``bool[S]``, where they count.
+    """
+
+    weight: jax.Array
+    given: jax.Array
+    valid: jax.Array
+    used: jax.Array
+
+
+@jax.jit
+def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> _Drawn:
+    """The policies of both players as one; of an environment without one, uniform."""
+    one = valid_policy(game, jnp.asarray(strategy), game.system)
+    if environment is None:
+        weight, given, valid = one
     else:
-        require_shape(f"{name} (stochastic)", policy, moves.shape)
-        used = policy > 0
-    wrong = jnp.any(used & ~game.available, axis=-1, keepdims=True)
-    moves = jnp.where(states[..., None], used & ~wrong, moves)
-    if deterministic:
-        return moves, fixed, weight
-    fixed = states if fixed is None else fixed | states
-    weight = policy if weight is None else jnp.where(states[..., None], policy, weight)
-    return moves, fixed, weight.astype(game.dtype)
+        other = valid_policy(game, jnp.asarray(environment), ~game.system)
+        system = game.system[..., None]
+        weight = jnp.where(system, one.distribution, other.distribution)
+        given = jnp.where(system, one.given, other.given)
+        valid = one.valid & other.valid
+    return _Drawn(weight, given, valid, lax.stop_gradient(weight) > 0)
 
 
 def _require(name: str, value: str, choices: tuple[str, ...]) -> None:
@@ -203,147 +236,113 @@ def _require(name: str, value: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"{name}={value!r}; choose {' or '.join(choices)}.")
 
 
+def _returns(graph: Graph, per: str, goal: Any, moves: Any, drawn: Any) -> Any:
+    """Whether the environment always comes back to a goal, as values per system move need."""
+    _require("per", per, ("move", "system_move"))
+    if per == "move":
+        return np.True_
+    back = attract(graph, goal, moves, rule=drawn).region
+    if graph.xp is np and not back.all():
+        first = tuple(int(i) for i in np.argwhere(~back)[0])
+        raise ValueError(
+            f"from state {first[0] if len(first) == 1 else first} the environment can move "
+            "for ever without the system, and such moves are not discounted with "
+            "per='system_move', so there is no value; use per='move', or give the system "
+            "a move in every cycle."
+        )
+    return back.all()
+
+
 # --- what is played ------------------------------------------------------------------------
 
 
 class _Play(NamedTuple):
-    """A discounted game, its moves pruned so that no play from a live state gets stuck.
+    """A discounted game over numbered states, as the loops read it; lanes may differ in it all.
 
-    `free` marks states whose moves are not discounted; `fixed` those whose moves are drawn by
-    the rows of `weight`. Where neither player draws, both are None.
+    Attributes:
+      system: ``bool[N]``.
+      drawn: ``bool[N]``, where moves are drawn by `weight`; None where nobody's are.
+      weight: columns ``[N]``.
+      horizon: the largest value of h, or infinite, or NaN where there is none.
+      discount: a scalar.
+      unit: relative rounding of a backup.
+      size: the largest reward.
+      tolerance: certified error asked for, or None.
     """
 
-    game: Game
-    reward: jax.Array  # [S, A], zero at moves that are not allowed
+    system: jax.Array
+    drawn: jax.Array | None
+    weight: list[jax.Array] | None
+    horizon: jax.Array
     discount: jax.Array
-    free: jax.Array
-    allowed: jax.Array
-    live: jax.Array
-    defined: jax.Array  # whether the environment always has to return to the system
-    fixed: Any
-    weight: Any
-
-    @property
-    def rate(self) -> jax.Array:
-        return jnp.where(self.live, jnp.where(self.free, 1, self.discount), 0)
-
-    @property
-    def sign(self) -> jax.Array:
-        """What each state's player maximises is sign times the reward."""
-        return jnp.where(self.game.system, 1, -1).astype(self.game.dtype)
-
-    def quantities(self, value: jax.Array) -> jax.Array:
-        return self.reward + self.rate[..., None] * expectation(self.game, value)
-
-    def backup(self, value: jax.Array) -> jax.Array:
-        q = self.quantities(value)
-        best = self.sign * action_max(self.sign[..., None] * q, self.allowed)
-        return self._settled(best, q)
-
-    def greedy(self, value: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The backup, the actions that attain it, and the quantities compared."""
-        q = self.quantities(value)
-        best, action = action_argmax(self.sign[..., None] * q, self.allowed)
-        return self._settled(self.sign * best, q), action, q
-
-    def _settled(self, best: jax.Array, q: jax.Array) -> jax.Array:
-        if self.fixed is not None:
-            best = jnp.where(self.fixed, action_mean(self.weight, q), best)
-        return jnp.where(self.live, best, 0)
-
-    def distribution(self, action: jax.Array) -> jax.Array:
-        """One action for each state, or the distribution where some are drawn."""
-        if self.fixed is None:
-            return action
-        chosen = jax.nn.one_hot(action, self.game.num_actions, dtype=self.game.dtype)
-        return jnp.where(self.fixed[..., None], self.weight, chosen)
-
-    def chain(self, action: jax.Array) -> tuple[jax.Array, Callable[[jax.Array], jax.Array]]:
-        """``r`` and ``x -> g P x`` of fixed choices."""
-        policy, rate = self.distribution(action), self.rate
-        paid = jnp.where(self.live, action_mean(policy, self.reward), 0)
-        if self.fixed is not None:
-            return paid, lambda x: rate * action_mean(policy, expectation(self.game, x))
-        chain = induced_chain(self.game, policy)
-        return paid, lambda x: rate * expectation(chain, x.ravel())[:, 0].reshape(x.shape)
+    unit: jax.Array
+    size: jax.Array
+    tolerance: jax.Array | None
 
 
-def _make_play(
-    game, reward, discount, per, moves, fixed=None, weight=None, *, follows=0
-) -> _Play:
-    """Prunes moves that lead to where play gets stuck; `follows` players have no choice."""
-    _require("per", per, ("move", "system_move"))
-    chosen = jnp.ones_like(game.system) if follows else ~game.system
-    stuck = ~moves.any(axis=-1)
-    # Chance, the environment and a strategy that is followed may all lead there.
-    lost = attractor(game, stuck, moves, rule=chosen, chance="some").region
-    moves = moves & ~lost[..., None] & ~exists_successor(game, lost)
-    if per == "move":
-        free, defined = jnp.zeros_like(game.system), jnp.bool_(True)
-    else:
-        free = ~game.system
-        drawn = jnp.zeros_like(free) if fixed is None else fixed
-        back = attractor(game, game.system | lost, moves, rule=drawn, chance="some").region
-        defined = back.all()
-        if not is_traced(back) and not defined:
-            first = tuple(int(i) for i in np.argwhere(~np.asarray(back))[0])
-            raise ValueError(
-                f"from state {first[0] if len(first) == 1 else first} the environment can move "
-                "for ever without the system, and such moves are not discounted with "
-                "per='system_move', so there is no value; use per='move', or give the system "
-                "a move in every cycle."
-            )
-    return _Play(
-        game=game,
-        reward=jnp.where(moves, expected_reward(game, reward), 0),
-        discount=jnp.asarray(discount, game.dtype),
-        free=free, allowed=moves, live=~lost, defined=defined, fixed=fixed, weight=weight,
-    )
+def _chosen(q: newton.Columns, play: _Play) -> tuple[jax.Array, list[jax.Array]]:
+    """What both players' best moves are worth, and their weights."""
+    best, weight = best_action([jnp.where(play.system, x, -x) for x in q], play)
+    best = jnp.where(play.system, best, -best)
+    if play.drawn is None:
+        return best, weight
+    pairs = zip(play.weight or [], weight, strict=True)
+    weight = [jnp.where(play.drawn, given, own) for given, own in pairs]
+    return jnp.where(play.drawn, _mean(weight, q), best), weight
+
+
+def _mean(weight: list[jax.Array], q: newton.Columns) -> jax.Array:
+    """The mean of columns that are infinite where moves are not allowed."""
+    return mean(weight, [jnp.where(jnp.isinf(x), 0, x) for x in q])
+
+
+def _gains(play: _Play, reward: jax.Array, moves: jax.Array, live: jax.Array) -> list[jax.Array]:
+    """Columns of a reward, infinitely bad for who moves where it is not allowed; else zero."""
+    never = jnp.where(play.system, -jnp.inf, jnp.inf).astype(reward.dtype)
+    if play.drawn is not None:
+        never = jnp.where(play.drawn, 0, never)
+    num_actions = moves.shape[-1]
+    pairs = zip(*(action_columns(num_actions, x) for x in (reward, moves)), strict=True)
+    return [jnp.where(live, jnp.where(m, r, never), 0) for r, m in pairs]
 
 
 # --- bounds --------------------------------------------------------------------------------
 
 
-def _terms(play: _Play) -> float:
-    """Rounding errors of one backup, in units of eps times its magnitude (see bellman.py)."""
-    count = play.game.num_successors + play.game.num_actions + 4
-    return count * float(jnp.finfo(play.game.dtype).eps)
-
-
-def _horizon(play: _Play, max_steps: jax.Array | int) -> jax.Array:
+def _horizon(rows: Any, play: _Play, moves, live, per: str, defined, max_steps) -> jax.Array:
     """A function h with ``h >= 1 + g P h`` for all moves; infinite or NaN if there is none.
 
     With tau the expected number of undiscounted moves before the next discounted one, at most,
-    and L its maximum: ``h = (1 + discount * L) / (1 - discount) + tau``.
+    and L its maximum: ``h = (1 + discount * L) / (1 - discount) + tau``. It is the value of the
+    play in which both players want it long.
     """
-    def count(tau: jax.Array) -> jax.Array:
-        moves = 1 + expectation(play.game, tau)
-        most = action_max(moves, play.allowed)
-        if play.fixed is not None:
-            most = jnp.where(play.fixed, action_mean(play.weight, moves), most)
-        return jnp.where(play.free & play.live, most, 0)
+    tau = jnp.zeros(live.shape, play.discount.dtype)
+    if per == "system_move":
+        free = live & ~play.system
+        slow = play._replace(system=jnp.ones_like(live))
 
-    def growing(carry):
-        tau, after, n = carry
-        return (jnp.max(after - tau) > 2.0**-7) & (n < max_steps) & play.defined
+        def judge(tau, after, given):
+            growth = jnp.max(after - tau, axis=0)
+            # Below, from 1 + P tau <= tau + growth follows that tau / (1 - growth) is enough.
+            return (growth <= 2.0**-7) | ~jnp.isfinite(growth) | ~given[1], jnp.abs(growth)
 
-    zero = jnp.zeros(play.game.state_shape, play.game.dtype)
-    tau, after, _ = lax.while_loop(
-        growing, lambda c: (c[1], count(c[1]), c[2] + 1), (zero, count(zero), jnp.int32(0))
-    )
-    # From 1 + P tau <= tau + growth follows that tau / (1 - growth) is enough.
-    growth = jnp.max(after - tau)
-    tau = jnp.where(growth < 0.5, tau / (1 - growth), jnp.inf)
-    gap = 1 - play.discount
-    horizon = (1 + play.discount * jnp.max(tau)) / gap + tau
-    slack = 2 * _terms(play) * jnp.max(horizon)
+        ones = jnp.ones(moves.shape, tau.dtype)
+        tau, after, _ = newton.solve(
+            rows, lambda q, given: _chosen(q, given[0]), judge,
+            newton.Backup(_gains(slow, ones, moves, free), free.astype(tau.dtype),
+                          jnp.zeros_like(play.discount), (slow, defined)),
+            tau, max_steps=max_steps)
+        growth = jnp.max(after - tau)
+        tau = jnp.where(growth < 0.5, tau / (1 - growth), jnp.inf)
+    horizon = (1 + play.discount * jnp.max(tau)) / (1 - play.discount) + tau
+    slack = 2 * play.unit * jnp.max(horizon)
     horizon = jnp.where(slack < 0.5, horizon * (1 + slack), jnp.inf)
-    valid = play.defined & (play.discount >= 0) & (play.discount < 1)
+    valid = defined & (play.discount >= 0) & (play.discount < 1)
     return jnp.where(valid, horizon, jnp.nan)
 
 
 class _Evidence(NamedTuple):
-    """Midpoint of the enclosure seen from the image, its half width, and what they show."""
+    """An enclosure seen from an image, and what it shows; as of evidence.Enclosure, by state."""
 
     shift: jax.Array
     half: jax.Array
@@ -352,153 +351,153 @@ class _Evidence(NamedTuple):
     finite: jax.Array
 
 
-def _certify(play: _Play, horizon, tolerance, value, image) -> _Evidence:
-    """``T v + [down, up]`` encloses the fixed point of T.
+def _certify(play: _Play, value: jax.Array, image: jax.Array) -> _Evidence:
+    """``T v + [down, up]`` encloses the fixed point of T; `horizon` for each state or its largest.
 
     With ``c = max(T v - v)``: if c >= 0, ``u = v + c h`` has ``T u <= u``, so the fixed point
     is at most ``T u <= T v + c (h - 1)``. If c < 0 the same holds with the constant
     ``1 / (1 - discount)``, as no move is discounted more. Likewise below. As the width grows
     with h, its maximum in place of h tells whether the enclosure is narrow enough everywhere.
     """
-    unit = _terms(play) * (jnp.max(jnp.abs(play.reward)) + jnp.max(jnp.abs(image)))
+    horizon = play.horizon
+    unit = play.unit * (play.size + jnp.max(jnp.abs(image), axis=0))
     change = image - value
-    top, bottom = jnp.max(change), jnp.min(change)
+    top, bottom = jnp.max(change, axis=0), jnp.min(change, axis=0)
     least = play.discount / (1 - play.discount)
     up = top * jnp.where(top > 0, horizon - 1, least) + unit * horizon
     down = bottom * jnp.where(bottom < 0, horizon - 1, least) - unit * horizon
     half = (up - down) / 2
-    known = jnp.all(jnp.isfinite(half))
-    goal = 4 * unit * horizon if tolerance is None else tolerance
+    known = jnp.isfinite(half)
+    goal = 4 * unit * horizon if play.tolerance is None else play.tolerance
     return _Evidence(
         shift=jnp.where(known, (up + down) / 2, 0),
         half=jnp.where(known, half, jnp.inf),
-        converged=known & jnp.all(half <= goal),
-        exhausted=known & jnp.all(half <= 2 * unit * horizon),
-        finite=jnp.isfinite(top - bottom) & ~jnp.any(jnp.isnan(horizon)),
+        converged=known & (half <= goal),
+        exhausted=known & (half <= 2 * unit * horizon),
+        finite=jnp.isfinite(top - bottom) & jnp.isfinite(play.size) & ~jnp.isnan(horizon),
     )
+
+
+def _judge(value: jax.Array, image: jax.Array, play: _Play) -> tuple[jax.Array, jax.Array]:
+    found = _certify(play, value, image)
+    # Where the horizon is not finite no number of sweeps proves anything.
+    return found.converged | found.exhausted | ~jnp.isfinite(found.half), found.half
 
 
 # --- solvers -------------------------------------------------------------------------------
 
 
-@partial(jax.jit, static_argnames=("method",))
-def _solve(play: _Play, tolerance, max_steps, evaluation_sweeps, *, method: str) -> Solution:
-    still = jax.tree.map(lax.stop_gradient, play)
-    horizon = _horizon(still, max_steps)
+_FIRST_SWEEPS = 128  # of large games: they cost less than linear systems far from the value
+
+
+@partial(jax.jit, static_argnames=("per", "method"))
+def _solve(
+    game: Game, drawn: _Drawn | None, moves, live, defined, reward, discount, tolerance,
+    max_steps, *, per: str, method: str,
+) -> Solution:
+    discount = jnp.asarray(discount, game.dtype)
+    if live is None:
+        live = jnp.ones(game.state_shape, bool)
+    reward = jnp.where(moves, expected_reward(game, reward), 0)
+    free = ~game.system if per == "system_move" else jnp.zeros_like(game.system)
+    rate = jnp.where(live, jnp.where(free, 1, discount), 0)
+    sign = jnp.where(game.system, 1, -1).astype(game.dtype)[..., None]
+
+    def backup(value: jax.Array) -> jax.Array:
+        q = reward + rate[..., None] * expectation(game, value)
+        best = sign[..., 0] * action_max(sign * q, moves)
+        if drawn is not None:
+            best = jnp.where(drawn.used, action_mean(drawn.weight, q), best)
+        return jnp.where(live, best, 0)
+
+    flat = live.ravel()
+    play = _Play(
+        game.system.ravel(), None if drawn is None else drawn.used.ravel(),
+        None if drawn is None else action_columns(game.num_actions, drawn.weight),
+        discount, discount, jnp.asarray(rounding_unit(game), game.dtype),
+        jnp.max(jnp.abs(reward)),
+        None if tolerance is None else jnp.asarray(tolerance, game.dtype))
+    rows = table(game)
+    horizon = _horizon(rows, play, moves, flat, per, defined, max_steps)
+    play = play._replace(horizon=jnp.max(horizon))
+    numbers = newton.Backup(
+        _gains(play, reward, moves, flat), rate.ravel(), jnp.zeros_like(discount), play)
+    zero = jnp.zeros(flat.shape, game.dtype)
     if method == "strategy_iteration":
-        found = _strategy_iteration(still, horizon, tolerance, max_steps)
-    elif method == "value_iteration":
-        found = _value_iteration(still, horizon, tolerance, max_steps)
+        value, image, num_steps = _strategy_iteration(rows, numbers, zero, max_steps)
     else:
-        found = _policy_sweeps(still, horizon, tolerance, max_steps, evaluation_sweeps)
-    value, image, action, num_steps = found
-    verdict = _certify(still, jnp.max(horizon), tolerance, value, image)
-    evidence = _certify(still, horizon, tolerance, value, image)
+        value, image, num_steps = newton.solve(
+            rows, _chosen, _judge, numbers, zero, newton=method == "policy_iteration",
+            monotone=False, first_sweeps=_FIRST_SWEEPS if flat.size > DENSE_LIMIT else 0,
+            max_steps=max_steps)
+    rows, numbers, play, horizon = lax.stop_gradient((rows, numbers, play, horizon))
+    q = [g + numbers.scale * x
+         for g, x in zip(numbers.reward, rows.expectation(value), strict=True)]
+    weight = jnp.stack(_chosen(q, play)[1], axis=-1).reshape(moves.shape)
+    verdict = _certify(play, value, image)
+    evidence = _certify(play._replace(horizon=horizon), value, image)
+    known = jnp.all(evidence.half < jnp.inf)
+
+    def answer(x: jax.Array) -> jax.Array:
+        return jnp.where(live, x.reshape(live.shape), -jnp.inf)
+
     middle = image + evidence.shift
-
-    def live(x: jax.Array) -> jax.Array:
-        return jnp.where(still.live, x, -jnp.inf)
-
     solution = Solution(
-        value=middle,
-        policy=still.distribution(action),
-        lower=live(jnp.where(evidence.half < jnp.inf, middle - evidence.half, -jnp.inf)),
-        upper=live(jnp.where(evidence.half < jnp.inf, middle + evidence.half, jnp.inf)),
+        value=middle.reshape(live.shape),
+        policy=jnp.argmax(weight, axis=-1).astype(jnp.int32) if drawn is None else weight,
+        lower=answer(jnp.where(known, middle - evidence.half, -jnp.inf)),
+        upper=answer(jnp.where(known, middle + evidence.half, jnp.inf)),
         residual=jnp.max(jnp.abs(image - value)),
         num_steps=num_steps,
         status=status_code(verdict.converged, verdict.finite, verdict.exhausted),
     )
     solution = jax.tree.map(lax.stop_gradient, solution)
-    return replace(solution, value=live(implicit(play.backup, middle)))
+    solution = replace(solution, value=answer(implicit(backup, solution.value)))
+    return solution if drawn is None else refuse(solution, drawn.given, drawn.valid)
 
 
-def _unfinished(evidence: _Evidence, n: jax.Array, max_steps) -> jax.Array:
-    # Where the horizon is not finite no number of sweeps proves anything.
-    done = evidence.converged | evidence.exhausted
-    return ~done & evidence.finite & (n < max_steps)
+_UNCHANGED = 3  # solves without a change of strategy after which more would not help
 
 
-def _policy_sweeps(play: _Play, horizon, tolerance, max_steps, sweeps):
-    """Sweeps of the operator, with some under both players' choices in between.
+class _Strategies(NamedTuple):
+    """Where strategy iteration is: z is to be looked at, the value of the choices `weight`."""
 
-    Evaluating both players' greedy choices can lead away from the value of a game (unlike that
-    of an MDP). So the outcome is kept only if its residual shrinks as a sweep would make it; if
-    not, plain sweeps follow, twice as many each time, which always contract in the norm that
-    is weighted by the horizon.
-    """
-    certify = partial(_certify, play, jnp.max(horizon), tolerance)
-    rate = 1 - 1 / jnp.max(horizon)
-
-    def size(value: jax.Array, image: jax.Array) -> jax.Array:
-        return jnp.max(jnp.abs(image - value) / horizon)
-
-    def evaluate(value: jax.Array, action: jax.Array) -> jax.Array:
-        paid, onward = play.chain(action)
-        return lax.fori_loop(0, sweeps, lambda _, v: paid + onward(v), value)
-
-    def body(carry):
-        old, plain, pause, n, _ = carry
-        value = lax.cond(plain > 0, lambda v, _: v, evaluate, *old[1:])
-        image, action, _ = play.greedy(value)
-        kept = (plain > 0) | (size(value, image) <= rate * size(*old[:2]))
-        new = jax.tree.map(partial(jnp.where, kept), (value, image, action), old)
-        pause = jnp.where(plain > 0, pause, jnp.where(kept, 0, 2 * pause + 1))
-        plain = jnp.where(plain > 0, plain - 1, pause)
-        return new, plain, pause, n + 1, certify(*new[:2])
-
-    zero = jnp.zeros(play.game.state_shape, play.game.dtype)
-    first = (zero, *play.greedy(zero)[:2])
-    start = (first, jnp.int32(0), jnp.int32(0), jnp.int32(1), certify(*first[:2]))
-    found, *_, n, _ = lax.while_loop(lambda c: _unfinished(c[4], c[3], max_steps), body, start)
-    return *found, n
+    z: jax.Array
+    weight: list[jax.Array]
+    value: jax.Array
+    image: jax.Array
+    unchanged: jax.Array
+    done: jax.Array
 
 
-def _value_iteration(play: _Play, horizon, tolerance, max_steps):
-    certify = partial(_certify, play, jnp.max(horizon), tolerance)
-
-    def body(carry):
-        _, value, n, _ = carry
-        image = play.backup(value)
-        return value, image, n + 1, certify(value, image)
-
-    value = jnp.zeros(play.game.state_shape, play.game.dtype)
-    image = play.backup(value)
-    start = (value, image, jnp.int32(1), certify(value, image))
-    value, image, n, _ = lax.while_loop(lambda c: _unfinished(c[3], c[2], max_steps), body, start)
-    return value, *play.greedy(value)[:2], n
-
-
-_QUIET = 3  # solves without a change of strategy after which more would not help
-
-
-def _strategy_iteration(play: _Play, horizon, tolerance, max_steps):
+def _strategy_iteration(rows: Any, numbers: newton.Backup, zero: jax.Array, max_steps: Any):
     """Solves for the value of both players' choices, then improves the environment's, or,
     where those are a best answer already, the system's (Hoffman and Karp 1966)."""
-    certify = partial(_certify, play, jnp.max(horizon), tolerance)
-
-    def body(carry):
-        (value, _, _), policy, n, quiet, _ = carry
-        paid, onward = play.chain(policy)
-        # Solving for the correction refines the value where the choices stay the same.
-        value = value + solve_linear(lambda x: x - onward(x), paid + onward(value) - value)
-        image, action, q = play.greedy(value)
-        margin = 2 * _terms(play) * (jnp.max(jnp.abs(play.reward)) + jnp.max(jnp.abs(value)))
-        own = jnp.where(play.live, action_mean(policy, q), 0)
-        better = play.live & (play.sign * (image - own) > margin)
-        if play.fixed is not None:
-            better &= ~play.fixed
-        answers = better & ~play.game.system
+    def step(rows: Any, k: _Strategies, given: newton.Backup) -> _Strategies:
+        play = given.extra
+        q = [g + given.scale * x
+             for g, x in zip(given.reward, rows.expectation(k.z), strict=True)]
+        image, best = _chosen(q, play)
+        own = _mean(k.weight, q)
+        margin = 2 * play.unit * (play.size + jnp.max(jnp.abs(k.z)))
+        better = jnp.where(play.system, image - own, own - image) > margin
+        if play.drawn is not None:
+            better &= ~play.drawn
+        answers = better & ~play.system
         change = jnp.where(answers.any(), answers, better)
-        policy = jnp.where(change, action, policy)
-        quiet = jnp.where(change.any(), 0, quiet + 1)
-        return (value, image, action), policy, n + 1, quiet, certify(value, image)
+        weight = [jnp.where(change, new, old) for new, old in zip(best, k.weight, strict=True)]
+        unchanged = jnp.where(change.any(), 0, k.unchanged + 1)
+        done = _judge(k.z, image, play)[0] | (unchanged > _UNCHANGED)
 
-    def unfinished(carry):
-        _, _, n, quiet, evidence = carry
-        return _unfinished(evidence, n, max_steps) & (quiet < _QUIET)
+        def solved() -> jax.Array:
+            # Solving for the correction refines the value where the choices stay the same.
+            return k.z + solver(System(rows, weight, given.scale)).solve(_mean(weight, q) - k.z)
 
-    zero = jnp.zeros(play.game.state_shape, play.game.dtype)
-    first = (zero, *play.greedy(zero)[:2])
-    start = (first, first[2], jnp.int32(1), jnp.int32(0), certify(*first[:2]))
-    found, _, n, _, _ = lax.while_loop(unfinished, body, start)
-    return *found, n
+        z = lax.cond(done, lambda: k.z, solved)
+        return _Strategies(z, weight, k.z, image, unchanged, done)
+
+    start = _Strategies(
+        zero, _chosen(numbers.reward, numbers.extra)[1], zero, zero, jnp.int32(-1),
+        jnp.bool_(False))
+    last, n = iterate(step, lambda k, _: k.done, rows, start, numbers, max_steps=max_steps)
+    return last.value, last.image, n
