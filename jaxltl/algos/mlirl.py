@@ -165,7 +165,7 @@ def make_problem(
         raise ValueError(f"feature {feature} at {tuple(pair)} is not finite.")
     if isinstance(model, Product):
         demonstrations = lift_trajectories(model, demonstrations)
-    weight = satisfaction_over
+    weight: Any = satisfaction_over
     if isinstance(weight, str):
         if weight not in ("initial", "all"):
             raise ValueError(

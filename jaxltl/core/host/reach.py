@@ -179,7 +179,7 @@ def _iterate(
 
 def _solved(matrix: Floats, b: Floats) -> Floats | None:
     try:
-        x = np.linalg.solve(matrix, b)
+        x = np.asarray(np.linalg.solve(matrix, b), np.float64)
     except np.linalg.LinAlgError:
         return None
     return x if np.isfinite(x).all() else None

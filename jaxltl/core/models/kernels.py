@@ -72,7 +72,9 @@ def by_action(
     else:
         rows = gather(value, successor)
         terms = term(weight.reshape(weight.shape + (1,) * (rows.ndim - 3)), rows)
-        whole = {jnp.add: jnp.sum, jnp.logical_or: jnp.any, jnp.minimum: jnp.min}[combine]
+        wholes: dict[Any, Any] = {
+            jnp.add: jnp.sum, jnp.logical_or: jnp.any, jnp.minimum: jnp.min}
+        whole = wholes[combine]
         found = whole(terms, axis=2)
     return [found[:, a] for a in range(num_actions)]
 

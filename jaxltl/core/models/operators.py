@@ -310,12 +310,12 @@ def first_action(condition: jax.Array) -> tuple[jax.Array, jax.Array]:
     return some, action
 
 
-def is_deterministic(policy: jax.Array) -> bool:
+def is_deterministic(policy: chex.Array) -> bool:
     """Whether a policy is given as one action per state (integers) rather than a distribution."""
     return jnp.issubdtype(jnp.result_type(policy), jnp.integer)
 
 
-def policy_distribution(model: Any, policy: jax.Array) -> jax.Array:
+def policy_distribution(model: Any, policy: Any) -> jax.Array:
     """Any policy as ``float[S, A]``, with its shape checked against the model.
 
     Raises:

@@ -340,7 +340,7 @@ def _modified_policy_iteration(model, reward, given: Parameters, max_steps, swee
         return value, *greedy(value)
 
     def finished(carry, _):
-        return judge(*carry[:2], given)[0]
+        return judge(carry[0], carry[1], given)[0]
 
     zero = jnp.zeros(model.num_states, model.dtype)
     start = lax.stop_gradient((zero, *greedy(zero)))

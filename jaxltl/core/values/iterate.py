@@ -62,7 +62,7 @@ def iterate(
             if every == 1:
                 carry, n = one(carry, n, active)
             else:
-                carry, n = lax.fori_loop(0, every, lambda _, c: one(*c, active), (carry, n))
+                carry, n = lax.fori_loop(0, every, lambda _, c: one(c[0], c[1], active), (carry, n))
             return carry, n, active & ~finished(carry, given) & (n < most)
 
         n = jnp.zeros(most.shape, jnp.int32)

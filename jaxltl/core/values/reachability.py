@@ -48,9 +48,9 @@ _HOST_LIMIT = 1024  # states up to which a concrete model is solved on the host,
 class Sets(NamedTuple):
     """What the graph decides: probability one, probability zero, and witnessing actions."""
 
-    one: jax.Array
-    zero: jax.Array
-    action: jax.Array
+    one: Any
+    zero: Any
+    action: Any
 
 
 def reachability_probability(
@@ -172,7 +172,7 @@ def min_sets(graph: Graph, target: Any) -> Sets:
 def _rows(model: Any) -> np.ndarray:
     """``float64[A, N, N]``, the transitions of a concrete model."""
     model = model.mdp if isinstance(model, Game) else model
-    world = model.mdp if isinstance(model, Product) else model
+    world: Any = model.mdp if isinstance(model, Product) else model
     dense = isinstance(world, DenseMDP)
     weight = np.where(support(world), np.asarray(world.transition if dense else world.probability),
                       0)
@@ -226,9 +226,9 @@ def _optimum_on_host(
     model: Any, graph: Graph, sets: Sets, components: EndComponents | None, tolerance: Any,
     objective: str,
 ) -> Solution | None:
-    allowed, group = graph.available, np.arange(sets.one.size)
+    allowed, group = graph.available, np.arange(sets.one.size, dtype=np.int32)
     if components is not None:
-        allowed, group = allowed & ~components.inside, components.component.ravel()
+        allowed, group = allowed & ~components.inside, np.asarray(components.component).ravel()
     undecided = ~(sets.one | sets.zero)
     found = host.optimum(
         _rows(model), allowed.reshape(len(group), -1), group, sets.one.ravel(), undecided.ravel(),
