@@ -19,7 +19,7 @@ from jax import lax
 
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
-from jaxltl.core.models.concrete import to_jax
+from jaxltl.core.models.concrete import namespace, to_jax
 from jaxltl.core.models.game import Game, as_game
 from jaxltl.core.models.operators import (
     action_max,
@@ -146,7 +146,8 @@ def strategy_value(
     Args:
       game, reward, discount, per, method, tolerance, max_steps: as in :func:`minimax_value`.
       strategy: ``int32[S]`` or ``float[S, A]``, distributions over available moves; read at
-        the system's states only.
+        the system's states only. Where no move is available play gets stuck, which is worth
+        minus infinity, as is each state from which it can come to that.
       environment: ``"adversarial"``, or a policy ``int32[S]`` or ``float[S, A]``, read at the
         environment's states only.
 
@@ -188,16 +189,26 @@ def strategy_value(
         if is_deterministic(policy):
             kind, shape = "of integers", game.state_shape
         require_shape(f"{name} ({kind})", policy, shape)
-        require_policy(game, policy, states)
+        require_policy(game, policy, _read(game, states))
     checked = _joint(game, strategy, environment)
     graph = graph_of(game, checked)
     system, used = take(graph, (game.system, checked.used))
-    drawn = graph.xp.ones_like(system) if environment is not None else system
+    followed = graph.xp.ones_like(system)
+    drawn = followed if environment is not None else system
     moves = graph.available & graph.xp.where(drawn[..., None], used, True)
-    defined = _returns(graph, per, system, moves, drawn)
-    moves, drawn = to_jax((moves, drawn))
-    return _solve(game, checked._replace(used=drawn), moves, None, defined, reward, discount,
+    # Whoever plays, nobody keeps away from where play gets stuck.
+    lost = attract(graph, ~moves.any(axis=-1), moves, rule=followed).region
+    moves = moves & ~lost[..., None]
+    defined = _returns(graph, per, system | lost, moves, drawn)
+    moves, drawn, live = to_jax((moves, drawn, ~lost))
+    return _solve(game, checked._replace(used=drawn), moves, live, defined, reward, discount,
                   tolerance, max_steps, per=per, method=method)
+
+
+def _read(game: Game, states: Any) -> Any:
+    """The states of a player whose rows of a policy are read: those that have moves at all."""
+    xp, states, available = namespace(states, game.available)
+    return states & xp.any(available, axis=-1)
 
 
 class _Drawn(NamedTuple):
@@ -218,16 +229,16 @@ class _Drawn(NamedTuple):
 
 @jax.jit
 def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> _Drawn:
-    """The policies of both players as one; of an environment without one, uniform."""
-    one = valid_policy(game, jnp.asarray(strategy), game.system)
-    if environment is None:
-        weight, given, valid = one
-    else:
-        other = valid_policy(game, jnp.asarray(environment), ~game.system)
-        system = game.system[..., None]
-        weight = jnp.where(system, one.distribution, other.distribution)
-        given = jnp.where(system, one.given, other.given)
-        valid = one.valid & other.valid
+    """The policies of both players as one, zero where neither is read."""
+    read = _read(game, game.system)
+    weight, given, valid = valid_policy(game, jnp.asarray(strategy), read)
+    weight = jnp.where(read[..., None], weight, 0)  # nothing of what is not read
+    if environment is not None:
+        read = _read(game, ~game.system)
+        other = valid_policy(game, jnp.asarray(environment), read)
+        weight = jnp.where(read[..., None], other.distribution, weight)
+        given = jnp.where(read[..., None], other.given, given)
+        valid &= other.valid
     return _Drawn(weight, given, valid, lax.stop_gradient(weight) > 0)
 
 
@@ -396,8 +407,6 @@ def _solve(
     max_steps, *, per: str, method: str,
 ) -> Solution:
     discount = jnp.asarray(discount, game.dtype)
-    if live is None:
-        live = jnp.ones(game.state_shape, bool)
     reward = jnp.where(moves, expected_reward(game, reward), 0)
     free = ~game.system if per == "system_move" else jnp.zeros_like(game.system)
     rate = jnp.where(live, jnp.where(free, 1, discount), 0)

@@ -387,6 +387,20 @@ def test_rows_of_another_player_are_not_read_and_others_have_to_be_distributions
         strategy_value(game, np.zeros(4, int), reward, 0.5, environment=np.array([2, 0, 0, 0]))
 
 
+def test_where_nobody_can_move_is_worth_minus_infinity_and_what_leads_there_too():
+    # 0 is the environment's and goes to 1 or 2; 2 has no move; 3 stays apart.
+    world = from_dense(np.eye(4)[[[1, 2], [0, 0], [0, 0], [3, 3]]])
+    available = np.array([[1, 1], [1, 1], [0, 0], [1, 1]], bool)
+    game = Game(world.replace(available=available), np.array([False, True, True, True]))
+    strategy = np.array([0, 0, -1, 1])
+    found = strategy_value(game, strategy, jnp.ones((4, 2)), 0.5)
+    assert found.status == Status.CONVERGED
+    np.testing.assert_allclose(found.value, [-np.inf, -np.inf, -np.inf, 2.0])
+    kind = strategy_value(
+        game, strategy, jnp.ones((4, 2)), 0.5, environment=np.zeros(4, int))
+    np.testing.assert_allclose(kind.value, [2.0, 2.0, -np.inf, 2.0])
+
+
 # --- representations, derivatives, laws ----------------------------------------------------
 
 
