@@ -1,12 +1,65 @@
-"""Tests compare with exact references, so they run in double precision.
+"""Tests compare with exact references, so they run in double precision, and compile in haste.
 
-The library never sets this; single precision is tested by ``jax.enable_x64(False)``.
+The library sets none of this; single precision is tested by ``jax.enable_x64(False)``.
+
+Compiling is what tests spend their time on, for programs that run once. So the compiler hardly
+optimises, and what one worker or run has compiled is read by the next. What the environment says
+stands: ``XLA_FLAGS= pytest`` tests the programs as users get them.
 """
 
+import getpass
+import hashlib
+import mmap
+import os
+import platform
+import tempfile
 from pathlib import Path
 
-import jax
+import jaxlib
 import pytest
+
+_HASTE = {
+    "xla_backend_optimization_level": "0",
+    "xla_llvm_disable_expensive_passes": "true",
+    "xla_cpu_use_fusion_emitters": "false",
+}
+
+
+def _known(flags: dict[str, str]) -> str:
+    """Those flags that the compiler knows, which ends the process for others."""
+    found = set()
+    for library in sorted(Path(jaxlib.__file__).parent.glob("*.so")):
+        with library.open("rb") as file:
+            text = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            found |= {name for name in flags if text.find(name.encode()) >= 0}
+    return " ".join(f"--{name}={value}" for name, value in flags.items() if name in found)
+
+
+def _cache() -> Path | None:
+    """A directory of this user, compiler and processor; none if it is somebody else's."""
+    processor = Path("/proc/cpuinfo")
+    features = processor.read_text().split("\n\n")[0] if processor.exists() else ""
+    lines = sorted(x for x in features.splitlines() if x.startswith(("flags", "Features", "model")))
+    key = hashlib.sha256("\n".join([platform.machine(), *lines]).encode()).hexdigest()[:12]
+    place = Path(tempfile.gettempdir()) / f"jaxltl-tests-{getpass.getuser()}"
+    place.mkdir(mode=0o700, exist_ok=True)
+    if hasattr(os, "getuid") and place.stat().st_uid != os.getuid():
+        return None
+    return place / f"jaxlib-{jaxlib.__version__}-{key}"
+
+
+# Before JAX reads them; workers and subprocesses inherit them.
+if "XLA_FLAGS" not in os.environ:
+    os.environ["XLA_FLAGS"] = _known(_HASTE)
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ and (place := _cache()):
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(place)
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+# XLA takes its own hints to the compiler for features that the processor lacks, and says so as an
+# error for each program that it reads.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 

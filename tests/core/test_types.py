@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.core.types import require_shape, status_code
+from jaxltl.core.types import Status, require_shape, status_code
 from tests import reference
 from tests.support import as_mdp, lane, stack
 
@@ -37,9 +37,9 @@ def test_check_is_for_the_host():
 
 
 def test_status_codes():
-    flags = jnp.array([True, False])
-    assert status_code(flags, jnp.array([True, True])).tolist() == [0, 1]
-    assert status_code(flags, jnp.array([False, False])).tolist() == [2, 2]
+    flags, yes = np.array([True, False]), np.array([True, True])
+    assert status_code(flags, yes).tolist() == [Status.CONVERGED, Status.MAX_STEPS]
+    assert status_code(flags, ~yes).tolist() == [Status.NONFINITE] * 2
 
 
 def test_shapes_are_named():
