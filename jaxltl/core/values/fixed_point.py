@@ -37,8 +37,7 @@ def implicit(
       `fixed_point`.
 
     Example:
-      >>> a = jnp.array(0.5)
-      >>> slope = jax.grad(lambda a: implicit(lambda v: 1 + a * v, jnp.array(2.0)))(a)
+      >>> slope = jax.grad(lambda a: implicit(lambda v: 1 + a * v, jax.numpy.array(2.0)))(0.5)
       >>> round(slope.item(), 3)
       4.0
     """

@@ -166,8 +166,8 @@ def inverse(matrix: jax.Array) -> jax.Array:
       matrix: ``float[N, N]``.
 
     Example:
-      >>> inverse(jnp.array([[1.0, -0.5], [0.0, 0.5]])).tolist()
-      [[1.0, 1.0], [0.0, 2.0]]
+      >>> inverse(jnp.array([[1.0, -0.5], [-0.5, 0.75]])).tolist()
+      [[1.5, 1.0], [1.0, 2.0]]
     """
     n = matrix.shape[-1]
     block = min(_BLOCK, n)
