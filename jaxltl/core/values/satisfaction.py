@@ -45,7 +45,7 @@ def satisfaction_probability(
     """
     kind = model.automaton.acceptance
     if kind in ("cosafe", "safety"):
-        target = model.final if kind == "cosafe" else ~model.final
+        target = model.final if kind == "cosafe" else _not_final(model)
     else:
         require_policy(model, policy)
         support = policy
@@ -94,7 +94,7 @@ def optimal_satisfaction(
     if kind == "safety":
         opposite = "min" if objective == "max" else "max"
         return complement(
-            reachability_probability(model, ~model.final, objective=opposite, **limits)
+            reachability_probability(model, _not_final(model), objective=opposite, **limits)
         )
     if objective == "min":
         negated = replace(model, automaton=_shifted(model.automaton))
@@ -107,7 +107,14 @@ def optimal_satisfaction(
 
 def _shifted(automaton: Automaton) -> Automaton:
     """The automaton of the negation; unlike `complement`, for traced tables too."""
-    return replace(automaton, priority=automaton.priority + 1, acceptance="parity", state_names=())
+    xp, priority = namespace(automaton.priority)
+    priority = to_jax((priority + 1).astype(xp.int32))
+    return replace(automaton, priority=priority, acceptance="parity", state_names=())
+
+
+def _not_final(model: Product) -> Any:
+    _, final = namespace(model.final)
+    return to_jax(~final)
 
 
 def _one_hot(policy: Any, num_actions: int) -> Any:

@@ -5,9 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxltl as jl
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.types import Status
 from jaxltl.core.values.reachability import reachability_probability
+from tests.core.graphs.test_engines import counted_programs
 
 RARE = 1e-3
 
@@ -95,3 +97,19 @@ def test_end_components_choose_together():
     np.testing.assert_allclose(found.value, [0.25, 0.25, 1, 0], atol=1e-13)
     assert (found.lower <= found.upper).all()
     assert found.policy[1] == 1
+
+
+@pytest.mark.parametrize("task", ["F g", "G !r", "G F g & G F y", "F G g", "(G F g) -> (G F y)"])
+def test_probabilities_of_small_tasks_compile_nothing(task):
+    with counted_programs() as compiled:
+        model = jl.product(jl.gridworld("g . r\n. s y", slip=0.2, initial="s"), task)
+        policy = np.full((*model.state_shape, model.num_actions), 0.25)
+        found = jl.satisfaction_probability(model, policy)
+        best, worst = (jl.optimal_satisfaction(model, objective=x) for x in ("max", "min"))
+    assert not compiled
+    for solution in (found, best, worst):
+        jl.check(solution)
+    assert (np.asarray(worst.lower) <= found.upper).all()
+    assert (np.asarray(found.lower) <= best.upper).all()
+    attained = jl.satisfaction_probability(model, best.policy)
+    np.testing.assert_allclose(attained.value, best.value, atol=1e-9)
