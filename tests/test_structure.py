@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -45,7 +46,8 @@ PUBLIC = [
 ]
 
 
-def imports(name: str) -> set[str]:
+@cache
+def imports(name: str) -> frozenset[str]:
     """Everything that a module imports anywhere in its text, as dotted names."""
     found = set()
     for node in ast.walk(ast.parse(MODULES[name].read_text())):
@@ -55,7 +57,7 @@ def imports(name: str) -> set[str]:
             assert node.level == 0, f"{name}: relative import in line {node.lineno}"
             found.add(node.module)
             found |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return found
+    return frozenset(found)
 
 
 def imports_any(name: str, roots: tuple[str, ...]) -> list[str]:
@@ -74,7 +76,8 @@ def storey(name: str) -> int | None:
     return None
 
 
-def below(name: str) -> set[str]:
+@cache
+def below(name: str) -> frozenset[str]:
     """The modules of the package that a module imports, anywhere in its text."""
     found = set()
     for other in imports(name):
@@ -82,7 +85,7 @@ def below(name: str) -> set[str]:
             other = other.rpartition(".")[0]
         if other and other != name:
             found.add(other)
-    return found
+    return frozenset(found)
 
 
 def test_every_module_has_a_storey():
