@@ -419,7 +419,8 @@ def test_what_is_learned_in_section_6_7(patrolled):
         assert 50 <= anew["eps_optimal_states"] <= anew["eps_optimal_states_met"] <= 54
         assert 10 <= straight["eps_optimal_states"] <= straight["eps_optimal_states_met"] < 45
         for row in (anew, straight):
-            assert row["moves"] == row["last_update_step"] + 20_000
+            # Steps are of many moves; the one in which the rest is over is made whole.
+            assert 0 <= row["moves"] - row["last_update_step"] - 20_000 < 1000
             assert 54 < row["updates"] <= 336
     assert [row["seed"] for row in found["learned"]] == [0, 1]
     shown = {k: np.array(v) for k, v in found["figure18"].items()}

@@ -90,9 +90,9 @@ def solve(
     """A value near the fixed point of a backup; nothing is proven here.
 
     Sweeps ``v <- v + (1 - damping) (T v - v)`` and steps of Newton's method, whose linear systems
-    are solved to a hundredth by BiCGSTAB, or on small models where that fails by elimination. A
-    step is kept if it halves the error, and where the backup is monotone and convex also if its
-    system was solved; if not, ever more sweeps come before the next.
+    are solved to a hundredth by BiCGSTAB, or where that fails, on small models with a monotone
+    backup, by elimination. A step is kept if it halves the error, and where the backup is monotone
+    and convex also if its system was solved; if not, ever more sweeps come before the next.
 
     Args:
       table: the model's, see :func:`~jaxltl.core.models.tables.table`.
@@ -109,7 +109,8 @@ def solve(
     Returns:
       The value, its image, and the applications of P.
     """
-    small = value.shape[0] <= DENSE_LIMIT
+    # Elsewhere an exact step is no better than another.
+    small = monotone and value.shape[0] <= DENSE_LIMIT
 
     def step(table: Any, k: _Search, given: Backup) -> _Search:
         ahead = table.expectation(k.z)
