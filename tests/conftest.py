@@ -7,6 +7,7 @@ optimises, and what one worker or run has compiled is read by the next. What the
 stands: ``XLA_FLAGS= pytest`` tests the programs as users get them.
 """
 
+import gc
 import getpass
 import hashlib
 import mmap
@@ -62,6 +63,9 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
+# Among as many objects as compiled programs leave, a tenth of the time would go into looking for
+# circles of some hundred new ones.
+gc.set_threshold(50_000, 20, 20)
 
 _MAPS = Path("/proc/self/maps")
 _MANY = 15_000

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
-from functools import partial
 from typing import Any
 
 import jax
@@ -138,9 +137,7 @@ def assert_gradients(
     def flat(arguments: dict[str, jax.Array]) -> jax.Array:
         return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(function(arguments))])
 
-    # Compiling is what costs here, so what is run a few times is hardly optimised.
-    @partial(jax.jit, compiler_options={
-        "xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True})
+    @jax.jit
     def derivatives(x, tangents, cotangent):
         _, forward = jax.linearize(flat, x)
         (gradient,) = jax.linear_transpose(forward, x)(cotangent)

@@ -22,10 +22,6 @@ from tests.support import as_mdp, bit_labels, lane, stack
 KINDS = ("sparse", "dense", "entry", "exit")
 COUNT, PRIORITIES = 100, 4
 
-# Compiling is what costs here, so what is run once is hardly optimised.
-fast_to_compile = partial(jax.jit, compiler_options={
-    "xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True})
-
 
 def random_model(rng, kind):
     """A model of a kind with three world states or six, and a parity automaton in products."""
@@ -132,7 +128,7 @@ def test_the_host_and_the_traced_sweeps_are_one(kind):
     rng = np.random.default_rng(KINDS.index(kind))
     cases = [random_case(rng, kind) for _ in range(COUNT)]
     spoiled = [{**case, "model": with_garbage(case["model"], rng, wild=False)} for case in cases]
-    traced = fast_to_compile(jax.vmap(partial(answers, kind=kind)))
+    traced = jax.jit(jax.vmap(partial(answers, kind=kind)))
     one, other = (jax.tree.map(np.asarray, traced(stack(x))) for x in (cases, spoiled))
     assert_equal(one, other, "traced, with nonsense where nothing is possible")
     for i, case in enumerate(cases):
