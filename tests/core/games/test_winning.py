@@ -81,10 +81,7 @@ REFERENCES = {
     ),
 }
 
-# Compiling is what costs here, so what is run a few times is hardly optimised.
-fast_to_compile = partial(jax.jit, compiler_options={
-    "xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True})
-compiled = fast_to_compile(winning_region)
+compiled = jax.jit(winning_region)
 
 
 def check_batch(seed, kind, shape, count):
