@@ -139,7 +139,7 @@ def graph_of(model: Any, *arguments: Any) -> Graph:
     lazy = model.mdp if isinstance(model, Game) else model
     world = lazy.mdp if isinstance(lazy, Product) else lazy
     if is_traced((model, arguments)) or not isinstance(world, MDP | DenseMDP):
-        return TracedGraph(model)
+        return TracedGraph(lax.stop_gradient(model))  # supports have no derivative
     return host_graph(model)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -23,7 +23,6 @@ from tests.support import (
     counted_traces,
     lane,
     mass_preserving,
-    random_product,
     random_representation,
     stack,
 )
@@ -38,6 +37,7 @@ class Solver:
       steps: whether it takes max_steps.
       stochastic: whether the policy that it returns is part of its differentiable answer.
       kinds: the representations that it takes.
+      differentiated: whether its derivatives are tested here.
     """
 
     solve: Callable[..., jl.Solution]
@@ -45,6 +45,13 @@ class Solver:
     steps: bool = True
     stochastic: bool = False
     kinds: tuple[str, ...] = REPRESENTATIONS
+    differentiated: bool = True
+
+
+def game_of(model):
+    """The system moves in the first state and wherever its number is even."""
+    number = np.arange(int(np.prod(model.state_shape))).reshape(model.state_shape)
+    return jl.Game(model, jnp.asarray(number % 2 == 0))
 
 
 def reach(model, x, *, objective=None, **options):
@@ -66,7 +73,7 @@ DISCOUNTED = {
                 m, x["reward"], x["discount"], method=method, **o),
             ("reward", "discount"),
         )
-        for method in ("modified_policy_iteration", "value_iteration")
+        for method in ("policy_iteration", "modified_policy_iteration", "value_iteration")
     },
     **{
         f"soft_value-{method}": Solver(
@@ -79,6 +86,19 @@ DISCOUNTED = {
     "boltzmann_value": Solver(
         lambda m, x, **o: jl.boltzmann_value(m, x["reward"], x["discount"], **o),
         ("reward", "discount"), stochastic=True,
+    ),
+    **{
+        f"minimax_value-{method}": Solver(
+            lambda m, x, method=method, **o: jl.minimax_value(
+                game_of(m), x["reward"], x["discount"], method=method, **o),
+            ("reward", "discount"), differentiated=False,
+        )
+        for method in ("policy_iteration", "value_iteration", "strategy_iteration")
+    },
+    "strategy_value": Solver(
+        lambda m, x, **o: jl.strategy_value(
+            game_of(m), x["policy"], x["reward"], x["discount"], **o),
+        ("reward", "discount", "policy"), differentiated=False,
     ),
     "occupancy_measure": Solver(
         lambda m, x, **o: jl.occupancy_measure(m, x["policy"], x["discount"], **o),
@@ -98,6 +118,8 @@ UNDISCOUNTED = {
     ),
 }
 SOLVERS = {**DISCOUNTED, **UNDISCOUNTED}
+# Elimination is one step.
+SOLVED_AT_ONCE = ("reachability-policy", "satisfaction_probability", "occupancy_measure")
 PAIRS = [(name, kind) for name, solver in SOLVERS.items() for kind in solver.kinds]
 
 
@@ -156,7 +178,8 @@ def test_representations_agree(name, kind):
     solve = SOLVERS[name].solve
     one = solve(model, inputs)
     other = solve(tables(explicit), flat_inputs(inputs, explicit))
-    assert one.status == other.status == Status.CONVERGED
+    assert one.status == other.status <= Status.UNCERTIFIED
+    assert one.status == Status.CONVERGED or name == "boltzmann_value"
     loose = 1e-6 if name in UNDISCOUNTED else 1e-10  # within the default tolerance
     for field in ("value", "lower", "upper", "policy"):
         np.testing.assert_allclose(
@@ -165,33 +188,150 @@ def test_representations_agree(name, kind):
         )
 
 
-# --- vmap, jit and traces ----------------------------------------------------------------------
+# --- lanes ---------------------------------------------------------------------------------------
+# Of each solver one program is compiled, whose lanes are a case each.
+
+HARDER = {  # discount, tolerance and the steps allowed
+    "one step": (0.999, 1e-9, 1), "few steps": (0.5, 1e-9, 3), "easy": (0.1, 1e-6, 10_000),
+    "harder": (0.9, 1e-6, 10_000), "hard": (0.999, 1e-6, 100_000),
+}
+INVALID = {
+    "too much": lambda row: 2.5 * row,
+    "negative": lambda row: row * np.where(np.arange(row.size) == row.argmax(), 1, -1),
+    "nan": lambda row: np.where(row == row.max(), np.nan, row),
+    "unavailable": lambda row: np.arange(row.size) == (row == 0).argmax(),
+}
+
+
+def nonsense(rng, model, inputs, values):
+    """The same model and inputs with anything at all where nothing is possible."""
+    world = getattr(model, "mdp", model)
+    none = ~np.asarray(world.available)
+    probability, successor = np.array(world.probability), np.array(world.successor)
+    nowhere = none[..., None] | (probability == 0)
+    successor[nowhere] = rng.integers(world.num_states, size=successor.shape)[nowhere]
+    probability[none] = rng.uniform(0.5, 9, probability.shape)[none]
+    assert none.any() and nowhere.any()
+    world = world.replace(probability=jnp.asarray(probability), successor=jnp.asarray(successor))
+    model = model.replace(mdp=world) if isinstance(model, jl.Product) else world
+    unavailable = ~np.asarray(model.available)
+    reward = inputs["reward"].copy()
+    reward[unavailable] = np.resize(values, unavailable.sum())
+    return model, {**inputs, "reward": reward}
+
+
+def cases_of(solver) -> dict[str, tuple[Any, dict, dict]]:
+    """Model, inputs and limits, by name."""
+    rng = np.random.default_rng(6)
+    kind = "product" if solver.kinds == ("product",) else "sparse"
+    usual = {"tolerance": np.float64(1e-6), "max_steps": np.int32(10_000)}
+    found = {}
+    for i, (name, (discount, tolerance, most)) in enumerate(HARDER.items()):
+        model, _, inputs = example(kind, i)
+        limits = {"tolerance": np.float64(tolerance), "max_steps": np.int32(most)}
+        found[name] = model, {**inputs, "discount": np.asarray(discount)}, limits
+    model, _, inputs = example(kind, 1)
+    found["usual"] = model, inputs, usual
+    for name, values in (("large", [1e9, -1e9]), ("infinite", [np.inf, -np.inf, np.nan])):
+        found[name] = *nonsense(rng, model, inputs, values), usual
+    # The last state that has an action that is not available, and that a game's system owns.
+    flat = inputs["policy"].reshape(-1, inputs["policy"].shape[-1])
+    place = max(s for s in range(0, len(flat), 2) if (flat[s] == 0).any())
+    for name, change in INVALID.items():
+        policy = flat.copy()
+        policy[place] = change(policy[place])
+        found[name] = model, {**inputs, "policy": policy.reshape(inputs["policy"].shape)}, usual
+    for name, bad in (("nan reward", np.nan), ("infinite reward", np.inf)):
+        reward = inputs["reward"].copy()
+        reward.reshape(flat.shape)[place, flat[place].argmax()] = bad
+        found[name] = model, {**inputs, "reward": reward}, usual
+    for name, discount in (("discount 1", 1.0), ("discount nan", np.nan)):
+        found[name] = model, {**inputs, "discount": np.asarray(discount)}, usual
+    return found
+
+
+@cache
+def solved(name: str) -> tuple[dict, dict[str, jl.Solution]]:
+    """The cases of a solver, and their solutions as lanes of one program."""
+    solver = SOLVERS[name]
+    cases = cases_of(solver)
+    models, inputs, limits = zip(*cases.values(), strict=True)
+    limits = [limits_of(solver, x) for x in limits]
+    batch = jax.jit(jax.vmap(lambda m, x, o: solver.solve(m, x, **o)))(
+        stack(models), stack(inputs), stack(limits))
+    batch = jax.tree.map(np.asarray, batch)
+    return cases, {case: lane(batch, i) for i, case in enumerate(cases)}
+
+
+def limits_of(solver, limits):
+    return limits if solver.steps else {"tolerance": limits["tolerance"]}
 
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_every_lane_is_as_if_alone(name):
     """Lanes of different models, difficulty and step limits do not disturb one another."""
     solver = SOLVERS[name]
-    rng = np.random.default_rng(1)
-    models, inputs = [], []
-    for discount in (0.0, 0.5, 0.9, 0.99):
-        model, explicit = (
-            random_product(rng) if solver.kinds == ("product",)
-            else random_representation(rng, "sparse")
-        )
-        models.append(model)
-        inputs.append({**random_inputs(rng, model, explicit), "discount": np.asarray(discount)})
-    options = {"tolerance": jnp.array([1e-3, 1e-9, 1e-6, 1e-8])}
-    if solver.steps:
-        options["max_steps"] = jnp.array([1, 3, 10_000, 10_000])
-    batched = jax.vmap(lambda m, x, o: solver.solve(m, x, **o))(
-        stack(models), stack(inputs), options
-    )
-    for i in range(4):
-        alone = solver.solve(models[i], inputs[i], **lane(options, i))
-        assert_solutions_agree(lane(batched, i), alone)
-        np.testing.assert_array_equal(batched.num_steps[i], alone.num_steps)
-        np.testing.assert_allclose(batched.policy[i], alone.policy, atol=1e-11)
+    cases, found = solved(name)
+    run = jax.jit(lambda m, x, o: solver.solve(m, x, **o))
+    for case in HARDER:
+        model, inputs, limits = cases[case]
+        alone = run(model, inputs, limits_of(solver, limits))
+        assert_solutions_agree(found[case], alone, 1e-9)
+        np.testing.assert_array_equal(found[case].num_steps, alone.num_steps)
+        np.testing.assert_allclose(found[case].policy, alone.policy, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_what_stands_where_nothing_is_possible_changes_nothing(name):
+    _, found = solved(name)
+    for other in ("large", "infinite"):
+        jax.tree.map(np.testing.assert_array_equal, found["usual"], found[other])
+
+
+@pytest.mark.parametrize("name", [n for n, s in SOLVERS.items() if "policy" in s.needs])
+def test_what_is_no_policy_is_invalid(name):
+    solver = SOLVERS[name]
+    cases, found = solved(name)
+    assert found["usual"].status == Status.CONVERGED
+    for case in INVALID:
+        assert found[case].status == Status.INVALID, case
+        with pytest.raises(ValueError, match=r"the policy's row .* of state"):
+            jl.check(found[case])
+        model, inputs, limits = cases[case]
+        with pytest.raises(ValueError, match=r"the policy's row .* of state"):
+            solver.solve(model, inputs, **limits_of(solver, limits))
+    model, inputs, limits = cases["usual"]
+    actions = inputs["policy"].argmax(-1)
+    for action in (5, -1):
+        actions.flat[0] = action
+        with pytest.raises(ValueError, match=f"takes action {action} in state"):
+            solver.solve(model, {**inputs, "policy": actions})
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_what_is_not_certified_has_not_converged(name):
+    solver = SOLVERS[name]
+    _, found = solved(name)
+    for case, one in found.items():
+        certain = np.isfinite(one.lower).all() and np.isfinite(one.upper).all()
+        assert certain or one.status != Status.CONVERGED, case
+        if one.status == Status.CONVERGED:
+            assert (one.lower <= one.value).all() and (one.value <= one.upper).all(), case
+    bad = [c for c in found if c.split()[-1] in solver.needs or c.split()[0] in solver.needs]
+    for case in bad:
+        assert found[case].status == Status.NONFINITE, case
+        assert found[case].num_steps <= 8, case
+
+
+@pytest.mark.parametrize("name", [n for n, s in SOLVERS.items() if s.steps])
+def test_no_more_steps_are_made_than_allowed(name):
+    cases, found = solved(name)
+    for case, one in found.items():
+        assert one.num_steps <= cases[case][2]["max_steps"], case
+    assert found["one step"].status == Status.MAX_STEPS or name in SOLVED_AT_ONCE
+
+
+# --- jit and traces ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", UNDISCOUNTED)  # the others are compiled as they are
@@ -199,7 +339,8 @@ def test_compiled_within_another_function_is_the_same(name):
     solver = SOLVERS[name]
     model, _, inputs = example(solver.kinds[-1] if solver.kinds == ("product",) else "sparse", 2)
     compiled = jax.jit(solver.solve)(model, inputs)
-    assert_solutions_agree(compiled, solver.solve(model, inputs))
+    # Outside it is the host that answers, as near as the default tolerance asks.
+    assert_solutions_agree(compiled, solver.solve(model, inputs), 1e-7)
 
 
 @pytest.mark.parametrize("name", SOLVERS)
@@ -222,20 +363,6 @@ def test_new_numbers_do_not_retrace(name):
 
 
 # --- how a solver ends -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", [n for n, s in SOLVERS.items() if s.steps and n != "policy_value"])
-def test_one_step_is_not_enough(name):
-    solver = SOLVERS[name]
-    model, _, inputs = example("product" if solver.kinds == ("product",) else "sparse")
-    # The Boltzmann solver polishes its one damped step, so only an impossible wish fails.
-    tolerance = 0.0 if name == "boltzmann_value" else 1e-12
-    solution = solver.solve(
-        model, {**inputs, "discount": 0.999}, tolerance=tolerance, max_steps=1
-    )
-    assert solution.status == Status.MAX_STEPS
-    with pytest.raises(jl.NotConverged, match=r"MAX_STEPS.*raise max_steps"):
-        jl.check(solution)
 
 
 @pytest.mark.parametrize(
@@ -274,16 +401,6 @@ def test_rewards_that_are_not_finite_are_reported(name, bad):
         jl.check(solution)
 
 
-@pytest.mark.parametrize("name", [n for n, s in SOLVERS.items() if "policy" in s.needs])
-def test_policies_that_are_not_finite_are_reported(name):
-    solver = SOLVERS[name]
-    model, _, inputs = example("product" if solver.kinds == ("product",) else "sparse")
-    policy = inputs["policy"].copy()
-    policy.flat[0] = np.nan
-    solution = solver.solve(model, {**inputs, "policy": policy})
-    assert solution.status == Status.NONFINITE
-
-
 @pytest.mark.parametrize("name", DISCOUNTED)
 @pytest.mark.parametrize("discount", [1.0, 1.5, np.nan])
 def test_discounts_outside_the_promise_never_converge(name, discount):
@@ -307,7 +424,8 @@ DERIVATIVES = [
         name, kind,
         marks=[] if kind == SOLVERS[name].kinds[0] or name in USUAL else pytest.mark.exhaustive,
     )
-    for name, kind in PAIRS if "value_iteration" not in name
+    for name, kind in PAIRS
+    if "value_iteration" not in name and SOLVERS[name].differentiated
 ]
 
 
