@@ -1,4 +1,4 @@
-"""``python -m benchmarks [a b c d e f g h i j] [--states N] [--json]``: a table, and JSON."""
+"""``python -m benchmarks [a b c d e f g h i j k l] [--states N] [--json]``: a table, and JSON."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def _search() -> list[dict[str, Any]]:
 def main() -> None:
     """Measures the chosen parts, prints a row each and at the end all as one JSON line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("parts", nargs="*", default=list("abcdefghi"),
-                        help="a to i, and j, which takes minutes")
+    parser.add_argument("parts", nargs="*", default=list("abcdefghikl"),
+                        help="a to l; j takes minutes and is left out unless it is named")
     parser.add_argument("--states", type=int, default=1_000_000)
     parser.add_argument("--json", action="store_true", help="only the JSON line")
     chosen = parser.parse_args()
@@ -64,9 +64,13 @@ def main() -> None:
             from benchmarks.todirl import run as measure
         elif part == "j":
             from benchmarks.todirl import run_large as measure
+        elif part == "k":
+            from benchmarks.lanes import run as measure
+        elif part == "l":
+            from benchmarks.first_calls import run as measure
         else:
-            parser.error(f"unknown part {part!r}; choose among {', '.join('abcdefghij')}")
-        found = measure() if part in "ceghij" else measure(chosen.states)
+            parser.error(f"unknown part {part!r}; choose among {', '.join('abcdefghijkl')}")
+        found = measure() if part in "ceghijkl" else measure(chosen.states)
         rows += found
         if not chosen.json:
             print(*map(_row_text, found), sep="\n", flush=True)

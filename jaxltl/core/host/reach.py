@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+DENSE_LIMIT = 1024  # states up to which matrices are dense
 _MAX_ROUNDS = 200
 
 Floats = NDArray[np.float64]
@@ -40,8 +41,10 @@ class Bounds(NamedTuple):
 
 def transition_rows(
     successor: NDArray[Any] | None, weight: NDArray[Any], memory: Integers, on_entry: bool
-) -> Floats:
-    """Transition matrices of a model beside a memory: ``float64[A, N, N]``.
+) -> list[Any]:
+    """Transition matrices of a model beside a memory, ``float64[N, N]`` for each action.
+
+    Sparse ones (SciPy's) beyond 1024 states.
 
     Args:
       successor: ``int[S, A, K]``, or None where every state is one.
@@ -56,13 +59,31 @@ def transition_rows(
     after = memory[target if on_entry else s]  # [T, Q]
     source = s[:, None] * num_memory + np.arange(num_memory)
     size = num_states * num_memory
-    rows = np.zeros((num_actions, size, size))
-    np.add.at(rows, (a[:, None], source, target[:, None] * num_memory + after),
-              weight[s, a, k][:, None].astype(float))
-    return rows
+    column = target[:, None] * num_memory + after
+    entries = np.broadcast_to(weight[s, a, k][:, None].astype(float), column.shape)
+    if size <= DENSE_LIMIT:
+        rows = np.zeros((num_actions, size, size))
+        np.add.at(rows, (a[:, None], source, column), entries)
+        return list(rows)
+    from scipy import sparse  # a tenth of a second that small models do not need
+
+    return [
+        sparse.csr_array(
+            (entries[a == i].ravel(), (source[a == i].ravel(), column[a == i].ravel())),
+            shape=(size, size))
+        for i in range(num_actions)
+    ]
 
 
-def of_policy(row: Floats, one: Booleans, undecided: Booleans, unit: float) -> Bounds | None:
+def policy_row(rows: list[Any], weight: Floats) -> Any:
+    """The chain of a policy ``float[N, A]``."""
+    total = rows[0] * weight[:, :1]
+    for row, w in zip(rows[1:], weight.T[1:], strict=True):
+        total = total + row * w[:, None]
+    return total if isinstance(total, np.ndarray) else total.tocsr()
+
+
+def of_policy(row: Any, one: Booleans, undecided: Booleans, unit: float) -> Bounds | None:
     """Probability of reaching `one` in the chain with transitions ``row[N, N]``.
 
     The bound is that of :func:`jaxltl.core.values.evidence.m_matrix_error`.
@@ -76,9 +97,9 @@ def of_policy(row: Floats, one: Booleans, undecided: Booleans, unit: float) -> B
       The bounds, or None if nothing could be proven.
     """
     open_ = np.flatnonzero(undecided)
-    inner = row[np.ix_(open_, open_)]
-    hit = row[open_][:, one].sum(1)
-    matrix = np.eye(len(open_)) - inner
+    kept = row[open_]
+    inner, hit = kept[:, open_], kept @ one.astype(float)
+    matrix = _minus(inner)
     found = _solved(matrix, hit)
     if found is None:
         return None
@@ -97,15 +118,16 @@ def of_policy(row: Floats, one: Booleans, undecided: Booleans, unit: float) -> B
 
 
 class _Choices(NamedTuple):
-    """`rows[A, N, N]`, which of them may be taken, and which states choose together."""
+    """Matrices of the actions, which rows may be taken, and which states choose together."""
 
-    rows: Floats
+    rows: list[Any]
     allowed: Booleans
     group: Integers
 
     def best(self, value: Floats, sign: int) -> tuple[Floats, Integers, Integers]:
-        """The optimum of ``rows @ value`` for each state, the state that chooses, its action."""
-        images = np.where(self.allowed, sign * (self.rows @ value), -np.inf)
+        """The optimum of ``rows @ value`` for each state, who chooses, and its action."""
+        ahead = np.stack([row @ value for row in self.rows])
+        images = np.where(self.allowed, sign * ahead, -np.inf)
         action = images.argmax(0)
         image = images.max(0)
         order = np.lexsort((-image, self.group))
@@ -115,15 +137,22 @@ class _Choices(NamedTuple):
         chosen = chooser[self.group]
         return sign * image[chosen], chosen, action
 
+    def taken(self, state: Integers, action: Integers) -> Any:
+        """The rows of some states and actions, one below the other."""
+        if isinstance(self.rows[0], np.ndarray):
+            return np.stack(self.rows)[action, state]
+        picked = [row[state] * (action == i)[:, None] for i, row in enumerate(self.rows)]
+        return sum(picked[1:], start=picked[0]).tocsr()
+
 
 def optimum(
-    rows: Floats, allowed: Booleans, group: Integers, one: Booleans, undecided: Booleans,
+    rows: list[Any], allowed: Booleans, group: Integers, one: Booleans, undecided: Booleans,
     sign: int, unit: float,
 ) -> Bounds | None:
     """The largest or smallest probability of reaching `one`, by policy iteration (Howard 1960).
 
     Args:
-      rows: ``float64[A, N, N]``.
+      rows: of :func:`transition_rows`.
       allowed: ``bool[N, A]``, the actions that may be taken; in an end component those that leave.
       group: ``int[N]``, a number that the states of an end component share.
       one, undecided: ``bool[N]``.
@@ -167,9 +196,9 @@ def _iterate(
         if round_ and (gain <= 1e-15 * np.abs(value[open_])).all():
             return value, round_
         leader = chosen[places]
-        row = choices.rows[action[leader], leader]
+        row = choices.taken(leader, action[leader])
         known_part = row @ np.where(open_, 0, known)
-        solved = _solved(np.eye(len(places)) - row[:, places], cost[places] + known_part)
+        solved = _solved(_minus(row[:, places]), cost[places] + known_part)
         if solved is None:
             return None
         value = known.copy()
@@ -177,9 +206,26 @@ def _iterate(
     return value, _MAX_ROUNDS
 
 
-def _solved(matrix: Floats, b: Floats) -> Floats | None:
+def _minus(inner: Any) -> Any:
+    """The identity minus a square matrix."""
+    if isinstance(inner, np.ndarray):
+        return np.eye(len(inner)) - inner
+    from scipy import sparse
+
+    return (sparse.eye_array(inner.shape[0]) - inner).tocsc()
+
+
+def _solved(matrix: Any, b: Floats) -> Floats | None:
+    if not b.size:
+        return b
+    x: NDArray[Any]
     try:
-        x = np.asarray(np.linalg.solve(matrix, b), np.float64)
-    except np.linalg.LinAlgError:
+        if isinstance(matrix, np.ndarray):
+            x = np.linalg.solve(matrix, b)
+        else:
+            from scipy.sparse import linalg
+
+            x = linalg.splu(matrix).solve(b)
+    except (np.linalg.LinAlgError, RuntimeError):  # singular
         return None
     return x if np.isfinite(x).all() else None

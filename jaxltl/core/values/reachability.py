@@ -42,7 +42,8 @@ from jaxltl.core.values.linear import Inverse, System, solver
 
 _POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
 _FAR_SWEEPS = 6  # sweeps of a guess, or of interval iteration after one that failed
-_HOST_LIMIT = 1024  # states up to which a concrete model is solved on the host, by elimination
+_HOST_LIMIT = 4096  # states up to which a concrete model is solved on the host, by elimination
+_FILLED = 2048  # of these undecided, as elimination may fill a matrix of so many rows
 
 
 class Sets(NamedTuple):
@@ -169,8 +170,8 @@ def min_sets(graph: Graph, target: Any) -> Sets:
 # --- small concrete models: the host ---------------------------------------------------------
 
 
-def _rows(model: Any) -> np.ndarray:
-    """``float64[A, N, N]``, the transitions of a concrete model."""
+def _rows(model: Any) -> list[Any]:
+    """The transitions of a concrete model, a matrix for each action."""
     model = model.mdp if isinstance(model, Game) else model
     world: Any = model.mdp if isinstance(model, Product) else model
     dense = isinstance(world, DenseMDP)
@@ -214,11 +215,12 @@ def _policy_on_host(model: Any, target: Any, policy: Any, tolerance: Any) -> Sol
         table = np.eye(model.num_actions, dtype=model.dtype)[table]
     graph = graph_of(model)
     sets = policy_sets(graph, np.asarray(target), table)
-    rows = _rows(model)
-    weight = table.reshape(len(rows[0]), -1).astype(float)
-    chain = np.einsum("sa,ast->st", weight, rows)
     one, zero = sets.one.ravel(), sets.zero.ravel()
-    found = host.of_policy(chain, one, ~(one | zero), _unit(model))
+    undecided = ~(one | zero)
+    if undecided.sum() > _FILLED:
+        return None
+    chain = host.policy_row(_rows(model), table.reshape(len(one), -1).astype(float))
+    found = host.of_policy(chain, one, undecided, _unit(model))
     return None if found is None else _host_solution(model, found, table, tolerance)
 
 
@@ -230,6 +232,8 @@ def _optimum_on_host(
     if components is not None:
         allowed, group = allowed & ~components.inside, np.asarray(components.component).ravel()
     undecided = ~(sets.one | sets.zero)
+    if undecided.sum() > _FILLED:
+        return None
     found = host.optimum(
         _rows(model), allowed.reshape(len(group), -1), group, sets.one.ravel(), undecided.ravel(),
         1 if objective == "max" else -1, _unit(model))

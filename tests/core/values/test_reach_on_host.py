@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
+from jaxltl.core.host import reach as host
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.types import Status
 from jaxltl.core.values.reachability import reachability_probability
@@ -61,7 +62,9 @@ def random_case(rng, size):
 
 
 @pytest.mark.parametrize("objective", ["max", "min", "policy"])
-def test_both_engines_give_the_same_bounds_and_regions(objective):
+@pytest.mark.parametrize("dense_limit", [host.DENSE_LIMIT, 0])
+def test_both_engines_give_the_same_bounds_and_regions(objective, dense_limit, monkeypatch):
+    monkeypatch.setattr(host, "DENSE_LIMIT", dense_limit)
     rng = np.random.default_rng(3)
 
     def solve(model, goal, policy):
