@@ -215,7 +215,7 @@ def _minus(inner: Any) -> Any:
     return (sparse.eye_array(inner.shape[0]) - inner).tocsc()
 
 
-def _solved(matrix: Any, b: Floats) -> Floats | None:
+def _solved(matrix: Any, b: Floats) -> NDArray[Any] | None:
     if not b.size:
         return b
     x: NDArray[Any]
