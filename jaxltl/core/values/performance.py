@@ -26,7 +26,9 @@ from jaxltl.core.models.operators import (
     action_mean,
     expectation,
     policy_distribution,
+    require_policy,
     transition_matrix,
+    valid_policy,
 )
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Status, require_shape, status_code
@@ -65,7 +67,6 @@ class Performance:
     status: jax.Array
 
 
-@partial(jax.jit, static_argnames=("method",))
 def task_performance(
     model: Product,
     policy: jax.Array,
@@ -91,7 +92,8 @@ def task_performance(
       :func:`task_performances` has an answer.
 
     Raises:
-      ValueError: the policy has the wrong shape, blocks are asked for another kind of
+      ValueError: the policy has the wrong shape or a row that is no distribution over available
+        actions (under ``jit`` the status is then INVALID), blocks are asked for another kind of
         task, or an unknown method.
 
     Example:
@@ -106,7 +108,13 @@ def task_performance(
     """
     if method not in ("auto", "blocks", "general"):
         raise ValueError(f"method={method!r}; choose auto, blocks or general.")
-    policy = policy_distribution(model, policy)
+    require_policy(model, policy)
+    return _task_performance(model, policy, tolerance, method=method)
+
+
+@partial(jax.jit, static_argnames=("method",))
+def _task_performance(model: Product, policy: jax.Array, tolerance, *, method: str) -> Performance:
+    policy, _, valid = valid_policy(model, policy)
     simple = model.automaton.acceptance in ("cosafe", "safety")
     if method == "blocks" and not simple:
         raise ValueError(
@@ -126,7 +134,13 @@ def task_performance(
             method="iterative" if math.prod(model.state_shape) > _BLOCK_LIMIT else "auto",
         )
         value, lower, upper = solution.value, solution.lower, solution.upper
-    return _summarize(model, value, lower, upper, tolerance)
+    found = _summarize(model, value, lower, upper, tolerance)
+    unknown = [jnp.where(valid, x, bad) for x, bad in (
+        (found.mean, jnp.nan), (found.lower, 0), (found.upper, 1), (found.worst, jnp.nan),
+        (found.worst_lower, 0), (found.worst_upper, 1))]
+    return Performance(
+        *unknown, found.worst_state, jnp.where(valid, found.value, jnp.nan),
+        jnp.where(valid, found.status, Status.INVALID).astype(jnp.int32))
 
 
 def _summarize(model: Product, value, lower, upper, tolerance) -> Performance:
@@ -257,8 +271,10 @@ def task_performances(
     require_shape("policies", policies, shape)
     found = _batched(models, policies, tolerance, batch=batch)
     status = np.asarray(found.status)
+    for w in np.flatnonzero(status == Status.INVALID):
+        require_policy(*jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies)))
     kind = models.automaton.acceptance
-    redone = np.flatnonzero(status != Status.CONVERGED)
+    redone = np.flatnonzero((status != Status.CONVERGED) & (status != Status.INVALID))
     if not redone.size or kind not in ("cosafe", "safety") or math.prod(states[1:]) > _EXACT_LIMIT:
         return found
     columns = jax.tree.map(np.array, found)

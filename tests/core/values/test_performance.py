@@ -108,7 +108,7 @@ def test_new_numbers_do_not_retrace():
     models, policies, _ = cases("cosafe", "exit")
     tp.task_performances(models, policies)
     with counted_traces() as traced:
-        tp.task_performances(models, policies[::-1])
+        tp.task_performances(jax.tree.map(lambda x: x[::-1], models), policies[::-1])
     assert not [name for name in traced if "performance" in name or name == "_batched"]
 
 
@@ -175,9 +175,23 @@ def test_policies_of_the_wrong_shape_are_refused():
         tp.task_performances(models, policies[:3])
     with pytest.raises(ValueError, match="models is a single product"):
         tp.task_performances(lane(models, 0), policies[0])
-    actions = jnp.zeros(policies.shape[1:3], int)
-    one_for_all = tp.task_performances(models, actions)
+    same = stack([lane(models, 0)] * NUM_MODELS)
+    one_for_all = tp.task_performances(same, np.asarray(lane(models, 0).available).argmax(-1))
     assert one_for_all.mean.shape == (NUM_MODELS,)
+
+
+def test_what_is_no_policy_is_refused_in_its_lane_alone():
+    models, policies, _ = cases("cosafe", "exit")
+    bad = np.array(policies)
+    bad[7, 2, 1] *= 2.5
+    found = tp._together(models, jnp.asarray(bad), None)
+    assert found.status[7] == Status.INVALID and np.isnan(found.mean[7])
+    assert (found.lower[7], found.upper[7]) == (0, 1)
+    assert (np.delete(np.asarray(found.status), 7) == Status.CONVERGED).all()
+    for call in (lambda: tp.task_performances(models, jnp.asarray(bad)),
+                 lambda: tp.task_performance(lane(models, 7), jnp.asarray(bad[7]))):
+        with pytest.raises(ValueError, match=r"of state \(2, 1\) sums to 2.5"):
+            call()
 
 
 # --- over worlds ----------------------------------------------------------------------------------
