@@ -36,8 +36,9 @@ from jaxltl.core.models.operators import (
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.tables import action_columns, table
 from jaxltl.core.types import Solution, Status, require_shape, status_code
-from jaxltl.core.values.evidence import m_matrix_error, refuse
+from jaxltl.core.values.evidence import m_matrix_error, refuse, rounding_unit
 from jaxltl.core.values.fixed_point import implicit
+from jaxltl.core.values.iterate import iterate
 from jaxltl.core.values.linear import Inverse, System, solver
 
 _POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
@@ -291,93 +292,130 @@ def _evaluate(model, target, policy, tolerance, max_steps, *, method) -> Solutio
 # --- optima: interval iteration -------------------------------------------------------------
 
 
+class _Search(NamedTuple):
+    """A problem of finding an optimum; `sign` times probabilities are maximised.
+
+    Where `cheap`, sweeps under a fixed policy go through its chain over single states; a product
+    gathers whole rows, which such a chain cannot.
+    """
+
+    model: Any
+    undecided: jax.Array
+    one: jax.Array
+    components: EndComponents | None
+    goal: jax.Array
+
+    @property
+    def cheap(self) -> bool:
+        return self.components is None and not isinstance(self.model, Product)
+
+    @property
+    def slack(self) -> float:
+        """Sums of nonnegative terms err by a relative amount, so rounded outwards bounds stay."""
+        return rounding_unit(self.model)
+
+    @property
+    def leaving(self) -> jax.Array:
+        available = self.model.available
+        return available if self.components is None else available & ~self.components.inside
+
+    def best(self, sign: int, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        value, action = action_argmax(sign * expectation(self.model, y), self.leaving)
+        return jnp.where(self.undecided, _collapse(self.components, sign * value), self.one), action
+
+    def nearer(self, sign: int, near: jax.Array, image: jax.Array) -> jax.Array:
+        return sign * jnp.maximum(sign * near, sign * image * (1 - sign * self.slack))
+
+    def closer(self, sign: int, far: jax.Array, image: jax.Array) -> jax.Array:
+        return sign * jnp.minimum(sign * far, sign * image * (1 + sign * self.slack))
+
+
+class _Bounds(NamedTuple):
+    near: jax.Array
+    far: jax.Array
+    failed: jax.Array  # whether the last guess was no bound
+    moved: jax.Array
+
+
+def _tighter(sign: int, _: None, carry: _Bounds, search: _Search) -> _Bounds:
+    """One round: a sweep and some under the greedy policy for `near`, a guess or sweeps for `far`.
+
+    A value that the operator does not carry away from the optimum is a bound, because the fixed
+    point is unique where end components are collapsed; so `far` is guessed, and where the guess
+    fails, plain interval iteration goes on.
+    """
+    near, far, failed, _ = carry
+    image, action = search.best(sign, near)
+    settled = jnp.max(jnp.abs(image - near)) <= search.goal / 32
+    new_near = search.nearer(sign, near, image)
+    if search.cheap:
+        new_near = _followed(sign, search, new_near, action)
+
+    def guess() -> tuple[jax.Array, jax.Array]:
+        # `near` moved by almost the tolerance; some sweeps give it its shape.
+        offered = jnp.clip(new_near + sign * 1.8 * search.goal, 0, 1)
+        offered = jnp.where(search.undecided, offered, search.one)
+
+        def sweep(_, pair: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            return pair[1], search.best(sign, pair[1])[0] * (1 + sign * search.slack)
+
+        before, after = lax.fori_loop(0, _FAR_SWEEPS, sweep, (offered, offered))
+        proven = jnp.all(sign * after <= sign * before)
+        return jnp.where(proven, search.closer(sign, far, after), far), ~proven
+
+    def sweeps() -> tuple[jax.Array, jax.Array]:
+        step = lax.fori_loop(
+            0, _FAR_SWEEPS, lambda _, y: search.closer(sign, y, search.best(sign, y)[0]), far)
+        return step, jnp.bool_(False)
+
+    new_far, failed = lax.cond(
+        settled, lambda: lax.cond(failed, sweeps, guess), lambda: (far, failed))
+    moved = jnp.any((new_near != near) | (new_far != far)) | failed
+    return _Bounds(new_near, new_far, failed, moved)
+
+
+def _followed(sign: int, search: _Search, near: jax.Array, action: jax.Array) -> jax.Array:
+    chain = induced_chain(search.model, action)
+
+    def sweep(_, y: jax.Array) -> jax.Array:
+        image = expectation(chain, y.ravel())[:, 0].reshape(y.shape)
+        return search.nearer(sign, y, jnp.where(search.undecided, image, search.one))
+
+    return lax.fori_loop(0, _POLICY_SWEEPS, sweep, near)
+
+
+def _narrow(carry: _Bounds, search: _Search) -> jax.Array:
+    return (jnp.max(jnp.abs(carry.far - carry.near)) <= 2 * search.goal) | ~carry.moved
+
+
 @partial(jax.jit, static_argnames=("objective",))
 def _optimize(model, sets: Sets, components, tolerance, max_steps, *, objective) -> Solution:
     """Encloses an optimum between a bound that a policy attains and one that is proven.
 
     The attained bound ("near") is the lower one of a maximum and the upper one of a
-    minimum. Sweeps under its own greedy policy move it soundly and cheaply. The other
-    ("far") is found by guessing: a value that the operator does not carry away from
-    the optimum is a bound, because the fixed point is unique where end components
-    are collapsed. Where the guess fails, plain interval iteration goes on.
+    minimum. Sweeps under its own greedy policy move it soundly and cheaply.
     """
     sign = 1 if objective == "max" else -1
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
     eps = jnp.finfo(model.dtype).eps
-    slack = (model.num_successors + model.num_actions + 4) * eps
-    goal = jnp.sqrt(eps) if tolerance is None else jnp.asarray(tolerance, model.dtype)
-    leaving = model.available if components is None else model.available & ~components.inside
-    # A product gathers whole rows, which its chain over single states cannot.
-    cheap_chain = components is None and not isinstance(model, Product)
-
-    def best(y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        value, action = action_argmax(sign * expectation(model, y), leaving)
-        return jnp.where(undecided, _collapse(components, sign * value), one), action
-
-    # Sums of nonnegative terms err by a relative amount, so rounded outwards these stay bounds.
-    def near_step(near: jax.Array, image: jax.Array) -> jax.Array:
-        return sign * jnp.maximum(sign * near, sign * image * (1 - sign * slack))
-
-    def far_step(far: jax.Array, image: jax.Array) -> jax.Array:
-        return sign * jnp.minimum(sign * far, sign * image * (1 + sign * slack))
-
-    def follow_greedy(near: jax.Array, action: jax.Array) -> jax.Array:
-        chain = induced_chain(model, action)
-
-        def sweep(_, y: jax.Array) -> jax.Array:
-            image = expectation(chain, y.ravel())[:, 0].reshape(y.shape)
-            return near_step(y, jnp.where(undecided, image, one))
-
-        return lax.fori_loop(0, _POLICY_SWEEPS, sweep, near)
-
-    def guess(near: jax.Array, far: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Offers `near` moved by almost the tolerance; some sweeps give it its shape."""
-        guessed = jnp.where(undecided, jnp.clip(near + sign * 1.8 * goal, 0, 1), one)
-
-        def sweep(_, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            return carry[1], best(carry[1])[0] * (1 + sign * slack)
-
-        before, after = lax.fori_loop(0, _FAR_SWEEPS, sweep, (guessed, guessed))
-        proven = jnp.all(sign * after <= sign * before)
-        return jnp.where(proven, far_step(far, after), far), ~proven
-
-    def iterate(_: jax.Array, far: jax.Array) -> tuple[jax.Array, jax.Array]:
-        step = lax.fori_loop(0, _FAR_SWEEPS, lambda _, y: far_step(y, best(y)[0]), far)
-        return step, jnp.bool_(False)
-
-    def body(carry):
-        near, far, failed, n, _ = carry
-        image, action = best(near)
-        settled = jnp.max(jnp.abs(image - near)) <= goal / 32
-        new_near = near_step(near, image)
-        if cheap_chain:
-            new_near = follow_greedy(new_near, action)
-        new_far, failed = lax.cond(
-            settled,
-            lambda: lax.cond(failed, iterate, guess, new_near, far),
-            lambda: (far, failed),
-        )
-        moved = jnp.any((new_near != near) | (new_far != far)) | failed
-        return new_near, new_far, failed, n + 1, moved
-
-    def unfinished(carry):
-        near, far, _, n, moved = carry
-        return (jnp.max(jnp.abs(far - near)) > 2 * goal) & (n < max_steps) & moved
-
+    goal = jnp.asarray(jnp.sqrt(eps) if tolerance is None else tolerance, model.dtype)
+    search = _Search(model, undecided, one, components, goal)
     top = jnp.where(undecided, 1, one)
     near, far = (one, top) if objective == "max" else (top, one)
-    start = (near, far, jnp.bool_(False), jnp.int32(0), jnp.bool_(True))
-    near, far, _, n, _ = lax.stop_gradient(lax.while_loop(unfinished, body, start))
-    action = best(near)[1]
+    start = _Bounds(near, far, jnp.bool_(False), jnp.bool_(True))
+    (near, far, *_), n = iterate(
+        partial(_tighter, sign), _narrow, None, start, search, max_steps=max_steps)
+    still = lax.stop_gradient(search)
+    action = still.best(sign, near)[1]
     if components is not None:
-        own = action_argmax(expectation(model, near), leaving)[0]
+        own = action_argmax(expectation(still.model, near), still.leaving)[0]
         exits = undecided & (own >= _collapse(components, own))
         towards = attract(TracedGraph(model), exits, components.inside).action
         action = jnp.where(exits, action, towards)
     lower, upper = (near, far) if objective == "max" else (far, near)
     value = (lower + upper) / 2
-    residual = jnp.max(jnp.abs(best(value)[0] - value))
+    residual = jnp.max(jnp.abs(still.best(sign, value)[0] - value))
     policy = jnp.where(undecided, action, sets.action)
     solution = Solution(
         value=value, policy=policy, lower=lower, upper=upper, residual=residual, num_steps=n,
