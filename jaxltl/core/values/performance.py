@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -135,12 +136,11 @@ def _task_performance(model: Product, policy: jax.Array, tolerance, *, method: s
         )
         value, lower, upper = solution.value, solution.lower, solution.upper
     found = _summarize(model, value, lower, upper, tolerance)
-    unknown = [jnp.where(valid, x, bad) for x, bad in (
-        (found.mean, jnp.nan), (found.lower, 0), (found.upper, 1), (found.worst, jnp.nan),
-        (found.worst_lower, 0), (found.worst_upper, 1))]
-    return Performance(
-        *unknown, found.worst_state, jnp.where(valid, found.value, jnp.nan),
-        jnp.where(valid, found.status, Status.INVALID).astype(jnp.int32))
+    unknown: Any = dict(
+        mean=jnp.nan, lower=0, upper=1, worst=jnp.nan, worst_lower=0, worst_upper=1,
+        value=jnp.nan, status=Status.INVALID)
+    return jax.tree.map(lambda x, bad: jnp.where(valid, x, jnp.asarray(bad, x.dtype)),
+                        found, replace(found, **unknown))
 
 
 def _summarize(model: Product, value, lower, upper, tolerance) -> Performance:
