@@ -136,9 +136,9 @@ def _task_performance(model: Product, policy: jax.Array, tolerance, *, method: s
         )
         value, lower, upper = solution.value, solution.lower, solution.upper
     found = _summarize(model, value, lower, upper, tolerance)
-    unknown: Any = dict(
-        mean=jnp.nan, lower=0, upper=1, worst=jnp.nan, worst_lower=0, worst_upper=1,
-        value=jnp.nan, status=Status.INVALID)
+    unknown: Any = {
+        "mean": jnp.nan, "lower": 0, "upper": 1, "worst": jnp.nan, "worst_lower": 0,
+        "worst_upper": 1, "value": jnp.nan, "status": Status.INVALID}
     return jax.tree.map(lambda x, bad: jnp.where(valid, x, jnp.asarray(bad, x.dtype)),
                         found, replace(found, **unknown))
 
