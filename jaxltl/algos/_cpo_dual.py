@@ -85,12 +85,15 @@ def cpo_weights(
     case = _case(q, r, s, c, delta)
     # The step to the limit, and on along the limit to the edge of the trust region.
     along = jnp.sqrt(ratio(jnp.maximum(room, 0), rest))
-    reward = jnp.where(case == Case.ACTIVE, along, jnp.sqrt(ratio(2 * delta, q)))
-    cost = jnp.where(case == Case.ACTIVE, -ratio(along * r + c, s), 0)
-    return (
-        jnp.where(case == Case.RECOVERY, 0, reward),
-        jnp.where(case == Case.RECOVERY, -jnp.sqrt(ratio(2 * delta, s)), cost),
-    )
+    zero = jnp.zeros_like(along)
+    # Both numbers are chosen at once: for two choices the compiler may work out the case twice and
+    # round in two ways, and a step that is half of one case and half of another is too long.
+    active = jnp.stack([along, -ratio(along * r + c, s)])
+    free = jnp.stack([jnp.sqrt(ratio(2 * delta, q)), zero])
+    recovery = jnp.stack([zero, -jnp.sqrt(ratio(2 * delta, s))])
+    chosen = jnp.where(case == Case.ACTIVE, active, free)
+    reward, cost = jnp.where(case == Case.RECOVERY, recovery, chosen)
+    return reward, cost
 
 
 def _floats(*numbers: chex.Numeric) -> tuple[jax.Array, ...]:
