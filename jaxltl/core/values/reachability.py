@@ -38,7 +38,7 @@ from jaxltl.core.models.tables import action_columns, table
 from jaxltl.core.types import Solution, Status, require_shape, status_code
 from jaxltl.core.values.evidence import m_matrix_error, refuse, rounding_unit
 from jaxltl.core.values.fixed_point import implicit
-from jaxltl.core.values.iterate import iterate
+from jaxltl.core.values.iterate import in_turn, iterate
 from jaxltl.core.values.linear import Inverse, System, solver
 
 _POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
@@ -116,20 +116,29 @@ def reachability_probability(
         if found is None:
             found = _evaluate(model, target, policy, tolerance, max_steps, method=method)
         return found
-    graph = graph_of(model, target)
-    target = take(graph, target)
-    sets = (max_sets if objective == "max" else min_sets)(graph, target)
-    components = None
-    if objective == "max":
-        components = components_within(graph, ~(sets.one | sets.zero))
-        if not traced and not components.inside.any():
-            components = None
+    if traced:
+        sets, components = in_turn(partial(_decided, objective=objective), model, target)
+        return _optimize(model, sets, components, tolerance, max_steps, objective=objective)
+    graph = graph_of(model)
+    sets, components = _decided(model, np.asarray(target), objective=objective)
+    if components is not None and not components.inside.any():
+        components = None
     if small:
         found = _optimum_on_host(model, graph, sets, components, tolerance, objective)
         if found is not None:
             return found
     arguments = to_jax((sets, components))
     return _optimize(model, *arguments, tolerance, max_steps, objective=objective)
+
+
+def _decided(model: Any, target: Any, *, objective: str) -> tuple[Sets, EndComponents | None]:
+    """What the graph decides of an optimum, and the end components in what is left."""
+    graph = graph_of(model, target)
+    target = take(graph, target)
+    if objective == "min":
+        return min_sets(graph, target), None
+    sets = max_sets(graph, target)
+    return sets, components_within(graph, ~(sets.one | sets.zero))
 
 
 def complement(reach: Solution) -> Solution:
@@ -337,7 +346,7 @@ class _Bounds(NamedTuple):
     moved: jax.Array
 
 
-def _tighter(sign: int, _: None, carry: _Bounds, search: _Search) -> _Bounds:
+def _tighter(sign: int, table: None, carry: _Bounds, search: _Search) -> _Bounds:
     """One round: a sweep and some under the greedy policy for `near`, a guess or sweeps for `far`.
 
     A value that the operator does not carry away from the optimum is a bound, because the fixed
