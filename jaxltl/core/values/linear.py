@@ -23,6 +23,7 @@ Operator = Callable[[jax.Array], jax.Array]
 
 DENSE_LIMIT = 512  # states up to which a system is inverted
 _BLOCK = 32
+_REFINEMENTS = 2
 _GOOD_RATE = 0.7  # a contraction at least this fast needs no Krylov method
 _STRETCH = 64  # steps between two looks at the true residual
 
@@ -88,14 +89,23 @@ class Inverse(NamedTuple):
     system: System
     inverse: jax.Array
 
+    def counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """As :meth:`solve`, and the products with the system that it took."""
+        x = _refined(self.inverse, self.system.matvec, b.ravel())
+        return x.reshape(b.shape), jnp.int32(_REFINEMENTS)
+
     def solve(self, b: jax.Array) -> jax.Array:
         """x with ``(I - c P_w) x = b``, for values of any shape with N entries."""
-        return _refined(self.inverse, self.system.matvec, b.ravel()).reshape(b.shape)
+        return self.counted(b)[0]
+
+    def transpose_counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """As :meth:`transpose_solve`, and the products that it took."""
+        # Without refinement: the transposed product would be a scatter.
+        return (b.ravel() @ self.inverse).reshape(b.shape), jnp.int32(0)
 
     def transpose_solve(self, b: jax.Array) -> jax.Array:
         """The same of the transpose."""
-        # Without refinement: the transposed product would be a scatter.
-        return (b.ravel() @ self.inverse).reshape(b.shape)
+        return self.transpose_counted(b)[0]
 
 
 class Krylov(NamedTuple):
@@ -116,25 +126,34 @@ class Krylov(NamedTuple):
         return self.counted(b)[0]
 
     def counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """x and the number of products that it took."""
+        """As of an Inverse."""
         x, n = _krylov(
             lambda table, given, x: System(table, *given).matvec(x), self.system.table,
             self.system[1:], b.ravel(), self.tolerance, self.max_steps)
         return x.reshape(b.shape), n
 
     def transpose_solve(self, b: jax.Array) -> jax.Array:
-        """As :meth:`Inverse.transpose_solve`."""
-        x = solve_linear(self.system.vecmat, b.ravel(), tolerance=self.tolerance)
-        return x.reshape(b.shape)
+        """As of an Inverse."""
+        return self.transpose_counted(b)[0]
+
+    def transpose_counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """As of an Inverse."""
+        x, n = _krylov(
+            lambda table, given, x: System(table, *given).vecmat(x), self.system.table,
+            self.system[1:], b.ravel(), self.tolerance, self.max_steps)
+        return x.reshape(b.shape), n
 
 
-def solver(system: System, method: str = "auto") -> Inverse | Krylov:
+def solver(
+    system: System, method: str = "auto", *, max_steps: jax.Array | int = 100_000
+) -> Inverse | Krylov:
     """What solves a system; its derivatives are not taken.
 
     Args:
       system: the system.
       method: ``"direct"`` (inversion), ``"iterative"`` (BiCGSTAB), or ``"auto"``, direct up to
         512 states.
+      max_steps: products with the system at most, if it is not inverted.
 
     Raises:
       ValueError: unknown method.
@@ -143,13 +162,13 @@ def solver(system: System, method: str = "auto") -> Inverse | Krylov:
         raise ValueError(f"method={method!r}; choose auto, direct or iterative.")
     system = lax.stop_gradient(system)
     if method == "iterative" or (method == "auto" and system.num_states > DENSE_LIMIT):
-        return Krylov(system)
+        return Krylov(system, max_steps=max_steps)
     return Inverse(system, in_turn(inverse, system.matrix()))
 
 
 def _refined(inverse_: jax.Array, matvec: Any, b: jax.Array) -> jax.Array:
     x = inverse_ @ b
-    for _ in range(2):
+    for _ in range(_REFINEMENTS):
         better = x + inverse_ @ (b - matvec(x))
         x = jnp.where(jnp.isfinite(better), better, x)
     return x

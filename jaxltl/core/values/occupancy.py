@@ -13,6 +13,7 @@ from jaxltl.core.models.tables import action_columns, table
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.evidence import refuse
 from jaxltl.core.values.fixed_point import implicit
+from jaxltl.core.values.iterate import in_turn
 from jaxltl.core.values.linear import System, solver
 
 
@@ -68,9 +69,7 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
 
     system = System(table(model), action_columns(model.num_actions, policy), discount)
     linear = solver(system)
-    visits = lax.stop_gradient(linear.transpose_solve(start))
-    # One step more brings down what elimination has left.
-    visits = lax.stop_gradient(visits + linear.transpose_solve(flow(visits) - visits))
+    visits, n = in_turn(_visits, model, policy, discount, start, linear)
     residual = jnp.sum(jnp.abs(flow(visits) - visits))
     gap = jnp.where(discount < 1, 1 - discount, jnp.nan)
     # The operator is a contraction in the sum norm, and each state's inflow may sum up
@@ -93,11 +92,19 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
         lower=lax.stop_gradient(jnp.maximum(frozen - bound, 0)),
         upper=lax.stop_gradient(frozen + bound),
         residual=lax.stop_gradient(residual),
-        num_steps=jnp.int32(2),
+        num_steps=n,
         status=status_code(
             lax.stop_gradient(bound <= goal), lax.stop_gradient(finite), bound <= 8 * rounding),
     )
     return refuse(solution, checked.given, checked.valid)
+
+
+def _visits(model, policy, discount, start, linear) -> tuple[jax.Array, jax.Array]:
+    visits, n = linear.transpose_counted(start)
+    flow = start + discount * pushforward(model, visits[..., None] * policy)
+    # One step more brings down what elimination has left.
+    more, m = linear.transpose_counted(flow - visits)
+    return visits + more, n + m + 1
 
 
 def feature_expectation(occupancy: jax.Array, features: jax.Array) -> jax.Array:

@@ -272,13 +272,14 @@ def _evaluate(model, target, policy, tolerance, max_steps, *, method) -> Solutio
     weight = action_columns(model.num_actions, policy)
     system = lax.stop_gradient(
         System(table(model), weight, undecided.ravel().astype(model.dtype)))
-    linear = solver(system, method)
+    linear = solver(system, method, max_steps=max_steps)
 
     def onward(y: jax.Array) -> jax.Array:
         return jnp.where(undecided, action_mean(policy, expectation(model, y)), 0)
 
     still = lax.stop_gradient(policy)
-    value = jnp.where(undecided, lax.stop_gradient(linear.solve(one)), one)
+    value, n = lax.stop_gradient(linear.counted(one))
+    value = jnp.where(undecided, value, one)
     # Elimination can break down where rounding closes what leaves a set hardly ever.
     value = jnp.clip(jnp.where(jnp.isfinite(value), value, 0), 0, 1)
     error, residual, _ = lax.stop_gradient(
@@ -286,7 +287,7 @@ def _evaluate(model, target, policy, tolerance, max_steps, *, method) -> Solutio
     goal = jnp.sqrt(jnp.finfo(model.dtype).eps) if tolerance is None else tolerance
     solution = Solution(
         value=value, policy=still, lower=jnp.maximum(value - error, 0),
-        upper=jnp.minimum(value + error, 1), residual=residual, num_steps=jnp.int32(2),
+        upper=jnp.minimum(value + error, 1), residual=residual, num_steps=n,
         # What elimination leaves is rounding.
         status=status_code(
             jnp.max(error) <= goal, jnp.isfinite(residual), isinstance(linear, Inverse)),
