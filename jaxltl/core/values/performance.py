@@ -3,7 +3,7 @@
 The probability of the task from each start (3.8), its mean over the starts (3.9) and its
 least value. One product's evaluation is written so that ``vmap`` over stacked worlds and
 policies is one fast program: the linear system falls into one block for each memory
-state, each is factored once, and a second solve certifies the first.
+state, each is inverted once, and a second solve certifies the first.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from jaxltl.core.values.linear import inverse
 from jaxltl.core.values.reachability import policy_sets
 from jaxltl.core.values.satisfaction import satisfaction_probability
 
-_BLOCK_LIMIT = 1024  # world states up to which a block is factored
+_BLOCK_LIMIT = 1024  # world states up to which a block is inverted
 _MAX_SWEEPS = 1000  # of automata with cycles; one without needs at most Q
 _EXACT_LIMIT = 4096  # product states up to which a stiff chain is eliminated on the host
 
@@ -78,10 +78,9 @@ def task_performance(
     """Probability that a policy does the product's task: mean and least over the starts (3.9).
 
     Args:
-      model: one product; ``vmap`` over stacked ones, or :func:`task_performances`. (Not
-        ``lax.map`` with a batch size that leaves a remainder: on a CPU that can lock up.)
+      model: one product; ``vmap`` over stacked ones, or :func:`task_performances`.
       policy: ``float[S, Q, A]`` or ``int32[S, Q]``.
-      method: ``"blocks"`` (one factorisation for each memory state, of co-safe and safety
+      method: ``"blocks"`` (one inverse for each memory state, of co-safe and safety
         tasks), ``"general"`` (:func:`~jaxltl.core.values.satisfaction.satisfaction_probability`,
         for any task), or ``"auto"``, blocks up to 1024 world states.
       tolerance: half the width of the bounds asked for; default the square root of the
@@ -288,8 +287,7 @@ def task_performances(
 
 
 def _batched(models: Product, policies: jax.Array, tolerance, *, batch: int) -> Performance:
-    """Batch after batch, each waited for: ``lax.map`` would run its remainder beside the rest,
-    which on a CPU can lock up for ever where both factor matrices."""
+    """Batch after batch, so that memory does not grow with the number of worlds."""
     count = len(policies)
     size = min(batch, count)
     parts = []

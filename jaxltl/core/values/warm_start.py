@@ -2,7 +2,8 @@
 
 For learners that solve a model again and again as it changes. Under ``vmap`` over models of one
 graph the lanes become the last axis of every array, so that whole rows of lanes are read at
-each successor, several times faster than lane by lane.
+each successor, several times faster than lane by lane. The loop is its own: lanes that are not
+active are left out of its condition, and it ends on the width of the bounds alone.
 """
 
 from __future__ import annotations
