@@ -242,7 +242,7 @@ def test_a_fixed_point_that_plain_iteration_misses():
 
     solution = jl.boltzmann_value(CYCLE, jnp.asarray(CYCLE_REWARD), 0.9)
     with pytest.raises(jl.NotConverged, match=r"UNCERTIFIED.*certified=False"):
-        jl.check(solution, certified=False)
+        jl.check(solution)
     jl.check(solution, certified=False)
     np.testing.assert_allclose(solution.value, [-2.46366, -3.49686], atol=1e-5)
     np.testing.assert_allclose(
