@@ -62,14 +62,15 @@ def cpo_dual(
     q, r, s, c, delta = _floats(q, r, s, c, delta)
     room, rest, _ = _plane(q, r, s, c, delta)
     case = _case(q, r, s, c, delta)
-    free, recovery = jnp.sqrt(q / (2 * delta)), jnp.sqrt(s / (2 * delta))
-    active = jnp.sqrt(ratio(rest, room))
-    trust = jnp.where(case == Case.ACTIVE, active, free)
-    cost = jnp.where(case == Case.ACTIVE, ratio(jnp.maximum(active * c + r, 0), s), 0)
-    return Dual(
-        trust=jnp.where(case == Case.RECOVERY, recovery, trust),
-        cost=jnp.where(case == Case.RECOVERY, 1, cost), case=case,
-    )
+    on_limit = jnp.sqrt(ratio(rest, room))
+    zero = jnp.zeros_like(on_limit)
+    # Chosen at once, as in `cpo_weights`.
+    active = jnp.stack([on_limit, ratio(jnp.maximum(on_limit * c + r, 0), s)])
+    free = jnp.stack([jnp.sqrt(q / (2 * delta)), zero])
+    recovery = jnp.stack([jnp.sqrt(s / (2 * delta)), zero + 1])
+    chosen = jnp.where(case == Case.ACTIVE, active, free)
+    trust, cost = jnp.where(case == Case.RECOVERY, recovery, chosen)
+    return Dual(trust=trust, cost=cost, case=case)
 
 
 def cpo_weights(
