@@ -339,7 +339,8 @@ def _moves_picture(found: Synthesis, environment: int | None) -> Any:
     )
     shown = np.sort(np.argsort(-size, kind="stable")[:MOST_PANELS])
     size_a = world.game.num_actions
-    mask = np.asarray(strategy.mask).reshape(nodes.game.num_states, -1, strategy.mask.shape[-1])
+    mask = np.asarray(strategy.allowed).reshape(
+        nodes.game.num_states, -1, strategy.allowed.shape[-1])
     region = np.asarray(strategy.region).reshape(nodes.game.num_states, -1)
     allowed = np.zeros((len(shown), world.game.num_states, size_a), bool)
     wins = np.zeros((len(shown), world.game.num_states), bool)

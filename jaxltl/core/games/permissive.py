@@ -39,7 +39,7 @@ class Permissive:
     Attributes:
       game: the game itself, or a Game on a Product with the strategy's memory.
       region: ``bool[S]`` (``[S, Q]``): where the strategy wins.
-      mask: ``bool[S, A]``: the moves it allows in the region, all of the environment's
+      allowed: ``bool[S, A]``: the moves it allows in the region, all of the environment's
         among them; nothing elsewhere.
       base_state, automaton_state: ``int32[S]``, the state of the world and of the task's
         automaton that each of the game's world states stands for.
@@ -49,7 +49,7 @@ class Permissive:
 
     game: Game
     region: jax.Array
-    mask: jax.Array
+    allowed: jax.Array
     base_state: jax.Array
     automaton_state: jax.Array
     maximal: bool = struct.field(pytree_node=False)
@@ -99,7 +99,7 @@ def permissive_strategy(
       >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]],
       ...                    label=[[0], [1]], propositions=["crash"], initial=[1, 0])
       >>> shield_ = permissive_strategy(world, "G !crash")
-      >>> shield_.maximal, shield_.mask[0].any(0).tolist()
+      >>> shield_.maximal, shield_.allowed[0].any(0).tolist()
       (True, [True, False])
     """
     if method not in METHODS:
@@ -152,15 +152,15 @@ def apply_strategy(strategy: Permissive) -> Restriction:
     """
     region, initial = np.asarray(strategy.region), np.asarray(strategy.game.initial)
     initial = np.where(region, initial, 0)
-    return restrict(strategy.game, initial / initial.sum(), allowed=strategy.mask)
+    return restrict(strategy.game, initial / initial.sum(), allowed=strategy.allowed)
 
 
-def shield(policy: jax.Array, mask: jax.Array) -> jax.Array:
+def shield(policy: jax.Array, allowed: jax.Array) -> jax.Array:
     """A policy kept to the moves that a mask allows.
 
     Args:
       policy: ``float[S, A]``, or ``int32[S]`` for a deterministic policy.
-      mask: ``bool[S, A]``.
+      allowed: ``bool[S, A]``, a mask of moves.
 
     Returns:
       A policy of the same kind: a distribution is scaled to the allowed moves, and uniform
@@ -175,23 +175,23 @@ def shield(policy: jax.Array, mask: jax.Array) -> jax.Array:
       >>> shield(np.array([[0.5, 0.25, 0.25]]), np.array([[False, True, True]])).tolist()
       [[0.0, 0.5, 0.5]]
     """
-    xp, policy, mask = namespace(policy, mask)
-    if xp is np and not mask.any():
+    xp, policy, allowed = namespace(policy, allowed)
+    if xp is np and not allowed.any():
         raise ValueError("the mask allows no move in any state; the specification is "
                          "unrealizable, or the mask is of another game.")
     first_of: Any = first_action if xp is np else operators.first_action
-    some, first = first_of(mask)
+    some, first = first_of(allowed)
     if operators.is_deterministic(policy):
-        if policy.shape != mask.shape[:-1]:
+        if policy.shape != allowed.shape[:-1]:
             raise ValueError(f"policy has shape {policy.shape}; the mask's states have "
-                             f"{mask.shape[:-1]}.")
-        allowed = xp.take_along_axis(mask, policy[..., None], axis=-1)[..., 0]
-        return to_jax(xp.where(allowed | ~some, policy, first.astype(policy.dtype)))
-    if policy.shape != mask.shape:
-        raise ValueError(f"policy has shape {policy.shape}; the mask has {mask.shape}.")
-    kept = xp.where(mask, policy, 0)
+                             f"{allowed.shape[:-1]}.")
+        inside = xp.take_along_axis(allowed, policy[..., None], axis=-1)[..., 0]
+        return to_jax(xp.where(inside | ~some, policy, first.astype(policy.dtype)))
+    if policy.shape != allowed.shape:
+        raise ValueError(f"policy has shape {policy.shape}; the mask has {allowed.shape}.")
+    kept = xp.where(allowed, policy, 0)
     total = kept.sum(-1, keepdims=True)
-    uniform = (mask / xp.maximum(mask.sum(-1, keepdims=True), 1)).astype(policy.dtype)
+    uniform = (allowed / xp.maximum(allowed.sum(-1, keepdims=True), 1)).astype(policy.dtype)
     shielded = xp.where(total > 0, kept / xp.where(total > 0, total, 1), uniform)
     return to_jax(xp.where(some[..., None], shielded, policy))
 

@@ -166,7 +166,7 @@ def test_safe_strategies_allow_exactly_what_some_winning_strategy_does():
                     break
                 inside = smaller
             used |= kept & inside[:, None]
-        np.testing.assert_array_equal(strategy.mask, used)
+        np.testing.assert_array_equal(strategy.allowed, used)
         assert strategy.maximal
 
 
@@ -221,7 +221,7 @@ def test_the_parity_construction_includes_every_memoryless_winning_strategy():
             continue
         strategy = permissive_strategy(game, task, method="parity")
         memory = np.asarray(strategy.game.mdp.next_memory)
-        mask, first = np.asarray(strategy.mask), strategy.game.mdp.initial_memory
+        mask, first = np.asarray(strategy.allowed), strategy.game.mdp.initial_memory
         available, system = np.asarray(game.available), np.asarray(game.system)
         successor = np.asarray(game.mdp.successor)[..., 0]
         for choice in itertools.product(*(np.flatnonzero(row) for row in available[system])):
