@@ -133,7 +133,8 @@ def solve(
         krylov=start_bicgstab(zero, zero),
         target=scalar, inner=none,
     )
-    lanes = "in turn" if newton else "side by side"
+    # Side by side wins where a row of lanes fills a vector unit, which doubles do not.
+    lanes = "side by side" if not newton and value.dtype.itemsize <= 4 else "in turn"
     last, n = iterate(
         step, lambda k, _: k.done, table, start, backup, max_steps=max_steps, lanes=lanes)
     return last.value, last.image, n
