@@ -160,6 +160,7 @@ def _sample(game: Game, key, state, action) -> jax.Array:
 
 
 def finite(x: jax.Array) -> jax.Array:
+    """Numbers as they are, zero for infinity."""
     return jnp.where(jnp.isinf(x), 0, x)
 
 

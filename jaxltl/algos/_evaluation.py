@@ -15,6 +15,7 @@ from jaxltl.core.types import require_shape
 
 
 def per_cost(name: str, value: Any, num_costs: int) -> np.ndarray:
+    """One number for each cost, of one for all or of as many."""
     value = np.asarray(value, float)
     if value.ndim:
         require_shape(name, value, (num_costs,))
@@ -63,6 +64,7 @@ def evaluate_all(
 def scores(
     problem: Any, parameters: jax.Array, key: chex.PRNGKey
 ) -> tuple[jax.Array, jax.Array]:
+    """Objective and costs ``[C]`` of one rollout under some parameters."""
     objective, cost = split(problem.evaluate(parameters, key))
     require_shape("the cost that evaluate returned", cost, problem.limit.shape)
     return objective.astype(parameters.dtype), cost.astype(parameters.dtype)

@@ -24,6 +24,7 @@ from jaxltl.core.values.minimax import minimax_value
 
 
 def shaped_reward(game: Game, reward: Any) -> np.ndarray:
+    """The reward checked against the game, as an array of one of its two shapes."""
     if not isinstance(game.mdp, MDP):
         raise ValueError(
             f"the game's model is a {type(game.mdp).__name__}; learning plays in an explicit MDP: "
@@ -79,6 +80,7 @@ def merge_successors(game: Game, reward: np.ndarray) -> tuple[Game, jax.Array]:
 
 
 def require_start(game: Game, region: jax.Array, base: np.ndarray, memory: np.ndarray) -> None:
+    """Raises a ValueError that names an initial state that is not won."""
     outside = np.flatnonzero((np.asarray(game.initial) > 0) & ~np.asarray(region))
     if outside.size == 0:
         return

@@ -41,16 +41,19 @@ class Network(nn.Module):
 
 
 def mean_network(hparams: Any, num_actions: int, dtype: Any) -> Network:
+    """The network of a policy's means."""
     return Network(hparams.hidden, num_actions, 0.1, dtype)
 
 
 def value_network(hparams: Any, dtype: Any) -> Network:
+    """The network of a value, or of a cost's."""
     return Network(hparams.value_hidden, 1, 0.1, dtype)
 
 
 def gaussian(
     parameters: Any, hparams: Any, inputs: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
+    """Mean and standard deviation of the actions at some inputs."""
     log_deviation = parameters["log_deviation"]
     network = mean_network(hparams, log_deviation.shape[0], log_deviation.dtype)
     mean = jnp.asarray(network.apply({"params": parameters["mean"]}, inputs))
@@ -85,6 +88,7 @@ def value_inputs(inputs: jax.Array) -> jax.Array:
 
 
 def normalized(moments: Moments, hparams: Any, observation: jax.Array) -> jax.Array:
+    """Observations centred and scaled, where that is asked for."""
     return (observation - moments.mean) / scale_of(moments) if hparams.normalize else observation
 
 

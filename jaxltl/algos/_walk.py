@@ -66,6 +66,7 @@ class Walk(NamedTuple):
 
 
 def walk_from(state: Any, moves: jax.Array) -> Walk:
+    """A walk that starts where the learner stands."""
     zero, false = jnp.int32(0), jnp.bool_(False)
     return Walk(
         state.moves, moves, state.position, state.counts, state.reward,

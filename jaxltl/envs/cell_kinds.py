@@ -44,6 +44,7 @@ def many_objects(num: int) -> dict[str, dict[str, int]]:
 
 
 def make_kinds(objects: Counts, obstacles: Counts) -> Kinds:
+    """Kinds of cells, each a name and its counts of colours, checked."""
     kinds: dict[str, tuple[int, ...]] = {}
     for name, counts in [*objects.items(), *obstacles.items()]:
         if name in kinds:
@@ -114,6 +115,7 @@ def categories(
 
 
 def codes_of(kinds: Kinds) -> NDArray[np.int64]:
+    """One number for each kind, by its counts of colours."""
     return _code(np.array([row for _, row in kinds]).reshape(-1, len(COLORS)))
 
 
@@ -122,11 +124,13 @@ def _crop(colors: NDArray[Any], width: int) -> NDArray[Any]:
 
 
 def check_margin(margin: int) -> None:
+    """Raises a ValueError unless a margin is at least 1."""
     if margin < 1:
         raise ValueError(f"margin={margin}; cells at the border need a ring of at least 1.")
 
 
 def check_colors(colors: ArrayLike, margin: int) -> NDArray[np.int32]:
+    """Colours as ``int32[rows, columns]``, checked; there is a cell inside the margin."""
     array = np.asarray(colors)
     check_margin(margin)
     if array.ndim != 2 or min(array.shape) < 2 * margin + 1 or array.dtype.kind not in "iu":

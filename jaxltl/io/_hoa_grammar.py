@@ -20,6 +20,7 @@ FALSE: Tree = ("false",)
 
 
 def unquoted(token: str) -> str:
+    """The text of a quoted token."""
     return re.sub(r"(?s)\\(.)", r"\1", token[1:-1])
 
 
@@ -73,6 +74,7 @@ _TERMINAL = {
 
 
 def error_at(line: int | None, message: str) -> ValueError:
+    """The error of a line, to be raised."""
     return ValueError(f"read_hoa: line {line}: {message}")
 
 
@@ -168,6 +170,8 @@ marks: _BEGIN INT* _FINISH
 
 @dataclass(frozen=True)
 class Edge:
+    """One edge as it is written."""
+
     label: Tree | None
     targets: list[Token]
     marks: list[Token]
@@ -176,6 +180,8 @@ class Edge:
 
 @dataclass(frozen=True)
 class State:
+    """One state as it is written, with its edges."""
+
     label: Tree | None
     number: Token
     name: str | None

@@ -36,6 +36,7 @@ class Header:
 
 
 def read_header(version: Token, items: list[list[Any]]) -> Header:
+    """The header's items, checked against one another."""
     if version not in ("v1", "v1.1"):
         raise error_at(version.line, f"version {version} is unknown. Write the automaton as v1.")
     given: dict[str, list[Any]] = {}
@@ -133,6 +134,7 @@ def _condition(tree: Tree, sets: int) -> Tree:
 
 
 def set_number(number: Token, sets: int) -> int:
+    """The number of an acceptance set, which has to exist."""
     if int(number) >= sets:
         raise error_at(
             number.line,

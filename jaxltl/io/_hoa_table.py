@@ -100,6 +100,7 @@ class Table:
 
 
 def read_table(header: Header, states: list[State], columns: NDArray[np.bool_]) -> Table:
+    """The transitions of the body as arrays over the letters."""
     truth = _label_truth(header, columns)
     edge_of = np.full((len(states), len(columns)), -1, np.int64)
     edges: list[Edge] = []

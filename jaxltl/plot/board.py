@@ -31,6 +31,7 @@ class Board(NamedTuple):
 
 
 def board_of(board: int | str, wall: str) -> Board:
+    """The board of a map, or of a number of cells a side."""
     if isinstance(board, str):
         cells = parse_map(board)
         return Board(cells, np.argwhere(cells != wall), wall)
@@ -51,6 +52,7 @@ def fill_cells(axes: Axes, world: Board, colors: Sequence[str], lines: str = PAP
 
 
 def frame_cells(axes: Axes, world: Board, color: str = PAPER) -> None:
+    """Draws the lines between the cells, and limits the axes to them."""
     rows, columns = world.cells.shape
     for row, column in np.argwhere(world.cells == world.wall):
         axes.add_patch(Rectangle((column, row), 1, 1, facecolor=WALL, lw=0))
@@ -70,6 +72,7 @@ def rule_cells(
 
 
 def draw_robot(axes: Axes, world: Board, place: int) -> None:
+    """Draws the environment's robot in its place."""
     row, column = world.places[place]
     axes.add_patch(Circle((column + 0.5, row + 0.5), 0.3, facecolor=ROBOT, lw=0, zorder=5))
 
@@ -94,6 +97,7 @@ def draw_moves(
 
 
 def number_cells(axes: Axes, rows: int, columns: int) -> None:
+    """Numbers rows and columns, from 1."""
     for axis, count in ((axes.xaxis, columns), (axes.yaxis, rows)):
         stride = max(1, count // 10)
         axis.set_ticks(np.arange(0, count, stride) + 0.5, labels=[
@@ -162,12 +166,14 @@ def keep_out_of_layout(axes: Axes) -> None:
 def require_directions(
     actions: Sequence[str], known: Mapping[str, tuple[int, int]] = DIRECTIONS
 ) -> None:
+    """Raises a ValueError for an action without a direction."""
     for name in actions:
         if name not in known:
             raise ValueError(f"action {name!r} has no direction; use {', '.join(known)}.")
 
 
 def as_mask(policy: ArrayLike, num_actions: int) -> NDArray[np.bool_]:
+    """Actions of a policy, or a mask of them, as ``bool[S, A]``."""
     given = np.asarray(policy)
     if given.dtype.kind in "iu":
         return np.asarray(given[:, None] == np.arange(num_actions))

@@ -60,6 +60,8 @@ class Graph(NamedTuple):
 
 
 class Box(NamedTuple):
+    """A rectangle along the axes, by its middle and half its sides."""
+
     center: Points
     half: Points
 

@@ -84,6 +84,7 @@ def head(axes: Axes, text: str) -> None:
 
 
 def plain_axes(axes: Axes) -> None:
+    """Axes without what distracts."""
     axes.tick_params(labelsize=8, color=FAINT, labelcolor=INK, length=3)
     axes.grid(color=FAINT, lw=0.5)
     axes.set_axisbelow(True)
@@ -120,6 +121,7 @@ def panel_rows(
 
 
 def bottom_labels(panels: Mapping[tuple[str, str], Axes], labels: Sequence[str]) -> None:
+    """Labels the axes of the last row of panels."""
     last, columns = list(panels)[-1][0], list(dict.fromkeys(column for _, column in panels))
     for column, label in zip(columns, labels, strict=False):
         if (last, column) in panels:

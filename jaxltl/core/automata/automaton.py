@@ -355,10 +355,12 @@ def complement(automaton: Automaton) -> Automaton:
 
 
 def extent_text(automaton: Automaton) -> str:
+    """How many states and letters an automaton has, in words."""
     counts = zip(automaton.delta.shape, ("state", "letter"), strict=True)
     sizes = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for n, name in counts)
     return f"{sizes} over {', '.join(automaton.propositions) or 'no propositions'}"
 
 
 def letter_text(names: Collection[str], row: NDArray[np.bool_]) -> str:
+    """A letter as the set of its propositions."""
     return "{" + ", ".join(name for name, holds in zip(names, row, strict=True) if holds) + "}"
