@@ -259,3 +259,19 @@ def test_only_used_propositions_make_letters():
     np.testing.assert_array_equal(
         np.asarray(lazy.automaton.letters)[np.asarray(lazy.letter), 0], np.arange(64) >> 3 & 1
     )
+
+
+def test_two_formulas_of_one_shape_share_a_program():
+    world = jl.gridworld("a . b\n. . .", slip=0.1)
+    models = [jl.product(world, task) for task in ("F a", "F b")]
+
+    @jax.jit
+    def weigh(model):
+        return jnp.sum(model.final * model.next_memory)
+
+    for model in models:
+        weigh(model)
+    assert weigh._cache_size() == 1
+    assert [m.automaton.propositions for m in models] == [("a",), ("b",)]
+    again = jax.tree.map(lambda x: x, models[1])
+    assert again.automaton.state_names == models[1].automaton.state_names
