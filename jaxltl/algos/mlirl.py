@@ -293,6 +293,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     """One step of the optimiser on :func:`objective`; deterministic given the state.
 
     Under ``vmap`` runs make their steps in turn: each takes as many evaluations as it needs.
+    A step is not differentiated through: :func:`objective` is what has derivatives.
     """
     return in_turn(_step, state, problem, hparams)
 

@@ -22,11 +22,6 @@ def rounding_unit(model: Any) -> float:
     return terms * float(jnp.finfo(model.dtype).eps)
 
 
-def magnitude(reward: jax.Array, value: jax.Array) -> jax.Array:
-    """The size of what a backup sums: the largest reward and the largest value."""
-    return jnp.max(jnp.abs(reward)) + jnp.max(jnp.abs(value), axis=0)
-
-
 class Enclosure(NamedTuple):
     """An enclosure seen from an image, and what it shows; a field may have lanes.
 
