@@ -14,21 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.app.files.tables import (
-    COUNT,
-    LEGEND,
-    MAP,
-    TABLE,
-    TEXT,
-    TRUTH,
-    Rule,
-    check_table,
-    choice,
-    is_list,
-    number_in,
-    read_bytes,
-    read_toml,
-)
+from jaxltl.app.files import tables
+from jaxltl.app.files.tables import COUNT, TEXT, TRUTH, Rule, choice, is_list, number_in
 from jaxltl.app.files.task import load_model
 from jaxltl.core.games.objective import GR1, Parity, gr1, safety
 from jaxltl.core.games.permissive import METHODS
@@ -107,10 +94,9 @@ _FORMULAS = Rule(
     lambda v: is_list(v, str) and bool(v), 'a list of Boolean formulas, such as ["a", "b & !c"]'
 )
 _KEYS: dict[str, dict[str, Rule]] = {
-    "": {"name": TEXT, "game": TABLE, "task": TABLE, "strategy": TABLE},
     "game": {
-        "map": MAP,
-        "legend": LEGEND,
+        "map": tables.MAP,
+        "legend": tables.LEGEND,
         "wall": TEXT,
         "slip": number_in(0, 1),
         "system_start": _START,
@@ -139,31 +125,17 @@ def read_game(path: str | Path) -> GameFile:
         The message names the file, the place and the fix.
     """
     path = Path(path)
-    data, _ = read_toml(path, "the game file")
-    check_table(path, "", data, _KEYS[""], ("game", "task"))
-    for table in ("game", "task", "strategy"):
-        check_table(path, table, data.get(table, {}), _KEYS[table])
-    _check_game(path, data["game"])
+    data, _ = tables.read_tables(path, "the game file", _KEYS, {"": ("game", "task")})
+    game = data["game"]
+    tables.check_source(path, "game", game, [k for k in game if k not in ("model", "initial")])
+    if "map" in game:
+        tables.refuse(path, "game", game, ("initial",), (
+            "a model; on a map give system_start and environment_start"))
     _check_task(path, data["task"])
     return GameFile(
-        path=path, name=data.get("name", path.stem), game=data["game"], task=data["task"],
+        path=path, name=data.get("name", path.stem), game=game, task=data["task"],
         strategy=data.get("strategy", {}), demanded="strategy" in data,
     )
-
-
-def _check_game(path: Path, game: Mapping[str, Any]) -> None:
-    if ("map" in game) == ("model" in game):
-        raise ValueError(f"{path}: [game] must have either a map or a model (an .npz file).")
-    for key in game:
-        if "model" in game and key not in ("model", "initial"):
-            raise ValueError(
-                f"{path}: [game] {key} belongs to a map; a model has it in its arrays."
-            )
-    if "map" in game and "initial" in game:
-        raise ValueError(
-            f"{path}: [game] initial belongs to a model; on a map give system_start and "
-            "environment_start."
-        )
 
 
 def _check_task(path: Path, task: Mapping[str, Any]) -> None:
@@ -196,9 +168,7 @@ def load_game(file: GameFile) -> World:
     try:
         if "model" in spec:
             return _from_arrays(file.path.parent / spec["model"], spec.get("initial"))
-        text = spec.pop("map")
-        if isinstance(text, dict):
-            text = read_bytes(file.path.parent / text["file"], "the map").decode()
+        text = tables.read_map(file.path, spec.pop("map"))
         wall = spec.get("wall", "#")
         for key in ("system_start", "environment_start"):
             if isinstance(spec.get(key), list):
@@ -225,10 +195,7 @@ def _from_arrays(path: Path, initial: str | None) -> World:
 def _cell(given: list[int], key: str, cells: np.ndarray, wall: str) -> tuple[int, int]:
     (row, column), (rows, columns) = given, cells.shape
     if not (1 <= row <= rows and 1 <= column <= columns):
-        raise ValueError(
-            f"{key} = {given} is off the map, which has rows 1 to {rows} and columns 1 to "
-            f"{columns}."
-        )
+        raise ValueError(f"{key} = {given} is {tables.off_map(cells.shape)}")
     if cells[row - 1, column - 1] == wall:
         raise ValueError(f"{key} = {given} is a wall of the map; start in another cell.")
     return row - 1, column - 1

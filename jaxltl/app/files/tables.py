@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import hashlib
 import math
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -61,6 +62,28 @@ LEGEND = Rule(
 )
 
 
+def read_tables(
+    path: Path, what: str, known: Mapping[str, Mapping[str, Rule]],
+    required: Mapping[str, Sequence[str]],
+) -> tuple[dict[str, Any], bytes]:
+    """The tables of a TOML file, all of known keys whose values obey their rules, and its bytes.
+
+    Args:
+      path: the file; `what` it is begins an error.
+      known: keys and rules by table; a file may have a ``name`` beside its tables.
+      required: keys that a table must have; by the empty name, the tables.
+
+    Raises:
+      ValueError: the file is missing or malformed, or a key is unknown, missing or wrong.
+    """
+    data, raw = read_toml(path, what)
+    check_table(path, "", data, {"name": TEXT, **dict.fromkeys(known, TABLE)}, required[""])
+    for table in known:
+        if table in data:
+            check_table(path, table, data[table], known[table], required.get(table, ()))
+    return data, raw
+
+
 def read_toml(path: Path, what: str) -> tuple[dict[str, Any], bytes]:
     """The tables of a TOML file, and its bytes.
 
@@ -80,6 +103,63 @@ def read_bytes(path: Path, what: str) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise ValueError(f"{what} cannot be read: {str(path)!r}: {error.strerror}.") from None
+
+
+def digest(path: Path, raw: bytes, names: Iterable[str]) -> str:
+    """A fingerprint of a file's bytes and of the files beside it that it names."""
+    found = hashlib.sha256(raw)
+    for name in names:
+        found.update(read_bytes(path.parent / name, f"{path} names a file that"))
+    return found.hexdigest()
+
+
+def read_map(path: Path, given: str | Mapping[str, str]) -> str:
+    """The text of a map that a file gives, or whose file it names."""
+    if isinstance(given, str):
+        return given
+    return read_bytes(path.parent / given["file"], "the map").decode()
+
+
+def off_map(shape: Sequence[int]) -> str:
+    """What is said of a cell that is not on a map."""
+    return f"off the map, which has rows 1 to {shape[0]} and columns 1 to {shape[1]}."
+
+
+def require_one(
+    path: Path, table: str, data: Mapping[str, Any], keys: tuple[str, str], wanted: str
+) -> None:
+    """Raises a ValueError unless a table has exactly one of two keys."""
+    if (keys[0] in data) == (keys[1] in data):
+        raise ValueError(f"{path}: [{table}] must have either {wanted}.")
+
+
+def refuse(path: Path, table: str, data: Iterable[str], keys: Iterable[str], belong: str) -> None:
+    """Raises a ValueError for the first key of a table that belongs elsewhere."""
+    for key in keys:
+        if key in data:
+            raise ValueError(f"{path}: [{table}] {key} belongs to {belong}.")
+
+
+def check_source(path: Path, table: str, data: Mapping[str, Any], of_map: Iterable[str]) -> None:
+    """Raises a ValueError unless there is a map or a model; keys of a map do not fit a model."""
+    require_one(path, table, data, ("map", "model"), "a map or a model (an .npz file)")
+    if "model" in data:
+        refuse(path, table, data, of_map, "a map; a model has it in its arrays")
+
+
+def check_demonstrations(
+    path: Path, shown: Mapping[str, Any], file: str, wanted: str, of_synthetic: Iterable[str]
+) -> None:
+    """Raises a ValueError unless there are files or runs to be made, with a discount."""
+    table = "demonstrations"
+    require_one(path, table, shown, (file, "synthetic"), f"{wanted} or synthetic = N")
+    if "synthetic" in shown and "discount" not in shown:
+        raise ValueError(
+            f"{path}: [{table}] lacks discount, that of the reward which the synthetic "
+            "demonstrator maximises; for example 0.95."
+        )
+    if file in shown:
+        refuse(path, table, shown, of_synthetic, "synthetic = N")
 
 
 def check_table(

@@ -7,33 +7,19 @@ beside it.
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from jaxltl.app.files.tables import (
-    COUNT,
-    LEGEND,
-    MAP,
-    NAMES,
-    TABLE,
-    TEXT,
-    Rule,
-    check_table,
-    choice,
-    is_list,
-    number_in,
-    read_bytes,
-    read_toml,
-)
+from jaxltl.app.files import tables
+from jaxltl.app.files.tables import COUNT, NAMES, TEXT, Rule, choice, is_list, number_in
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.mdp import MDP, from_dense, make_mdp
 from jaxltl.core.models.product import Product
@@ -48,8 +34,8 @@ class Task:
 
     Attributes:
       path: the file; `name` is its stem, unless the file gives one.
-      world, demonstrations, learner: the tables' keys and values, all known and of the right
-        kind; keys that were left out are absent.
+      world, demonstrations, learner, test: the tables' keys and values, all known and of the
+        right kind; keys that were left out are absent.
       formula: the task.
       label_on: which label a step of the product reads, ``"entry"`` or ``"exit"``.
       digest: a fingerprint of the file and of every file that it names.
@@ -63,6 +49,34 @@ class Task:
     demonstrations: Mapping[str, Any]
     learner: Mapping[str, Any]
     digest: str
+    test: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def memory(self) -> str:
+        """The formula whose automaton is the learner's memory; the task's own unless given."""
+        return str(self.learner.get("memory", self.formula))
+
+    @property
+    def radius(self) -> int:
+        """How far around its cell the learner sees."""
+        return int(self.learner.get("radius", 1))
+
+    @property
+    def is_colored(self) -> bool:
+        """Whether worlds are coloured grids, not text maps with a legend."""
+        return "legend" not in self.world
+
+
+def make_task(
+    path: Path, data: Mapping[str, Any], raw: bytes, named: Sequence[str], label_on: str
+) -> Task:
+    """A task of a file's checked tables and bytes, the files that it names, and a default."""
+    return Task(
+        path=path, name=data.get("name", path.stem), world=data["world"],
+        formula=data["task"]["formula"], label_on=data["task"].get("label_on", label_on),
+        demonstrations=data["demonstrations"], learner=data["learner"],
+        digest=tables.digest(path, raw, named), test=data.get("test", {}),
+    )
 
 
 class World(NamedTuple):
@@ -78,50 +92,60 @@ class World(NamedTuple):
     cells: np.ndarray | None
     actions: tuple[str, ...]
 
+    def where(self, state: int) -> dict[str, int]:
+        """A state's number from 0 and, on a map, its row and column from 1."""
+        return where(state, None if self.cells is None else self.cells.shape)
+
     def place(self, state: int) -> str:
-        """A state for people: its row and column from 1 on a map, else its number from 0."""
-        if self.cells is None:
-            return f"state {state}"
-        row, column = divmod(int(state), self.cells.shape[1])
-        return f"row {row + 1}, column {column + 1}"
+        """A state for people."""
+        return place(self.where(state))
+
+
+def where(state: int, shape: Sequence[int] | None) -> dict[str, int]:
+    """A state's number from 0 and, on a map of a shape, its row and column from 1."""
+    if shape is None:
+        return {"state": int(state)}
+    row, column = divmod(int(state), shape[1])
+    return {"state": int(state), "row": row + 1, "column": column + 1}
+
+
+def place(where: Mapping[str, int]) -> str:
+    """A state as people name it: row and column from 1 on a map, else its number from 0."""
+    if "row" in where:
+        return f"row {where['row']}, column {where['column']}"
+    return f"state {where['state']}"
 
 
 # --- the keys of each table -----------------------------------------------------------------
 
 
+# Of task files of any method.
+WORLD = {
+    "legend": tables.LEGEND, "wall": TEXT, "slip": number_in(0, 1), "absorbing": NAMES,
+    "initial": TEXT,
+}
+TASK = {"formula": TEXT, "label_on": choice("entry", "exit")}
+SYNTHETIC = {"synthetic": COUNT, "discount": number_in(0, 1, below=True), "length": COUNT}
+LEARNER = {"l2": number_in(0), "learning_rate": number_in(0), "steps": COUNT}
+REQUIRED: dict[str, Sequence[str]] = {
+    "": ("world", "task", "demonstrations", "learner"),
+    "task": ("formula",),
+    "learner": ("method", "discount"),
+}
 _KEYS: dict[str, dict[str, Rule]] = {
-    "": {
-        "name": TEXT,
-        **dict.fromkeys(("world", "task", "demonstrations", "learner"), TABLE),
-    },
-    "world": {
-        "map": MAP,
-        "legend": LEGEND,
-        "wall": TEXT,
-        "slip": number_in(0, 1),
-        "absorbing": NAMES,
-        "initial": TEXT,
-        "model": TEXT,
-    },
-    "task": {"formula": TEXT, "label_on": choice("entry", "exit")},
-    "demonstrations": {
-        "file": TEXT,
-        "synthetic": COUNT,
-        "discount": number_in(0, 1, below=True),
-        "length": COUNT,
-    },
+    "world": {"map": tables.MAP, **WORLD, "model": TEXT},
+    "task": TASK,
+    "demonstrations": {"file": TEXT, **SYNTHETIC},
     "learner": {
         # Files of other methods are read by modules of their own; see method_of.
         "method": Rule(lambda v: v == "mlirl", '"mlirl" or "todirl"'),
         "in": choice("product", "world"),
         "discount": number_in(0, 1, below=True),
         "mu": number_in(0),
-        "l2": number_in(0),
+        **LEARNER,
         "policy": choice("boltzmann", "soft"),
         "adjoint": choice("exact", "approximate"),
         "optimizer": choice("lbfgs", "adam", "sgd"),
-        "learning_rate": number_in(0),
-        "steps": COUNT,
         "tolerance": number_in(0),
         "start": Rule(lambda v: is_list(v, int | float), "a list of numbers, one per feature"),  # type: ignore[arg-type]
         "start_scale": number_in(0),
@@ -134,11 +158,6 @@ _KEYS: dict[str, dict[str, Rule]] = {
         ),
     },
 }
-_REQUIRED = {
-    "": ("world", "task", "demonstrations", "learner"),
-    "task": ("formula",),
-    "learner": ("method", "discount"),
-}
 
 
 def method_of(path: str | Path) -> Any:
@@ -147,7 +166,7 @@ def method_of(path: str | Path) -> Any:
     Raises:
       ValueError: the file cannot be read or is no TOML.
     """
-    learner = read_toml(Path(path), "the task file")[0].get("learner")
+    learner = tables.read_toml(Path(path), "the task file")[0].get("learner")
     return learner.get("method") if isinstance(learner, dict) else None
 
 
@@ -159,47 +178,15 @@ def read_task(path: str | Path) -> Task:
         unknown, missing or wrong. The message names the file, the place and the fix.
     """
     path = Path(path)
-    data, raw = read_toml(path, "the task file")
-    check_table(path, "", data, _KEYS[""], _REQUIRED[""])
-    for table in _REQUIRED[""]:
-        check_table(path, table, data[table], _KEYS[table], _REQUIRED.get(table, ()))
-    world, shown, learner = data["world"], data["demonstrations"], data["learner"]
-    _check_world(path, world)
-    _check_demonstrations(path, shown)
-    _check_learner(path, learner)
-    digest = hashlib.sha256(raw)
-    for name in _named_files(data):
-        digest.update(read_bytes(path.parent / name, f"{path} names a file that"))
-    return Task(
-        path=path, name=data.get("name", path.stem), world=world,
-        formula=data["task"]["formula"], label_on=data["task"].get("label_on", "entry"),
-        demonstrations=shown, learner=learner, digest=digest.hexdigest(),
-    )
-
-
-def _check_world(path: Path, world: Mapping[str, Any]) -> None:
-    if ("map" in world) == ("model" in world):
-        raise ValueError(f"{path}: [world] must have either a map or a model (an .npz file).")
-    for key in ("legend", "wall", "slip", "absorbing"):
-        if "model" in world and key in world:
-            raise ValueError(
-                f"{path}: [world] {key} belongs to a map; a model has it in its arrays."
-            )
-
-
-def _check_demonstrations(path: Path, shown: Mapping[str, Any]) -> None:
-    if ("file" in shown) == ("synthetic" in shown):
-        raise ValueError(
-            f"{path}: [demonstrations] must have either file = \"...\" or synthetic = N."
-        )
-    if "synthetic" in shown and "discount" not in shown:
-        raise ValueError(
-            f"{path}: [demonstrations] lacks discount, that of the reward for doing the task which "
-            "the synthetic demonstrator maximises; for example 0.95."
-        )
-    for key in ("discount", "length"):
-        if "file" in shown and key in shown:
-            raise ValueError(f"{path}: [demonstrations] {key} belongs to synthetic = N.")
+    data, raw = tables.read_tables(path, "the task file", _KEYS, REQUIRED)
+    world, shown = data["world"], data["demonstrations"]
+    tables.check_source(path, "world", world, ("legend", "wall", "slip", "absorbing"))
+    tables.check_demonstrations(path, shown, "file", 'file = "..."', ("discount", "length"))
+    _check_learner(path, data["learner"])
+    text = world.get("map")
+    named = [text["file"]] if isinstance(text, dict) else []
+    named += [table[key] for table, key in ((world, "model"), (shown, "file")) if key in table]
+    return make_task(path, data, raw, named, "entry")
 
 
 def _check_learner(path: Path, learner: Mapping[str, Any]) -> None:
@@ -224,13 +211,6 @@ def _check_learner(path: Path, learner: Mapping[str, Any]) -> None:
         )
 
 
-def _named_files(data: Mapping[str, Any]) -> list[str]:
-    text = data["world"].get("map")
-    names = [text["file"]] if isinstance(text, dict) else []
-    names += [data["world"]["model"]] if "model" in data["world"] else []
-    return names + ([data["demonstrations"]["file"]] if "file" in data["demonstrations"] else [])
-
-
 # --- the world ------------------------------------------------------------------------------
 
 
@@ -245,9 +225,7 @@ def load_world(task: Task) -> World:
         if "model" in spec:
             path = task.path.parent / spec["model"]
             return load_model(path, spec.get("initial"))[0]
-        text = spec.pop("map")
-        if isinstance(text, dict):
-            text = read_bytes(task.path.parent / text["file"], "the map").decode()
+        text = tables.read_map(task.path, spec.pop("map"))
         return World(gridworld(text, **spec), parse_map(text), ACTIONS)
     except ValueError as error:
         raise ValueError(f"{task.path}: [world] {error}") from None
@@ -305,7 +283,7 @@ def load_model(
 
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
-    raw = read_bytes(path, "the model")
+    raw = tables.read_bytes(path, "the model")
     arrays, what = {}, f"{str(path)!r} is not an .npz of plain arrays"
     try:
         file = np.load(io.BytesIO(raw), allow_pickle=False)
@@ -336,7 +314,12 @@ def _where_holds(formula: str, mdp: MDP) -> jax.Array:
 
 
 def load_demonstrations(task: Task, world: World) -> Trajectories:
-    """The demonstrations of a task's file.
+    """The demonstrations of a task's file; see :func:`read_demonstrations`."""
+    return read_demonstrations(task.path.parent / task.demonstrations["file"], world)
+
+
+def read_demonstrations(path: Path, world: World) -> Trajectories:
+    """The demonstrations of a file.
 
     The file is JSON, ``{"demonstrations": [...]}``. Each demonstration is an object with
     ``"cells"``, ``[row, column]`` counted from 1 at the top left (or ``"states"``, numbers
@@ -347,17 +330,8 @@ def load_demonstrations(task: Task, world: World) -> Trajectories:
       ValueError: not such a file, or a demonstration that the world cannot have made. The
         message names the demonstration and the step, both counted from 1.
     """
-    return read_demonstrations(task.path.parent / task.demonstrations["file"], world)
-
-
-def read_demonstrations(path: Path, world: World) -> Trajectories:
-    """The demonstrations of a file, as :func:`load_demonstrations` says.
-
-    Raises:
-      ValueError: likewise.
-    """
     try:
-        data = json.loads(read_bytes(path, "the demonstrations"))
+        data = json.loads(tables.read_bytes(path, "the demonstrations"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: this is not JSON: {error}") from None
     shown = data.get("demonstrations") if isinstance(data, dict) else None
@@ -426,10 +400,7 @@ def _read_cell(value: Any, world: World) -> int:
     row, column = value
     rows, columns = world.cells.shape
     if not (1 <= row <= rows and 1 <= column <= columns):
-        raise ValueError(
-            f"the cell [{row}, {column}] is off the map, which has rows 1 to {rows} and "
-            f"columns 1 to {columns}."
-        )
+        raise ValueError(f"the cell [{row}, {column}] is {tables.off_map(world.cells.shape)}")
     return (row - 1) * columns + column - 1
 
 

@@ -7,9 +7,7 @@ as :func:`jaxltl.io.colored_world.read_world` reads them, or text maps with a le
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,22 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.app.files.tables import (
-    COUNT,
-    LEGEND,
-    MAP,
-    NAMES,
-    TABLE,
-    TEXT,
-    Rule,
-    check_table,
-    choice,
-    is_list,
-    number_in,
-    read_bytes,
-    read_toml,
-)
-from jaxltl.app.files.task import World, read_demonstrations
+from jaxltl.app.files import tables
+from jaxltl.app.files import task as tasks
+from jaxltl.app.files.tables import COUNT, TEXT, Rule, choice, is_list, number_in
+from jaxltl.app.files.task import Task, World
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.labels import require_known
@@ -44,42 +30,6 @@ from jaxltl.envs.cell_kinds import COLORS
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
 from jaxltl.io.colored_world import read_world
-
-
-@dataclass(frozen=True)
-class Task:
-    """A checked task file.
-
-    Attributes:
-      path: the file; `name` is its stem, unless the file gives one.
-      world, demonstrations, learner, test: the tables' keys and values, all known and of the
-        right kind; keys that were left out are absent.
-      formula: the task.
-      memory: the formula whose automaton is the learner's memory; the task's own unless given.
-      label_on: which label a step of the product reads, ``"exit"`` or ``"entry"``.
-      digest: a fingerprint of the file and of every file that it names.
-    """
-
-    path: Path
-    name: str
-    world: Mapping[str, Any]
-    formula: str
-    memory: str
-    label_on: str
-    demonstrations: Mapping[str, Any]
-    learner: Mapping[str, Any]
-    test: Mapping[str, Any]
-    digest: str
-
-    @property
-    def radius(self) -> int:
-        """How far around its cell the learner sees."""
-        return int(self.learner.get("radius", 1))
-
-    @property
-    def is_colored(self) -> bool:
-        """Whether worlds are coloured grids, not text maps with a legend."""
-        return "legend" not in self.world
 
 
 class Scene(NamedTuple):
@@ -103,8 +53,7 @@ class Scene(NamedTuple):
 
     def place(self, state: int) -> dict[str, int]:
         """A state with its row and column, from 1."""
-        row, column = divmod(int(state), self.shape[1])
-        return {"state": int(state), "row": row + 1, "column": column + 1}
+        return tasks.where(state, self.shape)
 
 
 # --- the keys of each table -----------------------------------------------------------------
@@ -117,7 +66,7 @@ def _is_counts(value: Any) -> bool:
 
 
 def _is_maps(value: Any) -> bool:
-    return isinstance(value, list) and len(value) > 0 and all(MAP.holds(x) for x in value)
+    return isinstance(value, list) and len(value) > 0 and all(tables.MAP.holds(x) for x in value)
 
 
 _WHOLE = Rule(lambda v: is_list([v], int) and v >= 0, "a whole number of at least 0")
@@ -129,36 +78,19 @@ _MAPS = Rule(
     _is_maps,
     'a list of files and of maps with line breaks, such as ["map.txt"], with at least one of them',
 )
-_BELOW_ONE = number_in(0, 1, below=True)
-
-_COLORED = ("objects", "obstacles", "margin")
-_PLAIN = ("wall", "absorbing", "initial")
+_COLORED = {"objects": _COUNTS, "obstacles": _COUNTS, "margin": COUNT}
 _REWARDS = ("progress", "failure", "step", "won", "lost")
-_SYNTHETIC = ("discount", "length", *_REWARDS)
-_GENERATED = ("obstacles", "min_distance", "shape", "seed")
-
+_GENERATED = {
+    "obstacles": _WHOLE, "min_distance": COUNT,
+    "shape": Rule(lambda v: is_list(v, int) and len(v) == 2 and min(v) >= 1, "[rows, columns]"),
+    "seed": _WHOLE,
+}
 _KEYS: dict[str, dict[str, Rule]] = {
-    "": {
-        "name": TEXT,
-        **dict.fromkeys(("world", "task", "demonstrations", "learner", "test"), TABLE),
-    },
-    "world": {
-        "maps": _MAPS,
-        "objects": _COUNTS,
-        "obstacles": _COUNTS,
-        "margin": COUNT,
-        "slip": number_in(0, 1),
-        "legend": LEGEND,
-        "wall": TEXT,
-        "absorbing": NAMES,
-        "initial": TEXT,
-    },
-    "task": {"formula": TEXT, "label_on": choice("exit", "entry")},
+    "world": {"maps": _MAPS, **_COLORED, **tasks.WORLD},
+    "task": tasks.TASK,
     "demonstrations": {
         "files": Rule(lambda v: is_list(v, str) and len(v) > 0, "a list of files, one per world"),
-        "synthetic": COUNT,
-        "discount": _BELOW_ONE,
-        "length": COUNT,
+        **tasks.SYNTHETIC,
         **dict.fromkeys(_REWARDS, _NUMBER),
     },
     "learner": {
@@ -170,28 +102,19 @@ _KEYS: dict[str, dict[str, Rule]] = {
             lambda v: is_list(v, int) and all(x >= 1 for x in v),
             "a list of the widths of the hidden layers, such as [80, 80]",
         ),
-        "steps": COUNT,
+        **tasks.LEARNER,
         "patience": COUNT,
-        "held_out": _BELOW_ONE,
-        "learning_rate": number_in(0),
-        "l2": number_in(0),
+        "held_out": number_in(0, 1, below=True),
         "optimizer": choice("adam", "sgd", "rmsprop", "lbfgs"),
         "horizon": COUNT,
     },
     "test": {
         "maps": _MAPS,
         "generate": COUNT,
-        "seed": _WHOLE,
-        "obstacles": _WHOLE,
-        "min_distance": COUNT,
-        "shape": Rule(
-            lambda v: is_list(v, int) and len(v) == 2 and min(v) >= 1, "[rows, columns]"
-        ),
+        **_GENERATED,
         "leave_out": Rule(lambda v: is_list(v, str), "a list of names of test worlds"),
     },
 }
-_TABLES = ("world", "task", "demonstrations", "learner")
-_REQUIRED = {"world": ("maps",), "task": ("formula",), "learner": ("method", "discount")}
 
 
 def read_task(path: str | Path) -> Task:
@@ -202,55 +125,26 @@ def read_task(path: str | Path) -> Task:
         unknown, missing or wrong. The message names the file, the place and the fix.
     """
     path = Path(path)
-    data, raw = read_toml(path, "the task file")
-    check_table(path, "", data, _KEYS[""], _TABLES)
-    for table in (*_TABLES, "test"):
-        if table in data:
-            check_table(path, table, data[table], _KEYS[table], _REQUIRED.get(table, ()))
-    world, shown, learner = data["world"], data["demonstrations"], data["learner"]
-    test = data.get("test", {})
-    _check_world(path, world)
-    _check_demonstrations(path, shown, len(world["maps"]))
-    _check_learner(path, learner)
+    required = {**tasks.REQUIRED, "world": ("maps",)}
+    data, raw = tables.read_tables(path, "the task file", _KEYS, required)
+    world, shown, test = data["world"], data["demonstrations"], data.get("test", {})
+    if "legend" in world:
+        tables.refuse(path, "world", world, _COLORED, "coloured worlds, which have no legend")
+    else:
+        of_text = ("wall", "absorbing", "initial")
+        tables.refuse(path, "world", world, of_text, "maps with a legend")
+    of_synthetic = ("discount", "length", *_REWARDS)
+    tables.check_demonstrations(path, shown, "files", "files = [...]", of_synthetic)
+    if "files" in shown and len(shown["files"]) != len(world["maps"]):
+        raise ValueError(
+            f"{path}: [demonstrations] names {len(shown['files'])} files for "
+            f"{len(world['maps'])} worlds; give one for each of [world] maps, in their order."
+        )
+    _check_learner(path, data["learner"])
     if "test" in data:
         _check_test(path, test, "legend" in world)
-    digest = hashlib.sha256(raw)
-    for name in [*_files(world), *_files(test), *shown.get("files", ())]:
-        digest.update(read_bytes(path.parent / name, f"{path} names a file that"))
-    formula = data["task"]["formula"]
-    return Task(
-        path=path, name=data.get("name", path.stem), world=world, formula=formula,
-        memory=learner.get("memory", formula), label_on=data["task"].get("label_on", "exit"),
-        demonstrations=shown, learner=learner, test=test, digest=digest.hexdigest(),
-    )
-
-
-def _check_world(path: Path, world: Mapping[str, Any]) -> None:
-    colored = "legend" not in world
-    for key in _PLAIN if colored else _COLORED:
-        if key in world:
-            what = "maps with a legend" if colored else "coloured worlds, which have no legend"
-            raise ValueError(f"{path}: [world] {key} belongs to {what}.")
-
-
-def _check_demonstrations(path: Path, shown: Mapping[str, Any], num_worlds: int) -> None:
-    if ("files" in shown) == ("synthetic" in shown):
-        raise ValueError(
-            f"{path}: [demonstrations] must have either files = [...] or synthetic = N."
-        )
-    if "synthetic" in shown and "discount" not in shown:
-        raise ValueError(
-            f"{path}: [demonstrations] lacks discount, that of the reward which the synthetic "
-            "demonstrator maximises; for example 0.95."
-        )
-    for key in _SYNTHETIC:
-        if "files" in shown and key in shown:
-            raise ValueError(f"{path}: [demonstrations] {key} belongs to synthetic = N.")
-    if "files" in shown and len(shown["files"]) != num_worlds:
-        raise ValueError(
-            f"{path}: [demonstrations] names {len(shown['files'])} files for {num_worlds} worlds; "
-            "give one for each of [world] maps, in their order."
-        )
+    named = [*_files(world), *_files(test), *shown.get("files", ())]
+    return tasks.make_task(path, data, raw, named, "exit")
 
 
 def _check_learner(path: Path, learner: Mapping[str, Any]) -> None:
@@ -279,9 +173,8 @@ def _check_test(path: Path, test: Mapping[str, Any], plain: bool) -> None:
             f"{path}: [test] generate makes coloured worlds; where [world] has a legend, give "
             "maps = [...]."
         )
-    for key in _GENERATED:
-        if key in test and "generate" not in test:
-            raise ValueError(f"{path}: [test] {key} belongs to generate = N.")
+    if "generate" not in test:
+        tables.refuse(path, "test", test, _GENERATED, "generate = N")
 
 
 def _files(table: Mapping[str, Any]) -> list[str]:
@@ -342,7 +235,7 @@ def _read_scene(task: Task, table: str, number: int) -> Scene:
     file = _file_of(entry)
     name = f"map {number + 1}" if file is None else file
     try:
-        text = entry if file is None else read_bytes(task.path.parent / file, "the map").decode()
+        text = entry if file is None else tables.read_map(task.path, {"file": file})
         if task.is_colored:
             return _colored_scene(name, text, task.world, task.radius)
         return _plain_scene(name, text, task.world, task.radius)
@@ -489,14 +382,9 @@ def _alphabet(task: Task) -> list[frozenset[str]]:
     if not task.is_colored:
         shown = [frozenset(names) for names in task.world["legend"].values()]
         return list(dict.fromkeys([frozenset(), *shown]))
-    names = [scene_kind for scene_kind, _ in _kinds_of_first(task)]
-    return [frozenset(), *(frozenset({name}) for name in names)]
-
-
-def _kinds_of_first(task: Task) -> temporal_gridworld.Kinds:
     colored = _read_scene(task, "world", 0).colored
     assert colored is not None
-    return colored.kinds
+    return [frozenset(), *(frozenset({name}) for name, _ in colored.kinds)]
 
 
 def _translate(task: Task, place: str, text: str, alphabet: list[frozenset[str]]) -> Automaton:
@@ -523,7 +411,7 @@ def load_demonstrations(task: Task, scenes: Sequence[Scene]) -> list[Trajectorie
     for name, scene in zip(task.demonstrations["files"], scenes, strict=True):
         size = np.arange(scene.mdp.num_states).reshape(scene.shape).astype(str)
         world = World(scene.mdp, size, ACTIONS)
-        found.append(read_demonstrations(task.path.parent / name, world))
+        found.append(tasks.read_demonstrations(task.path.parent / name, world))
     return found
 
 
