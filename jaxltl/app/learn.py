@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import json
@@ -23,20 +24,15 @@ from jaxltl.app.files.task import (
     World,
     load_demonstrations,
     load_world,
-    read_task,
     synthetic_demonstrations,
 )
+from jaxltl.app.files.task import read_task as read_task
 from jaxltl.core.models.monitor import Verdict, verdicts
-from jaxltl.core.models.product import Product, lift_policy, product, project_policy
+from jaxltl.core.models.product import Product, lift_policy, product
 from jaxltl.core.models.restrict import restrict
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
-
-__all__ = [
-    "STEPS", "Learned", "Outcome", "Setup", "describe", "fingerprint", "history_of", "learn",
-    "pictures", "prepare", "read_task", "save", "summary", "task_pictures",
-]
 
 Report = Callable[[int, Mapping[str, np.ndarray]], None]
 
@@ -100,16 +96,12 @@ def _mlirl(
         model.mdp if in_world else model, features.values, shown,
         start=start, satisfaction_over=spec.get("satisfaction_over", "initial"),
     )
-    options = ("discount", "mu", "l2", "learning_rate", "start_scale", "policy", "adjoint",
-               "optimizer")
-    hparams = mlirl.Hparams(**{k: spec[k] for k in options if k in spec})
-    num_steps, tolerance = spec.get("steps", STEPS), spec.get("tolerance", _TOLERANCE)
-    states = first_states(mlirl.init, *seeds, problem, hparams)
-    found = learner.run_in_chunks(
-        mlirl.step, states, problem, hparams, num_steps=num_steps, lanes=True, keep="before",
-        until=learner.gradient_vanishes(tolerance), report=by_name(report), checkpoint=checkpoint,
+    hparams = settings(mlirl.Hparams, spec)
+    found, history = run_seeds(
+        mlirl, seeds, problem, hparams, report, num_steps=spec.get("steps", STEPS), keep="before",
+        until=learner.gradient_vanishes(spec.get("tolerance", _TOLERANCE)), checkpoint=checkpoint,
     )
-    states, history = found.state, history_of(found)
+    states = found.state
     evaluate = jax.jit(_policy_and_likelihood)
     weights = np.asarray(states.parameters)
     each = [jax.device_get(evaluate(one, problem, hparams)) for one in weights]
@@ -126,8 +118,33 @@ def _mlirl(
     )
 
 
+def settings(kind: Any, spec: Mapping[str, Any]) -> Any:
+    """A learner's Hparams of the keys of ``[learner]`` that it has; the method is another's."""
+    names = [field.name for field in dataclasses.fields(kind) if field.name != "method"]
+    return kind(**{name: spec[name] for name in names if name in spec})
+
+
+def run_seeds(
+    algorithm: Any, seeds: tuple[int, int], problem: Any, hparams: Any, report: Report | None,
+    **options: Any,
+) -> tuple[learner.Chunks, dict[str, np.ndarray]]:
+    """Runs of a learner from N seeds side by side, and their figures ``[T, N]`` by name.
+
+    Args:
+      algorithm: the learner's module.
+      seeds: the first, and how many.
+      options: for :func:`~jaxltl.algos.learner.run_in_chunks`.
+    """
+    states = _first_states(algorithm.init, *seeds, problem, hparams)
+    by_name = report and (lambda step, metrics: report(step, vars(metrics)))
+    found = learner.run_in_chunks(
+        algorithm.step, states, problem, hparams, lanes=True, report=by_name, **options
+    )
+    return found, {"step": found.step, **vars(found.metrics)}
+
+
 @functools.partial(jax.jit, static_argnames=("init", "num_seeds"))
-def first_states(
+def _first_states(
     init: Callable[..., Any], seed: int, num_seeds: int, problem: Any, hparams: Any
 ) -> Any:
     """A learner's N first states, each from a key of its own; one program."""
@@ -143,19 +160,6 @@ def _policy_and_likelihood(
     seen = problem.counts > 0
     log_policy = jnp.log(jnp.where(seen, solution.policy, 1))
     return solution.policy, -jnp.sum(problem.counts * log_policy), solution.status
-
-
-METHODS = {"mlirl": _mlirl}
-
-
-def by_name(report: Report | None) -> Callable[[int, Any], None] | None:
-    """A report of figures by name from one of a learner's metrics."""
-    return None if report is None else lambda step, metrics: report(step, vars(metrics))
-
-
-def history_of(found: learner.Chunks) -> dict[str, np.ndarray]:
-    """The figures of N runs side by side, ``[T, N]``, and ``step [T]``, by name."""
-    return {"step": found.step, **vars(found.metrics)}
 
 
 # --- the whole job --------------------------------------------------------------------------
@@ -246,9 +250,7 @@ def learn(
       ValueError: the learner cannot work on this task.
     """
     model, spec = setup.model, setup.task.learner
-    learned = METHODS[spec["method"]](
-        spec, model, setup.demonstrations, (seed, num_seeds), report, checkpoint
-    )
+    learned = _mlirl(spec, model, setup.demonstrations, (seed, num_seeds), report, checkpoint)
     progress("checking")
     loss = np.where(np.isfinite(learned.loss), learned.loss, np.inf)
     chosen = int(np.argmin(np.where(learned.converged, loss, loss + 1e12)))
@@ -278,9 +280,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     least = outcome.satisfaction[:, starts].min(axis=1)
     pairs = int(np.sum(np.asarray(setup.demonstrations.length)))
     result = {
-        "task": task.name,
-        "formula": task.formula,
-        "method": task.learner["method"],
+        **about(task),
         "in": task.learner.get("in", "product"),
         "num_states": world.mdp.num_states,
         "num_memory": model.num_memory,
@@ -292,7 +292,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         },
         "satisfaction": _evidence(outcome.solution, model, world, starts),
         "best_achievable": _evidence(outcome.best, model, world, starts),
-        "impossible_starts": [_place(world, s) for s in impossible],
+        "impossible_starts": [world.where(s) for s in impossible],
         "neg_log_likelihood": learned.neg_log_likelihood[i],
         "weights": dict(zip(learned.names, learned.weights[i].tolist(), strict=True)),
         "training": {
@@ -301,7 +301,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             "steps": int(learned.num_steps[i]),
             "converged": bool(learned.converged[i]),
             "solver": Status(int(learned.status[i])).name,
-            "hyperparameters": {k: v for k, v in task.learner.items() if k != "method"},
+            "hyperparameters": hyperparameters(task),
         },
         "seeds": {
             "first": outcome.seed,
@@ -313,10 +313,25 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             "loss": learned.loss,
             "neg_log_likelihood": learned.neg_log_likelihood,
         },
-        "seconds": round(outcome.seconds, 2),
-        "versions": {"jaxltl": jaxltl.__version__, "jax": jax.__version__},
+        **took(outcome.seconds),
     }
     return plain(result)
+
+
+def about(task: Task) -> dict[str, Any]:
+    """What a result begins with."""
+    return {"task": task.name, "formula": task.formula, "method": task.learner["method"]}
+
+
+def hyperparameters(task: Task) -> dict[str, Any]:
+    """What a task file says of the learner."""
+    return {k: v for k, v in task.learner.items() if k != "method"}
+
+
+def took(seconds: float) -> dict[str, Any]:
+    """What a result ends with."""
+    versions = {"jaxltl": jaxltl.__version__, "jax": jax.__version__}
+    return {"seconds": round(seconds, 2), "versions": versions}
 
 
 def _evidence(
@@ -332,19 +347,12 @@ def _evidence(
         "mean": {"value": weight @ value, "lower": weight @ lower, "upper": weight @ upper},
         "minimum": {
             "value": value[worst], "lower": lower[starts].min(), "upper": upper[worst],
-            **_place(world, worst),
+            **world.where(worst),
         },
         "num_starts": len(starts),
         "status": Status(int(solution.status)).name,
         "residual": solution.residual,
     }
-
-
-def _place(world: World, state: int) -> dict[str, int]:
-    if world.cells is None:
-        return {"state": state}
-    row, column = divmod(state, world.cells.shape[1])
-    return {"state": state, "row": row + 1, "column": column + 1}
 
 
 def plain(value: Any) -> Any:
@@ -359,12 +367,7 @@ def plain(value: Any) -> Any:
 
 
 def save(out: Path, outcome: Outcome) -> None:
-    """Writes ``policy.npz`` into a directory; see :func:`save_policy`."""
-    save_policy(out / "policy.npz", outcome)
-
-
-def save_policy(path: Path, outcome: Outcome) -> None:
-    """Writes the kept policy with all that it takes to run it, as an ``.npz``, atomically.
+    """Writes ``policy.npz``, the kept policy with all that it takes to run it, into a directory.
 
     Its arrays: ``policy [S, Q, A]``; ``initial_memory [S]`` and ``next_memory [S, Q]``, the memory
     at the start in s and after reading the label of s; ``label_on``; ``actions [A]``; ``weights
@@ -374,20 +377,34 @@ def save_policy(path: Path, outcome: Outcome) -> None:
       ValueError: the place cannot be written to.
     """
     model, learned, i = outcome.setup.model, outcome.learned, outcome.chosen
-    policy = project_policy(model, learned.policy[i])
-    arrays = {
-        "policy": policy.action,
-        "initial_memory": policy.initial_memory,
-        "next_memory": policy.next_memory,
-        "label_on": policy.label_on,
-        "actions": np.array(outcome.setup.world.actions),
+    save_arrays(out / "policy.npz", {
+        "policy": learned.policy[i],
+        **memory_arrays(model),
+        "actions": outcome.setup.world.actions,
         "weights": learned.weights[i],
-        "features": np.array(learned.names),
+        "features": learned.names,
         "all_weights": learned.weights,
         "satisfaction": outcome.solution.value,
         "lower": outcome.solution.lower,
         "upper": outcome.solution.upper,
+    })
+
+
+def memory_arrays(model: Product, size: int | None = None) -> dict[str, Any]:
+    """How the memory of a policy goes on, in the first states of a product."""
+    return {
+        "initial_memory": model.initial_memory[:size],
+        "next_memory": model.next_memory[:size],
+        "label_on": model.label_on,
     }
+
+
+def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Writes arrays as an ``.npz``, atomically.
+
+    Raises:
+      ValueError: the place cannot be written to.
+    """
     with atomic_write(path) as file:
         np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
 

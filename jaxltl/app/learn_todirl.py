@@ -17,9 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-import jaxltl
 from jaxltl.algos import learner, todirl
-from jaxltl.algos.checkpoint import atomic_write
 from jaxltl.app._todirl_parts import (
     LENGTH,
     Judged,
@@ -30,7 +28,8 @@ from jaxltl.app._todirl_parts import (
     counted_worlds,
     part_of,
 )
-from jaxltl.app._todirl_pictures import pictures, task_pictures
+from jaxltl.app._todirl_pictures import pictures as pictures
+from jaxltl.app._todirl_pictures import task_pictures as task_pictures
 from jaxltl.app.files.task_todirl import (
     Scene,
     Task,
@@ -39,14 +38,25 @@ from jaxltl.app.files.task_todirl import (
     load_automata,
     load_demonstrations,
     load_scenes,
-    read_task,
 )
-from jaxltl.app.learn import Report, by_name, fingerprint, first_states, history_of, plain
+from jaxltl.app.files.task_todirl import read_task as read_task
+from jaxltl.app.learn import (
+    Report,
+    about,
+    hyperparameters,
+    memory_arrays,
+    plain,
+    run_seeds,
+    save_arrays,
+    settings,
+    took,
+)
+from jaxltl.app.learn import fingerprint as fingerprint
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.models.batch import lift_memory, stack_products
 from jaxltl.core.models.operators import action_mean, expectation
-from jaxltl.core.models.product import Product, product, project_policy
+from jaxltl.core.models.product import Product, product
 from jaxltl.core.types import Status, status_code
 from jaxltl.core.values.performance import (
     Performance,
@@ -59,11 +69,6 @@ from jaxltl.envs import temporal_gridworld
 from jaxltl.envs.cell_kinds import COLORS
 from jaxltl.envs.gridworld import ACTIONS
 from jaxltl.io.learned_reward import LearnedReward, save_reward
-
-__all__ = [
-    "STEPS", "Outcome", "Setup", "describe", "fingerprint", "learn", "pictures", "prepare",
-    "read_task", "save", "summary", "task_pictures",
-]
 
 STEPS = 300  # at most, unless the task says otherwise
 
@@ -164,14 +169,12 @@ def learn(
         model, _observations(scenes, model), setup.demonstrations,
         held_out=spec.get("held_out", 0.2), network=network, horizon=spec.get("horizon"),
     )
-    hparams = _hparams(spec)
-    states = first_states(todirl.init, seed, num_seeds, problem, hparams)
-    found = learner.run_in_chunks(
-        todirl.step, states, problem, hparams, num_steps=spec.get("steps", STEPS), lanes=True,
-        until=learner.has_stopped, report=by_name(report), checkpoint=checkpoint,
+    hparams = settings(todirl.Hparams, spec)
+    found, history = run_seeds(
+        todirl, (seed, num_seeds), problem, hparams, report, num_steps=spec.get("steps", STEPS),
+        until=learner.has_stopped, checkpoint=checkpoint,
     )
-    states, history = found.state, history_of(found)
-    best = states.best
+    states, best = found.state, found.state.best
     learned = Learned(
         parameters=best.parameters, held_out=np.asarray(best.neg_log_likelihood),
         best_step=np.asarray(best.step), stopped=np.asarray(states.stopped),
@@ -184,11 +187,6 @@ def learn(
     judged, count = _judge(setup, learned, network, hparams, chosen), setup.num_training
     test = judged.part(slice(count, None)) if count < len(judged.status) else None
     return learned, chosen, judged.part(slice(count)), test
-
-
-def _hparams(spec: Mapping[str, Any]) -> todirl.Hparams:
-    options = ("discount", "l2", "learning_rate", "patience", "optimizer", "horizon")
-    return todirl.Hparams(**{k: spec[k] for k in options if k in spec})
 
 
 def _judge(
@@ -288,9 +286,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     task, history, count = setup.task, learned.history, setup.num_training
     infeasible = np.asarray(jax.vmap(infeasible_starts)(setup.worlds.judged)).sum(axis=1)
     result = {
-        "task": task.name,
-        "formula": task.formula,
-        "method": "todirl",
+        **about(task),
         "memory": task.memory,
         "label_on": task.label_on,
         "radius": task.radius,
@@ -314,7 +310,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             "gradient_norm": history["gradient_norm"][-1][i],
             "solver": Status(int(history["status"][:, i].max())).name,
             "solver_error": history["error"][:, i].max(),
-            "hyperparameters": {k: v for k, v in task.learner.items() if k != "method"},
+            "hyperparameters": hyperparameters(task),
         },
         "history": {
             "step": history["step"],
@@ -336,8 +332,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             "load": 'jaxltl.io.learned_reward.load_reward("network.npz")',
             "hidden": list(task.learner.get("hidden", (80, 80))),
         },
-        "seconds": round(outcome.seconds, 2),
-        "versions": {"jaxltl": jaxltl.__version__, "jax": jax.__version__},
+        **took(outcome.seconds),
     }
     return plain(result)
 
@@ -347,16 +342,16 @@ def _about_worlds(
 ) -> dict[str, Any]:
     found: dict[str, Any] = {"num_worlds": len(worlds.scenes)}
     for who, performance in judged.performance.items():
-        about = summarize(worlds.judged, performance, names=worlds.names, leave_out=leave_out)
+        mean = summarize(worlds.judged, performance, names=worlds.names, leave_out=leave_out)
         found[who] = {
-            "mean": {"value": about.mean, "lower": about.lower, "upper": about.upper},
-            "std": about.std,
-            "worst_world": {"name": about.worst_world, "value": about.worst},
-            "worst_start": about.worst_start,
-            "uncertain": list(about.uncertain),
+            "mean": {"value": mean.mean, "lower": mean.lower, "upper": mean.upper},
+            "std": mean.std,
+            "worst_world": {"name": mean.worst_world, "value": mean.worst},
+            "worst_start": mean.worst_start,
+            "uncertain": list(mean.uncertain),
         }
-        found["infeasible"], found["left_out"] = list(about.infeasible), list(about.left_out)
-        found["num_counted"] = about.num_worlds
+        found["infeasible"], found["left_out"] = list(mean.infeasible), list(mean.left_out)
+        found["num_counted"] = mean.num_worlds
     found["solver"] = Status(int(judged.status.max())).name
     found["worlds"] = [
         _about_world(scene, judged, w, int(infeasible[w]))
@@ -400,18 +395,12 @@ def save(out: Path, outcome: Outcome) -> None:
     worlds = outcome.setup.training
     for w, scene in enumerate(worlds.scenes):
         model, size = part_of(worlds.model, w), scene.mdp.num_states
-        policy = outcome.training.policy[w]
-        kept = project_policy(model, policy if policy.ndim == 3 else policy[0])
-        arrays = {
-            "policy": policy[..., :size, :, :],
-            "initial_memory": kept.initial_memory[:size],
-            "next_memory": kept.next_memory[:size],
-            "label_on": kept.label_on,
-            "actions": np.array(ACTIONS),
+        save_arrays(out / f"policy_{w + 1}.npz", {
+            "policy": outcome.training.policy[w][..., :size, :, :],
+            **memory_arrays(model, size),
+            "actions": ACTIONS,
             "satisfaction": outcome.training.performance["learned"].value[w, :size],
-        }
-        with atomic_write(out / f"policy_{w + 1}.npz") as file:
-            np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
+        })
 
 
 def learned_reward(outcome: Outcome) -> LearnedReward:

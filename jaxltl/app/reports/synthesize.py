@@ -8,14 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-import jaxltl
-from jaxltl.algos.checkpoint import atomic_write
 from jaxltl.app.files.game import World, task_text
-from jaxltl.app.learn import plain
+from jaxltl.app.learn import plain, save_arrays, took
 from jaxltl.app.synthesize import Play, Synthesis
 from jaxltl.core.games.objective import GR1
 from jaxltl.core.models.game import Game, is_deterministic
@@ -48,8 +45,7 @@ def summary(found: Synthesis, seconds: float) -> dict[str, Any]:
         "verdict": found.verdict._asdict(),
         "strategy": _about_strategy(found),
         "play": _about_play(found),
-        "seconds": round(seconds, 2),
-        "versions": {"jaxltl": jaxltl.__version__, "jax": jax.__version__},
+        **took(seconds),
     }
     return dict(plain(result))
 
@@ -201,8 +197,8 @@ def _missed(play: Play, found: Synthesis) -> str:
 # --- files ----------------------------------------------------------------------------------
 
 
-def save(out: Path, found: Synthesis) -> list[str]:
-    """Writes the strategies into a directory, atomically: the names of the files.
+def save(out: Path, found: Synthesis) -> None:
+    """Writes the strategies into a directory, atomically.
 
     ``strategy.npz``, if the system wins from some initial state, is its permissive strategy as
     the restricted game of N states: ``successor``, ``probability``, ``initial``, ``system``,
@@ -216,7 +212,6 @@ def save(out: Path, found: Synthesis) -> list[str]:
     GR(1) ``[N, M]`` with ``assumptions [M, N]``, which move its memory on; and the game of N
     nodes that it is played on, as above.
     """
-    written = []
     region = {"region": found.wins}
     nodes = found.nodes
     if found.strategy is not None and found.restricted is not None:
@@ -225,7 +220,7 @@ def save(out: Path, found: Synthesis) -> list[str]:
         arrays = _arrays(found, found.restricted.model, base) | region
         arrays["mask"] = found.restricted.model.available
         arrays["memory"] = found.restricted.memory
-        written.append(_savez(out / "strategy.npz", arrays))
+        save_arrays(out / "strategy.npz", arrays)
     if found.play is not None:
         game = nodes.game
         lost = jnp.where(found.winning.region, 0, game.initial)
@@ -234,8 +229,7 @@ def save(out: Path, found: Synthesis) -> list[str]:
         arrays |= {"counter_action": found.winning.counter_action, "available": game.available}
         if isinstance(found.winning.objective, GR1):
             arrays["assumptions"] = found.winning.objective.assumptions
-        written.append(_savez(out / "counter_strategy.npz", arrays))
-    return written
+        save_arrays(out / "counter_strategy.npz", arrays)
 
 
 def _arrays(found: Synthesis, game: Game, node: np.ndarray) -> dict[str, Any]:
@@ -250,12 +244,6 @@ def _arrays(found: Synthesis, game: Game, node: np.ndarray) -> dict[str, Any]:
         "world_state": found.nodes.world_state[node],
         "automaton_state": found.nodes.automaton_state[node],
     }
-
-
-def _savez(path: Path, arrays: Mapping[str, Any]) -> str:
-    with atomic_write(path) as file:
-        np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
-    return path.name
 
 
 FILES = ("strategy.npz", "counter_strategy.npz", "automaton.svg", "region.svg", "moves.svg")
