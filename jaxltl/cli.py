@@ -10,7 +10,6 @@ import functools
 import importlib
 import inspect
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -23,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 import jaxltl
+from jaxltl.app import programs
 from jaxltl.app.drawing import artist
 
 if TYPE_CHECKING:
@@ -72,63 +72,22 @@ def _float64() -> Iterator[None]:
         yield
 
 
-def _compiling(command: Callable[..., None]) -> Callable[..., None]:
-    """For commands that compile: the option that turns the cache of programs off."""
+def _compiling(*, soon: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """For commands that compile, with little effort if the work is short: the option --no-cache."""
 
-    @click.option("--no-cache", is_flag=True,
-                  help="Compile anew, and keep no compiled programs for the next time.")
-    @functools.wraps(command)
-    def run(*args: Any, no_cache: bool, **options: Any) -> None:
-        _keep_programs(not no_cache)
-        command(*args, **options)
+    def wrap(command: Callable[..., None]) -> Callable[..., None]:
+        @click.option("--no-cache", is_flag=True,
+                      help="Compile anew, and keep no compiled programs for the next time.")
+        @functools.wraps(command)
+        def run(*args: Any, no_cache: bool, **options: Any) -> None:
+            programs.keep_programs(not no_cache)
+            if soon:
+                programs.compile_soon()
+            command(*args, **options)
 
-    return run
+        return run
 
-
-def _keep_programs(wanted: bool) -> None:
-    """Tells JAX to keep compiled programs for the next time, or not to.
-
-    By the environment, where what the user has set there stands; in a process that is not the
-    command's own, nothing is changed.
-    """
-    if not _is_alone():
-        return
-    if not wanted:
-        os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
-        return
-    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        place = cache_directory()
-        try:
-            place.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            return
-        if not os.access(place, os.W_OK):
-            return
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(place)
-    # However small: a job has many programs, each of which takes longer to compile than to read.
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
-    # XLA takes its own hints to the compiler for features that the processor lacks, and says so
-    # as an error for each program that it reads.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-
-
-def _is_alone() -> bool:
-    """Whether the process is the command's own, where nobody has imported JAX before."""
-    return "jax" not in sys.modules
-
-
-def cache_directory() -> Path:
-    """Where the command line keeps compiled programs: in the user's directory for caches."""
-    home = Path.home()
-    if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
-    elif sys.platform == "darwin":
-        base = home / "Library" / "Caches"
-    else:
-        given = os.environ.get("XDG_CACHE_HOME", "")
-        base = Path(given) if os.path.isabs(given) else home / ".cache"
-    return base / "jaxltl" / "programs"
+    return wrap
 
 
 def _say(text: str) -> None:
@@ -159,7 +118,7 @@ def main() -> None:
 @click.option("--seeds", default=1, show_default=True, type=click.IntRange(1),
               help="Learn with this many seeds side by side and keep the best.")
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
-@_compiling
+@_compiling(soon=True)
 @_plain_errors
 def learn(task_file: Path, out: Path | None, seed: int, seeds: int, as_json: bool) -> None:
     """Learn a policy for a task, and say how well it does it.
@@ -169,7 +128,7 @@ def learn(task_file: Path, out: Path | None, seed: int, seeds: int, as_json: boo
     stopped when it is started again with the same task and options.
     """
     _begin(f"learning from {task_file}")
-    alone = _is_alone()
+    alone = programs.is_alone()
     job = _job(task_file)
     task = job.read_task(task_file)
     out = _directory(out, task.name)
@@ -284,7 +243,7 @@ def _report(result: Mapping[str, Any]) -> Any:
 
 @main.command()
 @click.argument("task_file", metavar="TASK.toml", type=click.Path(path_type=Path))
-@_compiling
+@_compiling(soon=True)
 @_plain_errors
 def check(task_file: Path) -> None:
     """Check a task file and all that it names, without learning."""
@@ -303,7 +262,7 @@ def check(task_file: Path) -> None:
               help="The cell of the environment's robot in moves.svg, from 1.  "
               "[default: where the strategy forbids most]")
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
-@_compiling
+@_compiling(soon=True)
 @_plain_errors
 def synthesize(
     game_file: Path, out: Path | None, environment: tuple[int, int] | None, as_json: bool
@@ -482,7 +441,7 @@ _EXPERIMENTS = {
               help="How often learning is repeated, in todirl, pac and cce.  [default: 10; in cce "
                    "50 for the regulator, 5 for the robot]")
 @click.option("--json", "as_json", is_flag=True, help="End with the figures as one JSON line.")
-@_compiling
+@_compiling(soon=False)
 @_plain_errors
 def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> None:
     """Print published figures beside ours."""

@@ -10,7 +10,6 @@ stands: ``XLA_FLAGS= pytest`` tests the programs as users get them.
 import gc
 import getpass
 import hashlib
-import mmap
 import os
 import platform
 import tempfile
@@ -19,21 +18,13 @@ from pathlib import Path
 import jaxlib
 import pytest
 
+from jaxltl.app.programs import keep_all_programs, known_flags
+
 _HASTE = {
     "xla_backend_optimization_level": "0",
     "xla_llvm_disable_expensive_passes": "true",
     "xla_cpu_use_fusion_emitters": "false",
 }
-
-
-def _known(flags: dict[str, str]) -> str:
-    """Those flags that the compiler knows, which ends the process for others."""
-    found = set()
-    for library in sorted(Path(jaxlib.__file__).parent.glob("*.so")):
-        with library.open("rb") as file:
-            text = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-            found |= {name for name in flags if text.find(name.encode()) >= 0}
-    return " ".join(f"--{name}={value}" for name, value in flags.items() if name in found)
 
 
 def _cache() -> Path | None:
@@ -51,14 +42,10 @@ def _cache() -> Path | None:
 
 # Before JAX reads them; workers and subprocesses inherit them.
 if "XLA_FLAGS" not in os.environ:
-    os.environ["XLA_FLAGS"] = _known(_HASTE)
+    os.environ["XLA_FLAGS"] = known_flags(_HASTE)
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ and (place := _cache()):
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(place)
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
-# XLA takes its own hints to the compiler for features that the processor lacks, and says so as an
-# error for each program that it reads.
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+keep_all_programs()
 
 import jax  # noqa: E402
 

@@ -16,7 +16,8 @@ from click.testing import CliRunner
 
 import jaxltl
 from jaxltl.app.drawing import artist, draw, drawing
-from jaxltl.cli import cache_directory, main
+from jaxltl.app.programs import SOON, cache_directory, known_flags
+from jaxltl.cli import main
 from jaxltl.core.automata.language import is_equivalent
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.io.hoa import read_hoa_stream
@@ -298,7 +299,8 @@ import sys, click
 from click.testing import CliRunner
 import jaxltl
 from jaxltl.app.drawing import artist, draw, drawing
-from jaxltl.cli import cache_directory, main
+from jaxltl.app.programs import cache_directory
+from jaxltl.cli import main
 assert CliRunner().invoke(main, ["--help"]).exit_code == 0
 def echo(text, **_):
     print(text, {heavy})
@@ -321,6 +323,7 @@ except SystemExit:
     print(jax.config.jax_enable_compilation_cache, jax.config.jax_compilation_cache_dir,
           jax.config.jax_persistent_cache_min_compile_time_secs,
           jax.config.jax_persistent_cache_min_entry_size_bytes)"""
+        environment.setdefault("XLA_FLAGS", "")
         return alone(code, tmp_path, **environment)
 
     place = tmp_path / "jaxltl" / "programs"
@@ -334,6 +337,27 @@ except SystemExit:
     assert cached("learn", "a.toml", XDG_CACHE_HOME=str(nowhere)).startswith("True None")
     library = "import jaxltl, jax; jaxltl.MDP; print(jax.config.jax_compilation_cache_dir)"
     assert alone(library, tmp_path) == "None"
+
+
+def test_short_work_is_compiled_soon_and_published_figures_as_the_library_is(tmp_path):
+    def flags(command, **environment):
+        code = f"""
+import os, sys
+from jaxltl import cli
+cli._begin = lambda text: sys.exit()
+try:
+    cli.main({command!r})
+except SystemExit:
+    print(os.environ.get("XLA_FLAGS"))"""
+        return alone(code, tmp_path, **environment)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("XLA_FLAGS", raising=False)
+        found = flags(["learn", "a.toml"]).split()
+        assert found and set(found) <= {f"--{name}={value}" for name, value in SOON.items()}
+        assert flags(["reproduce", "mlirl"]) == "None"
+    assert flags(["learn", "a.toml"], XLA_FLAGS="--xla_dump_to=x") == "--xla_dump_to=x"
+    assert known_flags({"xla_no_compiler_has_this": "1"}) == ""
 
 
 @pytest.mark.parametrize(("platform", "environment", "place"), [

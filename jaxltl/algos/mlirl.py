@@ -270,11 +270,11 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     parameters = unravel(flat + hparams.start_scale * noise)
     value = jnp.zeros(problem.model.state_shape, problem.model.dtype)
     if hparams.optimizer == "lbfgs":
-        shapes = jax.eval_shape(_evaluate, parameters, problem, hparams, value)
-        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        point = nothing.replace(
-            parameters=parameters, loss=jnp.full_like(nothing.loss, jnp.inf))
-        optimizer = line_search.start(parameters, point)
+        # Nothing is known yet; only the shapes are read.
+        zero = jnp.zeros((), value.dtype)
+        parts = Objective(zero, zero, value, jnp.int32(0))
+        optimizer = line_search.start(
+            parameters, line_search.Point(parameters, zero + jnp.inf, parameters, parts))
     else:
         optimizer = learner.strong(_optimizer(hparams).init(parameters))
     return State(key, jnp.int32(0), parameters, value, optimizer)

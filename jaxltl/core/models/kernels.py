@@ -12,6 +12,9 @@ import jax.numpy as jnp
 # Transitions of a state up to which what is summed over them is written out, so that XLA fuses
 # it into one pass and with what reads single actions; beyond, programs would grow too large.
 WRITTEN_OUT = 64
+# Transitions in all up to which they are gathered in one go: one pass over so few is as fast as
+# many, and every pass that is written out takes the compiler some ten milliseconds.
+FEW = 2**15
 # Entries of a short last axis up to which a reduction over it is written out.
 UNROLL = 16
 
@@ -57,9 +60,12 @@ def by_action(
 ) -> list[jax.Array]:
     """:func:`fold` for each action, from tables ``[N, A, K]``: A arrays ``[N, ...]``.
 
-    Where a state has many transitions, all actions are combined at once.
+    Where there are few transitions, or many in a state, all actions are combined at once.
     """
     num_actions, width = successor.shape[1:]
+    if successor.size <= FEW:
+        found = folded(successor, weight, value, term, combine, axis=2)
+        return [found[:, a] for a in range(num_actions)]
     if num_actions * width <= WRITTEN_OUT:
         return [
             fold([successor[:, a, k] for k in range(width)],
@@ -70,13 +76,24 @@ def by_action(
         found = fold([successor[..., k] for k in range(width)],
                      [weight[..., k] for k in range(width)], value, term, combine)
     else:
-        rows = gather(value, successor)
-        terms = term(weight.reshape(weight.shape + (1,) * (rows.ndim - 3)), rows)
-        wholes: dict[Any, Any] = {
-            jnp.add: jnp.sum, jnp.logical_or: jnp.any, jnp.minimum: jnp.min}
-        whole = wholes[combine]
-        found = whole(terms, axis=2)
+        found = folded(successor, weight, value, term, combine, axis=2)
     return [found[:, a] for a in range(num_actions)]
+
+
+def folded(
+    successor: jax.Array,
+    weight: jax.Array,
+    value: jax.Array,
+    term: Term = jnp.multiply,
+    combine: Term = jnp.add,
+    *,
+    axis: int,
+) -> jax.Array:
+    """:func:`fold` along the axis of the successors of whole tables, in one pass."""
+    rows = gather(value, successor)
+    terms = term(weight.reshape(weight.shape + (1,) * (rows.ndim - weight.ndim)), rows)
+    wholes: dict[Any, Any] = {jnp.add: jnp.sum, jnp.logical_or: jnp.any, jnp.minimum: jnp.min}
+    return wholes[combine](terms, axis=axis)
 
 
 def stacked(columns: Sequence[jax.Array]) -> jax.Array:

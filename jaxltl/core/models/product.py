@@ -282,6 +282,13 @@ def _read_at(value: jax.Array, memory: jax.Array) -> jax.Array:
     num_memory = value.shape[1]
     if num_memory > _SELECT:
         return jnp.take_along_axis(value, memory, axis=1)
+    if value.size * num_memory <= kernels.FEW:
+        # In one pass, which makes smaller programs.
+        here = memory.reshape(*value.shape[:2], 1) == jnp.arange(num_memory)
+        here = here.reshape(here.shape + (1,) * (value.ndim - 2))
+        if value.dtype == bool:
+            return jnp.any(here & value[:, None], axis=2)
+        return jnp.where(here, value[:, None], 0).sum(axis=2, dtype=value.dtype)
     result = jnp.broadcast_to(value[:, :1], value.shape)
     for q in range(1, num_memory):
         result = jnp.where(memory == q, value[:, q : q + 1], result)

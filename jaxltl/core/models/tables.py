@@ -27,21 +27,24 @@ _WIDEST = 6  # predecessor lists are at most this many times wider than successo
 
 
 class Successors(NamedTuple):
-    """Where the pairs of a model lead, an array ``[N]`` for each action and successor.
+    """Where the pairs of a model lead, ``[A, K, N]``: an array ``[N]`` for each transition.
 
     Separate arrays lie side by side in memory whatever layout XLA chooses, without which
-    its loops over states are not vectorised.
+    its loops over states are not vectorised. Where there are few transitions in all, they are
+    one array: programs are smaller.
 
     Attributes:
       successor: ``int32[N]``, by action and number of the successor.
       probability: ``float[N]``, likewise; zero at unavailable actions.
     """
 
-    successor: list[list[jax.Array]]
-    probability: list[list[jax.Array]]
+    successor: list[list[jax.Array]] | jax.Array
+    probability: list[list[jax.Array]] | jax.Array
 
     def expectation(self, value: jax.Array) -> list[jax.Array]:
         """Expected value of the next state, ``[N, ...]`` for each action, from ``[N, ...]``."""
+        if not isinstance(self.successor, list):
+            return list(kernels.folded(self.successor, self.probability, value, axis=1))
         pairs = zip(self.successor, self.probability, strict=True)
         return [kernels.fold(targets, weights, value) for targets, weights in pairs]
 
@@ -118,8 +121,10 @@ def successors(model: Any) -> Successors | None:
     return Successors(_columns(flat.reshape(rows)), _columns(probability.reshape(rows)))
 
 
-def _columns(entries: jax.Array) -> list[list[jax.Array]]:
-    """``[N, A, K]`` as arrays ``[N]``."""
+def _columns(entries: jax.Array) -> list[list[jax.Array]] | jax.Array:
+    """``[N, A, K]`` as arrays ``[N]``, or as one ``[A, K, N]``."""
+    if entries.size <= kernels.FEW:
+        return jnp.moveaxis(entries, 0, -1)
     _, num_actions, width = entries.shape
     return [[entries[:, a, k] for k in range(width)] for a in range(num_actions)]
 

@@ -72,9 +72,8 @@ class System(NamedTuple):
                 found = mean(self.weight, self.table.expectation(eye))
             return eye - jnp.broadcast_to(self.scale, (n,))[:, None] * found
         rows = jnp.arange(n)
-        target = jnp.stack([jnp.stack(x) for x in self.table.successor])  # [A, K, N]
-        weight = jnp.stack([w * jnp.stack(x) for w, x in zip(
-            self.weight, self.table.probability, strict=True)])
+        target = jnp.asarray(self.table.successor)  # [A, K, N]
+        weight = jnp.stack(self.weight)[:, None] * jnp.asarray(self.table.probability)
         return eye.at[jnp.broadcast_to(rows, target.shape), target].add(-self.scale * weight)
 
 
