@@ -188,7 +188,8 @@ def _learn(job: Any, task: Any, out: Path, seed: int, seeds: int, alone: bool) -
         outcome = job.Outcome(setup, *parts, seed=seed, seconds=time.perf_counter() - start)
         bar.set_description_str("drawing")
         pictures += [(p, begin(p.drawing)) for p in job.pictures(outcome)]
-        return _write(job, outcome, out, pictures)
+        live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]
+        return _write(job, outcome, out, pictures, live)
 
 
 @contextlib.contextmanager
@@ -213,7 +214,8 @@ def _learning(total: int) -> Iterator[Any]:
 
 
 def _write(
-    job: Any, outcome: Any, out: Path, pictures: list[tuple[Picture, Callable[[], bytes]]]
+    job: Any, outcome: Any, out: Path, pictures: list[tuple[Picture, Callable[[], bytes]]],
+    live: list[tuple[Any, dict[str, Callable[[], bytes]]]],
 ) -> dict[str, Any]:
     from jaxltl.algos.checkpoint import atomic_write
 
@@ -221,10 +223,11 @@ def _write(
     job.save(out, outcome)
     shown = []
     for picture, drawn in pictures:
-        shown.append((picture.title, drawn(), picture.caption))
+        shown.append((picture, drawn()))
         with atomic_write(out / picture.name) as file:
             file.write(shown[-1][1])
-    page = _report(result).page(result, shown, (out / "task.toml").read_text())
+    parts = [(x, {k: drawn().decode() for k, drawn in each.items()}) for x, each in live]
+    page = _report(result).page(result, shown, (out / "task.toml").read_text(), parts)
     with atomic_write(out / "report.html") as file:
         file.write(page.encode())
     # Last, so that its presence says that all the rest is there.

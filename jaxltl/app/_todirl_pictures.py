@@ -2,59 +2,153 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.app._todirl_parts import LENGTH, Judged, Outcome, Setup, Worlds, counted_worlds, part_of
 from jaxltl.app.drawing import Picture, drawing
-from jaxltl.app.learn import short_name
+from jaxltl.app.explorer import (
+    START,
+    Curves,
+    Explorer,
+    Layer,
+    TooLarge,
+    curves,
+    demonstrated_runs,
+    explorer,
+    learned_runs,
+)
+from jaxltl.app.learn import automaton_picture, over_seeds, short_name
 from jaxltl.core.models.batch import lift_memory
 from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.envs import temporal_gridworld
+from jaxltl.envs.gridworld import ACTIONS
 
 _PICTURES = 3  # worlds that are drawn, of each kind
 _WALKS = 3  # trajectories drawn in a world
 
 
+_FIGURES = ("per_pair", "held_out", "gradient_norm")
+
+
 def task_pictures(setup: Setup) -> list[Picture]:
     """The report's pictures that nothing has to be learned for."""
-    found = [Picture(
-        "automaton.svg", "The task as an automaton", drawing("automaton", setup.judge),
-        "States with a double circle: the task is done, whatever follows. Grey: it has failed. "
-        "Each state is named by the formula that is left to satisfy.",
-    )]
-    if setup.memory is not setup.judge:
+    same = setup.memory is setup.judge
+    found = [automaton_picture(setup.judge, "training-1" if same else "")]
+    if not same:
         found.append(Picture(
             "memory.svg", "What the learner remembers", drawing("automaton", setup.memory),
             "The automaton whose state is the learner's memory; the task above judges it.",
+            "training-1",
         ))
     return found
 
 
 def pictures(outcome: Outcome) -> list[Picture]:
     """The report's pictures of what was learned."""
-    setup, history = outcome.setup, outcome.learned.history
+    history = outcome.learned.history
     found = [Picture(
         "learning.svg", "Learning",
-        drawing("curves", {k: history[k].T for k in ("per_pair", "held_out", "gradient_norm")},
-                steps=history["step"]),
+        drawing("curves", {k: history[k].T for k in _FIGURES}, steps=history["step"]),
+        _caption_of_curves(outcome), "learning",
+    )]
+    for one in _drawn_worlds(outcome):
+        found += _draw(outcome, one)
+    return found
+
+
+def live(outcome: Outcome) -> list[Explorer | TooLarge | Curves]:
+    """The parts of the report that move."""
+    found: list[Explorer | TooLarge | Curves] = [
+        _look_into(outcome, one) for one in _drawn_worlds(outcome)
+    ]
+    history = outcome.learned.history
+    return [*found, curves("learning", "Learning", _caption_of_curves(outcome), history, _FIGURES)]
+
+
+def _caption_of_curves(outcome: Outcome) -> str:
+    return (
         "Negative log-likelihood of the average demonstrated pair, of the average held-out pair "
         "where there are any, and the gradient's length, before each step"
         + ("" if np.isnan(outcome.learned.held_out).any()
            else ". What is kept has the least held-out figure")
-        + ("; the line is the median over seeds, the band holds all of them."
-           if len(outcome.learned.held_out) > 1 else "."),
-    )]
-    for w, scene in list(enumerate(setup.training.scenes))[:_PICTURES]:
-        found += _draw(outcome, setup.training, outcome.training, w, f"training_{w + 1}",
-                       f"Training world: {scene.name}", True)
-    if setup.test is not None and outcome.test is not None:
+        + over_seeds(len(outcome.learned.held_out))
+    )
+
+
+class _Drawn(NamedTuple):
+    """A world that is drawn: its number among others, its policy, and its title."""
+
+    worlds: Worlds
+    judged: Judged
+    w: int
+    stem: str
+    title: str
+    arrows: bool
+    demonstrations: Trajectories | None
+
+    @property
+    def live(self) -> str:
+        return self.stem.replace("_", "-")
+
+    @property
+    def policy(self) -> np.ndarray:
+        """``[S, Q, A]``, or with a horizon ``[T, S, Q, A]``."""
+        return self.judged.policy[self.w][..., : self.worlds.scenes[self.w].mdp.num_states, :, :]
+
+    @property
+    def value(self) -> np.ndarray:
+        """``[S]``: the probability of doing the task from a start there."""
+        size = self.worlds.scenes[self.w].mdp.num_states
+        return np.asarray(self.judged.performance["learned"].value[self.w])[:size]
+
+
+def _drawn_worlds(outcome: Outcome) -> Iterator[_Drawn]:
+    setup, training, test = outcome.setup, outcome.setup.training, outcome.setup.test
+
+    def drawn(worlds: Worlds, judged: Judged, w: int, stem: str, title: str, arrows: bool,
+              shown: Trajectories | None = None) -> _Drawn:
+        mean = float(judged.performance["learned"].mean[w])
+        title = f"{title}: {worlds.scenes[w].name} ({mean:.4f})"
+        return _Drawn(worlds, judged, w, stem, title, arrows, shown)
+
+    for w, shown in enumerate(setup.demonstrations[:_PICTURES]):
+        yield drawn(training, outcome.training, w, f"training_{w + 1}", "Training world", True,
+                    shown)
+    if test is not None and outcome.test is not None:
         for n, (rank, w) in enumerate(_chosen_worlds(setup, outcome.test)):
-            title = f"Test world, {rank}: {setup.test.scenes[w].name}"
-            found += _draw(outcome, setup.test, outcome.test, w, f"test_{n + 1}", title, n == 0)
-    return found
+            yield drawn(test, outcome.test, w, f"test_{n + 1}", f"Test world, {rank}", n == 0)
+
+
+_CAPTION = (
+    "One map for each state of the learner's memory; an arrow is as long as its action is "
+    "likely{}. In the title, the mean probability of doing the task."
+)
+
+
+def _look_into(outcome: Outcome, one: _Drawn) -> Explorer | TooLarge:
+    setup, scene, policy = outcome.setup, one.worlds.scenes[one.w], one.policy
+    stationary = policy.ndim == 3
+    moving = policy if stationary else policy[0]
+    names = setup.memory.state_names or ("",) * len(setup.memory.delta)
+    layers = {
+        str(q): Layer(f"memory {q}: {names[q]}", None, moving[:, q]) for q in _memory_shown(setup)
+    }
+    starts = np.asarray(scene.mdp.initial) > 0
+    layers[START] = Layer("where a run starts", np.where(starts, one.value, np.nan), None)
+    model = part_of(one.worlds.model, one.w)
+    shown = [] if one.demonstrations is None else demonstrated_runs(model, one.demonstrations)
+    place: Any = scene.cells if scene.colored is None else part_of(scene.colored, ...)
+    return explorer(
+        one.live, one.title, _CAPTION.format("" if stationary else " at the first step"), model,
+        layers, [*shown, *learned_runs(model, policy, outcome.seed)], place=place, actions=ACTIONS,
+        label="probability of doing the task", wall=setup.task.world.get("wall", "#"),
+    )
 
 
 def _chosen_worlds(setup: Setup, judged: Judged) -> list[tuple[str, int]]:
@@ -69,50 +163,38 @@ def _chosen_worlds(setup: Setup, judged: Judged) -> list[tuple[str, int]]:
     return [(rank, w) for w, rank in found.items()]
 
 
-def _draw(
-    outcome: Outcome, worlds: Worlds, judged: Judged, w: int, stem: str, title: str,
-    arrows: bool,
-) -> list[Picture]:
+def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
     """A world with runs of its policy and, if asked for, the policy itself."""
-    setup, scene = outcome.setup, worlds.scenes[w]
-    size = scene.mdp.num_states
-    policy = judged.policy[w][..., :size, :, :]
+    setup, scene, policy = outcome.setup, one.worlds.scenes[one.w], one.policy
     moving = policy if policy.ndim == 3 else policy[0]
-    mean = float(judged.performance["learned"].mean[w])
-    title = f"{title} ({mean:.4f})"
     shown = _memory_shown(setup)
     names = setup.memory.state_names or ("",) * len(setup.memory.delta)
     # About as many characters as a panel is wide.
     width = int(np.clip(5 * scene.shape[1], 9, 50))
     titles = [short_name(f"memory {q}: {names[q]}", width) for q in shown]
-    when = "" if policy.ndim == 3 else " at the first step"
-    caption = (
-        f"One map for each state of the learner's memory; an arrow is as long as its action is "
-        f"likely{when}. In the title, the mean probability of doing the task."
-    )
+    caption = _CAPTION.format("" if policy.ndim == 3 else " at the first step")
     if scene.colored is None:
         assert scene.cells is not None
-        panels = np.broadcast_to(
-            np.asarray(judged.performance["learned"].value[w])[:size], (len(shown), size))
         drawn = drawing(
-            "grid", scene.cells, panels, moving.transpose(1, 0, 2)[shown], titles=titles,
+            "grid", scene.cells, np.broadcast_to(one.value, (len(shown), one.value.size)),
+            moving.transpose(1, 0, 2)[shown], titles=titles,
             label="probability from a start there",
             wall=setup.task.world.get("wall", "#"),
         )
         caption += " Colours: the probability of doing the task if a run starts there."
-        return [Picture(f"{stem}.svg", title, drawn, caption)]
+        return [Picture(f"{one.stem}.svg", one.title, drawn, caption, one.live)]
     found: list[Picture] = []
-    if arrows:
+    if one.arrows:
         drawn = drawing("temporal_gridworld", part_of(scene.colored, ...), moving, memory=shown,
                         title=titles)
-        found.append(Picture(f"{stem}.svg", title, drawn, caption))
+        found.append(Picture(f"{one.stem}.svg", one.title, drawn, caption, one.live))
     if policy.ndim == 3:
-        walks = _walks(outcome, worlds, w, judged.policy[w])
+        walks = _walks(outcome, one.worlds, one.w, one.judged.policy[one.w])
         found.append(Picture(
-            f"{stem}_runs.svg", title if not arrows else f"Runs in {scene.name}",
+            f"{one.stem}_runs.svg", f"Runs in {scene.name}" if one.arrows else one.title,
             drawing("temporal_gridworld", part_of(scene.colored, ...), trajectories=walks),
             f"{len(walks.length)} runs of the learned policy from random starts, each until the "
-            "task is done or has failed.",
+            "task is done or has failed.", one.live,
         ))
     return found
 

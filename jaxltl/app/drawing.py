@@ -23,12 +23,16 @@ class Drawing(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A picture of a report: its file's name, title, caption, and how it is drawn."""
+    """A picture of a report: its file's name, title, caption, and how it is drawn.
+
+    A page leaves it out where it has the live part that says the same.
+    """
 
     name: str
     title: str
     drawing: Drawing
     caption: str
+    live: str = ""
 
 
 Artist = Callable[[Drawing], Callable[[], bytes]]
@@ -40,11 +44,12 @@ def drawing(function: str, *arguments: Any, **options: Any) -> Drawing:
 
 
 def draw(picture: Drawing) -> bytes:
-    """The SVG of a picture."""
+    """The SVG of a picture: of a figure, or as its function says."""
     # Deferred: learning alone does not need matplotlib.
     from jaxltl import plot
 
-    return plot.to_bytes(getattr(plot, picture.function)(*picture.arguments, **picture.options))
+    found = getattr(plot, picture.function)(*picture.arguments, **picture.options)
+    return found.encode() if isinstance(found, str) else plot.to_bytes(found)
 
 
 @contextlib.contextmanager

@@ -19,6 +19,17 @@ import jaxltl
 from jaxltl.algos import learner, mlirl
 from jaxltl.algos.checkpoint import atomic_write
 from jaxltl.app.drawing import Picture, drawing
+from jaxltl.app.explorer import (
+    START,
+    Curves,
+    Explorer,
+    Layer,
+    TooLarge,
+    curves,
+    demonstrated_runs,
+    explorer,
+    learned_runs,
+)
 from jaxltl.app.files.task import (
     Task,
     World,
@@ -27,6 +38,7 @@ from jaxltl.app.files.task import (
     synthetic_demonstrations,
 )
 from jaxltl.app.files.task import read_task as read_task
+from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.product import Product, lift_policy, product
 from jaxltl.core.models.restrict import restrict
@@ -409,13 +421,24 @@ def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
         np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
 
 
+LIVE = "policy"  # the name of the page's live part
+
+
 def task_pictures(setup: Setup) -> list[Picture]:
     """The report's pictures that nothing has to be learned for."""
-    return [Picture(
-        "automaton.svg", "The task as an automaton", drawing("automaton", setup.model.automaton),
+    return [automaton_picture(setup.model.automaton, LIVE)]
+
+
+def automaton_picture(automaton: Automaton, live: str) -> Picture:
+    """The task's automaton."""
+    return Picture(
+        "automaton.svg", "The task as an automaton", drawing("automaton", automaton),
         "States with a double circle: the task is done, whatever follows. Grey: it has failed. "
-        "Each state is named by the formula that is left to satisfy.",
-    )]
+        "Each state is named by the formula that is left to satisfy.", live,
+    )
+
+
+_FIGURES = ("loss", "neg_log_likelihood", "satisfaction", "gradient_norm")
 
 
 def pictures(outcome: Outcome) -> list[Picture]:
@@ -423,43 +446,78 @@ def pictures(outcome: Outcome) -> list[Picture]:
     cells, history = outcome.setup.world.cells, outcome.learned.history
     return [*([] if cells is None else _maps(outcome, cells)), Picture(
         "learning.svg", "Learning",
-        drawing(
-            "curves", {k: v.T for k, v in history.items() if k != "step"}, steps=history["step"],
-            show=("loss", "neg_log_likelihood", "satisfaction", "gradient_norm"),
-        ),
-        "Figures of the weights before each step"
-        + ("; the line is the median over seeds, the band holds all of them."
-           if len(outcome.learned.loss) > 1 else "."),
+        drawing("curves", {k: v.T for k, v in history.items() if k != "step"},
+                steps=history["step"], show=_FIGURES),
+        "Figures of the weights before each step" + over_seeds(len(outcome.learned.loss)),
+        "learning",
     )]
 
 
-def _maps(outcome: Outcome, cells: np.ndarray) -> list[Picture]:
-    model, actions = outcome.setup.model, outcome.setup.world.actions
+def over_seeds(count: int) -> str:
+    """How the caption of learning curves ends."""
+    band = "; the line is the median over seeds, the band holds all of them"
+    return f"{band if count > 1 else ''}."
+
+
+def live(outcome: Outcome) -> list[Explorer | TooLarge | Curves]:
+    """The parts of the report that move."""
+    setup, model = outcome.setup, outcome.setup.model
+    policy = np.asarray(outcome.learned.policy[outcome.chosen])
+    caption = "Figures of the weights before each step" + over_seeds(len(outcome.learned.loss))
+    return [
+        explorer(
+            LIVE, "What it does", "An arrow is as long as its action is likely; colours are the "
+            "probability of doing the task from there. Cells that cannot be met with a memory are "
+            "blank.", model, _layers(outcome),
+            [*demonstrated_runs(model, setup.demonstrations),
+             *learned_runs(model, policy, outcome.seed)],
+            place=setup.world.cells, actions=setup.world.actions, label=_LABEL,
+            wall=setup.task.world.get("wall", "#"),
+        ),
+        curves("learning", "Learning", caption, outcome.learned.history, _FIGURES),
+    ]
+
+
+_LABEL = "probability of doing the task"
+
+
+def _layers(outcome: Outcome) -> dict[str, Layer]:
+    """By memory where the policy still matters: not done, not failed, and reachable."""
+    model = outcome.setup.model
     policy = np.asarray(outcome.learned.policy[outcome.chosen])
     value = np.array(outcome.solution.value)
     starts = np.asarray(model.mdp.initial) > 0
-    at_start = np.where(starts, from_starts(model, value), np.nan)
-    # Memory states where the policy still matters: not done, not failed, and reachable.
     open_ = verdicts(model.automaton) == Verdict.UNDECIDED
-    undecided = open_ & (value > 0).any(axis=0)
     met = _reached(model)
-    shown = np.flatnonzero(undecided & met.any(axis=0))
+    shown = np.flatnonzero(open_ & (value > 0).any(axis=0) & met.any(axis=0)).tolist()
     names = model.automaton.state_names or ("",) * model.num_memory
-    label = "probability of doing the task"
+    found = {
+        str(q): Layer(f"memory {q}: {names[q]}", np.where(met[:, q], value[:, q], np.nan),
+                      np.where(met[:, q, None], policy[:, q], np.nan))
+        for q in shown
+    }
+    at_start = np.where(starts, from_starts(model, value), np.nan)
+    return {**found, START: Layer("where a run starts", at_start, None)}
+
+
+def _maps(outcome: Outcome, cells: np.ndarray) -> list[Picture]:
+    layers = _layers(outcome)
+    start = layers.pop(START)
     maps = [Picture(
-        "values.svg", "From where it works", drawing("grid", cells, at_start, label=label),
-        "Probability that the learned policy does the task, from each initial state.",
+        "values.svg", "From where it works", drawing("grid", cells, start.value, label=_LABEL),
+        "Probability that the learned policy does the task, from each initial state.", LIVE,
     )]
-    if shown.size:
-        panels = np.where(met, value, np.nan).T[shown]
-        arrows = np.where(met[..., None], policy, np.nan).transpose(1, 0, 2)[shown]
-        titles = [short_name(f"memory {q}: {names[q]}") for q in shown]
+    if layers:
+        drawn = drawing(
+            "grid", cells, [x.value for x in layers.values()], [x.policy for x in layers.values()],
+            titles=[short_name(x.name) for x in layers.values()], label=_LABEL,
+            actions=outcome.setup.world.actions,
+        )
         maps.append(Picture(
-            "policy.svg", "What it does",
-            drawing("grid", cells, panels, arrows, titles=titles, label=label, actions=actions),
+            "policy.svg", "What it does", drawn,
             "One map for each state of the automaton, which is the policy's memory. An arrow is as "
             "long as its action is likely; colours are the probability of doing the task from "
-            "there. Cells that cannot be met with that memory are blank.",
+            "there. Cells that cannot be met with that memory are blank.", LIVE,
         ))
     return maps
 

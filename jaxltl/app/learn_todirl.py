@@ -28,6 +28,7 @@ from jaxltl.app._todirl_parts import (
     counted_worlds,
     part_of,
 )
+from jaxltl.app._todirl_pictures import live as live
 from jaxltl.app._todirl_pictures import pictures as pictures
 from jaxltl.app._todirl_pictures import task_pictures as task_pictures
 from jaxltl.app.files.task_todirl import (

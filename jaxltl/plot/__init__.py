@@ -1,12 +1,14 @@
 """Pictures, one call each: automata, grid maps, games of two robots, learning curves.
 
 Each function returns a new matplotlib ``Figure`` and touches no global state, so it works
-without a display and in any thread. ``figure.savefig("name.svg")`` writes it.
+without a display and in any thread. ``figure.savefig("name.svg")`` writes it. Those named live
+return the text of an SVG for pages that move.
 """
 
 from jaxltl.plot.automata import automaton
 from jaxltl.plot.curves import bands, curves, lines, paths
 from jaxltl.plot.games import compare, game_moves, game_region, game_values
+from jaxltl.plot.live import live_automaton, live_curve, live_map
 from jaxltl.plot.maps import grid, strategies
 from jaxltl.plot.style import to_bytes
 from jaxltl.plot.worlds import temporal_gridworld
@@ -21,6 +23,9 @@ __all__ = [
     "game_values",
     "grid",
     "lines",
+    "live_automaton",
+    "live_curve",
+    "live_map",
     "paths",
     "strategies",
     "temporal_gridworld",

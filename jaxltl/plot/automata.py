@@ -52,7 +52,7 @@ def automaton(
     Raises:
       ValueError: graphviz is asked for and cannot be run.
     """
-    table = _on_the_host(automaton)
+    table = on_the_host(automaton)
     doomed = drawing.rejecting(table)
     texts = edge_texts(table, doomed)
     graph = drawing.arrange(
@@ -91,7 +91,8 @@ def as_svg(value: Automaton) -> str:
     return to_bytes(automaton(value), "svg").decode()
 
 
-def _on_the_host(automaton: Automaton) -> Automaton:
+def on_the_host(automaton: Automaton) -> Automaton:
+    """The same with NumPy arrays."""
     return replace(
         automaton,
         delta=np.asarray(automaton.delta),

@@ -126,9 +126,7 @@ def _cells(
     low: float, high: float, wall: str, numbers: bool,
 ) -> Any:
     rows, columns = kinds.shape
-    names, counts = np.unique(kinds, return_counts=True)
-    plain = "." if "." in names else str(names[np.argmax(counts)])
-    special = [str(k) for k in names if k not in (plain, wall)]
+    special = kind_colors(kinds, wall)
     shown: NDArray[np.float64] = np.full(kinds.shape, np.nan)
     if values is not None:
         shown = values.reshape(kinds.shape)
@@ -142,10 +140,7 @@ def _cells(
         if kind == wall:
             axes.add_patch(Rectangle((c, r), 1, 1, facecolor=WALL, lw=0))
         elif kind in special:
-            color = _NAMED.get(
-                re.sub(r"\d+$", "", str(kind)).lower()[:1] if len(str(kind)) < 3 else "",
-                KINDS[special.index(str(kind)) % len(KINDS)],
-            )
+            color = special[str(kind)]
             if blank:
                 axes.add_patch(Rectangle((c, r), 1, 1, facecolor=color, lw=0))
             if not tiny and blank:
@@ -163,6 +158,19 @@ def _cells(
     axes.set(xlim=(0, columns), ylim=(rows, 0), aspect="equal")
     number_cells(axes, rows, columns)
     return image
+
+
+def kind_colors(kinds: NDArray[np.str_], wall: str) -> dict[str, str]:
+    """The colour of each kind of cell that is neither plain nor a wall."""
+    names, counts = np.unique(kinds, return_counts=True)
+    plain = "." if "." in names else str(names[np.argmax(counts)])
+    special = [str(k) for k in names if k not in (plain, wall)]
+    return {
+        kind: _NAMED.get(
+            re.sub(r"\d+$", "", kind).lower()[:1] if len(kind) < 3 else "", KINDS[i % len(KINDS)]
+        )
+        for i, kind in enumerate(special)
+    }
 
 
 def _short_number(value: float) -> str:

@@ -1,44 +1,33 @@
 """One self-contained page about a learned policy: its evidence, figures and pictures."""
 
-
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from jaxltl.app.reports.page import (
-    certified,
-    frame,
-    head,
-    number,
-    place,
-    probability,
-    spread,
-    tiles,
-)
+from jaxltl.app.drawing import Picture
+from jaxltl.app.files.task import place
+from jaxltl.app.reports.live import Part, live_page
+from jaxltl.app.reports.page import Remark, certified, number, probability, rows, spread, tiles
 
 
 def page(
-    result: Mapping[str, Any], pictures: Iterable[tuple[str, bytes, str]], task_text: str
+    result: Mapping[str, Any], pictures: Iterable[tuple[Picture, bytes]], task_text: str,
+    parts: Sequence[Part] = (),
 ) -> str:
-    """The report as HTML that needs no other file and no network.
-
-    Args:
-      result: as from :func:`jaxltl.app.learn.summary`.
-      pictures: title, SVG and caption of each.
-      task_text: the task file, shown at the end.
-    """
-    parts = [
-        *head(result, _sentence(result), warnings(result)),
-        _tiles(result),
-        "<h2>Probability of doing the task</h2>",
-        _evidence_table(result),
-        "<h2>What was learned</h2>",
-        _weights_table(result),
-        _seeds(result),
+    """The report of :func:`jaxltl.app.learn.summary`; see :func:`~.live.live_page`."""
+    told = [
+        "<h2>Probability of doing the task</h2>", _evidence_table(result),
+        "<h2>Weights</h2>", _weights_table(result), _seeds(result),
     ]
-    return frame(result, parts, pictures, task_text)
+    return live_page(result, _sentence(result), remarks(result), _tiles(result), parts, told,
+                     pictures, task_text)
+
+
+def remarks(result: Mapping[str, Any]) -> list[Remark]:
+    """What the page says first."""
+    return [("warning", text) for text in warnings(result)]
 
 
 def table(result: Mapping[str, Any]) -> str:
@@ -53,14 +42,10 @@ def table(result: Mapping[str, Any]) -> str:
         "probability of doing the task, over "
         f"{result['satisfaction']['num_starts']} initial states",
     ]
-    for title, key in (("learned policy", "satisfaction"), ("best achievable", "best_achievable")):
-        for what in ("mean", "minimum"):
-            entry = result[key][what]
-            where = place(entry) if what == "minimum" else ""
-            lines.append(
-                f"  {title:16} {what:8} {probability(entry['value']):>9}   certified "
-                f"{certified(entry):15} {where}".rstrip()
-            )
+    lines += [
+        f"  {title:16} {what:8} {value:>9}   certified {bounds:15} {where}".rstrip()
+        for title, what, value, bounds, where, _ in _evidence(result)
+    ]
     weights = "  ".join(f"{k} {number(v)}" for k, v in result["weights"].items())
     lines += [
         "",
@@ -138,32 +123,27 @@ def _tiles(result: Mapping[str, Any]) -> str:
     ])
 
 
-def _evidence_table(result: Mapping[str, Any]) -> str:
-    rows = []
+def _evidence(result: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Whose probability, which, its value, its bounds, where, and how its solver ended."""
     for title, key in (("learned policy", "satisfaction"), ("best achievable", "best_achievable")):
         for what in ("mean", "minimum"):
             entry = result[key][what]
             where = place(entry) if what == "minimum" else ""
-            rows.append(
-                f"<tr><td>{title}, {what}</td><td>{probability(entry['value'])}</td>"
-                f"<td>{certified(entry)}</td>"
-                f"<td>{html.escape(where)}</td><td>{result[key]['status'].lower()}</td></tr>"
-            )
-    return (
-        "<div class=scroll><table><thead><tr><th></th><th>probability</th><th>certified</th>"
-        "<th>where</th><th>solver</th></tr></thead><tbody>"
-        + "".join(rows) + "</tbody></table></div>"
+            yield (title, what, probability(entry["value"]), certified(entry), where,
+                   result[key]["status"].lower())
+
+
+def _evidence_table(result: Mapping[str, Any]) -> str:
+    lines = [(f"{title}, {what}", *rest) for title, what, *rest in _evidence(result)]
+    return rows(("", "probability", "certified", "where", "solver"), lines) + (
         "<p class=muted>The true probability is certified to be that close.</p>"
     )
 
 
 def _weights_table(result: Mapping[str, Any]) -> str:
-    names = "".join(f"<th>{html.escape(n)}</th>" for n in result["weights"])
-    values = "".join(f"<td>{number(v)}</td>" for v in result["weights"].values())
-    return (
-        f"<div class=scroll><table><thead><tr><th>feature</th>{names}</tr></thead>"
-        f"<tbody><tr><td>weight</td>{values}</tr></tbody></table></div>"
-    )
+    weights = result["weights"]
+    return rows(("feature", *map(html.escape, weights)),
+                [("weight", *(number(v) for v in weights.values()))])
 
 
 def _seeds(result: Mapping[str, Any]) -> str:

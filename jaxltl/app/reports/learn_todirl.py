@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from jaxltl.app.reports.page import (
-    certified,
-    frame,
-    head,
-    number,
-    place,
-    probability,
-    spread,
-    tiles,
-)
+from jaxltl.app.drawing import Picture
+from jaxltl.app.files.task import place
+from jaxltl.app.reports.live import Part, live_page
+from jaxltl.app.reports.page import Remark, certified, number, probability, rows, spread, tiles
 
 _WHO = {
     "learned": "learned reward", "expert": "expert, who knows the task", "random": "random moves",
@@ -24,26 +18,23 @@ _ROWS = 20  # worlds in a table
 
 
 def page(
-    result: Mapping[str, Any], pictures: Iterable[tuple[str, bytes, str]], task_text: str
+    result: Mapping[str, Any], pictures: Iterable[tuple[Picture, bytes]], task_text: str,
+    parts: Sequence[Part] = (),
 ) -> str:
-    """The report as HTML that needs no other file and no network.
-
-    Args:
-      result: as from :func:`jaxltl.app.learn_todirl.summary`.
-      pictures: title, SVG and caption of each.
-      task_text: the task file, shown at the end.
-    """
-    parts = [
-        *head(result, _sentence(result), warnings(result)),
-        _tiles(result),
-        f"<h2>Mean probability of doing the task{_within(result)}</h2>",
-        _evidence_table(result),
-    ]
+    """The report of :func:`jaxltl.app.learn_todirl.summary`; see :func:`~.live.live_page`."""
+    told = [f"<h2>Mean probability of doing the task{_within(result)}</h2>",
+            _evidence_table(result)]
     for key, title in (("test", "Test worlds"), ("training", "Training worlds")):
         if result[key]:
-            parts += [f"<h2>{title}</h2>", _worlds_table(result[key])]
-    parts += [_seeds(result), _network(result)]
-    return frame(result, parts, pictures, task_text)
+            told += [f"<h2>{title}</h2>", _worlds_table(result[key])]
+    told += [_seeds(result), _network(result)]
+    return live_page(result, _sentence(result), remarks(result), _tiles(result), parts, told,
+                     pictures, task_text)
+
+
+def remarks(result: Mapping[str, Any]) -> list[Remark]:
+    """What the page says first."""
+    return [("warning", text) for text in warnings(result)]
 
 
 def table(result: Mapping[str, Any]) -> str:
@@ -201,24 +192,15 @@ def _tiles(result: Mapping[str, Any]) -> str:
     return tiles(figures)
 
 
-def _rows(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    head = "".join(f"<th>{text}</th>" for text in header)
-    body = "".join("<tr>" + "".join(f"<td>{x}</td>" for x in row) + "</tr>" for row in rows)
-    return (
-        f"<div class=scroll><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-        "</div>"
-    )
-
-
 def _evidence_table(result: Mapping[str, Any]) -> str:
-    rows = []
+    lines = []
     for key in ("test", "training"):
         about = result[key]
         if not about:
             continue
         for who in _WHO:
             one = about[who]
-            rows.append((
+            lines.append((
                 f"{key}, {who}", probability(one["mean"]["value"]), certified(one["mean"]),
                 number(one["std"]) if about["num_counted"] > 1 else "",
                 f"{probability(one['worst_world']['value'])}, "
@@ -226,7 +208,7 @@ def _evidence_table(result: Mapping[str, Any]) -> str:
                 probability(one["worst_start"]),
             ))
     header = ("", "mean", "certified", "deviation", "worst world", "worst start")
-    return _rows(header, rows) + (
+    return rows(header, lines) + (
         "<p class=muted>The true mean over worlds and starts is certified to be that close. The "
         "deviation is over worlds; the worst start is over all starts of all worlds. The expert "
         "knows the task and is soft-optimal for it.</p>"
@@ -235,7 +217,7 @@ def _evidence_table(result: Mapping[str, Any]) -> str:
 
 def _worlds_table(about: Mapping[str, Any]) -> str:
     worlds = sorted(about["worlds"], key=lambda world: _known(world["mean"]["value"]))
-    rows = []
+    lines = []
     for world in worlds[:_ROWS]:
         least = world["minimum"]
         name = html.escape(world["name"])
@@ -243,15 +225,15 @@ def _worlds_table(about: Mapping[str, Any]) -> str:
             name += " (left out)"
         if world["infeasible_starts"]:
             name += f"<br><span class=bad>{world['infeasible_starts']} infeasible starts</span>"
-        rows.append((
+        lines.append((
             name, probability(world["mean"]["value"]),
             certified(world["mean"]), f"{probability(least['value'])}, from {place(least)}",
             probability(world["expert"]), probability(world["random"]),
         ))
     header = ("world", "mean", "certified", "worst start", "expert", "random")
-    more = len(worlds) - len(rows)
-    return _rows(header, rows) + (
-        f"<p class=muted>The worst {len(rows)}; the other {more} are in result.json.</p>"
+    more = len(worlds) - len(lines)
+    return rows(header, lines) + (
+        f"<p class=muted>The worst {len(lines)}; the other {more} are in result.json.</p>"
         if more > 0 else ""
     )
 

@@ -1,0 +1,234 @@
+"""The parts of a page that move, as HTML with the same content in tables, and their data."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxltl.app.drawing import Picture
+from jaxltl.app.explorer import START, Curves, Explorer, TooLarge
+from jaxltl.app.files.task import place, where
+from jaxltl.app.reports.page import Remark, compose, number, probability, rows
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.text import edge_guards
+from jaxltl.core.models.monitor import Verdict, verdicts
+
+_MOST_ROWS = 12  # of a table of curves
+_SIGNS = {"up": "↑", "down": "↓", "left": "←", "right": "→", "stay": "•"}
+_VERDICTS = {
+    Verdict.SATISFIED: "the task is done", Verdict.VIOLATED: "the task has failed",
+    Verdict.UNDECIDED: "",
+}
+
+
+Part = tuple[Explorer | Curves | TooLarge, Mapping[str, str]]  # with its pictures as SVG
+
+
+def live_page(
+    result: Mapping[str, Any], sentence: str, remarks: Iterable[Remark], tiles: str,
+    parts: Sequence[Part], told: Iterable[str], pictures: Iterable[tuple[Picture, bytes]],
+    task_text: str,
+) -> str:
+    """A report: what matters first, policies to look into, tables, curves, pictures, the task.
+
+    Args:
+      result, sentence, remarks, task_text: as for :func:`~jaxltl.app.reports.page.compose`.
+      tiles, told: HTML before and after the policies.
+      parts: what moves.
+      pictures: those that no part says are shown.
+    """
+    looked = [section(*part) for part in parts if not isinstance(part[0], Curves)]
+    learned = [section(*part) for part in parts if isinstance(part[0], Curves)]
+    moving = [part for part, _ in parts if isinstance(part, Explorer)]
+    names = {part.name for part, _ in parts if not isinstance(part, TooLarge)}
+    return compose(
+        result, sentence, remarks, [tiles, *looked, *told, *learned],
+        [one for one in pictures if one[0].live not in names], task_text,
+        json.dumps([data(part) for part in moving], separators=(",", ":"), allow_nan=False),
+    )
+
+
+def section(part: Explorer | Curves | TooLarge, drawn: Mapping[str, str]) -> str:
+    """A part of a page, with its pictures as SVG."""
+    if isinstance(part, TooLarge):
+        return f'<ul class="remarks"><li class="note">{html.escape(part.text)}</li></ul>'
+    if isinstance(part, Curves):
+        return _curves(part, drawn)
+    return _explorer(part, drawn)
+
+
+def data(part: Explorer) -> dict[str, Any]:
+    """What the page's script must know of an explorer."""
+    def listed(array: np.ndarray | None) -> Any:
+        if array is None:
+            return None
+        return [_finite(x) for x in array] if array.ndim == 1 else [listed(x) for x in array]
+
+    return {
+        "name": part.name, "label": part.label, "actions": part.actions,
+        "rows": part.shape and part.shape[0], "columns": part.shape and part.shape[1],
+        "first": next(iter(part.layers)), "told": _told(part),
+        "layers": {
+            key: {"value": listed(layer.value), "policy": listed(layer.policy)}
+            for key, layer in part.layers.items()
+        },
+        "runs": [{"name": run.name, "steps": run.steps} for run in part.runs],
+    }
+
+
+def _finite(value: float) -> float | None:
+    return round(float(value), 6) if np.isfinite(value) else None
+
+
+def _told(part: Explorer) -> dict[str, str]:
+    """What each memory stands for, and each other layer."""
+    names = part.automaton.state_names or ("",) * len(part.automaton.delta)
+    found = {}
+    for q, (name, verdict) in enumerate(zip(names, verdicts(part.automaton), strict=True)):
+        told = [_VERDICTS[Verdict(int(verdict))], name and f"left to satisfy: {name}"]
+        if str(q) not in part.layers and verdict == Verdict.UNDECIDED:
+            told[0] = "nothing is shown: no run that can do the task has this memory"
+        found[str(q)] = f"Memory {q}: " + "; ".join(text for text in told if text)
+    return {**found, START: f"Where a run starts: {part.label} from there"}
+
+
+def _explorer(part: Explorer, drawn: Mapping[str, str]) -> str:
+    panes = f'<div><h3>Its memory: the automaton</h3><div class="scroll">{drawn["automaton"]}</div>'
+    panes += (
+        '<p class="muted">Filled: the memory that is shown. Double circle: the task is done, '
+        "whatever follows. Grey: it has failed.</p></div>"
+    )
+    if "map" in drawn:
+        colored = any(layer.value is not None for layer in part.layers.values())
+        scale = ('<p class="scale"><span>0</span><i></i><span>1</span> '
+                 f"<span>{html.escape(part.label)}</span></p>") if colored else ""
+        panes = (
+            '<div><h3>The map</h3><div class="board" tabindex="0" role="group" aria-label="Map; '
+            f'the arrow keys go from cell to cell">{drawn["map"]}</div>{scale}</div>{panes}'
+        )
+    tables = [_layer_table(part, key) for key in part.layers]
+    runs = [_run_table(part, number) for number in range(len(part.runs))]
+    played = "".join(runs)
+    return (
+        f'<section class="explorer" id="{part.name}"><h2>{html.escape(part.title)}</h2>'
+        f'<p class="muted">{html.escape(part.caption)}</p><div class="card">{_choice(part)}'
+        f'<p class="memory" aria-live="polite"></p>{_player(part)}'
+        f'<p class="readout" role="status" aria-live="polite">Point at a cell of the map, choose a '
+        "state of the automaton, or play a run.</p>"
+        f'<div class="panes{" two" if "map" in drawn else ""}">{panes}</div></div>'
+        f"{folded('What is shown, as a table', ''.join(tables))}"
+        f"{folded('The automaton as a table', _automaton_table(part.automaton))}"
+        f"{folded('The run as a table', played) if runs else ''}</section>"
+    )
+
+
+def folded(title: str, content: str) -> str:
+    """What is opened when it is asked for."""
+    return f'<details><summary>{title}</summary><div class="scroll">{content}</div></details>'
+
+
+def _choice(part: Explorer) -> str:
+    """A button for each layer."""
+    buttons = "".join(
+        f'<button type="button" data-memory="{key}" aria-pressed="false" '
+        f'title="{html.escape(layer.name)}">{"starts" if key == START else key}</button>'
+        for key, layer in part.layers.items()
+    )
+    return (f'<div class="choose" role="group" aria-label="Memory that is shown">'
+            f"<span>Memory</span>{buttons}</div>")
+
+
+def _player(part: Explorer) -> str:
+    if not part.runs:
+        return ""
+    options = "".join(f'<option value="{i}">{html.escape(run.name)}</option>'
+                      for i, run in enumerate(part.runs))
+    return (
+        f'<div class="player" role="group" aria-label="Runs"><select aria-label="Run">{options}'
+        '</select><button type="button" class="back" aria-label="One step back">‹</button>'
+        '<button type="button" class="play" aria-pressed="false">Play</button>'
+        '<button type="button" class="on" aria-label="One step on">›</button>'
+        '<input type="range" min="0" max="0" value="0" step="1" aria-label="Step of the run"></div>'
+    )
+
+
+def _layer_table(part: Explorer, key: str) -> str:
+    """The numbers of a layer, as they lie on the map or state by state."""
+    layer = part.layers[key]
+    size = len(part.names)
+    texts = []
+    for state in range(size):
+        value = None if layer.value is None else _finite(layer.value[state])
+        chances = None if layer.policy is None else layer.policy[state]
+        told = [html.escape(part.names[state])] if part.names[state] not in ("", ".") else []
+        if value is not None:
+            told.append(probability(value))
+        if chances is not None and np.isfinite(chances).all():
+            best = part.actions[int(np.argmax(chances))]
+            told.append(_SIGNS.get(best, html.escape(best)))
+        texts.append(" ".join(told))
+    caption = f"<caption>{html.escape(layer.name)}: the likeliest action</caption>"
+    if layer.policy is None:
+        caption = f"<caption>{html.escape(layer.name)}: {html.escape(part.label)}</caption>"
+    if part.shape is None:
+        return rows(("state", ""), [(str(s), text) for s, text in enumerate(texts)],
+                    caption, f'data-memory="{key}"')
+    down, across = part.shape
+    lines = [(str(r + 1), *texts[r * across : (r + 1) * across]) for r in range(down)]
+    header = ("row", *(str(c + 1) for c in range(across)))
+    return rows(header, lines, caption, f'data-memory="{key}"')
+
+
+def _automaton_table(automaton: Automaton) -> str:
+    names = automaton.state_names or ("",) * len(automaton.delta)
+    moves: dict[int, list[str]] = {}
+    for (q, target, _), guard in edge_guards(automaton).items():
+        moves.setdefault(q, []).append(f"<code>{html.escape(guard)}</code> to {target}")
+    lines = []
+    for q, verdict in enumerate(verdicts(automaton)):
+        kind = _VERDICTS[Verdict(int(verdict))]
+        if q == int(automaton.initial):
+            kind = "first" + (f"; {kind}" if kind else "")
+        lines.append((str(q), kind, f"<code>{html.escape(names[q])}</code>",
+                      "<br>".join(moves.get(q, ()))))
+    return rows(("state", "", "left to satisfy", "goes on"), lines, "", 'class="told"')
+
+
+def _run_table(part: Explorer, number: int) -> str:
+    run = part.runs[number]
+    lines = [
+        (str(t), place(where(state, part.shape)), str(memory),
+         "" if action is None else html.escape(part.actions[action]))
+        for t, (state, memory, action) in enumerate(run.steps)
+    ]
+    return rows(("step", "where", "memory", "action"), lines,
+                f"<caption>{html.escape(run.name)}</caption>", f'data-run="{number}"')
+
+
+def _curves(part: Curves, drawn: Mapping[str, str]) -> str:
+    plots = "".join(
+        f"<figure><h3>{html.escape(name.replace('_', ' '))}</h3>{svg}</figure>"
+        for name, svg in drawn.items()
+    )
+    chosen = _spread(len(part.steps))
+    lines = [
+        (str(int(part.steps[t])), *(number(_finite(np.nanmedian(x[t]))) for x in
+                                    part.figures.values()))
+        for t in chosen
+    ]
+    header = ("step", *(name.replace("_", " ") for name in part.figures))
+    return (
+        f'<section id="{part.name}"><h2>{html.escape(part.title)}</h2>'
+        f'<p class="muted">{html.escape(part.caption)}</p><div class="curves">{plots}</div>'
+        f"{folded('Learning as a table', rows(header, lines))}</section>"
+    )
+
+
+def _spread(count: int) -> Sequence[int]:
+    """Some of so many rows, the first and the last among them."""
+    return sorted({int(t) for t in np.linspace(0, count - 1, min(count, _MOST_ROWS))})
+

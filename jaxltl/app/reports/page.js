@@ -1,0 +1,178 @@
+"use strict";
+// Each explorer shows one memory of a policy at a time, and plays runs on map and automaton.
+(() => {
+  const CELL = 40, PAUSE = 600;
+  document.documentElement.classList.add("live");
+  const all = JSON.parse(document.getElementById("data").textContent);
+
+  const percent = (x) => x === null ? "unknown" : x >= 0.00095 || x === 0 ? x.toFixed(4)
+    : x.toExponential(1);
+
+  function explore(root, data) {
+    const one = (query) => root.querySelector(query);
+    const every = (query) => [...root.querySelectorAll(query)];
+    const map = one("svg.map"), token = one(".token"), cursor = one(".cursor");
+    const readout = one(".readout"), slider = one("input[type=range]");
+    const select = one("select"), play = one(".play");
+    let key = data.first, cell = null, timer = null;
+
+    const place = (state) => data.columns === null ? `state ${state}`
+      : `row ${Math.floor(state / data.columns) + 1}, column ${state % data.columns + 1}`;
+
+    const show = (element, visible) => { element.style.display = visible ? "" : "none"; };
+
+    function say(text) { readout.textContent = text; }
+
+    function choose(next) {
+      key = String(next);
+      for (const element of every("[aria-pressed][data-memory]")) {
+        element.setAttribute("aria-pressed", element.dataset.memory === key);
+      }
+      for (const query of [".layer", ".marked", "table[data-memory]"]) {
+        for (const element of every(query)) show(element, element.dataset.memory === key);
+      }
+      const layer = data.layers[key], scale = one(".scale");
+      if (scale) show(scale, Boolean(layer && layer.value));
+      one(".memory").textContent = data.told[key];
+      if (cell !== null) describe(cell);
+    }
+
+    function describe(state) {
+      const layer = data.layers[key], parts = [place(state)];
+      if (layer && layer.value && layer.value[state] !== null) {
+        parts.push(`${data.label} ${percent(layer.value[state])}`);
+      }
+      const row = layer && layer.policy && layer.policy[state];
+      if (row && row[0] !== null) {
+        const moves = row.map((x, a) => [x, data.actions[a]]).filter(([x]) => x >= 0.0005);
+        moves.sort((a, b) => b[0] - a[0]);
+        parts.push(moves.map(([x, name]) => `${name} ${x.toFixed(3)}`).join(", "));
+      } else if (!layer || layer.value === null || layer.value[state] === null) {
+        parts.push("nothing is shown here");
+      }
+      say(parts.join(" · "));
+    }
+
+    function point(state) {
+      cell = state;
+      cursor.style.visibility = "visible";
+      cursor.setAttribute("x", state % data.columns * CELL);
+      cursor.setAttribute("y", Math.floor(state / data.columns) * CELL);
+      describe(state);
+    }
+
+    function under(event) {
+      const at = new DOMPoint(event.clientX, event.clientY)
+        .matrixTransform(map.getScreenCTM().inverse());
+      const row = Math.floor(at.y / CELL), column = Math.floor(at.x / CELL);
+      if (row < 0 || column < 0 || row >= data.rows || column >= data.columns) return null;
+      return row * data.columns + column;
+    }
+
+    function stop() {
+      clearInterval(timer);
+      timer = null;
+      play.textContent = "Play";
+      play.setAttribute("aria-pressed", "false");
+      readout.setAttribute("aria-live", "polite");
+    }
+
+    // The step t of the run that is chosen, on map, automaton and in words.
+    function step(t) {
+      const run = data.runs[Number(select.value)], [state, memory, action] = run.steps[t];
+      slider.max = run.steps.length - 1;
+      slider.value = t;
+      const did = action === null ? "the run ends here" : `goes ${data.actions[action]}`;
+      const text = `step ${t} of ${run.steps.length - 1}: ${place(state)} · memory ${memory} · ${did}`;
+      slider.setAttribute("aria-valuetext", text);
+      cell = null;
+      choose(memory);
+      if (cursor) cursor.style.visibility = "hidden";
+      if (token) {
+        const x = (state % data.columns + 0.5) * CELL;
+        const y = (Math.floor(state / data.columns) + 0.5) * CELL;
+        token.style.visibility = "visible";
+        token.style.transform = `translate(${x}px, ${y}px)`;
+      }
+      const before = t > 0 ? run.steps[t - 1][1] : null;
+      for (const edge of every(".edge")) {
+        edge.classList.toggle("taken", before !== null && before !== memory
+          && Number(edge.dataset.from) === before && Number(edge.dataset.to) === memory);
+      }
+      for (const track of every(".track")) show(track, track.dataset.run === select.value);
+      for (const table of every("table[data-run]")) {
+        show(table, table.dataset.run === select.value);
+        [...table.tBodies[0].rows].forEach((row, i) => {
+          if (i === t) row.setAttribute("aria-current", "step");
+          else row.removeAttribute("aria-current");
+        });
+      }
+      say(`${run.name}, ${text}`);
+    }
+
+    for (const element of every("[aria-pressed][data-memory]")) {
+      const chosen = () => { stop(); choose(element.dataset.memory); };
+      element.addEventListener("click", chosen);
+      if (element.tagName !== "BUTTON") {
+        element.addEventListener("keydown", (event) => {
+          if (event.key !== "Enter" && event.key !== " ") return;
+          event.preventDefault();
+          chosen();
+        });
+      }
+    }
+    if (map) {
+      map.addEventListener("pointermove", (event) => {
+        const state = timer === null ? under(event) : null;
+        if (state !== null && state !== cell) point(state);
+      });
+      map.addEventListener("click", (event) => {
+        const state = under(event);
+        if (state !== null) { stop(); point(state); }
+      });
+      map.addEventListener("keydown", (event) => {
+        const by = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
+        if (!(event.key in by)) return;
+        event.preventDefault();
+        stop();
+        if (cell === null) return point(0);
+        const row = Math.floor(cell / data.columns) + by[event.key][0];
+        const column = cell % data.columns + by[event.key][1];
+        if (row >= 0 && column >= 0 && row < data.rows && column < data.columns) {
+          point(row * data.columns + column);
+        }
+      });
+    }
+    if (select) {
+      select.addEventListener("change", () => { stop(); step(0); });
+      slider.addEventListener("input", () => { stop(); step(Number(slider.value)); });
+      one(".back").addEventListener("click", () => {
+        stop();
+        step(Math.max(0, Number(slider.value) - 1));
+      });
+      one(".on").addEventListener("click", () => {
+        stop();
+        step(Math.min(Number(slider.max), Number(slider.value) + 1));
+      });
+      play.addEventListener("click", () => {
+        if (timer !== null) return stop();
+        const run = data.runs[Number(select.value)];
+        step(Number(slider.value) < run.steps.length - 1 && token
+          && token.style.visibility === "visible" ? Number(slider.value) : 0);
+        play.textContent = "Pause";
+        play.setAttribute("aria-pressed", "true");
+        readout.setAttribute("aria-live", "off");
+        timer = setInterval(() => {
+          const next = Number(slider.value) + 1;
+          if (next > Number(slider.max)) return stop();
+          return step(next);
+        }, PAUSE);
+      });
+      slider.max = data.runs[0].steps.length - 1;
+      for (const table of every("table[data-run]")) show(table, table.dataset.run === "0");
+    }
+    choose(key);
+  }
+
+  for (const data of all) explore(document.getElementById(data.name), data);
+})();
