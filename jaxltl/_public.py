@@ -50,6 +50,7 @@ from jaxltl.core.values.discounted import optimal_value, policy_value
 from jaxltl.core.values.mean_payoff import mean_payoff
 from jaxltl.core.values.minimax import minimax_value, strategy_value
 from jaxltl.core.values.occupancy import feature_expectation, occupancy_measure
+from jaxltl.core.values.optimal_actions import OptimalActions, optimal_actions
 from jaxltl.core.values.performance import task_performance, task_performances
 from jaxltl.core.values.reachability import reachability_probability
 from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
@@ -77,6 +78,7 @@ __all__ = [
     "Game",
     "Monitor",
     "NotConverged",
+    "OptimalActions",
     "Parity",
     "Permissive",
     "Product",
@@ -123,6 +125,7 @@ __all__ = [
     "minimax_value",
     "monitor_step",
     "occupancy_measure",
+    "optimal_actions",
     "optimal_satisfaction",
     "optimal_value",
     "parity",

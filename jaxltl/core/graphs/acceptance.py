@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.end_components import closed_components, components_within
@@ -24,10 +25,15 @@ class Accepting(NamedTuple):
       region: ``bool[S, Q]``.
       action: ``int32[S, Q]``: in the region, the action of a policy by which almost every
         run is accepted.
+      inside: ``bool[S, Q, A]``: in the region, the actions of the state's end component; who takes
+        them all for ever reads its least priority, which is even, for ever. False elsewhere.
+      least: ``int32[S, Q]``: in the region, that priority; -1 elsewhere.
     """
 
     region: jax.Array
     action: jax.Array
+    inside: jax.Array
+    least: jax.Array
 
 
 def accepting_end_components(model: Product) -> Accepting:
@@ -42,7 +48,8 @@ def accepting_end_components(model: Product) -> Accepting:
 
     Returns:
       :class:`Accepting`. A run is accepted with the largest probability of reaching its
-      region.
+      region. Its end components do not overlap: those of a greater p lie within those of a lesser
+      one or outside of them all, and then the largest counts.
     """
     graph = graph_of(model)
     xp, available = graph.xp, graph.available
@@ -59,9 +66,14 @@ def accepting_end_components(model: Product) -> Accepting:
         towards = attract(graph, hit, components.inside).action
         action = xp.where(hit, action, towards)
         new = wins & ~found.region
-        return Accepting(found.region | new, xp.where(new, action, found.action))
+        return Accepting(
+            found.region | new, xp.where(new, action, found.action),
+            found.inside | (components.inside & new[..., None]),
+            xp.where(new, least, found.least).astype(np.int32))
 
-    start = Accepting(~everywhere, graph.first(available)[1])
+    nothing = xp.zeros(graph.state_shape, np.int32)
+    start = Accepting(
+        ~everywhere, graph.first(available)[1], xp.zeros(available.shape, bool), nothing - 1)
     return to_jax(graph.times(priority.max() // 2 + 1, body, start))
 
 

@@ -180,7 +180,7 @@ def min_sets(graph: Graph, target: Any) -> Sets:
 # --- small concrete models: the host ---------------------------------------------------------
 
 
-def _rows(model: Any) -> list[Any]:
+def action_matrices(model: Any) -> list[Any]:
     """The transitions of a concrete model, a matrix for each action."""
     model = model.mdp if isinstance(model, Game) else model
     world: Any = model.mdp if isinstance(model, Product) else model
@@ -229,7 +229,7 @@ def _policy_on_host(model: Any, target: Any, policy: Any, tolerance: Any) -> Sol
     undecided = ~(one | zero)
     if undecided.sum() > _FILLED:
         return None
-    chain = host.policy_row(_rows(model), table.reshape(len(one), -1).astype(float))
+    chain = host.policy_row(action_matrices(model), table.reshape(len(one), -1).astype(float))
     found = host.of_policy(chain, one, undecided, _unit(model))
     return None if found is None else _host_solution(model, found, table, tolerance)
 
@@ -245,8 +245,8 @@ def _optimum_on_host(
     if undecided.sum() > _FILLED:
         return None
     found = host.optimum(
-        _rows(model), allowed.reshape(len(group), -1), group, sets.one.ravel(), undecided.ravel(),
-        1 if objective == "max" else -1, _unit(model))
+        action_matrices(model), allowed.reshape(len(group), -1), group, sets.one.ravel(),
+        undecided.ravel(), 1 if objective == "max" else -1, _unit(model))
     if found is None:
         return None
     exits, action = (x.reshape(sets.one.shape) for x in (found.exits, found.action))

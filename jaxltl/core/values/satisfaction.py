@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 from jax import lax
 
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.graphs.acceptance import accepting_bottom_components, accepting_end_components
+from jaxltl.core.graphs.acceptance import (
+    Accepting,
+    accepting_bottom_components,
+    accepting_end_components,
+)
 from jaxltl.core.models.concrete import namespace, to_jax
 from jaxltl.core.models.operators import is_deterministic, require_policy
 from jaxltl.core.models.product import Product
@@ -85,24 +89,53 @@ def optimal_satisfaction(
     Raises:
       ValueError: the objective is unknown.
     """
+    problem = as_reachability(model, objective)
+    found = reachability_probability(
+        problem.model, problem.target, objective=problem.objective, tolerance=tolerance,
+        max_steps=max_steps)
+    if problem.accepting is not None:
+        accepting = problem.accepting
+        xp, (region, action), chosen = namespace(
+            (accepting.region, accepting.action), found.policy)
+        found = replace(found, policy=to_jax(xp.where(region, action, chosen).astype(xp.int32)))
+    return complement(found) if problem.opposite else found
+
+
+class Reaching(NamedTuple):
+    """The optimal reachability problem that a task's optimum is.
+
+    Attributes:
+      model: the product, or that of the task's negation.
+      target: ``bool[S, Q]``.
+      objective: ``"max"`` or ``"min"``.
+      opposite: whether the task's probability is one minus that of the target.
+      accepting: for Buchi and parity, what the target is made of.
+    """
+
+    model: Product
+    target: Any
+    objective: str
+    opposite: bool
+    accepting: Accepting | None = None
+
+
+def as_reachability(model: Product, objective: str) -> Reaching:
+    """What is to be reached, and whether often or seldom, for the best probability of a task.
+
+    Raises:
+      ValueError: the objective is unknown.
+    """
     if objective not in ("max", "min"):
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
-    limits: dict[str, Any] = {"tolerance": tolerance, "max_steps": max_steps}
     kind = model.automaton.acceptance
     if kind == "cosafe":
-        return reachability_probability(model, model.final, objective=objective, **limits)
+        return Reaching(model, model.final, objective, False)
     if kind == "safety":
-        opposite = "min" if objective == "max" else "max"
-        return complement(
-            reachability_probability(model, _not_final(model), objective=opposite, **limits)
-        )
+        return Reaching(model, _not_final(model), "min" if objective == "max" else "max", True)
     if objective == "min":
-        negated = replace(model, automaton=_shifted(model.automaton))
-        return complement(optimal_satisfaction(negated, **limits))
+        model = replace(model, automaton=_shifted(model.automaton))
     accepting = accepting_end_components(model)
-    reach = reachability_probability(model, accepting.region, objective="max", **limits)
-    xp, (region, action), chosen = namespace(tuple(accepting), reach.policy)
-    return replace(reach, policy=to_jax(xp.where(region, action, chosen).astype(xp.int32)))
+    return Reaching(model, accepting.region, "max", objective == "min", accepting)
 
 
 def _shifted(automaton: Automaton) -> Automaton:
