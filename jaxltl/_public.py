@@ -42,7 +42,7 @@ from jaxltl.core.models.product import (
     product,
     project_policy,
 )
-from jaxltl.core.models.restrict import restrict
+from jaxltl.core.models.restrict import restrict, with_allowed
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, rollout
 from jaxltl.core.types import NotConverged, Solution, Status, check
 from jaxltl.core.values.boltzmann import boltzmann_fixed_points, boltzmann_value
@@ -156,5 +156,6 @@ __all__ = [
     "verdict",
     "verify",
     "winning_region",
+    "with_allowed",
     "write_hoa",
 ]

@@ -42,7 +42,7 @@ PUBLIC = [
     "pushforward", "reach", "reachability_probability", "read_hoa", "restrict", "rollout", "safety",
     "sample_successor", "satisfaction_probability", "shield", "soft_value", "stack_products",
     "states_where", "strategy_value", "synchronize", "task_performance", "task_performances",
-    "to_automaton", "to_dense", "verdict", "verify", "winning_region", "write_hoa",
+    "to_automaton", "to_dense", "verdict", "verify", "winning_region", "with_allowed", "write_hoa",
 ]
 
 

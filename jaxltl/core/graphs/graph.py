@@ -158,8 +158,8 @@ def host_graph(model: Any) -> HostGraph:
     letter = np.asarray(lazy.letter)
     memory = np.ascontiguousarray(np.asarray(lazy.automaton.delta)[:, letter].T)
     return HostGraph(
-        rows, available, memory, letter, lazy.label_on == "entry",
-        lazy.state_shape,
+        rows, available, memory, letter, lazy.label_on == "entry", lazy.state_shape,
+        None if lazy.allowed is None else np.asarray(lazy.allowed),
     )
 
 

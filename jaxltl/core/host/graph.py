@@ -32,6 +32,7 @@ class HostGraph:
       letter: ``int[S]``, what the automaton reads of a world state.
       on_entry: whether the label of the state that is entered is read, not of the one left.
       state_shape: ``(S,)`` or ``(S, Q)``.
+      allowed: ``bool[S, Q, A]``, to which the world's actions are narrowed, or None.
     """
 
     rows: Rows
@@ -40,6 +41,7 @@ class HostGraph:
     letter: Integers
     on_entry: bool
     state_shape: tuple[int, ...]
+    allowed: Booleans | None = None
 
     xp = np
 
@@ -56,12 +58,13 @@ class HostGraph:
         """``bool[S, A]``."""
         lazy = self.world_available[:, None]
         shape = (*self.next_memory.shape, self.num_actions)
-        return np.broadcast_to(lazy, shape).reshape(*self.state_shape, -1)
+        lazy = np.broadcast_to(lazy, shape) if self.allowed is None else lazy & self.allowed
+        return lazy.reshape(*self.state_shape, -1)
 
     def exists(self, region: Booleans) -> Booleans:
         """Whether some successor lies in a region: ``bool[S, A]``; False where unavailable."""
-        found = self.through(region, self.rows.lead_to)
-        return found.reshape(*self.state_shape, -1)
+        found = self.through(region, self.rows.lead_to).reshape(*self.state_shape, -1)
+        return found if self.allowed is None else found & self.available
 
     def forall(self, region: Booleans) -> Booleans:
         """Whether all successors lie in a region: ``bool[S, A]``; True where unavailable."""
@@ -71,7 +74,8 @@ class HostGraph:
         """The smallest value among the successors: ``[S, A]``; the dtype's largest without any."""
         most = np.iinfo(value.dtype).max
         found = self.through(value, lambda x: self.rows.least(x, most))
-        return found.reshape(*self.state_shape, -1)
+        found = found.reshape(*self.state_shape, -1)
+        return found if self.allowed is None else np.where(self.available, found, most)
 
     def through(
         self, value: NDArray[Any], reduce: Callable[[NDArray[Any]], NDArray[Any]],
@@ -98,7 +102,8 @@ class HostGraph:
         if not self.on_entry:
             return here[:, :, None] & self.available
         found = self.rows.lead_to(np.ascontiguousarray(here))
-        return found.reshape(-1, self.num_actions, self.num_memory).swapaxes(1, 2)
+        found = found.reshape(-1, self.num_actions, self.num_memory).swapaxes(1, 2)
+        return found if self.allowed is None else found & self.available
 
     def first(self, mask: Booleans) -> tuple[Booleans, Integers]:
         """Whether a mask ``bool[S, A]`` holds for some action, and the first one (or 0)."""

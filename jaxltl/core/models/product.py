@@ -81,12 +81,15 @@ class Product:
       automaton: the task.
       letter: ``int32[S]``, the automaton's letter that each world state shows.
       label_on: which label a step reads; static.
+      allowed: ``bool[S, Q, A]``, the actions to which the world's are narrowed, or None; see
+        :func:`~jaxltl.core.models.restrict.with_allowed`.
     """
 
     mdp: MDP | DenseMDP
     automaton: Automaton
     letter: jax.Array | np.ndarray
     label_on: str = struct.field(pytree_node=False, default="entry")
+    allowed: jax.Array | np.ndarray | None = None
 
     @property
     def num_states(self) -> int:
@@ -122,9 +125,10 @@ class Product:
     @property
     def available(self) -> jax.Array:
         """``bool[S, Q, A]``."""
-        xp, available = namespace(self.mdp.available)
+        xp, available, allowed = namespace(self.mdp.available, self.allowed)
         shape = (*self.state_shape, self.num_actions)
-        return to_jax(xp.broadcast_to(available[:, None, :], shape))
+        available = xp.broadcast_to(available[:, None, :], shape)
+        return to_jax(available if allowed is None else available & allowed)
 
     @property
     def next_memory(self) -> jax.Array:
@@ -237,17 +241,21 @@ _SELECT = 16  # memory states up to which reading at a memory is a selection
 # --- the primitives -----------------------------------------------------------------------
 
 
-def _through(model: Product, operator, value: jax.Array, term, combine) -> jax.Array:
+def _through(model: Product, operator, value: jax.Array, term, combine, empty=0) -> jax.Array:
     """Applies a primitive of the world at every memory state: ``[S, Q, A]`` from ``[S, Q]``.
 
     On entry the value of t is read at delta(q, L(t)), before the world's operator; on
-    exit at delta(q, L(s)), after it.
+    exit at delta(q, L(s)), after it. Where an action is not allowed the result is `empty`.
     """
     if model.label_on == "entry":
         value = _read_at(value, model.next_memory)
-        return _each_memory(model.mdp, operator, value, term, combine)
-    result = _each_memory(model.mdp, operator, value, term, combine)
-    return _read_at(result, model.next_memory[:, :, None])
+        result = _each_memory(model.mdp, operator, value, term, combine)
+    else:
+        result = _each_memory(model.mdp, operator, value, term, combine)
+        result = _read_at(result, model.next_memory[:, :, None])
+    if model.allowed is None:
+        return result
+    return jnp.where(model.allowed, result, jnp.asarray(empty, result.dtype))
 
 
 def _each_memory(world: MDP | DenseMDP, operator, value, term, combine) -> jax.Array:
@@ -271,7 +279,9 @@ def reads(model: Product, marked: jax.Array) -> jax.Array:
     here = jnp.asarray(marked)[:, model.letter].T
     if model.label_on == "exit":
         return here[:, :, None] & model.available
-    return _each_memory(model.mdp, operators.exists_successor, here, kernels.hits, jnp.logical_or)
+    found = _each_memory(
+        model.mdp, operators.exists_successor, here, kernels.hits, jnp.logical_or)
+    return found & model.available
 
 
 def _read_at(value: jax.Array, memory: jax.Array) -> jax.Array:
@@ -312,7 +322,9 @@ def _(model: Product, region: jax.Array) -> jax.Array:
 
 @operators.least_successor.register
 def _(model: Product, value: jax.Array) -> jax.Array:
-    return _through(model, operators.least_successor, value, kernels.only_real, jnp.minimum)
+    return _through(
+        model, operators.least_successor, value, kernels.only_real, jnp.minimum,
+        kernels.largest(value.dtype))
 
 
 @operators.sample_successor.register

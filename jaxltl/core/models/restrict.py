@@ -1,17 +1,62 @@
-"""The reachable part of a model, as an ordinary one."""
+"""Parts of a model: fewer actions, or the reachable states as an ordinary model."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import chex
 import jax
 import numpy as np
 
-from jaxltl.core.models.concrete import to_jax
+from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, make_mdp, support
 from jaxltl.core.models.product import Product, flat_successor
+
+
+def with_allowed(model: Any, allowed: chex.Array) -> Any:
+    """The same model in which only some of the actions are left.
+
+    Args:
+      model: an MDP, a DenseMDP, a Product or a Game.
+      allowed: ``bool[S, A]``, in a product ``bool[S, Q, A]``, such as the actions that lose
+        nothing or a permissive strategy's mask.
+
+    Returns:
+      A model of the same kind and states, whose `available` is the mask.
+
+    Raises:
+      ValueError: the mask has another shape or dtype, holds an action that is not available, or
+        leaves a state without any (the latter two unless something is traced).
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> mdp = from_dense([[[1.0], [1.0]]])
+      >>> with_allowed(mdp, np.array([[False, True]])).available.tolist()
+      [[False, True]]
+    """
+    shape = (*model.state_shape, model.num_actions)
+    if np.shape(allowed) != shape or allowed.dtype != bool:
+        raise ValueError(
+            f"allowed is {allowed.dtype}{list(np.shape(allowed))}; expected bool{list(shape)}.")
+    if not is_traced((model, allowed)):
+        mask, available = np.asarray(allowed), np.asarray(model.available)
+        if (wrong := np.argwhere(mask & ~available)).size:
+            *state, action = wrong[0].tolist()
+            raise ValueError(f"allowed: action {action} is not available in state {_named(state)}.")
+        if (stuck := np.argwhere(available.any(-1) & ~mask.any(-1))).size:
+            raise ValueError(
+                f"allowed: no action is left in state {_named(stuck[0].tolist())}; allow one.")
+    if isinstance(model, Game):
+        return replace(model, mdp=with_allowed(model.mdp, allowed))
+    if isinstance(model, Product):
+        return replace(model, allowed=allowed)
+    return replace(model, available=allowed)
+
+
+def _named(state: list[int]) -> str:
+    return f"{state[0]}" + "".join(f" with memory {q}" for q in state[1:])
 
 
 class Restriction(NamedTuple):
@@ -79,10 +124,9 @@ def restrict(
     states = np.flatnonzero(seen)
     stuck = states[~allowed[states].any(-1)]
     if stuck.size:
-        first, memory_of = divmod(int(stuck[0]), num_memory)
-        where = f"{first}" + (f" with memory {memory_of}" if num_memory > 1 else "")
+        place = list(divmod(int(stuck[0]), num_memory))[: 2 if num_memory > 1 else 1]
         raise ValueError(
-            f"no action is allowed in state {where}, which is reachable; the mask is empty "
+            f"no action is allowed in state {_named(place)}, which is reachable; the mask is empty "
             "there. Start inside the winning region, or allow an action."
         )
     number[states] = np.arange(states.size)

@@ -43,7 +43,7 @@ class Successors(NamedTuple):
 
     def expectation(self, value: jax.Array) -> list[jax.Array]:
         """Expected value of the next state, ``[N, ...]`` for each action, from ``[N, ...]``."""
-        if not isinstance(self.successor, list):
+        if not (isinstance(self.successor, list) or isinstance(self.probability, list)):
             return list(kernels.folded(self.successor, self.probability, value, axis=1))
         pairs = zip(self.successor, self.probability, strict=True)
         return [kernels.fold(targets, weights, value) for targets, weights in pairs]
