@@ -16,6 +16,7 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.envs.text_map import plain_kind
 
 MOST_CELLS = 20_000  # of all maps of a world together, that a page holds
 MOST_STATES = 40  # of an automaton
@@ -112,9 +113,13 @@ def explorer(
     marked = [(int(s), int(q), int(a)) for s, q, a in marked]
     drawn = {"automaton": drawing("live_automaton", model.automaton, name)}
     shape, names = None, [""] * size
+    if isinstance(place, np.ndarray):
+        plain = plain_kind(place)
+        names = ["" if kind == plain else str(kind) for kind in place.ravel()]
+    elif place is not None:
+        propositions = np.array(place.mdp.propositions)
+        names = [", ".join(propositions[row]) for row in np.asarray(place.mdp.label)]
     if place is not None:
-        names = [str(kind) for kind in place.ravel()] if isinstance(place, np.ndarray) else [
-            ", ".join(np.array(place.mdp.propositions)[row]) for row in np.asarray(place.mdp.label)]
         shape = (int(place.shape[0]), int(place.shape[1]))
         drawn["map"] = drawing(
             "live_map", place, name, {key: (x.value, x.policy) for key, x in layers.items()},

@@ -33,3 +33,9 @@ def parse_map(text: str) -> np.ndarray:
                 f"{lines[i]!r}. All rows must have the same length."
             )
     return np.array(rows)
+
+
+def plain_kind(cells: np.ndarray) -> str:
+    """The kind of cell that shows nothing: ``.``, or the most frequent."""
+    names, counts = np.unique(cells, return_counts=True)
+    return "." if "." in names else str(names[np.argmax(counts)])

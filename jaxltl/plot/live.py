@@ -291,8 +291,8 @@ def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
     parts.append(f'<path class="axis" d="M{left} 6V{high - below}H{wide - 6}"/>')
     for value in (low, (low + high_value) / 2, high_value):
         told = f"{10**value if logs else value:.3g}"
-        parts.append(f'<text x="{left - 6}" y="{float(down(np.array(value))):.1f}" class="tick end">'
-                     f"{told}</text>")
+        y = float(down(np.array(value)))
+        parts.append(f'<text x="{left - 6}" y="{y:.1f}" class="tick end">{told}</text>')
     for step, anchor in ((x[0], "start"), (x[-1], "end")):
         told = f"{'step ' if anchor == 'end' else ''}{step:g}"
         parts.append(f'<text x="{float(across(step)):.1f}" y="{high - 9}" class="tick {anchor}">'
@@ -306,6 +306,7 @@ def _svg(
     sides = " ".join(f"{x:.0f}" for x in box)
     return (
         f'<svg id="{name}" class="{kind}" viewBox="{sides}" width="{box[2]:.0f}" '
-        f'height="{box[3]:.0f}" style="--wide:{box[2]:.0f}px" role="group" aria-label="{html.escape(label)}">'
+        f'height="{box[3]:.0f}" style="--wide:{box[2]:.0f}px" role="group" '
+        f'aria-label="{html.escape(label)}">'
         f"{''.join(parts)}</svg>"
     )

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.envs.text_map import parse_map
+from jaxltl.envs.text_map import parse_map, plain_kind
 from jaxltl.plot.board import (
     STEPS,
     WALL,
@@ -162,9 +162,7 @@ def _cells(
 
 def kind_colors(kinds: NDArray[np.str_], wall: str) -> dict[str, str]:
     """The colour of each kind of cell that is neither plain nor a wall."""
-    names, counts = np.unique(kinds, return_counts=True)
-    plain = "." if "." in names else str(names[np.argmax(counts)])
-    special = [str(k) for k in names if k not in (plain, wall)]
+    special = [str(k) for k in np.unique(kinds) if k not in (plain_kind(kinds), wall)]
     return {
         kind: _NAMED.get(
             re.sub(r"\d+$", "", kind).lower()[:1] if len(kind) < 3 else "", KINDS[i % len(KINDS)]

@@ -128,7 +128,7 @@ def _explorer(part: Explorer, drawn: Mapping[str, str]) -> str:
 
 def folded(title: str, content: str) -> str:
     """What is opened when it is asked for."""
-    return f'<details><summary>{title}</summary><div class="scroll">{content}</div></details>'
+    return f"<details><summary>{title}</summary>{content}</details>"
 
 
 def _choice(part: Explorer) -> str:
@@ -164,7 +164,7 @@ def _layer_table(part: Explorer, key: str) -> str:
     for state in range(size):
         value = None if layer.value is None else _finite(layer.value[state])
         chances = None if layer.policy is None else layer.policy[state]
-        told = [html.escape(part.names[state])] if part.names[state] not in ("", ".") else []
+        told = [html.escape(part.names[state])] if part.names[state] else []
         if value is not None:
             told.append(probability(value))
         if chances is not None and np.isfinite(chances).all():
@@ -206,7 +206,7 @@ def _run_table(part: Explorer, number: int) -> str:
         for t, (state, memory, action) in enumerate(run.steps)
     ]
     return rows(("step", "where", "memory", "action"), lines,
-                f"<caption>{html.escape(run.name)}</caption>", f'data-run="{number}"')
+                f"<caption>{html.escape(run.name)}</caption>", f'class="told" data-run="{number}"')
 
 
 def _curves(part: Curves, drawn: Mapping[str, str]) -> str:

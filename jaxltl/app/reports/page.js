@@ -28,6 +28,12 @@
       for (const element of every("[aria-pressed][data-memory]")) {
         element.setAttribute("aria-pressed", element.dataset.memory === key);
       }
+      const chosen = one(".state[aria-pressed=true]"), frame = one(".scroll:has(.automaton)");
+      if (chosen && frame) {
+        // Where the automaton is wider than its frame, the state comes into the middle.
+        const at = chosen.getBoundingClientRect(), around = frame.getBoundingClientRect();
+        frame.scrollLeft += at.left + at.width / 2 - around.left - around.width / 2;
+      }
       for (const query of [".layer", ".marked", "table[data-memory]"]) {
         for (const element of every(query)) show(element, element.dataset.memory === key);
       }
@@ -91,8 +97,11 @@
       if (token) {
         const x = (state % data.columns + 0.5) * CELL;
         const y = (Math.floor(state / data.columns) + 0.5) * CELL;
+        // It glides from step to step, and appears where it first is.
+        token.style.transition = token.style.visibility === "visible" ? "" : "none";
         token.style.visibility = "visible";
         token.style.transform = `translate(${x}px, ${y}px)`;
+        token.getBoundingClientRect();
       }
       const before = t > 0 ? run.steps[t - 1][1] : null;
       for (const edge of every(".edge")) {
