@@ -227,7 +227,7 @@ def _write(
         with atomic_write(out / picture.name) as file:
             file.write(shown[-1][1])
     parts = [(x, {k: drawn().decode() for k, drawn in each.items()}) for x, each in live]
-    page = _report(result).page(result, shown, (out / "task.toml").read_text(), parts)
+    page = _report(result).page(result, parts, shown, (out / "task.toml").read_text())
     with atomic_write(out / "report.html") as file:
         file.write(page.encode())
     # Last, so that its presence says that all the rest is there.

@@ -82,14 +82,10 @@ class Learned:
 
 
 def _mlirl(
-    spec: Mapping[str, Any],
-    model: Product,
-    shown: Trajectories,
-    seeds: tuple[int, int],
-    report: Report | None,
-    checkpoint: Path | None,
+    setup: Setup, seeds: tuple[int, int], report: Report | None, checkpoint: Path | None
 ) -> Learned:
     """Inverse RL by maximum likelihood, in the world or in the product (chapter 2)."""
+    spec, model, shown = setup.task.learner, setup.model, setup.demonstrations
     in_world = spec.get("in", "product") == "world"
     avoid, progress = spec.get("avoid", ()), spec.get("progress")
     if in_world:
@@ -261,8 +257,8 @@ def learn(
     Raises:
       ValueError: the learner cannot work on this task.
     """
-    model, spec = setup.model, setup.task.learner
-    learned = _mlirl(spec, model, setup.demonstrations, (seed, num_seeds), report, checkpoint)
+    model = setup.model
+    learned = _mlirl(setup, (seed, num_seeds), report, checkpoint)
     progress("checking")
     loss = np.where(np.isfinite(learned.loss), learned.loss, np.inf)
     chosen = int(np.argmin(np.where(learned.converged, loss, loss + 1e12)))

@@ -14,7 +14,7 @@ import pytest
 from jaxltl.app import explorer as exploring
 from jaxltl.app.drawing import Picture, draw, drawing
 from jaxltl.app.explorer import START, Layer, TooLarge, curves, demonstrated_runs, learned_runs
-from jaxltl.app.reports.live import live_page
+from jaxltl.app.reports.live import Said, live_page
 from jaxltl.core.models.product import lift_trajectories, product
 from jaxltl.core.models.trajectories import make_trajectories
 from jaxltl.envs.gridworld import ACTIONS, gridworld
@@ -69,7 +69,8 @@ def made(**options):
 
 def page(*parts, remarks=()):
     drawn = [(p, {k: draw(d).decode() for k, d in p.drawings.items()}) for p in parts]
-    return live_page(RESULT, "a sentence", remarks, "", drawn, ["<h2>Told</h2>"], PICTURES, "[t]")
+    said = Said("a sentence", remarks, "", ["<h2>Told</h2>"])
+    return live_page(RESULT, said, drawn, PICTURES, "[task]")
 
 
 def learning():

@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-from jaxltl.app.drawing import Picture
 from jaxltl.app.files.task import place
-from jaxltl.app.reports.live import Part, live_page
+from jaxltl.app.reports.live import Said, live_page
 from jaxltl.app.reports.page import Remark, certified, number, probability, rows, spread, tiles
 
 
-def page(
-    result: Mapping[str, Any], pictures: Iterable[tuple[Picture, bytes]], task_text: str,
-    parts: Sequence[Part] = (),
-) -> str:
-    """The report of :func:`jaxltl.app.learn.summary`; see :func:`~.live.live_page`."""
-    told = [
+def page(result: Mapping[str, Any], *shown: Any) -> str:
+    """The report of :func:`jaxltl.app.learn.summary`.
+
+    Args:
+      result: the summary.
+      shown: what moves, pictures and the task file, as for :func:`~.live.live_page`.
+    """
+    said = Said(_sentence(result), remarks(result), _tiles(result), _told(result))
+    return live_page(result, said, *shown)
+
+
+def _told(result: Mapping[str, Any]) -> list[str]:
+    """What stands after the policies."""
+    return [
         "<h2>Probability of doing the task</h2>", _evidence_table(result),
         "<h2>Weights</h2>", _weights_table(result), _seeds(result),
     ]
-    return live_page(result, _sentence(result), remarks(result), _tiles(result), parts, told,
-                     pictures, task_text)
 
 
 def remarks(result: Mapping[str, Any]) -> list[Remark]:

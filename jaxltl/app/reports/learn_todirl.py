@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
-from jaxltl.app.drawing import Picture
 from jaxltl.app.files.task import place
-from jaxltl.app.reports.live import Part, live_page
+from jaxltl.app.reports.live import Said, live_page
 from jaxltl.app.reports.page import Remark, certified, number, probability, rows, spread, tiles
 
 _WHO = {
@@ -17,19 +16,25 @@ _WHO = {
 _ROWS = 20  # worlds in a table
 
 
-def page(
-    result: Mapping[str, Any], pictures: Iterable[tuple[Picture, bytes]], task_text: str,
-    parts: Sequence[Part] = (),
-) -> str:
-    """The report of :func:`jaxltl.app.learn_todirl.summary`; see :func:`~.live.live_page`."""
+def page(result: Mapping[str, Any], *shown: Any) -> str:
+    """The report of :func:`jaxltl.app.learn_todirl.summary`.
+
+    Args:
+      result: the summary.
+      shown: what moves, pictures and the task file, as for :func:`~.live.live_page`.
+    """
+    said = Said(_sentence(result), remarks(result), _tiles(result), _told(result))
+    return live_page(result, said, *shown)
+
+
+def _told(result: Mapping[str, Any]) -> list[str]:
+    """What stands after the policies."""
     told = [f"<h2>Mean probability of doing the task{_within(result)}</h2>",
             _evidence_table(result)]
     for key, title in (("test", "Test worlds"), ("training", "Training worlds")):
         if result[key]:
             told += [f"<h2>{title}</h2>", _worlds_table(result[key])]
-    told += [_seeds(result), _network(result)]
-    return live_page(result, _sentence(result), remarks(result), _tiles(result), parts, told,
-                     pictures, task_text)
+    return [*told, _seeds(result), _network(result)]
 
 
 def remarks(result: Mapping[str, Any]) -> list[Remark]:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import base64
 import html
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from importlib import resources
+from string import Template
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxltl.app.drawing import Picture
 from jaxltl.app.explorer import START, Curves, Explorer, TooLarge
 from jaxltl.app.files.task import place, where
-from jaxltl.app.reports.page import Remark, compose, number, probability, rows
+from jaxltl.app.reports.page import Remark, number, probability, rows
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import edge_guards
 from jaxltl.core.models.monitor import Verdict, verdicts
@@ -28,34 +31,83 @@ _VERDICTS = {
 Part = tuple[Explorer | Curves | TooLarge, Mapping[str, str]]  # with its pictures as SVG
 
 
+class Said(NamedTuple):
+    """What a page says of a result.
+
+    Attributes:
+      sentence: what was done, as HTML.
+      remarks: what a reader must know first.
+      tiles, told: HTML before and after the policies.
+    """
+
+    sentence: str
+    remarks: Sequence[Remark]
+    tiles: str
+    told: Sequence[str]
+
+
 def live_page(
-    result: Mapping[str, Any], sentence: str, remarks: Iterable[Remark], tiles: str,
-    parts: Sequence[Part], told: Iterable[str], pictures: Iterable[tuple[Picture, bytes]],
-    task_text: str,
+    result: Mapping[str, Any], said: Said, parts: Sequence[Part],
+    pictures: Iterable[tuple[Picture, bytes]], task_text: str,
 ) -> str:
-    """A report: what matters first, policies to look into, tables, curves, pictures, the task.
+    """A page that needs no other file and no network.
+
+    First what matters, then policies to look into, tables, curves, pictures and the task.
 
     Args:
-      result, sentence, remarks, task_text: as for :func:`~jaxltl.app.reports.page.compose`.
-      tiles, told: HTML before and after the policies.
+      result: what ``result.json`` holds; read are its task, formula, versions and seconds.
+      said: what is said of it.
       parts: what moves.
-      pictures: those that no part says are shown.
+      pictures: with their SVG; those that a part stands for are left out.
+      task_text: the task file, shown at the end.
     """
-    looked = [section(*part) for part in parts if not isinstance(part[0], Curves)]
-    learned = [section(*part) for part in parts if isinstance(part[0], Curves)]
-    moving = [part for part, _ in parts if isinstance(part, Explorer)]
-    names = {part.name for part, _ in parts if not isinstance(part, TooLarge)}
-    return compose(
-        result, sentence, remarks, [tiles, *looked, *told, *learned],
-        [one for one in pictures if one[0].live not in names], task_text,
-        json.dumps([data(part) for part in moving], separators=(",", ":"), allow_nan=False),
+    name, names = html.escape(result["task"]), {p.name for p, _ in parts}
+    names -= {part.name for part, _ in parts if isinstance(part, TooLarge)}
+    body = [
+        f"<h1>{name}</h1><p class=muted>{said.sentence}</p>"
+        f"<p class=formula><code>{html.escape(result['formula'])}</code></p>",
+        _remarks(said.remarks), said.tiles,
+        *(section(*part) for part in parts if not isinstance(part[0], Curves)),
+        *said.told,
+        *(section(*part) for part in parts if isinstance(part[0], Curves)),
+        *(_picture(*one) for one in pictures if one[0].live not in names),
+        f"<h2>The task file</h2><div class=scroll><pre><code>{html.escape(task_text)}</code></pre>"
+        f"</div><p class=muted>jaxltl {result['versions']['jaxltl']}, "
+        f"jax {result['versions']['jax']}, {result['seconds']:.1f} s</p>",
+    ]
+    moving = [data(part) for part, _ in parts if isinstance(part, Explorer)]
+    known = json.dumps(moving, separators=(",", ":"), allow_nan=False)
+    return Template(_file("page.html")).substitute(
+        title=name, style=_file("page.css"), script=_file("page.js"), body="\n".join(body),
+        # Nothing in it may end the script that it stands in.
+        data=known.replace("<", "\\u003c"),
+    )
+
+
+def _file(name: str) -> str:
+    return resources.files("jaxltl.app.reports").joinpath(name).read_text()
+
+
+def _remarks(told: Iterable[Remark]) -> str:
+    said = {"warning": "<b>Warning:</b> "}
+    items = [f'<li class="{kind}">{said.get(kind, "")}{html.escape(text)}</li>'
+             for kind, text in told]
+    return f'<ul class="remarks">{"".join(items)}</ul>' if items else ""
+
+
+def _picture(picture: Picture, svg: bytes) -> str:
+    title, caption = html.escape(picture.title), html.escape(picture.caption)
+    image = base64.b64encode(svg).decode()
+    return (
+        f'<h2>{title}</h2><figure><div class="paper"><img alt="{title}: {caption}" '
+        f'src="data:image/svg+xml;base64,{image}"></div><figcaption>{caption}</figcaption></figure>'
     )
 
 
 def section(part: Explorer | Curves | TooLarge, drawn: Mapping[str, str]) -> str:
     """A part of a page, with its pictures as SVG."""
     if isinstance(part, TooLarge):
-        return f'<ul class="remarks"><li class="note">{html.escape(part.text)}</li></ul>'
+        return _remarks([("note", part.text)])
     if isinstance(part, Curves):
         return _curves(part, drawn)
     return _explorer(part, drawn)

@@ -1,68 +1,12 @@
-"""What pages and texts about learned policies share: their frame, and how figures are written."""
+"""What pages and texts about learned policies share: tables, and how figures are written."""
 
 from __future__ import annotations
 
-import base64
-import html
 import math
 from collections.abc import Iterable, Mapping
-from importlib import resources
-from string import Template
 from typing import Any
 
-from jaxltl.app.drawing import Picture
-
 Remark = tuple[str, str]  # its kind, "warning" (shown in red), "note" or "good", and its text
-
-
-def remarks(told: Iterable[Remark]) -> str:
-    """What a reader must know first, as a list."""
-    said = {"warning": "<b>Warning:</b> "}
-    items = [f'<li class="{kind}">{said.get(kind, "")}{html.escape(text)}</li>'
-             for kind, text in told]
-    return f'<ul class="remarks">{"".join(items)}</ul>' if items else ""
-
-
-def compose(
-    result: Mapping[str, Any], sentence: str, told: Iterable[Remark], parts: Iterable[str],
-    pictures: Iterable[tuple[Picture, bytes]], task_text: str, data: str = "[]",
-) -> str:
-    """A page that needs no other file and no network.
-
-    Args:
-      result: what ``result.json`` holds; read are its task, formula, versions and seconds.
-      sentence: what was done, as HTML.
-      told: the remarks at the top.
-      parts: HTML.
-      pictures: with their SVG.
-      task_text: the task file, shown at the end.
-      data: JSON for the page's script.
-    """
-    head = (
-        f"<h1>{html.escape(result['task'])}</h1><p class=muted>{sentence}</p>"
-        f"<p class=formula><code>{html.escape(result['formula'])}</code></p>{remarks(told)}"
-    )
-    shown = []
-    for picture, svg in pictures:
-        title, image = html.escape(picture.title), base64.b64encode(svg).decode()
-        shown.append(
-            f'<h2>{title}</h2><figure><div class="paper"><img alt="{title}: '
-            f'{html.escape(picture.caption)}" src="data:image/svg+xml;base64,{image}"></div>'
-            f"<figcaption>{html.escape(picture.caption)}</figcaption></figure>"
-        )
-    end = (
-        f"<h2>The task file</h2><div class=scroll><pre><code>{html.escape(task_text)}</code></pre>"
-        f"</div><p class=muted>jaxltl {result['versions']['jaxltl']}, "
-        f"jax {result['versions']['jax']}, {result['seconds']:.1f} s</p>"
-    )
-    return Template(_file("page.html")).substitute(
-        title=html.escape(result["task"]), style=_file("page.css"), script=_file("page.js"),
-        body="\n".join([head, *parts, *shown, end]), data=data.replace("<", "\\u003c"),
-    )
-
-
-def _file(name: str) -> str:
-    return resources.files("jaxltl.app.reports").joinpath(name).read_text()
 
 
 def rows(
