@@ -478,14 +478,14 @@ _LABEL = "probability of doing the task"
 
 
 def _layers(outcome: Outcome) -> dict[str, Layer]:
-    """By memory where the policy still matters: not done, not failed, and reachable."""
+    """By memory where the policy still matters: not done, not failed, and met on some way."""
     model = outcome.setup.model
     policy = np.asarray(outcome.learned.policy[outcome.chosen])
     value = np.array(outcome.solution.value)
     starts = np.asarray(model.mdp.initial) > 0
     open_ = verdicts(model.automaton) == Verdict.UNDECIDED
     met = _reached(model)
-    shown = np.flatnonzero(open_ & (value > 0).any(axis=0) & met.any(axis=0)).tolist()
+    shown = np.flatnonzero(open_ & met.any(axis=0)).tolist()
     names = model.automaton.state_names or ("",) * model.num_memory
     found = {
         str(q): Layer(f"memory {q}: {names[q]}", np.where(met[:, q], value[:, q], np.nan),

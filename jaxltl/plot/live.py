@@ -192,17 +192,20 @@ def live_map(
         )
     parts += [_track(i, cells, columns) for i, cells in enumerate(runs)]
     parts += [_cell(0, 0, "cursor", ""), f'<circle class="token" r="{CELL * 0.28:g}"/>']
-    stride = max(1, -(-max(ground.shape) // 16))
+    stride = -(-max(ground.shape) // 16)
     beyond = max([0, *(-row for row, _, _ in ground.ring)]) * CELL
+    # Numbers grow with the map, so that they can be read where it is scaled down.
+    zoom = max(1.0, max(ground.shape) / 16)
+    margin = _MARGIN * zoom
     for axis, count in enumerate((columns, rows)):
         for i in range(0, count, stride):
-            along, off = i * CELL + CELL / 2, -beyond - 10
+            along, off = i * CELL + CELL / 2, -beyond - margin / 2
             x, y = (along, off) if axis == 0 else (off, along)
             parts.append(f'<text class="number" x="{x:g}" y="{y:g}">{i + 1}</text>')
-    low, more = -beyond - _MARGIN, 2 * beyond + _MARGIN + 2
+    low, more = -beyond - margin, 2 * beyond + margin + 2
     box = (low, low, columns * CELL + more, rows * CELL + more)
     return _svg(f"{name}-map", "map", box, parts,
-                f"A map of {rows} rows and {columns} columns; a table follows")
+                f"A map of {rows} rows and {columns} columns; a table follows", zoom)
 
 
 def _cell(row: int, column: int, kind: str, color: str, more: str = "") -> str:
@@ -301,12 +304,13 @@ def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
 
 
 def _svg(
-    name: str, kind: str, box: Sequence[float], parts: Iterable[str], label: str
+    name: str, kind: str, box: Sequence[float], parts: Iterable[str], label: str,
+    zoom: float = 1.0,
 ) -> str:
     sides = " ".join(f"{x:.0f}" for x in box)
     return (
         f'<svg id="{name}" class="{kind}" viewBox="{sides}" width="{box[2]:.0f}" '
-        f'height="{box[3]:.0f}" style="--wide:{box[2]:.0f}px" role="group" '
+        f'height="{box[3]:.0f}" style="--wide:{box[2]:.0f}px;--zoom:{zoom:.2g}" role="group" '
         f'aria-label="{html.escape(label)}">'
         f"{''.join(parts)}</svg>"
     )

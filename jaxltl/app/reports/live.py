@@ -20,8 +20,13 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import edge_guards
 from jaxltl.core.models.monitor import Verdict, verdicts
 
+_NARROW = 24  # columns of a map that shares the width with the automaton
 _MOST_ROWS = 12  # of a table of curves
 _SIGNS = {"up": "↑", "down": "↓", "left": "←", "right": "→", "stay": "•"}
+_MARKS = {
+    "buchi": " Dots: arrows to be taken again and again.",
+    "parity": " Numbers: the least that is met again and again must be even.",
+}
 _VERDICTS = {
     Verdict.SATISFIED: "the task is done", Verdict.VIOLATED: "the task has failed",
     Verdict.UNDECIDED: "",
@@ -143,7 +148,7 @@ def _told(part: Explorer) -> dict[str, str]:
     for q, (name, verdict) in enumerate(zip(names, verdicts(part.automaton), strict=True)):
         told = [_VERDICTS[Verdict(int(verdict))], name and f"left to satisfy: {name}"]
         if str(q) not in part.layers and verdict == Verdict.UNDECIDED:
-            told[0] = "nothing is shown: no run that can do the task has this memory"
+            told[0] = "nothing is shown: no policy meets this memory"
         found[str(q)] = f"Memory {q}: " + "; ".join(text for text in told if text)
     return {**found, START: f"Where a run starts: {part.label} from there"}
 
@@ -152,29 +157,32 @@ def _explorer(part: Explorer, drawn: Mapping[str, str]) -> str:
     panes = f'<div><h3>Its memory: the automaton</h3><div class="scroll">{drawn["automaton"]}</div>'
     panes += (
         '<p class="muted">Filled: the memory that is shown. Double circle: the task is done, '
-        "whatever follows. Grey: it has failed.</p></div>"
+        f"whatever follows. Grey: it has failed.{_MARKS.get(part.automaton.acceptance, '')}</p>"
+        "</div>"
     )
-    if "map" in drawn:
+    hint, narrow = "Choose a state of the automaton, or play a run.", part.shape is not None
+    if part.shape is not None:
+        narrow = part.shape[1] <= _NARROW
         colored = any(layer.value is not None for layer in part.layers.values())
         scale = ('<p class="scale"><span>0</span><i></i><span>1</span> '
                  f"<span>{html.escape(part.label)}</span></p>") if colored else ""
+        hint = "Point at a cell of the map, choose a state of the automaton, or play a run."
         panes = (
-            '<div><h3>The map</h3><div class="board" tabindex="0" role="group" aria-label="Map; '
-            f'the arrow keys go from cell to cell">{drawn["map"]}</div>{scale}</div>{panes}'
+            '<div><h3>The map</h3><div class="scroll board" tabindex="0" role="group" '
+            'aria-label="Map; the arrow keys go from cell to cell">'
+            f'{drawn["map"]}</div>{scale}</div>{panes}'
         )
     tables = [_layer_table(part, key) for key in part.layers]
     runs = [_run_table(part, number) for number in range(len(part.runs))]
-    played = "".join(runs)
     return (
         f'<section class="explorer" id="{part.name}"><h2>{html.escape(part.title)}</h2>'
         f'<p class="muted">{html.escape(part.caption)}</p><div class="card">{_choice(part)}'
         f'<p class="memory" aria-live="polite"></p>{_player(part)}'
-        f'<p class="readout" role="status" aria-live="polite">Point at a cell of the map, choose a '
-        "state of the automaton, or play a run.</p>"
-        f'<div class="panes{" two" if "map" in drawn else ""}">{panes}</div></div>'
+        f'<p class="readout" role="status" aria-live="polite">{hint}</p>'
+        f'<div class="panes{" two" if narrow else ""}">{panes}</div></div>'
         f"{folded('What is shown, as a table', ''.join(tables))}"
         f"{folded('The automaton as a table', _automaton_table(part.automaton))}"
-        f"{folded('The run as a table', played) if runs else ''}</section>"
+        f"{folded('The run as a table', ''.join(runs)) if runs else ''}</section>"
     )
 
 

@@ -14,12 +14,19 @@
     const map = one("svg.map"), token = one(".token"), cursor = one(".cursor");
     const readout = one(".readout"), slider = one("input[type=range]");
     const select = one("select"), play = one(".play");
-    let key = data.first, cell = null, timer = null;
+    let key = data.first, cell = null, timer = null, started = false;
 
     const place = (state) => data.columns === null ? `state ${state}`
       : `row ${Math.floor(state / data.columns) + 1}, column ${state % data.columns + 1}`;
 
     const show = (element, visible) => { element.style.display = visible ? "" : "none"; };
+
+    // Where a picture is wider than its frame, a part of it comes into the middle.
+    function center(part) {
+      const frame = part.closest(".scroll"), at = part.getBoundingClientRect();
+      const around = frame.getBoundingClientRect();
+      frame.scrollLeft += at.left + at.width / 2 - around.left - around.width / 2;
+    }
 
     function say(text) { readout.textContent = text; }
 
@@ -28,12 +35,8 @@
       for (const element of every("[aria-pressed][data-memory]")) {
         element.setAttribute("aria-pressed", element.dataset.memory === key);
       }
-      const chosen = one(".state[aria-pressed=true]"), frame = one(".scroll:has(.automaton)");
-      if (chosen && frame) {
-        // Where the automaton is wider than its frame, the state comes into the middle.
-        const at = chosen.getBoundingClientRect(), around = frame.getBoundingClientRect();
-        frame.scrollLeft += at.left + at.width / 2 - around.left - around.width / 2;
-      }
+      const chosen = one(".state[aria-pressed=true]");
+      if (chosen) center(chosen);
       for (const query of [".layer", ".marked", "table[data-memory]"]) {
         for (const element of every(query)) show(element, element.dataset.memory === key);
       }
@@ -86,6 +89,7 @@
     // The step t of the run that is chosen, on map, automaton and in words.
     function step(t) {
       const run = data.runs[Number(select.value)], [state, memory, action] = run.steps[t];
+      started = true;
       slider.max = run.steps.length - 1;
       slider.value = t;
       const did = action === null ? "the run ends here" : `goes ${data.actions[action]}`;
@@ -101,7 +105,7 @@
         token.style.transition = token.style.visibility === "visible" ? "" : "none";
         token.style.visibility = "visible";
         token.style.transform = `translate(${x}px, ${y}px)`;
-        token.getBoundingClientRect();
+        center(token);
       }
       const before = t > 0 ? run.steps[t - 1][1] : null;
       for (const edge of every(".edge")) {
@@ -166,8 +170,7 @@
       play.addEventListener("click", () => {
         if (timer !== null) return stop();
         const run = data.runs[Number(select.value)];
-        step(Number(slider.value) < run.steps.length - 1 && token
-          && token.style.visibility === "visible" ? Number(slider.value) : 0);
+        step(started && Number(slider.value) < run.steps.length - 1 ? Number(slider.value) : 0);
         play.textContent = "Pause";
         play.setAttribute("aria-pressed", "true");
         readout.setAttribute("aria-live", "off");
