@@ -41,6 +41,7 @@ from jaxltl.core.models.product import (
     lift_trajectories,
     product,
     project_policy,
+    project_trajectories,
 )
 from jaxltl.core.models.restrict import restrict, with_allowed
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, rollout
@@ -134,6 +135,7 @@ __all__ = [
     "policy_value",
     "product",
     "project_policy",
+    "project_trajectories",
     "pushforward",
     "reach",
     "reachability_probability",

@@ -39,9 +39,10 @@ PUBLIC = [
     "make_game", "make_mdp", "make_monitor", "make_trajectories", "mean_payoff", "minimax_value",
     "monitor_step", "occupancy_measure", "optimal_actions", "optimal_satisfaction", "optimal_value",
     "parity", "parse_ltl", "permissive_strategy", "policy_value", "product", "project_policy",
-    "pushforward", "reach", "reachability_probability", "read_hoa", "restrict", "rollout", "safety",
-    "sample_successor", "satisfaction_probability", "shield", "soft_value", "stack_products",
-    "states_where", "strategy_value", "synchronize", "task_performance", "task_performances",
+    "project_trajectories", "pushforward", "reach", "reachability_probability", "read_hoa",
+    "restrict", "rollout", "safety", "sample_successor", "satisfaction_probability", "shield",
+    "soft_value", "stack_products", "states_where", "strategy_value", "synchronize",
+    "task_performance", "task_performances",
     "to_automaton", "to_dense", "verdict", "verify", "winning_region", "with_allowed", "write_hoa",
 ]
 

@@ -23,7 +23,8 @@ from jaxltl.algos import _line_search as line_search
 from jaxltl.algos import learner
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.operators import expectation
-from jaxltl.core.models.product import Product, lift_trajectories
+from jaxltl.core.models.product import Product, allowed_steps, lift_trajectories
+from jaxltl.core.models.restrict import with_allowed
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status, require_shape, worst
 from jaxltl.core.values.boltzmann import boltzmann_value
@@ -139,6 +140,7 @@ def make_problem(
     start: Any = None,
     reward: Reward = linear_reward,
     satisfaction_over: str | jax.Array = "initial",
+    allowed: jax.Array | None = None,
 ) -> Problem:
     """A checked :class:`Problem`.
 
@@ -151,11 +153,17 @@ def make_problem(
         network's ``apply``.
       satisfaction_over: the states over which g sums (2.6): ``"initial"`` (where the model
         starts; the dissertation's prose), ``"all"`` (its formula), or weights ``float[S]``.
+      allowed: ``bool[S, A]`` (``[S, Q, A]``), the actions that policies choose from, such as those
+        that lose nothing of the task (:func:`~jaxltl.core.values.optimal_actions.optimal_actions`);
+        default all. Demonstrated steps that take others are left out:
+        :func:`~jaxltl.core.models.product.allowed_steps` tells which.
 
     Raises:
-      ValueError: features or weights of the wrong shape, features that are not finite,
-        an unknown `satisfaction_over`, or a reward of the wrong shape.
+      ValueError: features, weights or mask of the wrong shape, features that are not finite,
+        an unknown `satisfaction_over`, a reward of the wrong shape, demonstrations that are not the
+        world's, or one of which no step is allowed.
     """
+    model = model if allowed is None else with_allowed(model, allowed)
     actions = (*model.state_shape, model.num_actions)
     features = jnp.asarray(features, model.dtype)
     if features.shape[:-1] != actions:
@@ -163,6 +171,7 @@ def make_problem(
     if (wrong := ~np.isfinite(np.asarray(features))).any():
         *pair, feature = np.argwhere(wrong)[0].tolist()
         raise ValueError(f"feature {feature} at {tuple(pair)} is not finite.")
+    kept = allowed_steps(model, demonstrations)
     if isinstance(model, Product):
         demonstrations = lift_trajectories(model, demonstrations)
     weight: Any = satisfaction_over
@@ -180,18 +189,24 @@ def make_problem(
     if shape != actions:
         raise ValueError(f"the reward has shape {shape}; expected {actions}.")
     return Problem(
-        model=model, features=features, counts=pair_counts(model, demonstrations),
+        model=model, features=features, counts=pair_counts(model, demonstrations, kept),
         start=start, satisfaction_weight=weight, reward=reward,
     )
 
 
 @jax.jit  # one program, where it is called alone
-def pair_counts(model: Any, trajectories: Trajectories) -> jax.Array:
-    """How often each state-action pair occurs in trajectories of a model: ``float[S, A]``."""
+def pair_counts(
+    model: Any, trajectories: Trajectories, kept: jax.Array | None = None
+) -> jax.Array:
+    """How often each state-action pair occurs in trajectories of a model: ``float[S, A]``.
+
+    In those steps that are `kept`, ``bool[N, T]``; default all.
+    """
+    kept = trajectories.mask if kept is None else kept
     actions = (*model.state_shape, model.num_actions)
     pair = trajectories.state * model.num_actions + trajectories.action
     flat = jnp.zeros(int(np.prod(actions)), model.dtype)
-    return flat.at[pair].add(trajectories.mask.astype(model.dtype)).reshape(actions)
+    return flat.at[pair].add(kept.astype(model.dtype)).reshape(actions)
 
 
 def solve(

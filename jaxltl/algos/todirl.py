@@ -23,9 +23,10 @@ from flax import struct
 from jax import lax
 
 from jaxltl.algos import learner
-from jaxltl.core.models.batch import stack_models, stack_observations, training_counts
+from jaxltl.core.models.batch import narrow, stack_models, stack_observations, training_counts
 from jaxltl.core.models.batch import world as lane
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.restrict import with_allowed
 from jaxltl.core.models.tables import Predecessors, predecessors
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status, status_code
@@ -194,6 +195,7 @@ def make_problem(
     network: nn.Module | None = None,
     weight: Any = None,
     horizon: int | None = None,
+    allowed: Any = None,
 ) -> Problem:
     """A checked :class:`Problem`, on the host.
 
@@ -207,13 +209,19 @@ def make_problem(
       network: the reward; default :class:`RewardNetwork`.
       weight: ``float[W]``, factors of the worlds' likelihoods; default 1.
       horizon: count pairs by time, for ``Hparams.horizon``.
+      allowed: ``bool[S, Q, A]``, or one for each world: the actions that policies choose from, such
+        as those that lose nothing of the task
+        (:func:`~jaxltl.core.values.optimal_actions.optimal_actions`); default all. Demonstrated
+        steps that take others are left out.
 
     Raises:
       ValueError: worlds of different shapes or propositions, observations, weights or
-        rewards of the wrong shape, demonstrations that do not fit their world or exceed the
-        horizon, or no pair left to learn from.
+        rewards of the wrong shape, masks that do not fit, demonstrations that do not fit their
+        world or exceed the horizon, or no pair left to learn from.
     """
     model = stack_models(worlds)
+    if allowed is not None:
+        model = narrow(model, allowed)
     num_worlds, dtype = model.letter.shape[0], model.dtype
     observation = stack_observations(model, observation)
     counts, other = training_counts(model, demonstrations, held_out, horizon=horizon)
@@ -266,6 +274,7 @@ def plan(
     hparams: Hparams,
     *,
     initial: jax.Array | None = None,
+    allowed: jax.Array | None = None,
 ) -> Solution:
     """Soft value and policy (3.4), (3.5) of a learned reward in any world.
 
@@ -275,14 +284,18 @@ def plan(
       observation: ``float[S, O]``.
       hparams: discount, tolerance, method and horizon are read.
       initial: ``float[S, Q]``, a value to start from.
+      allowed: ``bool[S, Q, A]``, the actions to choose from in this world; default all. Inside
+        those that lose nothing of its task the plan does it as well as it can be done, and what
+        was learned decides how.
 
     Returns:
       :class:`~jaxltl.core.types.Solution`, differentiable in the parameters; with a
       horizon, value and policy have a first axis of time. Batches of worlds by ``vmap``.
 
     Raises:
-      ValueError: unknown method.
+      ValueError: unknown method, or a mask that does not fit.
     """
+    model = model if allowed is None else with_allowed(model, allowed)
     return _plan(reward(network, parameters, model, observation), model, hparams, initial)
 
 

@@ -29,7 +29,7 @@ from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.models import operators
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.product import Product
+from jaxltl.core.models.product import Product, project_trajectories
 from jaxltl.core.models.trajectories import Trajectories, rollout
 from jaxltl.core.values.soft import soft_value
 from jaxltl.envs.cell_kinds import (
@@ -581,4 +581,4 @@ def demonstrations(
     runs = rollout(
         model, policy, key, num_trajectories=num, num_steps=horizon, stop=is_over(model)
     )
-    return replace(runs, state=runs.state // model.num_memory)
+    return project_trajectories(model, runs)

@@ -267,3 +267,63 @@ def test_features_refuse_what_does_not_exist():
         mlirl.task_features(lazy, demonstrations, avoid=["z"])
     with pytest.raises(ValueError, match="needs a co-safe task"):
         mlirl.task_features(jl.product(world, "G !r"), demonstrations)
+
+
+# --- fewer actions -----------------------------------------------------------------------------
+
+
+def masked(reward=mlirl.linear_reward, **options):
+    """The product of the little map in which no move may enter r."""
+    world, demonstrations = grid(slip=0.2)
+    lazy = jl.product(world, f"{TASK} & (!r U g)")
+    allowed = jl.optimal_actions(lazy).allowed
+    features = mlirl.task_features(lazy, demonstrations).values
+    return lazy, allowed, demonstrations, mlirl.make_problem(
+        lazy, features, demonstrations, allowed=allowed, **options)
+
+
+@pytest.mark.parametrize("kind", ["boltzmann", "soft"])
+@pytest.mark.parametrize("mu", [None, 0.5])
+def test_inside_a_mask_the_policy_and_the_gradient_are_those_of_a_model_without_the_rest(kind, mu):
+    lazy, allowed, _, problem = masked()
+    flat = jl.restrict(lazy, np.full(lazy.state_shape, 1 / lazy.num_states), allowed=allowed).model
+    hparams = mlirl.Hparams(discount=0.6, policy=kind, mu=mu)
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=problem.features.shape[-1]))
+    policy = mlirl.solve(weights, problem, hparams).policy
+    assert ((policy > 0) == allowed).all()
+    reward = (problem.features @ weights).reshape(flat.available.shape)
+    value = jl.soft_value if kind == "soft" else jl.boltzmann_value
+    np.testing.assert_allclose(
+        policy.reshape(reward.shape), value(flat, reward, 0.6).policy, atol=1e-9)
+    direction = np.random.default_rng(1).normal(size=weights.shape)
+    assert_gradients(
+        lambda x: mlirl.objective(x["weights"], problem, hparams)[0],
+        {"weights": weights}, {"weights": direction})
+
+
+def test_steps_outside_the_mask_are_left_out_by_name():
+    lazy, allowed, demonstrations, problem = masked()
+    kept = jl.core.models.product.allowed_steps(jl.with_allowed(lazy, allowed), demonstrations)
+    assert 0 < (~kept & np.asarray(demonstrations.mask)).sum() < demonstrations.length.sum()
+    assert problem.counts.sum() == kept.sum()
+    assert (problem.counts[~np.asarray(allowed)] == 0).all()
+    with pytest.raises(ValueError, match="trajectory 1: none of its 1 steps takes an allowed act"):
+        shown = jl.make_trajectories(lazy.mdp, [[(0, DOWN), (3, RIGHT)], [(1, RIGHT)]])
+        mlirl.make_problem(lazy, problem.features, shown, allowed=allowed)
+
+
+def test_trajectories_of_another_model_are_refused():
+    world, demonstrations = grid()
+    lazy = jl.product(world, TASK)
+    lifted = jl.lift_trajectories(lazy, demonstrations)
+    features = np.zeros((*lazy.state_shape, 4, 1))
+    with pytest.raises(ValueError, match=r"belong to a model of shape \(6, 3\).*project_traj"):
+        mlirl.make_problem(lazy, features, lifted)
+    with pytest.raises(ValueError, match=r"belong to a model of shape \(6,\).*lift_traj"):
+        jl.project_trajectories(lazy, demonstrations)
+    with pytest.raises(ValueError, match="trajectory 0, step 1: state 6 does not exist"):
+        outside = jl.Trajectories(np.array([[0, 6]]), np.array([[0, 0]]), np.array([2]))
+        mlirl.make_problem(world, np.zeros((6, 4, 1)), outside)
+    back = jl.project_trajectories(lazy, lifted)
+    np.testing.assert_array_equal(back.state, demonstrations.state)
+    assert back.state_shape == world.state_shape

@@ -211,7 +211,7 @@ def test_the_expert_is_recovered_with_the_features_of_its_reward():
     true = {"params": {"table": table}}
     expert = plan(Table(), true, model, observation, hparams)
     runs = jl.rollout(model, expert.policy, jax.random.key(0), num_trajectories=200, num_steps=20)
-    runs = runs.replace(state=runs.state // model.num_memory)
+    runs = jl.project_trajectories(model, runs)
     problem = todirl.make_problem(model, observation, runs, network=Table(), held_out=None)
     flat, unravel = ravel_pytree(true)
 
@@ -344,3 +344,48 @@ def test_stacked_products_are_taken_as_they_are():
         network=todirl.RewardNetwork((3, 3)))
     for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(small((0, 1))), strict=True):
         np.testing.assert_array_equal(x, y)
+
+
+# --- fewer actions -----------------------------------------------------------------------------
+
+
+def test_inside_a_mask_the_plan_and_the_gradient_are_those_of_worlds_without_the_rest():
+    models = [lazy(0), lazy(1)]
+    masks = [np.asarray(jl.optimal_actions(m).allowed) for m in models]
+    assert not all(m.all() for m in masks)
+    problem = small((0, 1), allowed=masks)
+    hparams = todirl.Hparams(discount=0.9, l2=0.0, tolerance=1e-12)
+    point = parameters(problem)
+    policy = todirl.solve(point, problem, hparams).policy
+    assert ((policy > 0) == np.stack(masks)).all()
+    for i, (model, mask) in enumerate(zip(models, masks, strict=True)):
+        new = todirl.plan(
+            problem.network, point, model, jnp.asarray(seen(model)), hparams, allowed=mask)
+        np.testing.assert_allclose(new.policy, policy[i], atol=1e-9)
+        anywhere = np.full(model.state_shape, 1 / model.num_states)
+        flat = jl.restrict(model, anywhere, allowed=mask).model
+        reward = todirl.reward(problem.network, point, model, jnp.asarray(seen(model)))
+        expected = jl.soft_value(flat, reward.reshape(flat.available.shape), 0.9).policy
+        np.testing.assert_allclose(policy[i].reshape(expected.shape), expected, atol=1e-9)
+    flat, unravel = ravel_pytree(point)
+    direction = np.random.default_rng(1).normal(size=flat.shape)
+    found = ravel_pytree(gradient(point, problem, hparams))[0] @ direction
+    ahead, behind = (slope(unravel(flat + h * direction), problem, hparams)[0][0]
+                     for h in (1e-5, -1e-5))
+    np.testing.assert_allclose(found, (ahead - behind) / 2e-5, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("masks", "message"), [
+    (lambda m: [m], "there are 1 masks for 2 worlds"),
+    (lambda m: [m, m & False], "world 1: allowed: no action is left in state 0 with memory 0"),
+])
+def test_masks_that_fit_no_world_are_refused(masks, message):
+    mask = np.ones((*lazy().state_shape, 4), bool)
+    with pytest.raises(ValueError, match=message):
+        small((0, 1), allowed=masks(mask))
+
+
+def test_trajectories_of_the_product_are_refused():
+    lifted = jl.lift_trajectories(lazy(), demonstrated())
+    with pytest.raises(ValueError, match="demonstrations in world 0: the trajectories belong to a"):
+        todirl.make_problem(lazy(), seen(lazy()), lifted)

@@ -20,8 +20,9 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.product import Product, letters, product
-from jaxltl.core.models.trajectories import Trajectories, make_trajectories
+from jaxltl.core.models.product import Product, allowed_steps, letters, memory_along, product
+from jaxltl.core.models.restrict import with_allowed
+from jaxltl.core.models.trajectories import Trajectories, make_trajectories, require_states
 
 
 def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit") -> Product:
@@ -185,6 +186,27 @@ def world(model: Product, number: int) -> Product:
     return jax.tree.map(lambda x: x[number], model)
 
 
+def narrow(models: Product, allowed: Any) -> Product:
+    """Stacked products in each of which only some of the actions are left.
+
+    Args:
+      models: W stacked products.
+      allowed: ``bool[S, Q, A]`` for a single one, ``bool[W, S, Q, A]``, or a mask for each.
+
+    Raises:
+      ValueError: a mask that does not fit, or another number; the message names the world.
+    """
+    masks = allowed if isinstance(allowed, list | tuple) or np.ndim(allowed) > 3 else [allowed]
+    if len(masks) != num_worlds(models):
+        raise ValueError(f"there are {len(masks)} masks for {num_worlds(models)} worlds.")
+    for w, mask in enumerate(masks):
+        try:
+            with_allowed(world(models, w), np.asarray(mask))
+        except ValueError as error:
+            raise ValueError(f"world {w}: {error}") from error
+    return replace(models, allowed=jnp.asarray(np.stack([np.asarray(x) for x in masks])))
+
+
 def lift_memory(policy: jax.Array, task: Automaton | int) -> jax.Array:
     """A policy with the memory of one automaton, in the product with a synchronized one.
 
@@ -291,7 +313,7 @@ def demonstrated_counts(
     *,
     horizon: int | None = None,
 ) -> jax.Array:
-    """How often each pair of the products occurs in trajectories of their worlds.
+    """How often each allowed pair of the products occurs in trajectories of their worlds.
 
     Args:
       models: stacked products.
@@ -303,8 +325,9 @@ def demonstrated_counts(
       ``float[W, S, Q, A]``; with a horizon ``float[W, T, S, Q, A]``.
 
     Raises:
-      ValueError: another number of worlds, a trajectory that its world cannot make, or that
-        exceeds the horizon. The message names the world, the trajectory and the step.
+      ValueError: another number of worlds, a trajectory that its world cannot make, that exceeds
+        the horizon, or of which no step takes an allowed action. The message names the world, the
+        trajectory and the step.
     """
     given, count = _of_each_world(trajectories), num_worlds(models)
     if len(given) != count:
@@ -329,29 +352,20 @@ def demonstrated_counts(
         counts = np.zeros(size, int)
         if rows:
             try:
+                if len(one.state_shape or ()) > 1:  # smaller worlds than the stack's are no mistake
+                    require_states(one, model.mdp)
                 checked = make_trajectories(model.mdp, rows)
+                inside = allowed_steps(model, checked)
             except ValueError as error:
                 raise ValueError(f"demonstrations in world {w}: {error}") from error
-            state, action, inside = (
-                np.asarray(x) for x in (checked.state, checked.action, checked.mask))
-            lifted = state * model.num_memory + _memory_along(model, state)
+            state, action = np.asarray(checked.state), np.asarray(checked.action)
+            lifted = state * model.num_memory + memory_along(model, state)
             pair = lifted * model.num_actions + action
             if horizon is not None:
                 pair = pair + np.arange(pair.shape[1]) * (model.num_states * model.num_actions)
             counts = np.bincount(pair[inside], minlength=size)
         found.append(counts.reshape(shape))
     return jnp.asarray(np.stack(found), models.dtype)
-
-
-def _memory_along(model: Product, state: np.ndarray) -> np.ndarray:
-    """The memory along trajectories ``int[N, T]``; on the host, where no length compiles anew."""
-    delta, letter = np.asarray(model.automaton.delta), np.asarray(model.letter)[state]
-    read = letter[:, 1:] if model.label_on == "entry" else letter[:, :-1]
-    memory = np.empty_like(state)
-    memory[:, 0] = np.asarray(model.initial_memory)[state[:, 0]]
-    for t in range(read.shape[1]):
-        memory[:, t + 1] = delta[memory[:, t], read[:, t]]
-    return memory
 
 
 def stack_observations(models: Product, observation: Any) -> jax.Array:

@@ -24,7 +24,7 @@ from jaxltl.core.models import kernels, operators
 from jaxltl.core.models.concrete import namespace, to_jax
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.models.trajectories import Trajectories, require_states
 
 
 class _Names:
@@ -370,7 +370,6 @@ def _successor(world: MDP | DenseMDP) -> jax.Array:
 # --- lifting and projecting -----------------------------------------------------------------
 
 
-@jax.jit  # so that a call outside of jit compiles once, not operation by operation
 def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectories:
     """World trajectories with the memory that the automaton had along them.
 
@@ -380,7 +379,16 @@ def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectorie
 
     Returns:
       Trajectories of the product, states numbered ``s * Q + q``.
+
+    Raises:
+      ValueError: they are not the world's.
     """
+    require_states(trajectories, model.mdp)
+    return _lifted(model, trajectories)
+
+
+@jax.jit  # so that a call outside of jit compiles once, not operation by operation
+def _lifted(model: Product, trajectories: Trajectories) -> Trajectories:
     delta = jnp.asarray(model.automaton.delta)
 
     def one(states: jax.Array) -> jax.Array:
@@ -392,7 +400,64 @@ def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectorie
 
     inside = jnp.arange(trajectories.state.shape[1]) < trajectories.length[:, None]
     state = jax.vmap(one)(trajectories.state)
-    return replace(trajectories, state=jnp.where(inside, state, 0).astype(jnp.int32))
+    return replace(
+        trajectories, state=jnp.where(inside, state, 0).astype(jnp.int32),
+        state_shape=model.state_shape)
+
+
+def project_trajectories(model: Product, trajectories: Trajectories) -> Trajectories:
+    """Trajectories of a product without the memory; the inverse of :func:`lift_trajectories`.
+
+    Args:
+      model: the product.
+      trajectories: of the product, such as those of a rollout in it.
+
+    Raises:
+      ValueError: they are not the product's.
+    """
+    require_states(trajectories, model)
+    return replace(
+        trajectories, state=trajectories.state // model.num_memory,
+        state_shape=model.mdp.state_shape)
+
+
+def memory_along(model: Product, state: np.ndarray) -> np.ndarray:
+    """The memory along the states of world trajectories ``int[N, T]``, on the host.
+
+    What comes behind a trajectory's end is the memory of a run on.
+    """
+    delta, letter = np.asarray(model.automaton.delta), np.asarray(model.letter)[state]
+    read = letter[:, 1:] if model.label_on == "entry" else letter[:, :-1]
+    memory = np.empty_like(state)
+    memory[:, 0] = np.asarray(model.initial_memory)[state[:, 0]]
+    for t in range(read.shape[1]):
+        memory[:, t + 1] = delta[memory[:, t], read[:, t]]
+    return memory
+
+
+def allowed_steps(model: Any, trajectories: Trajectories) -> np.ndarray:
+    """Which steps that count take an action that the model has: ``bool[N, T]``, on the host.
+
+    Args:
+      model: the world, or a product, perhaps narrowed by
+        :func:`~jaxltl.core.models.restrict.with_allowed`.
+      trajectories: of the world.
+
+    Raises:
+      ValueError: they are not the world's, or no step of one is left.
+    """
+    world = model.mdp if isinstance(model, Product) else model
+    require_states(trajectories, world)
+    state, action, inside = (
+        np.asarray(x) for x in (trajectories.state, trajectories.action, trajectories.mask))
+    place = (state, memory_along(model, state)) if isinstance(model, Product) else (state,)
+    kept = inside & np.asarray(model.available)[(*place, action)]
+    if (lost := np.flatnonzero(inside.any(1) & ~kept.any(1))).size:
+        n = lost[0]
+        raise ValueError(
+            f"trajectory {n}: none of its {inside[n].sum()} steps takes an allowed action, so "
+            "nothing can be learned from it; leave it out, or allow more.")
+    return kept
 
 
 def lift_policy(model: Product, policy: jax.Array) -> jax.Array:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core.models.concrete import is_traced, namespace, to_jax
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.operators import policy_distribution, sample_successor
 
@@ -23,16 +24,20 @@ class Trajectories:
       state: ``int32[N, T]``.
       action: ``int32[N, T]``, the action taken in that state.
       length: ``int32[N]``, the number of pairs that count.
+      state_shape: of the model whose states they number, ``(S,)`` or in a product ``(S, Q)``;
+        None: not known. Static.
     """
 
     state: jax.Array
     action: jax.Array
     length: jax.Array
+    state_shape: tuple[int, ...] | None = struct.field(pytree_node=False, default=None)
 
     @property
     def mask(self) -> jax.Array:
         """``bool[N, T]``: which pairs count."""
-        return jnp.arange(self.state.shape[-1]) < self.length[..., None]
+        xp, length = namespace(self.length)
+        return to_jax(xp.arange(self.state.shape[-1]) < length[..., None])
 
 
 def make_trajectories(
@@ -73,9 +78,35 @@ def make_trajectories(
                 raise ValueError(f"{where}: action {a} is not available in state {s}; "
                                  f"available are {np.flatnonzero(available[s]).tolist()}.")
             state[n, t], action[n, t] = s, a
-    trajectories = Trajectories(*(jnp.asarray(x, jnp.int32) for x in (state, action, length)))
+    trajectories = Trajectories(
+        jnp.asarray(state, jnp.int32), jnp.asarray(action, jnp.int32),
+        jnp.asarray(length, jnp.int32), state_shape=model.state_shape)
     _check_steps(model, state, action, np.asarray(length))
     return trajectories
+
+
+def require_states(trajectories: Trajectories, model: Any) -> None:
+    """Refuses trajectories that number the states of another model.
+
+    Raises:
+      ValueError: they belong to a model of another shape, or hold a state that does not exist.
+    """
+    expected, found = model.state_shape, trajectories.state_shape
+    if found is not None and found != expected:
+        hint = ""
+        if len(found) > len(expected):
+            hint = "; project_trajectories(product, trajectories) leaves out the memory"
+        elif len(found) < len(expected):
+            hint = "; lift_trajectories(product, trajectories) adds the memory"
+        raise ValueError(
+            f"the trajectories belong to a model of shape {found}; expected {expected}{hint}.")
+    if found is None and not is_traced(trajectories):
+        state = np.where(trajectories.mask, trajectories.state, 0)
+        if (wrong := np.argwhere((state < 0) | (state >= model.num_states))).size:
+            n, t = wrong[0]
+            raise ValueError(
+                f"trajectory {n}, step {t}: state {state[n, t]} does not exist; states are 0 to "
+                f"{model.num_states - 1}.")
 
 
 def _check_steps(
@@ -141,4 +172,6 @@ def rollout(
 
     states, actions, length = jax.vmap(one)(jax.random.split(key, num_trajectories))
     mask = jnp.arange(num_steps) < length[:, None]
-    return Trajectories(jnp.where(mask, states, 0), jnp.where(mask, actions, 0), length)
+    return Trajectories(
+        jnp.where(mask, states, 0), jnp.where(mask, actions, 0), length,
+        state_shape=model.state_shape)
