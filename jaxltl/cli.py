@@ -274,8 +274,8 @@ def synthesize(
 
     Prints the winning region, a permissive strategy of the system, which allows many moves and
     wins whichever it makes, what an independent check says of them, and a play that the
-    environment wins where it does. Writes strategy.npz, counter_strategy.npz, result.json and
-    pictures, those that there are.
+    environment wins where it does. Writes strategy.npz, counter_strategy.npz, result.json,
+    report.html and pictures, those that there are.
 
     The exit status is 0 whoever wins; 2 for mistakes, and for a task that is unrealizable from
     every initial state where the file demands a strategy by a table [strategy].
@@ -338,14 +338,17 @@ def _stages(names: tuple[str, ...]) -> Iterator[Callable[[str], None]]:
 def _write_synthesis(found: Any, out: Path, place: int | None, begin: float) -> dict[str, Any]:
     from jaxltl.algos.checkpoint import atomic_write
     from jaxltl.app.reports import synthesize as report
+    from jaxltl.app.reports.synthesize_page import page
 
     for stale in ("result.json", *report.FILES):
         (out / stale).unlink(missing_ok=True)
     report.save(out, found)
-    for name, picture in report.pictures(found, place):
-        with atomic_write(out / name) as file:
-            file.write(picture)
+    pictures = report.pictures(found, place)
     result = report.summary(found, time.perf_counter() - begin)
+    text = page(result, found, pictures, (out / "game.toml").read_text())
+    for name, content in (*pictures, ("report.html", text.encode())):
+        with atomic_write(out / name) as file:
+            file.write(content)
     # Last, so that its presence says that all the rest is there.
     with atomic_write(out / "result.json") as file:
         file.write((json.dumps(result, indent=2, allow_nan=False) + "\n").encode())

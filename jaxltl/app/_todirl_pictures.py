@@ -145,8 +145,9 @@ def _look_into(outcome: Outcome, one: _Drawn) -> Explorer | TooLarge:
     shown = [] if one.demonstrations is None else demonstrated_runs(model, one.demonstrations)
     place: Any = scene.cells if scene.colored is None else part_of(scene.colored, ...)
     return explorer(
-        one.live, one.title, _CAPTION.format("" if stationary else " at the first step"), model,
-        layers, [*shown, *learned_runs(model, policy, outcome.seed)], place=place, actions=ACTIONS,
+        one.live, one.title, _CAPTION.format("" if stationary else " at the first step"),
+        setup.memory, layers, [*shown, *learned_runs(model, policy, outcome.seed)],
+        size=scene.mdp.num_states, place=place, actions=ACTIONS,
         label="probability of doing the task", wall=setup.task.world.get("wall", "#"),
     )
 

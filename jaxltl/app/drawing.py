@@ -30,7 +30,7 @@ class Picture(NamedTuple):
 
     name: str
     title: str
-    drawing: Drawing
+    drawing: Drawing | None  # None where it is drawn already
     caption: str
     live: str = ""
 

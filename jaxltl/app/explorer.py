@@ -47,13 +47,15 @@ class Explorer(NamedTuple):
     Attributes:
       name: what its ids begin with; a picture of this name says the same.
       title, caption, label: for people; the label is what values are.
-      automaton: the policy's memory.
+      automaton: the policy's memory, or None.
       shape: rows and columns of the map, or None.
       names: S texts, what is in each cell.
       actions: A names.
       layers: what there is to see, by the memory's number or :data:`START`.
       runs: what there is to play.
       marked: (state, memory, action) that must be seen.
+      cells, places: of some states, the cells of their pieces, and their names; of others, the
+        cell of their own number.
       drawings: by ``"automaton"`` and, if there is one, ``"map"``.
     """
 
@@ -61,13 +63,15 @@ class Explorer(NamedTuple):
     title: str
     caption: str
     label: str
-    automaton: Automaton
+    automaton: Automaton | None
     shape: tuple[int, int] | None
     names: list[str]
     actions: tuple[str, ...]
     layers: Mapping[str, Layer]
     runs: list[Run]
     marked: list[tuple[int, int, int]]
+    cells: Mapping[int, Sequence[int]]
+    places: Mapping[int, str]
     drawings: Mapping[str, Drawing]
 
 
@@ -91,18 +95,20 @@ class TooLarge(NamedTuple):
 
 
 def explorer(
-    name: str, title: str, caption: str, model: Product, layers: Mapping[str, Layer],
-    runs: list[Run], *, place: Any = None, actions: Sequence[str] = (), label: str = "",
-    wall: str = "#", marked: Iterable[tuple[int, int, int]] = (),
+    name: str, title: str, caption: str, automaton: Automaton | None,
+    layers: Mapping[str, Layer], runs: list[Run], *, size: int, place: Any = None,
+    actions: Sequence[str] = (), label: str = "", wall: str = "#",
+    marked: Iterable[tuple[int, int, int]] = (), cells: Mapping[int, Sequence[int]] | None = None,
+    places: Mapping[int, str] | None = None,
 ) -> Explorer | TooLarge:
     """What there is to see of a policy; or why that is too much for a page.
 
     Args:
-      model: the world beside the policy's memory.
+      size: S, how many states or cells there are.
       place: the cells of a text map, a coloured world, or None; else see :class:`Explorer`.
       wall: the kind of cell that is not a place.
     """
-    count, size = len(model.automaton.delta), int(np.prod(model.mdp.available.shape[:-1]))
+    count = 0 if automaton is None else len(automaton.delta)
     if size * len(layers) > MOST_CELLS or count > MOST_STATES:
         return TooLarge(name, (
             f"{size} states by {len(layers)} maps, and an automaton of {count} states, are more "
@@ -111,7 +117,7 @@ def explorer(
             "beside this page have the figures."
         ), {})
     marked = [(int(s), int(q), int(a)) for s, q, a in marked]
-    drawn = {"automaton": drawing("live_automaton", model.automaton, name)}
+    drawn = {} if automaton is None else {"automaton": drawing("live_automaton", automaton, name)}
     shape, names = None, [""] * size
     if isinstance(place, np.ndarray):
         plain = plain_kind(place)
@@ -123,11 +129,12 @@ def explorer(
         shape = (int(place.shape[0]), int(place.shape[1]))
         drawn["map"] = drawing(
             "live_map", place, name, {key: (x.value, x.policy) for key, x in layers.items()},
-            runs=[[s for s, _, _ in run.steps] for run in runs], marked=marked, actions=actions,
-            wall=wall,
+            runs=[[(cells or {}).get(s, [s])[0] for s, _, _ in run.steps] for run in runs],
+            marked=marked, actions=actions, wall=wall,
+            pieces=max((len(each) for each in (cells or {}).values()), default=1),
         )
-    return Explorer(name, title, caption, label, model.automaton, shape, names, tuple(actions),
-                    layers, runs, marked, drawn)
+    return Explorer(name, title, caption, label, automaton, shape, names, tuple(actions), layers,
+                    runs, marked, cells or {}, places or {}, drawn)
 
 
 def curves(

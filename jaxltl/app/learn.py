@@ -464,11 +464,11 @@ def live(outcome: Outcome) -> list[Explorer | TooLarge | Curves]:
         explorer(
             LIVE, "What it does", "An arrow is as long as its action is likely; colours are the "
             "probability of doing the task from there. Cells that cannot be met with a memory are "
-            "blank.", model, _layers(outcome),
+            "blank.", model.automaton, _layers(outcome),
             [*demonstrated_runs(model, setup.demonstrations),
              *learned_runs(model, policy, outcome.seed)],
-            place=setup.world.cells, actions=setup.world.actions, label=_LABEL,
-            wall=setup.task.world.get("wall", "#"),
+            size=setup.world.mdp.num_states, place=setup.world.cells, actions=setup.world.actions,
+            label=_LABEL, wall=setup.task.world.get("wall", "#"),
         ),
         curves("learning", "Learning", caption, outcome.learned.history, _FIGURES),
     ]

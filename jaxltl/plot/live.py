@@ -152,6 +152,7 @@ def live_map(
     marked: Iterable[tuple[int, int, int]] = (),
     actions: Sequence[str] = ("up", "down", "left", "right"),
     wall: str = "#",
+    pieces: int = 1,
 ) -> str:
     """A map with a layer for each memory, of which a page shows one at a time; the first is shown.
 
@@ -164,6 +165,7 @@ def live_map(
       marked: (state, memory, action) to be seen at once: ``g.marked``.
       actions: A names, of up, down, left and right.
       wall: the kind of cell that is not a place.
+      pieces: how many are moved on the map, ``circle.token``.
     """
     ground = _ground(place, wall)
     rows, columns = ground.shape
@@ -191,7 +193,9 @@ def live_map(
             f'<path d="{_triangle(row, column, actions[action], 1.0)}"/></g>'
         )
     parts += [_track(i, cells, columns) for i, cells in enumerate(runs)]
-    parts += [_cell(0, 0, "cursor", ""), f'<circle class="token" r="{CELL * 0.28:g}"/>']
+    parts.append(_cell(0, 0, "cursor", ""))
+    parts += [f'<circle class="token piece-{i}" r="{CELL * (0.28 - 0.04 * i):g}"/>'
+              for i in range(pieces)]
     stride = -(-max(ground.shape) // 16)
     beyond = max([0, *(-row for row, _, _ in ground.ring)]) * CELL
     # Numbers grow with the map, so that they can be read where it is scaled down.

@@ -62,9 +62,9 @@ def runs():
 
 
 def made(**options):
-    options = {"place": CELLS, "actions": ACTIONS, "label": "probability"} | options
+    options = {"place": CELLS, "actions": ACTIONS, "label": "probability", "size": 12} | options
     return exploring.explorer(
-        "policy", "What it does", "A caption", MODEL, layers(), runs(), **options)
+        "policy", "What it does", "A caption", MODEL.automaton, layers(), runs(), **options)
 
 
 def page(*parts, remarks=()):

@@ -10,6 +10,7 @@ from jaxltl import plot
 from jaxltl.app import synthesize as synthesis
 from jaxltl.app.files.game import load_game, read_game
 from jaxltl.app.reports import synthesize as report
+from jaxltl.app.reports.synthesize_page import play_explorer
 from tests.test_cli import failure, run
 
 SQUARE = """
@@ -107,7 +108,8 @@ def test_a_maximal_strategy_and_its_evidence(won):
 def test_the_files_of_a_strategy(won):
     _, result, out = won
     assert {path.name for path in out.iterdir()} == {
-        "game.toml", "strategy.npz", "result.json", "automaton.svg", "region.svg", "moves.svg"}
+        "game.toml", "strategy.npz", "result.json", "report.html", "automaton.svg",
+        "region.svg", "moves.svg"}
     assert json.loads((out / "result.json").read_text()) == result
     with np.load(out / "strategy.npz") as file:
         found = dict(file)
@@ -159,7 +161,7 @@ def test_an_unrealizable_task_is_an_answer(lost):
     assert result["strategy"] is None and result["region"]["initial_states"] == 0
     assert len(result["region"]["lost_initial_states"]) == 6
     assert {path.name for path in out.iterdir()} == {
-        "game.toml", "counter_strategy.npz", "result.json", "region.svg"}
+        "game.toml", "counter_strategy.npz", "result.json", "report.html", "region.svg"}
 
 
 def test_the_play_obeys_the_rules_and_ends_in_failure(lost):
@@ -217,7 +219,8 @@ def test_some_initial_states_are_won_and_others_lost(arrays, tmp_path):
     assert found["play"] == {"steps": [{"mover": "start", "move": "", "state": 2}],
                              "repeats_from": None, "failed": True, "by_chance": False}
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "game.toml", "strategy.npz", "counter_strategy.npz", "result.json", "automaton.svg"}
+        "game.toml", "strategy.npz", "counter_strategy.npz", "result.json", "report.html",
+        "automaton.svg"}
     with np.load(tmp_path / "out" / "strategy.npz") as file:
         assert file["world_state"].tolist() == [0, 1]
         assert file["mask"].tolist() == [[True, False], [True, False]]
@@ -255,6 +258,34 @@ def test_a_refuted_result_is_never_passed_off(arrays, tmp_path, monkeypatch):
     result = run("synthesize", arrays(), "--out", tmp_path / "out")
     assert result.exit_code == 2 and "independent check: REFUTED: state" in result.stdout
     assert "the independent check refutes the result" in result.stderr
+
+
+# --- the page -------------------------------------------------------------------------------
+
+
+def test_the_page_says_and_plays_what_was_found(won, lost):
+    text = (won[2] / "report.html").read_text()
+    assert "http" not in text and "<b>Warning:</b>" not in text
+    assert "The task is realizable." in text and "independent check: confirmed" in text
+    assert 'class="token piece-1"' in text and "The game file" in text
+    assert text.count("data:image") == 2  # region and moves; the automaton is live
+    text = (lost[2] / "report.html").read_text()
+    assert "A play that the environment wins" in text and text.count("data:image") == 1
+
+
+def test_a_play_of_the_strategy_is_one(tmp_path):
+    (tmp_path / "game.toml").write_text(SQUARE)
+    found = synthesis.synthesize(read_game(tmp_path / "game.toml"))
+    part = play_explorer(found)
+    (run,), game = part.runs, found.world.game
+    successor = np.asarray(game.mdp.successor)
+    collides = np.asarray(game.label)[:, game.propositions.index("collision")]
+    count = len(found.world.actions)
+    for (here, _, action), (there, _, _) in itertools.pairwise(run.steps):
+        assert not collides[here] and there in successor[here, action % count]
+        assert part.actions[action].endswith(
+            "(system)" if bool(np.asarray(game.system)[here]) else "(environment)")
+        assert found.world.describe(here) == part.places[here] and len(part.cells[here]) == 2
 
 
 # --- the examples ---------------------------------------------------------------------------

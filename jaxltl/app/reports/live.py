@@ -43,12 +43,14 @@ class Said(NamedTuple):
       sentence: what was done, as HTML.
       remarks: what a reader must know first.
       tiles, told: HTML before and after the policies.
+      file: what the file is called that was read.
     """
 
     sentence: str
     remarks: Sequence[Remark]
     tiles: str
     told: Sequence[str]
+    file: str = "The task file"
 
 
 def live_page(
@@ -76,7 +78,7 @@ def live_page(
         *said.told,
         *(section(*part) for part in parts if isinstance(part[0], Curves)),
         *(_picture(*one) for one in pictures if one[0].live not in names),
-        f"<h2>The task file</h2><div class=scroll><pre><code>{html.escape(task_text)}</code></pre>"
+        f"<h2>{said.file}</h2><div class=scroll><pre><code>{html.escape(task_text)}</code></pre>"
         f"</div><p class=muted>jaxltl {result['versions']['jaxltl']}, "
         f"jax {result['versions']['jax']}, {result['seconds']:.1f} s</p>",
     ]
@@ -128,7 +130,8 @@ def data(part: Explorer) -> dict[str, Any]:
     return {
         "name": part.name, "label": part.label, "actions": part.actions,
         "rows": part.shape and part.shape[0], "columns": part.shape and part.shape[1],
-        "first": next(iter(part.layers)), "told": _told(part),
+        "first": next(iter(part.layers), None), "told": _told(part),
+        "cells": part.cells, "places": part.places,
         "layers": {
             key: {"value": listed(layer.value), "policy": listed(layer.policy)}
             for key, layer in part.layers.items()
@@ -143,26 +146,35 @@ def _finite(value: float) -> float | None:
 
 def _told(part: Explorer) -> dict[str, str]:
     """What each memory stands for, and each other layer."""
+    found: dict[str, str] = {}
+    if part.automaton is None:
+        return found
     names = part.automaton.state_names or ("",) * len(part.automaton.delta)
-    found = {}
     for q, (name, verdict) in enumerate(zip(names, verdicts(part.automaton), strict=True)):
         told = [_VERDICTS[Verdict(int(verdict))], name and f"left to satisfy: {name}"]
-        if str(q) not in part.layers and verdict == Verdict.UNDECIDED:
+        if part.layers and str(q) not in part.layers and verdict == Verdict.UNDECIDED:
             told[0] = "nothing is shown: no policy meets this memory"
         found[str(q)] = f"Memory {q}: " + "; ".join(text for text in told if text)
     return {**found, START: f"Where a run starts: {part.label} from there"}
 
 
 def _explorer(part: Explorer, drawn: Mapping[str, str]) -> str:
-    panes = f'<div><h3>Its memory: the automaton</h3><div class="scroll">{drawn["automaton"]}</div>'
-    panes += (
-        '<p class="muted">Filled: the memory that is shown. Double circle: the task is done, '
-        f"whatever follows. Grey: it has failed.{_MARKS.get(part.automaton.acceptance, '')}</p>"
-        "</div>"
-    )
-    hint, narrow = "Choose a state of the automaton, or play a run.", part.shape is not None
+    panes, tables = "", "".join(_layer_table(part, key) for key in part.layers)
+    folds = [("What is shown, as a table", tables)]
+    if part.automaton is not None:
+        marks = _MARKS.get(part.automaton.acceptance, "")
+        folds.append(("The automaton as a table", _automaton_table(part.automaton)))
+        panes = (
+            '<div><h3>Its memory: the automaton</h3><div class="scroll">'
+            f'{drawn["automaton"]}</div><p class="muted">Filled: the memory that is shown. Double '
+            "circle: the task is done, whatever follows. Grey: it has failed."
+            f"{marks}</p></div>"
+        )
+    runs = [_run_table(part, i) for i in range(len(part.runs))]
+    folds.append(("The run as a table", "".join(runs)))
+    hint, narrow = "Choose a state of the automaton, or play a run.", False
     if part.shape is not None:
-        narrow = part.shape[1] <= _NARROW
+        narrow = part.shape[1] <= _NARROW and part.automaton is not None
         colored = any(layer.value is not None for layer in part.layers.values())
         scale = ('<p class="scale"><span>0</span><i></i><span>1</span> '
                  f"<span>{html.escape(part.label)}</span></p>") if colored else ""
@@ -172,17 +184,13 @@ def _explorer(part: Explorer, drawn: Mapping[str, str]) -> str:
             'aria-label="Map; the arrow keys go from cell to cell">'
             f'{drawn["map"]}</div>{scale}</div>{panes}'
         )
-    tables = [_layer_table(part, key) for key in part.layers]
-    runs = [_run_table(part, number) for number in range(len(part.runs))]
     return (
         f'<section class="explorer" id="{part.name}"><h2>{html.escape(part.title)}</h2>'
         f'<p class="muted">{html.escape(part.caption)}</p><div class="card">{_choice(part)}'
         f'<p class="memory" aria-live="polite"></p>{_player(part)}'
         f'<p class="readout" role="status" aria-live="polite">{hint}</p>'
         f'<div class="panes{" two" if narrow else ""}">{panes}</div></div>'
-        f"{folded('What is shown, as a table', ''.join(tables))}"
-        f"{folded('The automaton as a table', _automaton_table(part.automaton))}"
-        f"{folded('The run as a table', ''.join(runs)) if runs else ''}</section>"
+        f"{''.join(folded(*fold) for fold in folds if fold[1])}</section>"
     )
 
 
@@ -193,6 +201,8 @@ def folded(title: str, content: str) -> str:
 
 def _choice(part: Explorer) -> str:
     """A button for each layer."""
+    if not part.layers:
+        return ""
     buttons = "".join(
         f'<button type="button" data-memory="{key}" aria-pressed="false" '
         f'title="{html.escape(layer.name)}">{"starts" if key == START else key}</button>'
@@ -261,7 +271,7 @@ def _automaton_table(automaton: Automaton) -> str:
 def _run_table(part: Explorer, number: int) -> str:
     run = part.runs[number]
     lines = [
-        (str(t), place(where(state, part.shape)), str(memory),
+        (str(t), html.escape(part.places.get(state, place(where(state, part.shape)))), str(memory),
          "" if action is None else html.escape(part.actions[action]))
         for t, (state, memory, action) in enumerate(run.steps)
     ]

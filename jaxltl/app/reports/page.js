@@ -11,12 +11,13 @@
   function explore(root, data) {
     const one = (query) => root.querySelector(query);
     const every = (query) => [...root.querySelectorAll(query)];
-    const map = one("svg.map"), token = one(".token"), cursor = one(".cursor");
+    const map = one("svg.map"), tokens = every(".token"), cursor = one(".cursor");
     const readout = one(".readout"), slider = one("input[type=range]");
     const select = one("select"), play = one(".play");
     let key = data.first, cell = null, timer = null, started = false;
 
-    const place = (state) => data.columns === null ? `state ${state}`
+    const place = (state) => data.places[state] ? data.places[state]
+      : data.columns === null ? `state ${state}`
       : `row ${Math.floor(state / data.columns) + 1}, column ${state % data.columns + 1}`;
 
     const show = (element, visible) => { element.style.display = visible ? "" : "none"; };
@@ -42,7 +43,7 @@
       }
       const layer = data.layers[key], scale = one(".scale");
       if (scale) show(scale, Boolean(layer && layer.value));
-      one(".memory").textContent = data.told[key];
+      one(".memory").textContent = data.told[key] ?? "";
       if (cell !== null) describe(cell);
     }
 
@@ -56,7 +57,7 @@
         const moves = row.map((x, a) => [x, data.actions[a]]).filter(([x]) => x >= 0.0005);
         moves.sort((a, b) => b[0] - a[0]);
         parts.push(moves.map(([x, name]) => `${name} ${x.toFixed(3)}`).join(", "));
-      } else if (!layer || layer.value === null || layer.value[state] === null) {
+      } else if (data.first !== null && (!layer || layer.value === null || layer.value[state] === null)) {
         parts.push("nothing is shown here");
       }
       say(parts.join(" · "));
@@ -93,20 +94,22 @@
       slider.max = run.steps.length - 1;
       slider.value = t;
       const did = action === null ? "the run ends here" : `goes ${data.actions[action]}`;
-      const text = `step ${t} of ${run.steps.length - 1}: ${place(state)} · memory ${memory} · ${did}`;
+      const parts = [place(state), ...(data.told[memory] ? [`memory ${memory}`] : []), did];
+      const text = `step ${t} of ${run.steps.length - 1}: ${parts.join(" · ")}`;
       slider.setAttribute("aria-valuetext", text);
       cell = null;
       choose(memory);
       if (cursor) cursor.style.visibility = "hidden";
-      if (token) {
-        const x = (state % data.columns + 0.5) * CELL;
-        const y = (Math.floor(state / data.columns) + 0.5) * CELL;
+      tokens.forEach((token, i) => {
+        const at = data.cells[state] ? data.cells[state][i] : state;
+        const x = (at % data.columns + 0.5) * CELL;
+        const y = (Math.floor(at / data.columns) + 0.5) * CELL;
         // It glides from step to step, and appears where it first is.
         token.style.transition = token.style.visibility === "visible" ? "" : "none";
         token.style.visibility = "visible";
         token.style.transform = `translate(${x}px, ${y}px)`;
-        center(token);
-      }
+        if (i === 0) center(token);
+      });
       const before = t > 0 ? run.steps[t - 1][1] : null;
       for (const edge of every(".edge")) {
         edge.classList.toggle("taken", before !== null && before !== memory

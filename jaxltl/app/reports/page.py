@@ -20,12 +20,13 @@ def rows(
       more: attributes of the table.
     """
     head = "".join(f'<th scope="col">{text}</th>' for text in header)
+    head = head and f"<thead><tr>{head}</tr></thead>"
     body = "".join(
         f'<tr><th scope="row">{first}</th>' + "".join(f"<td>{x}</td>" for x in rest) + "</tr>"
         for first, *rest in lines
     )
     return (
-        f'<div class="scroll"><table {more}>{caption}<thead><tr>{head}</tr></thead>'
+        f'<div class="scroll"><table {more}>{caption}{head}'
         f"<tbody>{body}</tbody></table></div>"
     )
 

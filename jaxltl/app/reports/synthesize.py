@@ -124,14 +124,15 @@ def table(result: Mapping[str, Any], found: Synthesis) -> str:
         ]
         if strategy["num_memory"] > 1:
             lines.append(f"  memory            {strategy['num_memory']} states")
-    lines += ["", _verdict(result)]
+    lines += ["", verdict(result)]
     if found.play is not None:
         note = "" if found.world.places is None else " (cells as row, column)"
         lines += ["", f"a play that the environment wins{note}", *describe_play(found)]
     return "\n".join(lines)
 
 
-def _verdict(result: Mapping[str, Any]) -> str:
+def verdict(result: Mapping[str, Any]) -> str:
+    """What the independent check says."""
     if is_confirmed(result):
         what = "both players' strategies" + (
             " and the permissive strategy" if result["strategy"] else "")
@@ -246,7 +247,8 @@ def _arrays(found: Synthesis, game: Game, node: np.ndarray) -> dict[str, Any]:
     }
 
 
-FILES = ("strategy.npz", "counter_strategy.npz", "automaton.svg", "region.svg", "moves.svg")
+FILES = ("strategy.npz", "counter_strategy.npz", "automaton.svg", "region.svg", "moves.svg",
+         "report.html")
 MOST_MAPS = 36  # of the environment's places
 MOST_PANELS = 6  # of a strategy's memory
 
