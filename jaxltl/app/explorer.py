@@ -53,7 +53,7 @@ class Explorer(NamedTuple):
       actions: A names.
       layers: what there is to see, by the memory's number or :data:`START`.
       runs: what there is to play.
-      marked: (state, memory, action) that must be seen.
+      marked, marks: (state, memory, action) that must be seen, and what they are, for people.
       cells, places: of some states, the cells of their pieces, and their names; of others, the
         cell of their own number.
       drawings: by ``"automaton"`` and, if there is one, ``"map"``.
@@ -70,6 +70,7 @@ class Explorer(NamedTuple):
     layers: Mapping[str, Layer]
     runs: list[Run]
     marked: list[tuple[int, int, int]]
+    marks: str
     cells: Mapping[int, Sequence[int]]
     places: Mapping[int, str]
     drawings: Mapping[str, Drawing]
@@ -98,8 +99,8 @@ def explorer(
     name: str, title: str, caption: str, automaton: Automaton | None,
     layers: Mapping[str, Layer], runs: list[Run], *, size: int, place: Any = None,
     actions: Sequence[str] = (), label: str = "", wall: str = "#",
-    marked: Iterable[tuple[int, int, int]] = (), cells: Mapping[int, Sequence[int]] | None = None,
-    places: Mapping[int, str] | None = None,
+    marked: Iterable[tuple[int, int, int]] = (), marks: str = "",
+    cells: Mapping[int, Sequence[int]] | None = None, places: Mapping[int, str] | None = None,
 ) -> Explorer | TooLarge:
     """What there is to see of a policy; or why that is too much for a page.
 
@@ -134,7 +135,7 @@ def explorer(
             pieces=max((len(each) for each in (cells or {}).values()), default=1),
         )
     return Explorer(name, title, caption, label, automaton, shape, names, tuple(actions), layers,
-                    runs, marked, cells or {}, places or {}, drawn)
+                    runs, marked, marks, cells or {}, places or {}, drawn)
 
 
 def curves(

@@ -113,7 +113,7 @@ def test_learned_runs_follow_the_policy_and_the_world():
 
 
 def test_pictures_are_whole_and_their_parts_can_be_found():
-    part = made(marked=[(9, 1, RIGHT)])
+    part = made(marked=[(9, 1, RIGHT)], marks="Told not to")
     automaton, board = (
         ElementTree.fromstring(draw(part.drawings[k]).decode()) for k in ("automaton", "map"))
     states = [g for g in automaton.iter("g") if "state" in (g.get("class") or "").split()]
@@ -132,6 +132,7 @@ def test_pictures_are_whole_and_their_parts_can_be_found():
     assert (marked.get("data-state"), marked.get("data-memory"), marked.get("data-action")) == (
         "9", "1", str(RIGHT))
     assert len([r for r in board.iter("rect") if r.get("class") == "wall"]) == 1
+    assert "Told not to:</b> row 3, column 2, memory 1, right" in page(part)
 
 
 def test_the_page_is_one_file_and_nothing_in_it_is_taken_for_markup():
@@ -221,9 +222,9 @@ window.addEventListener("load", () => {
   found.keyed = look();
   one("button[data-memory=start]").click();
   found.starts = look();
-  press(one(".board svg"), "ArrowDown");
-  press(one(".board svg"), "ArrowDown");
-  press(one(".board svg"), "ArrowDown");
+  press(one(".board"), "ArrowDown");
+  press(one(".board"), "ArrowDown");
+  press(one(".board"), "ArrowDown");
   found.cell = look();
   const box = one("svg.map").getScreenCTM();
   one("svg.map").dispatchEvent(new MouseEvent("click", { bubbles: true,

@@ -182,7 +182,7 @@ def _explorer(part: Explorer, drawn: Mapping[str, str]) -> str:
         panes = (
             '<div><h3>The map</h3><div class="scroll board" tabindex="0" role="group" '
             'aria-label="Map; the arrow keys go from cell to cell">'
-            f'{drawn["map"]}</div>{scale}</div>{panes}'
+            f'{drawn["map"]}</div>{scale}{_marked(part)}</div>{panes}'
         )
     return (
         f'<section class="explorer" id="{part.name}"><h2>{html.escape(part.title)}</h2>'
@@ -192,6 +192,17 @@ def _explorer(part: Explorer, drawn: Mapping[str, str]) -> str:
         f'<div class="panes{" two" if narrow else ""}">{panes}</div></div>'
         f"{''.join(folded(*fold) for fold in folds if fold[1])}</section>"
     )
+
+
+def _marked(part: Explorer) -> str:
+    """The steps that the map has in red."""
+    steps = [
+        f"{part.places.get(s, place(where(s, part.shape)))}, memory {q}, {part.actions[a]}"
+        for s, q, a in part.marked
+    ]
+    if not steps:
+        return ""
+    return f"<p class=bad><b>{html.escape(part.marks)}:</b> {html.escape('; '.join(steps))}</p>"
 
 
 def folded(title: str, content: str) -> str:

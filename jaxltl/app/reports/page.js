@@ -84,7 +84,14 @@
       timer = null;
       play.textContent = "Play";
       play.setAttribute("aria-pressed", "false");
-      readout.setAttribute("aria-live", "polite");
+      quiet(false);
+    }
+
+    // A run that plays by itself is not read aloud; its steps are in the table.
+    function quiet(on) {
+      for (const told of [readout, one(".memory")]) {
+        told.setAttribute("aria-live", on ? "off" : "polite");
+      }
     }
 
     // The step t of the run that is chosen, on map, automaton and in words.
@@ -146,7 +153,7 @@
         const state = under(event);
         if (state !== null) { stop(); point(state); }
       });
-      map.addEventListener("keydown", (event) => {
+      one(".board").addEventListener("keydown", (event) => {
         const by = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
         if (!(event.key in by)) return;
         event.preventDefault();
@@ -176,7 +183,7 @@
         step(started && Number(slider.value) < run.steps.length - 1 ? Number(slider.value) : 0);
         play.textContent = "Pause";
         play.setAttribute("aria-pressed", "true");
-        readout.setAttribute("aria-live", "off");
+        quiet(true);
         timer = setInterval(() => {
           const next = Number(slider.value) + 1;
           if (next > Number(slider.max)) return stop();
