@@ -297,7 +297,8 @@ def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
     parts.append(f'<path class="curve" d="M{"L".join(path(np.nanmedian(scaled, axis=1)))}"/>')
     parts.append(f'<path class="axis" d="M{left} 6V{high - below}H{wide - 6}"/>')
     for value in (low, (low + high_value) / 2, high_value):
-        told = f"{10**value if logs else value:.3g}"
+        real = 10**value if logs else value
+        told = f"{real:.4g}" if abs(real) >= 1000 else f"{real:.3g}"
         y = float(down(np.array(value)))
         parts.append(f'<text x="{left - 6}" y="{y:.1f}" class="tick end">{told}</text>')
     for step, anchor in ((x[0], "start"), (x[-1], "end")):
