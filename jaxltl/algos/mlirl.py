@@ -7,7 +7,7 @@ that the policy does the task (2.6).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,8 +21,12 @@ from jax.flatten_util import ravel_pytree
 
 from jaxltl.algos import _line_search as line_search
 from jaxltl.algos import learner
+from jaxltl.algos._features import Features as Features
+from jaxltl.algos._features import pair_counts
+from jaxltl.algos._features import progress_states as progress_states
+from jaxltl.algos._features import task_features as task_features
+from jaxltl.algos._features import world_features as world_features
 from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.models.operators import expectation
 from jaxltl.core.models.product import Product, allowed_steps, lift_trajectories
 from jaxltl.core.models.restrict import with_allowed
 from jaxltl.core.models.trajectories import Trajectories
@@ -194,21 +198,6 @@ def make_problem(
     )
 
 
-@jax.jit  # one program, where it is called alone
-def pair_counts(
-    model: Any, trajectories: Trajectories, kept: jax.Array | None = None
-) -> jax.Array:
-    """How often each state-action pair occurs in trajectories of a model: ``float[S, A]``.
-
-    In those steps that are `kept`, ``bool[N, T]``; default all.
-    """
-    kept = trajectories.mask if kept is None else kept
-    actions = (*model.state_shape, model.num_actions)
-    pair = trajectories.state * model.num_actions + trajectories.action
-    flat = jnp.zeros(int(np.prod(actions)), model.dtype)
-    return flat.at[pair].add(kept.astype(model.dtype)).reshape(actions)
-
-
 def solve(
     parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
 ) -> Solution:
@@ -357,152 +346,3 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     :func:`solve` tells with it how well its value is known.
     """
     return solve(state.parameters, problem, hparams, state.value).policy
-
-
-# --- the features of Table 1 -----------------------------------------------------------------
-
-
-class Features(NamedTuple):
-    """Named features: `values` is ``float[S, A, F]`` (``[S, Q, A, F]``)."""
-
-    values: jax.Array
-    names: tuple[str, ...]
-
-
-def task_features(
-    model: Product,
-    demonstrations: Trajectories,
-    *,
-    avoid: Collection[str] = (),
-    progress: Sequence[int] | None = None,
-) -> Features:
-    """The features of Table 1 in a product, zero where the task is done.
-
-    ``demonstrated``: whether the product pair occurs in the lifted demonstrations;
-    ``goal``: probability that the next automaton state is final; ``progress``:
-    probability of entering one of the automaton states `progress` from another;
-    ``avoid``: minus the probability that the next cell shows a proposition of `avoid`
-    (left out if there is none); ``time``: -1.
-
-    Args:
-      model: the product, whose acceptance is co-safe.
-      demonstrations: in the world.
-      avoid: propositions.
-      progress: automaton states; default :func:`progress_states`.
-
-    Raises:
-      ValueError: the task is not co-safe, or a state or proposition does not exist.
-    """
-    if model.automaton.acceptance != "cosafe":
-        raise ValueError("task_features needs a co-safe task, which has final states.")
-    chosen = progress_states(model) if progress is None else tuple(progress)
-    for q in chosen:
-        if not 0 <= q < model.num_memory:
-            raise ValueError(
-                f"progress: automaton state {q} does not exist; there are {model.num_memory}."
-            )
-    _require_known(model.mdp, avoid, "avoid")
-    values = _task_values(model, demonstrations, avoid=tuple(avoid), progress=chosen)
-    return Features(values, _names(avoid))
-
-
-@partial(jax.jit, static_argnames=("avoid", "progress"))
-def _task_values(
-    model: Product, demonstrations: Trajectories, *, avoid: tuple[str, ...],
-    progress: tuple[int, ...],
-) -> jax.Array:
-    lifted, num_memory = lift_trajectories(model, demonstrations), model.num_memory
-    target, every = np.isin(np.arange(num_memory), progress), jnp.arange(num_memory)
-
-    def entering(q: jax.Array) -> jax.Array:
-        region = jnp.broadcast_to(target & (every != q), model.state_shape)
-        return expectation(model, region.astype(model.dtype))[:, q]
-
-    columns = [
-        (pair_counts(model, lifted) > 0).astype(model.dtype),
-        expectation(model, model.final.astype(model.dtype)),
-        jax.vmap(entering, out_axes=1)(every),
-    ]
-    red = _shows(model.mdp, avoid)[:, None] & jnp.ones(num_memory, bool)
-    return _table1(model, columns, red, avoid, model.final)
-
-
-def world_features(
-    world: MDP | DenseMDP,
-    demonstrations: Trajectories,
-    *,
-    goal: Collection[str],
-    progress: Collection[str] = (),
-    avoid: Collection[str] = (),
-) -> Features:
-    """The features of Table 1 without an automaton (case 1), zero in cells that show `goal`.
-
-    As in :func:`task_features`, with the probability that the next cell shows a
-    proposition of `goal`, `progress` and `avoid`.
-
-    Raises:
-      ValueError: a proposition does not exist.
-    """
-    for names, argument in ((goal, "goal"), (progress, "progress"), (avoid, "avoid")):
-        _require_known(world, names, argument)
-    values = _world_values(
-        world, demonstrations, goal=tuple(goal), progress=tuple(progress), avoid=tuple(avoid)
-    )
-    return Features(values, _names(avoid))
-
-
-@partial(jax.jit, static_argnames=("goal", "progress", "avoid"))
-def _world_values(
-    world: MDP | DenseMDP, demonstrations: Trajectories, *, goal: tuple[str, ...],
-    progress: tuple[str, ...], avoid: tuple[str, ...],
-) -> jax.Array:
-    columns = [
-        (pair_counts(world, demonstrations) > 0).astype(world.dtype),
-        expectation(world, _shows(world, goal).astype(world.dtype)),
-        expectation(world, _shows(world, progress).astype(world.dtype)),
-    ]
-    return _table1(world, columns, _shows(world, avoid), avoid, _shows(world, goal))
-
-
-def _table1(
-    model: Any, columns: list[jax.Array], red: jax.Array, avoid: tuple[str, ...], done: jax.Array
-) -> jax.Array:
-    if avoid:
-        columns.append(-expectation(model, red.astype(model.dtype)))
-    columns.append(-jnp.ones_like(columns[0]))
-    return jnp.where(done[..., None, None], 0, jnp.stack(columns, axis=-1))
-
-
-def _names(avoid: Collection[str]) -> tuple[str, ...]:
-    return ("demonstrated", "goal", "progress", *(("avoid",) if avoid else ()), "time")
-
-
-def _shows(world: MDP | DenseMDP, names: tuple[str, ...]) -> jax.Array:
-    """``bool[S]``: where any of the propositions holds."""
-    return jnp.any(world.label[:, [world.propositions.index(n) for n in names]], axis=1)
-
-
-def _require_known(world: MDP | DenseMDP, names: Collection[str], argument: str) -> None:
-    for name in names:
-        if name not in world.propositions:
-            raise ValueError(
-                f"{argument}: {name!r} is not a proposition of the world; "
-                f"it has {', '.join(world.propositions) or '(none)'}."
-            )
-
-
-def progress_states(model: Product) -> tuple[int, ...]:
-    """Automaton states that are not final but nearer to it than the farthest start.
-
-    Nearer in letters that occur in the world; the starts are the memories of initial
-    states.
-    """
-    delta = np.asarray(model.automaton.delta)[:, np.unique(np.asarray(model.letter))]
-    final = np.asarray(model.automaton.final)
-    distance = np.where(final, 0.0, np.inf)
-    for _ in range(len(delta)):
-        distance = np.minimum(distance, 1 + distance[delta].min(axis=1))
-    starts = np.asarray(model.initial_memory)[np.asarray(model.mdp.initial) > 0]
-    finite = distance[starts][np.isfinite(distance[starts])]
-    farthest = finite.max(initial=0)
-    return tuple(int(q) for q in np.flatnonzero((distance > 0) & (distance < farthest)))

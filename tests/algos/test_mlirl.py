@@ -265,8 +265,51 @@ def test_features_refuse_what_does_not_exist():
         mlirl.task_features(lazy, demonstrations, progress=[3])
     with pytest.raises(ValueError, match="avoid: 'z' is not a proposition"):
         mlirl.task_features(lazy, demonstrations, avoid=["z"])
-    with pytest.raises(ValueError, match="needs a co-safe task"):
-        mlirl.task_features(jl.product(world, "G !r"), demonstrations)
+    with pytest.raises(ValueError, match="progress belongs to co-safe tasks"):
+        mlirl.task_features(jl.product(world, "G !r"), demonstrations, progress=[0])
+
+
+# --- features of any task ----------------------------------------------------------------------
+
+
+def test_features_of_a_task_without_end_by_hand():
+    """Patrol c and g for ever: visits, and the way to where both can be had again and again."""
+    world, _ = grid()
+    world = world.replace(successor=jl.gridworld("b c r\n. . g").successor)
+    runs = jl.make_trajectories(world, [[(0, RIGHT), (1, DOWN), (4, RIGHT)]])
+    lazy = jl.product(world, "G F c & G F g & G !r")
+    best = jl.optimal_satisfaction(lazy)
+    found = mlirl.task_features(lazy, runs, avoid=["r"], best=best)
+    assert found.names == ("demonstrated", "accepting", "avoid", "nearer")
+    reads = np.zeros((*lazy.state_shape, 4))
+    red = np.zeros_like(reads)
+    automaton, letter = lazy.automaton, np.asarray(lazy.letter)
+    for s in range(6):
+        for a in range(4):
+            t = int(world.successor[s, a, 0])
+            red[s, :, a] = -float(t == 2)
+            reads[s, :, a] = np.asarray(automaton.priority)[:, letter[t]] == 0
+    np.testing.assert_allclose(found.values[..., 1], reads, atol=1e-12)
+    np.testing.assert_allclose(found.values[..., 2], red, atol=1e-12)
+    shown = np.asarray(jl.lift_trajectories(lazy, runs).state[0])
+    expected = np.zeros_like(reads)
+    expected.reshape(-1, 4)[shown, [RIGHT, DOWN, RIGHT]] = 1
+    np.testing.assert_array_equal(found.values[..., 0], expected)
+    # Along the best policy every step brings the next visit, or the component, nearer by one.
+    alive = np.argwhere(np.asarray(best.value) == 1)
+    chosen = np.asarray(best.policy)[tuple(alive.T)]
+    np.testing.assert_allclose(found.values[..., 3][(*alive.T, chosen)], 1, atol=1e-9)
+    others = np.asarray(found.values[..., 3])[tuple(alive.T)]
+    assert (others <= 1 + 1e-9).all() and (others < 0).any()
+
+
+def test_nearer_is_the_step_that_the_quickest_way_is_shorter_by():
+    world, demonstrations = grid()
+    lazy = jl.product(world, TASK)
+    found = mlirl.task_features(lazy, demonstrations, best=jl.optimal_satisfaction(lazy))
+    assert found.names == ("demonstrated", "goal", "progress", "time", "nearer")
+    q = int(lazy.initial_memory[0])
+    np.testing.assert_allclose(found.values[0, q, :, -1], [0, -1, 0, 1], atol=1e-9)
 
 
 # --- fewer actions -----------------------------------------------------------------------------
@@ -327,3 +370,18 @@ def test_trajectories_of_another_model_are_refused():
     back = jl.project_trajectories(lazy, lifted)
     np.testing.assert_array_equal(back.state, demonstrations.state)
     assert back.state_shape == world.state_shape
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_by_construction_whatever_was_learned(dtype):
+    """Weights that make exponentials underflow leave the best probability what it is."""
+    with jax.enable_x64(dtype == jnp.float64):
+        lazy, allowed, _, problem = masked()
+        for sign in (-1, 1):
+            weights = sign * 1e4 * jnp.arange(1.0, problem.features.shape[-1] + 1, dtype=dtype)
+            for kind in ("boltzmann", "soft"):
+                hparams = mlirl.Hparams(discount=0.5, policy=kind)
+                policy = mlirl.solve(weights, problem, hparams).policy
+                assert ((policy > 0) == allowed).all()
+                done = jl.satisfaction_probability(lazy, policy)
+                assert (done.lower[jl.optimal_satisfaction(lazy).lower == 1] == 1).all()

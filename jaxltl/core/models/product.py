@@ -284,6 +284,23 @@ def reads(model: Product, marked: jax.Array) -> jax.Array:
     return found & model.available
 
 
+def expected_reads(model: Product, marked: jax.Array) -> jax.Array:
+    """The probability that an action makes the automaton read a marked transition.
+
+    Args:
+      model: the product.
+      marked: ``bool[Q, L]``, transitions of the automaton.
+
+    Returns:
+      ``float[S, Q, A]``, zero at unavailable actions.
+    """
+    here = jnp.asarray(marked)[:, model.letter].T.astype(model.dtype)
+    if model.label_on == "exit":
+        return here[:, :, None] * model.available
+    found = _each_memory(model.mdp, operators.expectation, here, jnp.multiply, jnp.add)
+    return found * model.available
+
+
 def _read_at(value: jax.Array, memory: jax.Array) -> jax.Array:
     """``value[s, memory[s, q]]``, as a selection for few memory states.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial, reduce
 from typing import Any
@@ -27,6 +28,7 @@ from jaxltl.core.values.discounted import (
 from jaxltl.core.values.iterate import iterate
 from jaxltl.core.values.linear import System
 
+_LEAST = 0.95  # of the logarithm of the least normal number, to which probabilities may fall
 _SWEEPS_BETWEEN = 4  # sweeps between two looks at what is left
 
 
@@ -112,8 +114,14 @@ def policy_logits(
 def with_softmax(
     model: Any, reward: jax.Array, discount: jax.Array, solution: Solution
 ) -> Solution:
-    """The solution with the softmax of its action values as its policy."""
+    """The solution with the softmax of its action values as its policy.
+
+    Every available action has a positive probability, also where its exponential is too small for
+    the dtype: what a policy surely does depends on it.
+    """
     q = policy_logits(model, reward, discount, solution.value)
+    least = jnp.max(q, axis=-1, keepdims=True) + _LEAST * math.log(jnp.finfo(q.dtype).tiny)
+    q = jnp.where(model.available, jnp.maximum(q, least), q)
     return replace(solution, policy=jax.nn.softmax(q, axis=-1))
 
 

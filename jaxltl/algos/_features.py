@@ -1,0 +1,241 @@
+"""Features of moves, for rewards that are learned: those of Table 1, for any task.
+
+A table of numbers ``[S, Q, A, F]`` with a name for each of the F features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.core.host.quickest import until_read
+from jaxltl.core.host.reach import policy_row, steps_until
+from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.operators import expectation
+from jaxltl.core.models.product import Product, expected_reads, lift_trajectories
+from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.types import Solution
+from jaxltl.core.values.reachability import action_matrices
+from jaxltl.core.values.satisfaction import as_reachability, visiting
+
+
+@jax.jit  # one program, where it is called alone
+def pair_counts(
+    model: Any, trajectories: Trajectories, kept: jax.Array | None = None
+) -> jax.Array:
+    """How often each state-action pair occurs in trajectories of a model: ``float[S, A]``.
+
+    In those steps that are `kept`, ``bool[N, T]``; default all.
+    """
+    kept = trajectories.mask if kept is None else kept
+    actions = (*model.state_shape, model.num_actions)
+    pair = trajectories.state * model.num_actions + trajectories.action
+    flat = jnp.zeros(int(np.prod(actions)), model.dtype)
+    return flat.at[pair].add(kept.astype(model.dtype)).reshape(actions)
+
+
+class Features(NamedTuple):
+    """Named features: `values` is ``float[S, A, F]`` (``[S, Q, A, F]``)."""
+
+    values: jax.Array
+    names: tuple[str, ...]
+
+
+def task_features(
+    model: Product,
+    demonstrations: Trajectories,
+    *,
+    avoid: Collection[str] = (),
+    progress: Sequence[int] | None = None,
+    best: Solution | None = None,
+) -> Features:
+    """Features in a product: those of Table 1 for a co-safe task, and their like for any other.
+
+    ``demonstrated``: whether the product pair occurs in the lifted demonstrations;
+    ``goal`` (co-safe): probability that the next automaton state is final; ``progress``
+    (co-safe): probability of entering one of the automaton states `progress` from another;
+    ``accepting`` (Buchi and parity): probability of reading a transition of the least even
+    priority; ``avoid``: minus the probability that the next cell shows a proposition of `avoid`
+    (left out if there is none); ``time`` (co-safe): -1; ``nearer`` (with `best`, unless the task
+    is a safety one): by how many steps an action shortens the best policy's expected way to where
+    the task is done, or to an accepting component and there to the next accepting visit. All are
+    zero where the task is done.
+
+    Args:
+      model: the product.
+      demonstrations: in the world.
+      avoid: propositions.
+      progress: automaton states; default :func:`progress_states`.
+      best: of :func:`~jaxltl.core.values.satisfaction.optimal_satisfaction`; concrete.
+
+    Raises:
+      ValueError: a state or proposition does not exist, or `progress` is given for a task that is
+        not co-safe.
+    """
+    kind = model.automaton.acceptance
+    if progress is not None and kind != "cosafe":
+        raise ValueError("progress belongs to co-safe tasks, which have final states.")
+    chosen: tuple[int, ...] = ()
+    if kind == "cosafe":
+        chosen = progress_states(model) if progress is None else tuple(progress)
+    for q in chosen:
+        if not 0 <= q < model.num_memory:
+            raise ValueError(
+                f"progress: automaton state {q} does not exist; there are {model.num_memory}."
+            )
+    _require_known(model.mdp, avoid, "avoid")
+    nearer = None if best is None or kind == "safety" else _nearer(model, best)
+    values = _task_values(model, demonstrations, nearer, avoid=tuple(avoid), progress=chosen)
+    main = {"cosafe": ("goal", "progress"), "safety": ()}.get(kind, ("accepting",))
+    names = ("demonstrated", *main, *(("avoid",) if avoid else ()))
+    names += (("time",) if kind == "cosafe" else ()) + (("nearer",) if nearer is not None else ())
+    return Features(values, names)
+
+
+def _nearer(model: Product, best: Solution) -> np.ndarray:
+    """By how much an action shortens the way ahead, ``float[S, Q, A]``; what is lost is farthest.
+
+    The way leads to where the task is done, or to an accepting component and there to its next
+    accepting visit.
+    """
+    problem, lost = as_reachability(model, "max"), np.asarray(best.upper).ravel() <= 0
+    reached = np.asarray(problem.target).ravel()
+    rows = action_matrices(model)
+    ahead = _steps(rows, best.policy, reached | lost)
+    if problem.accepting is None:
+        inside, visits = np.zeros_like(ahead), rows
+    else:
+        visits = until_read(rows, *visiting(problem))
+        inside = np.where(reached, _steps(visits, best.policy, ~reached), 0)
+    # Whoever leaves the component has all of a way before him.
+    ahead = np.where(reached, 0, np.where(lost, ahead.max(initial=0), ahead)) + inside.max(
+        initial=0)
+    way = np.where(reached, inside, ahead)
+    entered = np.where(reached, inside.max(initial=0), ahead)
+    found = np.stack([
+        np.where(reached, way - visit @ way, way - row @ entered)
+        for row, visit in zip(rows, visits, strict=True)
+    ], -1)
+    available = np.asarray(model.available)
+    return np.where(available, found.reshape(available.shape), 0).astype(model.dtype)
+
+
+def _steps(rows: list[Any], policy: Any, ended: np.ndarray) -> np.ndarray:
+    """Expected steps until a set is entered or a transition that is left out is made."""
+    chosen = np.asarray(policy).reshape(-1, 1) == np.arange(len(rows))
+    found = steps_until(policy_row(rows, chosen.astype(float)), ~ended)
+    return np.zeros(ended.size) if found is None else found
+
+
+@partial(jax.jit, static_argnames=("avoid", "progress"))
+def _task_values(
+    model: Product, demonstrations: Trajectories, nearer: jax.Array | None, *,
+    avoid: tuple[str, ...], progress: tuple[int, ...],
+) -> jax.Array:
+    lifted, num_memory = lift_trajectories(model, demonstrations), model.num_memory
+    kind = model.automaton.acceptance
+    columns = [(pair_counts(model, lifted) > 0).astype(model.dtype)]
+    done = model.final if kind == "cosafe" else jnp.zeros(model.state_shape, bool)
+    if kind == "cosafe":
+        target, every = np.isin(np.arange(num_memory), progress), jnp.arange(num_memory)
+
+        def entering(q: jax.Array) -> jax.Array:
+            region = jnp.broadcast_to(target & (every != q), model.state_shape)
+            return expectation(model, region.astype(model.dtype))[:, q]
+
+        columns += [
+            expectation(model, model.final.astype(model.dtype)),
+            jax.vmap(entering, out_axes=1)(every),
+        ]
+    elif kind != "safety":
+        priority = jnp.asarray(model.automaton.priority)
+        even = jnp.where(priority % 2 == 0, priority, jnp.iinfo(priority.dtype).max)
+        columns.append(expected_reads(model, priority == jnp.min(even)))
+    if avoid:
+        red = _shows(model.mdp, avoid)[:, None] & jnp.ones(num_memory, bool)
+        columns.append(-expectation(model, red.astype(model.dtype)))
+    if kind == "cosafe":
+        columns.append(-jnp.ones_like(columns[0]))
+    if nearer is not None:
+        columns.append(nearer)
+    return _stacked(columns, done)
+
+
+def world_features(
+    world: MDP | DenseMDP,
+    demonstrations: Trajectories,
+    *,
+    goal: Collection[str],
+    progress: Collection[str] = (),
+    avoid: Collection[str] = (),
+) -> Features:
+    """The features of Table 1 without an automaton (case 1), zero in cells that show `goal`.
+
+    As in :func:`task_features`, with the probability that the next cell shows a
+    proposition of `goal`, `progress` and `avoid`.
+
+    Raises:
+      ValueError: a proposition does not exist.
+    """
+    for names, argument in ((goal, "goal"), (progress, "progress"), (avoid, "avoid")):
+        _require_known(world, names, argument)
+    values = _world_values(
+        world, demonstrations, goal=tuple(goal), progress=tuple(progress), avoid=tuple(avoid)
+    )
+    shown = ("avoid",) if avoid else ()
+    return Features(values, ("demonstrated", "goal", "progress", *shown, "time"))
+
+
+@partial(jax.jit, static_argnames=("goal", "progress", "avoid"))
+def _world_values(
+    world: MDP | DenseMDP, demonstrations: Trajectories, *, goal: tuple[str, ...],
+    progress: tuple[str, ...], avoid: tuple[str, ...],
+) -> jax.Array:
+    columns = [
+        (pair_counts(world, demonstrations) > 0).astype(world.dtype),
+        expectation(world, _shows(world, goal).astype(world.dtype)),
+        expectation(world, _shows(world, progress).astype(world.dtype)),
+    ]
+    if avoid:
+        columns.append(-expectation(world, _shows(world, avoid).astype(world.dtype)))
+    return _stacked([*columns, -jnp.ones_like(columns[0])], _shows(world, goal))
+
+
+def _stacked(columns: list[jax.Array], done: jax.Array) -> jax.Array:
+    return jnp.where(done[..., None, None], 0, jnp.stack(columns, axis=-1))
+
+
+def _shows(world: MDP | DenseMDP, names: tuple[str, ...]) -> jax.Array:
+    """``bool[S]``: where any of the propositions holds."""
+    return jnp.any(world.label[:, [world.propositions.index(n) for n in names]], axis=1)
+
+
+def _require_known(world: MDP | DenseMDP, names: Collection[str], argument: str) -> None:
+    for name in names:
+        if name not in world.propositions:
+            raise ValueError(
+                f"{argument}: {name!r} is not a proposition of the world; "
+                f"it has {', '.join(world.propositions) or '(none)'}."
+            )
+
+
+def progress_states(model: Product) -> tuple[int, ...]:
+    """Automaton states that are not final but nearer to it than the farthest start.
+
+    Nearer in letters that occur in the world; the starts are the memories of initial
+    states.
+    """
+    delta = np.asarray(model.automaton.delta)[:, np.unique(np.asarray(model.letter))]
+    final = np.asarray(model.automaton.final)
+    distance = np.where(final, 0.0, np.inf)
+    for _ in range(len(delta)):
+        distance = np.minimum(distance, 1 + distance[delta].min(axis=1))
+    starts = np.asarray(model.initial_memory)[np.asarray(model.mdp.initial) > 0]
+    finite = distance[starts][np.isfinite(distance[starts])]
+    farthest = finite.max(initial=0)
+    return tuple(int(q) for q in np.flatnonzero((distance > 0) & (distance < farthest)))
