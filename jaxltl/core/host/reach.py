@@ -100,12 +100,12 @@ def of_policy(row: Any, one: Booleans, undecided: Booleans, unit: float) -> Boun
     kept = row[open_]
     inner, hit = kept[:, open_], kept @ one.astype(float)
     matrix = _minus(inner)
-    found = _solved(matrix, hit)
+    found = solved(matrix, hit)
     if found is None:
         return None
     found = np.clip(found, 0, 1)
     residual = np.abs(hit + inner @ found - found)
-    error = _solved(matrix, 2 * residual + 4 * unit * (found + 1e-3))
+    error = solved(matrix, 2 * residual + 4 * unit * (found + 1e-3))
     if error is None or (error < 0).any():
         return None
     if (error - inner @ error < residual + unit * (found + error)).any():
@@ -198,11 +198,11 @@ def _iterate(
         leader = chosen[places]
         row = choices.taken(leader, action[leader])
         known_part = row @ np.where(open_, 0, known)
-        solved = _solved(_minus(row[:, places]), cost[places] + known_part)
-        if solved is None:
+        found = solved(_minus(row[:, places]), cost[places] + known_part)
+        if found is None:
             return None
         value = known.copy()
-        value[places] = solved
+        value[places] = found
     return value, _MAX_ROUNDS
 
 
@@ -215,7 +215,8 @@ def _minus(inner: Any) -> Any:
     return (sparse.eye_array(inner.shape[0]) - inner).tocsc()
 
 
-def _solved(matrix: Any, b: Floats) -> NDArray[Any] | None:
+def solved(matrix: Any, b: Floats) -> NDArray[Any] | None:
+    """The solution of a system, dense or sparse; None where it is singular."""
     if not b.size:
         return b
     x: NDArray[Any]
@@ -229,3 +230,19 @@ def _solved(matrix: Any, b: Floats) -> NDArray[Any] | None:
     except (np.linalg.LinAlgError, RuntimeError):  # singular
         return None
     return x if np.isfinite(x).all() else None
+
+
+def steps_until(row: Any, open_: Booleans) -> Floats | None:
+    """Expected steps of a chain ``row[N, N]`` that surely leaves some states, ``float64[N]``.
+
+    Zero elsewhere; None where the equation could not be solved to six digits, since it takes
+    longer than double precision can tell.
+    """
+    places = np.flatnonzero(open_)
+    inner = row[places][:, places]
+    found = solved(_minus(inner), np.ones(places.size))
+    if found is None or (np.abs(1 + inner @ found - found) > 1e-6 * found).any():
+        return None
+    steps = np.zeros(len(open_))
+    steps[places] = found
+    return steps

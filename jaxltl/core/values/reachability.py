@@ -21,6 +21,7 @@ from jaxltl.core.graphs.attractor import attract, avoid, surely
 from jaxltl.core.graphs.end_components import EndComponents, components_within
 from jaxltl.core.graphs.graph import Graph, TracedGraph, graph_of, take
 from jaxltl.core.host import reach as host
+from jaxltl.core.host.quickest import quickest
 from jaxltl.core.models.concrete import is_traced, namespace, to_jax
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import DenseMDP, support
@@ -44,6 +45,7 @@ from jaxltl.core.values.linear import Inverse, System, solver
 _POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
 _FAR_SWEEPS = 6  # sweeps of a guess, or of interval iteration after one that failed
 _HOST_LIMIT = 4096  # states up to which a concrete model is solved on the host, by elimination
+QUICK_LIMIT = 100_000  # states of a concrete model up to which its quickest policy is looked for
 _FILLED = 2048  # of these undecided, as elimination may fill a matrix of so many rows
 
 
@@ -88,7 +90,9 @@ def reachability_probability(
     Returns:
       :class:`Solution`; `value` is ``float[S]``, exactly 0 or 1 where the graph says so. An
       optimum's `policy` is ``int32[S]`` and attains its bound on the safe side
-      (`lower` for a maximum, `upper` for a minimum).
+      (`lower` for a maximum, `upper` for a minimum). Of the policies that do it is the
+      quickest, on a concrete model, see
+      :func:`~jaxltl.core.values.satisfaction.optimal_satisfaction`.
 
     Raises:
       ValueError: a shape is wrong, or the objective or method is unknown.
@@ -123,12 +127,16 @@ def reachability_probability(
     sets, components = _decided(model, np.asarray(target), objective=objective)
     if components is not None and not components.inside.any():
         components = None
+    found, ties = None, False
     if small:
-        found = _optimum_on_host(model, graph, sets, components, tolerance, objective)
-        if found is not None:
-            return found
-    arguments = to_jax((sets, components))
-    return _optimize(model, *arguments, tolerance, max_steps, objective=objective)
+        found, ties = _optimum_on_host(model, graph, sets, components, tolerance, objective)
+    if found is None:
+        arguments = to_jax((sets, components))
+        found = _optimize(model, *arguments, tolerance, max_steps, objective=objective)
+    decided = sets.zero | (np.asarray(target) if objective == "max" else sets.one)
+    action = np.asarray(found.policy)
+    good = _attaining(graph, sets, components, action, ties, objective)
+    return replace(found, policy=to_jax(_quickest(model, graph, good, decided, action)))
 
 
 def _decided(model: Any, target: Any, *, objective: str) -> tuple[Sets, EndComponents | None]:
@@ -237,24 +245,72 @@ def _policy_on_host(model: Any, target: Any, policy: Any, tolerance: Any) -> Sol
 def _optimum_on_host(
     model: Any, graph: Graph, sets: Sets, components: EndComponents | None, tolerance: Any,
     objective: str,
-) -> Solution | None:
+) -> tuple[Solution | None, Any]:
+    """The optimum, if it could be found, and the actions that tie: ``bool[S, A]``."""
     allowed, group = graph.available, np.arange(sets.one.size, dtype=np.int32)
     if components is not None:
         allowed, group = allowed & ~components.inside, np.asarray(components.component).ravel()
     undecided = ~(sets.one | sets.zero)
     if undecided.sum() > _FILLED:
-        return None
+        return None, False
+    rows = action_matrices(model)
     found = host.optimum(
-        action_matrices(model), allowed.reshape(len(group), -1), group, sets.one.ravel(),
-        undecided.ravel(), 1 if objective == "max" else -1, _unit(model))
+        rows, allowed.reshape(len(group), -1), group, sets.one.ravel(), undecided.ravel(),
+        1 if objective == "max" else -1, _unit(model))
     if found is None:
-        return None
+        return None, False
     exits, action = (x.reshape(sets.one.shape) for x in (found.exits, found.action))
     if components is not None:
         towards = attract(graph, exits, components.inside).action
         action = np.where(exits, action, towards)
     policy = np.where(undecided, action, sets.action).astype(np.int32)
-    return _host_solution(model, found, policy, tolerance)
+    ties = _ties(model, rows, found, objective).reshape(graph.available.shape)
+    return _host_solution(model, found, policy, tolerance), ties
+
+
+def _ties(model: Any, rows: list[Any], found: host.Bounds, objective: str) -> Any:
+    """The actions that do not lead away from the bound that is attained: ``bool[S, A]``.
+
+    It is then a bound of whatever policy decides almost surely by them.
+    """
+    unit = _unit(model)
+    bound = found.lower if objective == "max" else found.upper
+    ahead = np.stack([row @ bound for row in rows], -1)
+    if objective == "max":
+        keeps = ahead * (1 - unit) >= bound[:, None]
+    else:
+        keeps = ahead * (1 + unit) <= bound[:, None]
+    return keeps & ((bound > 0) & (bound < 1))[:, None]
+
+
+def _attaining(
+    graph: Graph, sets: Sets, components: EndComponents | None, policy: Any, ties: Any,
+    objective: str,
+) -> Any:
+    """Actions by which any policy that decides almost surely attains the bound: ``bool[S, A]``."""
+    undecided = ~(sets.one | sets.zero)[..., None]
+    good = undecided & ((policy[..., None] == np.arange(graph.num_actions)) | ties)
+    if objective == "max":
+        good |= sets.one[..., None] & graph.forall(sets.one)
+    if components is not None:
+        good |= components.inside
+    return good & graph.available
+
+
+def _quickest(model: Any, graph: Graph, good: Any, decided: Any, policy: Any) -> Any:
+    """The policy of some actions that decides in the least expected time.
+
+    Where it is decided, or if that is too hard to find, it is the policy that is given.
+    """
+    if decided.size > QUICK_LIMIT or decided.all():
+        return policy
+    start = surely(graph, decided, good)
+    if not start.region.all():
+        return policy
+    action = np.where(decided, policy, start.action)
+    found = quickest(
+        action_matrices(model), good.reshape(decided.size, -1), ~decided.ravel(), action.ravel())
+    return policy if found is None else found.reshape(decided.shape).astype(np.int32)
 
 
 # --- a fixed policy: a linear system with a certificate -----------------------------------

@@ -19,18 +19,27 @@ N = S * Q
 KINDS = ("cosafe", "safety", "buchi", "parity")
 CASES = list(every(KINDS, ("entry", "exit"), ("max", "min")))
 LETTERS = [[bool(n & 1), bool(n >> 1)] for n in range(L)]
-FRACTIONS = np.array([[1, 0], [1, 0], [1 / 2, 1 / 2], [1 / 2, 1 / 2], [1 / 3, 2 / 3]])
+FRACTIONS = np.array([[6, 0, 0], [6, 0, 0], [3, 3, 0], [3, 3, 0], [2, 4, 0]]) / 6
 
 
 def random_case(rng, kind, label_on):
-    """Halves and thirds, so that ties are exact; many loops, and an action may be missing."""
-    successor = rng.integers(0, S, (S, A, 2))
-    loops = (rng.random((S, A, 2)) < 0.3) | (rng.random((S, 1, 1)) < 0.4)
-    successor = np.where(loops, np.arange(S)[:, None, None], successor)
+    """Halves and thirds, so that ties are exact; many loops, and an action may be missing.
+
+    Where action 1 is lazy, it does what action 0 does half of the time, and else stays.
+    """
+    own = np.arange(S)[:, None, None]
+    successor = rng.integers(0, S, (S, A, 3))
+    loops = (rng.random((S, A, 3)) < 0.3) | (rng.random((S, 1, 1)) < 0.4)
+    successor = np.where(loops, own, successor)
+    successor[..., 2] = own[..., 0]
+    probability = FRACTIONS[rng.integers(len(FRACTIONS), size=(S, A))]
+    lazy = rng.random(S) < 0.3
+    successor[lazy, 1] = successor[lazy, 0]
+    probability[lazy, 1] = probability[lazy, 0] / 2 + np.array([0, 0, 1 / 2])
     available = rng.random((S, A)) < 0.9
     available[np.arange(S), rng.integers(A, size=S)] = True
     world = make_mdp(
-        successor, FRACTIONS[rng.integers(len(FRACTIONS), size=(S, A))], available=available,
+        successor, probability, available=available,
         initial=np.full(S, 1 / S), label=rng.random((S, 2)) < 0.5, propositions=["a", "b"],
     )
     delta = np.where(rng.random((Q, L)) < 0.4, rng.integers(0, Q, (Q, L)), np.arange(Q)[:, None])
@@ -51,7 +60,7 @@ def explicit(model):
     world, task = jax.tree.map(np.asarray, (model.mdp, model.automaton))
     letter = np.asarray(model.letter)
     matrix, priority = np.zeros((N, A, N)), np.full((N, N), 99)
-    for s, q, a, k in every(range(S), range(Q), range(A), range(2)):
+    for s, q, a, k in every(range(S), range(Q), range(A), range(3)):
         if world.available[s, a] and world.probability[s, a, k] > 0:
             t = int(world.successor[s, a, k])
             read = letter[t] if model.label_on == "entry" else letter[s]
@@ -101,19 +110,24 @@ def in_accepting_components(matrix, priority):
     return components(chain, priority)[1].any(0)
 
 
+def with_all_values(rng, kind, label_on, objective):
+    """A case with its tables, all of its policies and what they attain."""
+    model = random_case(rng, kind, label_on)
+    matrix, priority = explicit(model)
+    if objective == "min":
+        priority = priority + 1  # the negation, to be attained with the largest probability
+    policies = deterministic(matrix)
+    return model, matrix, priority, policies, *probabilities(policies, matrix, priority)
+
+
 def case_that_matters(rng, kind, label_on, objective):
-    """A case in which policies differ, with its tables and all of their values."""
+    """One in which policies differ; what the graph does not decide is rare."""
     while True:
-        model = random_case(rng, kind, label_on)
-        matrix, priority = explicit(model)
-        if objective == "min":
-            priority = priority + 1  # the negation, to be attained with the largest probability
-        policies = deterministic(matrix)
-        values, sure = probabilities(policies, matrix, priority)
-        best = values.max(0)
-        inner = (best * (1 - best) > 1e-9).any()  # what the graph does not decide is rare
+        case = with_all_values(rng, kind, label_on, objective)
+        values, best = case[4], case[4].max(0)
+        inner = (best * (1 - best) > 1e-9).any()
         if (inner or rng.random() < 0.15) and np.ptp(values, 0).max() > 1e-9:
-            return model, matrix, priority, policies, values, sure
+            return case
 
 
 def check_case(rng, kind, label_on, objective):
