@@ -180,7 +180,9 @@ def demonstrated_runs(model: Product, shown: Trajectories) -> list[Run]:
     """The first demonstrations with the memory that they have, and where each ended, if sure."""
     world, runs = _steps(model), []
     states, actions = np.asarray(shown.state), np.asarray(shown.action)
-    for number, length in enumerate(np.asarray(shown.length)[:MOST_RUNS].tolist()):
+    lengths = np.asarray(shown.length)
+    for number in np.flatnonzero(lengths > 0)[:MOST_RUNS].tolist():
+        length = int(lengths[number])
         at, did = states[number, :length].tolist(), actions[number, :length].tolist()
         reached, _ = world.reached(at[-1], did[-1])
         if len(reached) == 1:
@@ -190,16 +192,19 @@ def demonstrated_runs(model: Product, shown: Trajectories) -> list[Run]:
             memory.append(world.remember(memory[-1], here, there))
         ends: list[int | None] = [None] * (len(at) - length)
         steps = list(zip(at, memory, [*did, *ends], strict=True))
-        runs.append(Run(f"demonstration {number + 1}", steps))
+        runs.append(Run(f"demonstration {number + 1} of {len(lengths)}", steps))
     return runs
 
 
 def learned_runs(model: Product, policy: np.ndarray, seed: int, count: int = 3) -> list[Run]:
-    """Runs of a policy ``[S, Q, A]`` or ``[T, S, Q, A]`` until the task is decided, or for long."""
+    """Runs of a policy ``[S, Q, A]`` or ``[T, S, Q, A]`` until the task is decided, or for long.
+
+    A run ends too where the policy is none, as after a solver that failed.
+    """
     rng, world = np.random.default_rng(seed), _steps(model)
     decided = verdicts(model.automaton) != Verdict.UNDECIDED
     initial = np.asarray(model.mdp.initial, float)
-    longest = LONGEST_RUN if policy.ndim == 3 else len(policy)
+    longest = LONGEST_RUN if policy.ndim == 3 else min(len(policy), LONGEST_RUN)
     runs = []
     for number in range(count):
         here = int(rng.choice(len(initial), p=initial / initial.sum()))
@@ -207,7 +212,9 @@ def learned_runs(model: Product, policy: np.ndarray, seed: int, count: int = 3) 
         steps: list[tuple[int, int, int | None]] = []
         while not decided[memory] and len(steps) < longest:
             now = policy if policy.ndim == 3 else policy[len(steps)]
-            chances = np.nan_to_num(now[here, memory].astype(float))
+            chances = now[here, memory].astype(float)
+            if not (np.isfinite(chances).all() and chances.sum() > 0):
+                break
             action = int(rng.choice(len(chances), p=chances / chances.sum()))
             steps.append((here, memory, action))
             reached, likely = world.reached(here, action)

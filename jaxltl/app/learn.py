@@ -30,6 +30,7 @@ from jaxltl.app.explorer import (
     explorer,
     learned_runs,
 )
+from jaxltl.app.files.tables import errors_in
 from jaxltl.app.files.task import (
     Task,
     World,
@@ -215,10 +216,8 @@ def prepare(task: Task, seed: int) -> Setup:
       ValueError: something in the task or its files is wrong.
     """
     world = load_world(task)
-    try:
+    with errors_in(f"{task.path}: [task] "):
         model = product(world.mdp, task.formula, label_on=task.label_on)
-    except ValueError as error:
-        raise ValueError(f"{task.path}: [task] {error}") from None
     if "file" in task.demonstrations:
         return Setup(task, world, model, load_demonstrations(task, world), 0)
     key = jax.random.fold_in(jax.random.key(seed), 0)

@@ -31,6 +31,7 @@ from jaxltl.app._todirl_parts import (
 from jaxltl.app._todirl_pictures import live as live
 from jaxltl.app._todirl_pictures import pictures as pictures
 from jaxltl.app._todirl_pictures import task_pictures as task_pictures
+from jaxltl.app.files.tables import errors_in
 from jaxltl.app.files.task_todirl import (
     Scene,
     Task,
@@ -117,11 +118,9 @@ def _stack(task: Task, scenes: list[Scene], judge: Automaton, memory: Automaton)
     """All worlds at once, so that what works in them is compiled once."""
     mdps = [scene.mdp for scene in scenes]
     both = judge if memory is judge else synchronize(memory, judge)
-    try:
+    with errors_in(f"{task.path}: "):
         model = stack_products(mdps, memory, label_on=task.label_on)
         judged = stack_products(mdps, both, label_on=task.label_on)
-    except ValueError as error:
-        raise ValueError(f"{task.path}: {error}") from None
     return Worlds(scenes, model, judged, _observations(scenes, model))
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.app.files.game import GameFile, World, automaton_of, load_game, load_objective
+from jaxltl.app.files.tables import errors_in
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.objective import GR1, Parity
 from jaxltl.core.games.permissive import Permissive, apply_strategy, permissive_strategy
@@ -176,10 +177,8 @@ def make_nodes(file: GameFile, world: World) -> Nodes:
 
 def _strategy(file: GameFile, nodes: Nodes) -> Permissive:
     method, bound = file.strategy.get("method", "auto"), file.strategy.get("bound")
-    try:
+    with errors_in(f"{file.path}: [strategy] "):
         return permissive_strategy(nodes.game, nodes.objective, method=method, bound=bound)
-    except ValueError as error:
-        raise ValueError(f"{file.path}: [strategy] {error}") from None
 
 
 def check_strategy(nodes: Nodes, strategy: Permissive, restricted: Restriction) -> Verification:

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
@@ -110,6 +111,17 @@ def test_learned_runs_follow_the_policy_and_the_world():
         assert run.steps[-1][2] is None
     within = learned_runs(MODEL, np.broadcast_to(policy(), (3, *policy().shape)), 0)
     assert max(len(run.steps) for run in within) <= 4
+
+
+def test_what_solvers_fail_at_does_not_stop_the_page():
+    nowhere = np.full((CELLS.size, MODEL.num_memory, 4), np.nan)
+    assert [run.steps for run in learned_runs(MODEL, nowhere, 0, count=1)] == [[(8, 0, None)]]
+    history = {"step": np.arange(3), "loss": np.array([[1.0], [np.nan], [np.inf]])}
+    told = page(curves("learning", "Learning", "", history, ("loss",)))
+    assert told.count("<td>unknown</td>") == 2 and told.count('class="plot"') == 1
+    started_where_it_is_done = replace(SHOWN, length=np.array([0, 2]))
+    assert [run.name for run in demonstrated_runs(MODEL, started_where_it_is_done)] == [
+        "demonstration 2 of 2"]
 
 
 def test_pictures_are_whole_and_their_parts_can_be_found():

@@ -140,22 +140,17 @@ def read_game(path: str | Path) -> GameFile:
 
 def _check_task(path: Path, task: Mapping[str, Any]) -> None:
     lists = [k for k in ("assumptions", "guarantees", "safe") if k in task]
-    if "formula" in task and lists:
-        raise ValueError(
-            f"{path}: [task] has both formula and {lists[0]}; give either a formula, or "
-            "guarantees with assumptions and safe where needed."
-        )
-    if "formula" not in task and not {"guarantees", "safe"} & set(lists):
-        raise ValueError(
-            f'{path}: [task] lacks what the system is to achieve: formula = "...", or '
-            'guarantees = ["..."], each to be met again and again, or safe = "...", to hold '
-            "for ever."
-        )
-    if "assumptions" in task and "guarantees" not in task:
-        raise ValueError(
-            f"{path}: [task] has assumptions but no guarantees, so that they assume in vain; add "
-            "guarantees or leave them out."
-        )
+    tables.reject(path, "task", (
+        ("formula" in task and bool(lists),
+         f"has both formula and {''.join(lists[:1])}; give either a formula, or guarantees with "
+         "assumptions and safe where needed"),
+        ("formula" not in task and not {"guarantees", "safe"} & set(lists),
+         'lacks what the system is to achieve: formula = "...", or guarantees = ["..."], each to '
+         'be met again and again, or safe = "...", to hold for ever'),
+        ("assumptions" in task and "guarantees" not in task,
+         "has assumptions but no guarantees, so that they assume in vain; add guarantees or leave "
+         "them out"),
+    ))
 
 
 def load_game(file: GameFile) -> World:
@@ -165,7 +160,7 @@ def load_game(file: GameFile) -> World:
       ValueError: a malformed map or model. The message names the file and the place.
     """
     spec = dict(file.game)
-    try:
+    with tables.errors_in(f"{file.path}: [game] "):
         if "model" in spec:
             return _from_arrays(file.path.parent / spec["model"], spec.get("initial"))
         text = tables.read_map(file.path, spec.pop("map"))
@@ -174,8 +169,6 @@ def load_game(file: GameFile) -> World:
             if isinstance(spec.get(key), list):
                 spec[key] = _cell(spec[key], key, parse_map(text), wall)
         game = grid_game(text, **spec)
-    except ValueError as error:
-        raise ValueError(f"{file.path}: [game] {error}") from None
     return World(game, ACTIONS, text, wall, places(text, wall=wall))
 
 
@@ -186,10 +179,8 @@ def _from_arrays(path: Path, initial: str | None) -> World:
             f"{str(path)!r} lacks the array system: for each state True where the system moves "
             "and False where the environment does."
         )
-    try:
+    with tables.errors_in(f"{str(path)!r}: "):
         return World(make_game(world.mdp, more["system"]), world.actions)
-    except ValueError as error:
-        raise ValueError(f"{str(path)!r}: {error}") from None
 
 
 def _cell(given: list[int], key: str, cells: np.ndarray, wall: str) -> tuple[int, int]:
@@ -212,15 +203,13 @@ def load_objective(file: GameFile, world: World) -> tuple[Game, Parity | GR1]:
         must be Boolean is not.
     """
     task, game = file.task, world.game
-    try:
+    with tables.errors_in(f"{file.path}: [task] "):
         if "formula" in task:
             return task_game(game, task["formula"])
         safe = task.get("safe", "true")
         if "guarantees" not in task:
             return game, safety(game, safe)
         return game, gr1(game, task.get("assumptions", ()), task["guarantees"], safe=safe)
-    except ValueError as error:
-        raise ValueError(f"{file.path}: [task] {error}") from None
 
 
 def task_text(task: Mapping[str, Any]) -> str:

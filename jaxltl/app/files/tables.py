@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import hashlib
 import math
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,6 +61,15 @@ LEGEND = Rule(
     lambda v: isinstance(v, dict) and all(is_list(x, str) for x in v.values()),
     'a table of cells and their propositions, such as { w = [], r = ["r"] }',
 )
+
+
+@contextlib.contextmanager
+def errors_in(place: str) -> Iterator[None]:
+    """Errors meant for people begin with the place that they come from."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{place}{error}") from None
 
 
 def read_tables(
@@ -129,15 +139,19 @@ def require_one(
     path: Path, table: str, data: Mapping[str, Any], keys: tuple[str, str], wanted: str
 ) -> None:
     """Raises a ValueError unless a table has exactly one of two keys."""
-    if (keys[0] in data) == (keys[1] in data):
-        raise ValueError(f"{path}: [{table}] must have either {wanted}.")
+    reject(path, table, [((keys[0] in data) == (keys[1] in data), f"must have either {wanted}")])
 
 
 def refuse(path: Path, table: str, data: Iterable[str], keys: Iterable[str], belong: str) -> None:
     """Raises a ValueError for the first key of a table that belongs elsewhere."""
-    for key in keys:
-        if key in data:
-            raise ValueError(f"{path}: [{table}] {key} belongs to {belong}.")
+    reject(path, table, [(key in data, f"{key} belongs to {belong}") for key in keys])
+
+
+def reject(path: Path, table: str, faults: Iterable[tuple[bool, str]]) -> None:
+    """Raises a ValueError for the first fault of a table that there is, with what is told of it."""
+    for there, told in faults:
+        if there:
+            raise ValueError(f"{path}: [{table}] {told}.")
 
 
 def check_source(path: Path, table: str, data: Mapping[str, Any], of_map: Iterable[str]) -> None:
@@ -153,11 +167,9 @@ def check_demonstrations(
     """Raises a ValueError unless there are files or runs to be made, with a discount."""
     table = "demonstrations"
     require_one(path, table, shown, (file, "synthetic"), f"{wanted} or synthetic = N")
-    if "synthetic" in shown and "discount" not in shown:
-        raise ValueError(
-            f"{path}: [{table}] lacks discount, that of the reward which the synthetic "
-            "demonstrator maximises; for example 0.95."
-        )
+    reject(path, table, [("synthetic" in shown and "discount" not in shown,
+                          "lacks discount, that of the reward which the synthetic demonstrator "
+                          "maximises; for example 0.95")])
     if file in shown:
         refuse(path, table, shown, of_synthetic, "synthetic = N")
 

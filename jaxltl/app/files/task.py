@@ -190,25 +190,19 @@ def read_task(path: str | Path) -> Task:
 
 
 def _check_learner(path: Path, learner: Mapping[str, Any]) -> None:
-    in_world = learner.get("in", "product") == "world"
-    if in_world and "goal" not in learner:
-        raise ValueError(
-            f'{path}: [learner] lacks goal, the propositions of the goal cells, which in = "world" '
-            "needs since the learner does not see the formula."
-        )
-    if in_world and "mu" in learner:
-        raise ValueError(
-            f'{path}: [learner] mu weighs the probability of doing the task; it needs '
-            'in = "product".'
-        )
-    if not in_world and "goal" in learner:
-        raise ValueError(f'{path}: [learner] goal belongs to in = "world".')
-    kind = str if in_world else int
-    if any(not isinstance(x, kind) for x in learner.get("progress", ())):
-        raise ValueError(
-            f"{path}: [learner] progress = {learner['progress']!r}; it must be a list of "
-            + ("propositions." if in_world else "automaton states (or left out).")
-        )
+    in_world, progress = learner.get("in", "product") == "world", learner.get("progress", ())
+    kind: type = str if in_world else int
+    wanted = "propositions" if in_world else "automaton states (or left out)"
+    tables.reject(path, "learner", (
+        (in_world and "goal" not in learner,
+         'lacks goal, the propositions of the goal cells, which in = "world" needs since the '
+         "learner does not see the formula"),
+        (in_world and "mu" in learner,
+         'mu weighs the probability of doing the task; it needs in = "product"'),
+        (not in_world and "goal" in learner, 'goal belongs to in = "world"'),
+        (any(not isinstance(x, kind) for x in progress),
+         f"progress = {progress!r}; it must be a list of {wanted}"),
+    ))
 
 
 # --- the world ------------------------------------------------------------------------------
@@ -221,14 +215,12 @@ def load_world(task: Task) -> World:
       ValueError: a malformed map or model. The message names the file and the place.
     """
     spec = dict(task.world)
-    try:
+    with tables.errors_in(f"{task.path}: [world] "):
         if "model" in spec:
             path = task.path.parent / spec["model"]
             return load_model(path, spec.get("initial"))[0]
         text = tables.read_map(task.path, spec.pop("map"))
         return World(gridworld(text, **spec), parse_map(text), ACTIONS)
-    except ValueError as error:
-        raise ValueError(f"{task.path}: [world] {error}") from None
 
 
 _ARRAYS = (
@@ -261,7 +253,7 @@ def load_model(
                                if k in arrays}
     names = arrays.get("propositions", np.zeros(0, str))
     options["propositions"] = [str(x) for x in names.ravel()]
-    try:
+    with tables.errors_in(f"{str(path)!r}: "):
         if "transition" in arrays:
             mdp = from_dense(arrays["transition"], **options)
         elif {"successor", "probability"} <= set(arrays):
@@ -270,8 +262,6 @@ def load_model(
             raise ValueError("it needs the array transition, or successor and probability.")
         if initial is not None:
             mdp = replace(mdp, initial=_where_holds(initial, mdp))
-    except ValueError as error:
-        raise ValueError(f"{str(path)!r}: {error}") from None
     default = [f"action {a}" for a in range(mdp.num_actions)]
     actions = tuple(str(a) for a in arrays.get("actions", np.array(default)).ravel())
     if len(set(actions)) != mdp.num_actions:
@@ -341,10 +331,8 @@ def read_demonstrations(path: Path, world: World) -> Trajectories:
         )
     sequences = []
     for number, one in enumerate(shown, start=1):
-        try:
+        with tables.errors_in(f"{path}: demonstration {number}"):
             sequences.append(_read_demonstration(one, world))
-        except ValueError as error:
-            raise ValueError(f"{path}: demonstration {number}{error}") from None
     return make_trajectories(world.mdp, sequences)
 
 
@@ -366,8 +354,7 @@ def _read_demonstration(one: Any, world: World) -> list[tuple[int, int]]:
             f"{kind}, except perhaps the last."
         )
     read = _read_cell if kind == "cells" else _read_state
-    states = [_at_step(t, read, place, world) for t, place in enumerate(places, start=1)]
-    actions = [_at_step(t, _read_action, name, world) for t, name in enumerate(names, start=1)]
+    states, actions = (_each_step(*x, world) for x in ((read, places), (_read_action, names)))
     available = np.asarray(world.mdp.available)
     successor, probability = np.asarray(world.mdp.successor), np.asarray(world.mdp.probability)
     for t, (s, a) in enumerate(zip(states, actions, strict=False)):
@@ -385,11 +372,12 @@ def _read_demonstration(one: Any, world: World) -> list[tuple[int, int]]:
     return list(zip(states, actions, strict=False))
 
 
-def _at_step(step: int, read: Callable[[Any, World], int], value: Any, world: World) -> int:
-    try:
-        return read(value, world)
-    except ValueError as error:
-        raise ValueError(f", step {step}: {error}") from None
+def _each_step(read: Callable[[Any, World], int], values: list[Any], world: World) -> list[int]:
+    found = []
+    for step, value in enumerate(values, start=1):
+        with tables.errors_in(f", step {step}: "):
+            found.append(read(value, world))
+    return found
 
 
 def _read_cell(value: Any, world: World) -> int:

@@ -135,11 +135,11 @@ def read_task(path: str | Path) -> Task:
         tables.refuse(path, "world", world, of_text, "maps with a legend")
     of_synthetic = ("discount", "length", *_REWARDS)
     tables.check_demonstrations(path, shown, "files", "files = [...]", of_synthetic)
-    if "files" in shown and len(shown["files"]) != len(world["maps"]):
-        raise ValueError(
-            f"{path}: [demonstrations] names {len(shown['files'])} files for "
-            f"{len(world['maps'])} worlds; give one for each of [world] maps, in their order."
-        )
+    files, number = shown.get("files", world["maps"]), len(world["maps"])
+    tables.reject(path, "demonstrations", [
+        (len(files) != number, f"names {len(files)} files for {number} worlds; give one for each "
+         "of [world] maps, in their order"),
+    ])
     _check_learner(path, data["learner"])
     if "test" in data:
         _check_test(path, test, "legend" in world)
@@ -148,31 +148,24 @@ def read_task(path: str | Path) -> Task:
 
 
 def _check_learner(path: Path, learner: Mapping[str, Any]) -> None:
-    if learner["discount"] == 1 and "horizon" not in learner:
-        raise ValueError(
-            f"{path}: [learner] discount = 1 needs a horizon, the number of steps of a run; or "
-            "choose a discount below 1, such as 0.95."
-        )
-    if learner.get("optimizer") == "lbfgs" and "learning_rate" in learner:
-        raise ValueError(
-            f'{path}: [learner] learning_rate does not belong to optimizer = "lbfgs", which '
-            "searches for its own."
-        )
-    if learner.get("held_out") == 0 and "patience" in learner:
-        raise ValueError(
-            f"{path}: [learner] patience waits for a better held-out likelihood; it needs a "
-            "held_out above 0."
-        )
+    tables.reject(path, "learner", (
+        (learner["discount"] == 1 and "horizon" not in learner,
+         "discount = 1 needs a horizon, the number of steps of a run; or choose a discount below "
+         "1, such as 0.95"),
+        (learner.get("optimizer") == "lbfgs" and "learning_rate" in learner,
+         'learning_rate does not belong to optimizer = "lbfgs", which searches for its own'),
+        (learner.get("held_out") == 0 and "patience" in learner,
+         "patience waits for a better held-out likelihood; it needs a held_out above 0"),
+    ))
 
 
 def _check_test(path: Path, test: Mapping[str, Any], plain: bool) -> None:
-    if "maps" not in test and "generate" not in test:
-        raise ValueError(f"{path}: [test] must have maps = [...] or generate = N, or both.")
-    if "generate" in test and plain:
-        raise ValueError(
-            f"{path}: [test] generate makes coloured worlds; where [world] has a legend, give "
-            "maps = [...]."
-        )
+    tables.reject(path, "test", (
+        ("maps" not in test and "generate" not in test,
+         "must have maps = [...] or generate = N, or both"),
+        ("generate" in test and plain,
+         "generate makes coloured worlds; where [world] has a legend, give maps = [...]"),
+    ))
     if "generate" not in test:
         tables.refuse(path, "test", test, _GENERATED, "generate = N")
 
@@ -234,13 +227,11 @@ def _read_scene(task: Task, table: str, number: int) -> Scene:
     entry = source["maps"][number]
     file = _file_of(entry)
     name = f"map {number + 1}" if file is None else file
-    try:
+    with tables.errors_in(f"{task.path}: [{table}] {name}: "):
         text = entry if file is None else tables.read_map(task.path, {"file": file})
         if task.is_colored:
             return _colored_scene(name, text, task.world, task.radius)
         return _plain_scene(name, text, task.world, task.radius)
-    except ValueError as error:
-        raise ValueError(f"{task.path}: [{table}] {name}: {error}") from None
 
 
 def _with_settings(text: str, world: Mapping[str, Any]) -> str:
@@ -340,14 +331,12 @@ def _generate(task: Task, first: Scene, judge: Automaton) -> list[Scene]:
     if first.mdp.num_successors > 1:
         slip = 1 - float(first.mdp.probability[0, 0, 0])
     seeds = range(spec.get("seed", 0), spec.get("seed", 0) + spec["generate"])
-    try:
+    with tables.errors_in(f"{task.path}: [test] generate: "):
         made = temporal_gridworld.random_worlds(
             seeds, judge, shape=tuple(spec.get("shape", first.shape)), objects=objects,
             obstacles=obstacles, num_obstacles=spec.get("obstacles", max(shown, default=0)),
             min_distance=spec.get("min_distance", 3), margin=first.colored.margin, slip=slip,
         )
-    except ValueError as error:
-        raise ValueError(f"{task.path}: [test] generate: {error}") from None
     return [
         _of_world(f"seed {seed}", world, task.radius)
         for seed, world in zip(seeds, made, strict=True)
@@ -389,13 +378,11 @@ def _alphabet(task: Task) -> list[frozenset[str]]:
 
 def _translate(task: Task, place: str, text: str, alphabet: list[frozenset[str]]) -> Automaton:
     names = sorted(frozenset().union(*alphabet))
-    try:
+    with tables.errors_in(f"{task.path}: {place}: "):
         formula = parse_ltl(text)
         require_known(formula.propositions, names, "the formula")
         read = dict.fromkeys(letter & set(formula.propositions) for letter in alphabet)
         return to_automaton(formula, letters=list(read))
-    except ValueError as error:
-        raise ValueError(f"{task.path}: {place}: {error}") from None
 
 
 # --- demonstrations -------------------------------------------------------------------------

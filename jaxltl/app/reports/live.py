@@ -297,8 +297,7 @@ def _curves(part: Curves, drawn: Mapping[str, str]) -> str:
     )
     chosen = _spread(len(part.steps))
     lines = [
-        (str(int(part.steps[t])), *(number(_finite(np.nanmedian(x[t]))) for x in
-                                    part.figures.values()))
+        (str(int(part.steps[t])), *(number(_median(x[t])) for x in part.figures.values()))
         for t in chosen
     ]
     header = ("step", *(name.replace("_", " ") for name in part.figures))
@@ -307,6 +306,11 @@ def _curves(part: Curves, drawn: Mapping[str, str]) -> str:
         f'<p class="muted">{html.escape(part.caption)}</p><div class="curves">{plots}</div>'
         f"{folded('Learning as a table', rows(header, lines))}</section>"
     )
+
+
+def _median(values: np.ndarray) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else None
 
 
 def _spread(count: int) -> Sequence[int]:
