@@ -130,3 +130,25 @@ def test_the_host_is_as_good_as_the_traced_engine(task):
         for found in (host, traced):
             attained = jl.satisfaction_probability(model, found.policy).value
             np.testing.assert_allclose(attained, host.value, atol=1e-7)
+
+
+@pytest.mark.parametrize(("task", "objective"), [
+    ("F g", "max"), ("G !t", "max"), ("F t", "min"), ("G !g", "min"), ("G F g", "max"),
+    ("F G t", "min"),
+])
+def test_among_equal_odds_the_short_way_and_never_worse_odds(task, objective):
+    """Even odds by way of 1, worse ones at once, even ones after a while, even ones at once."""
+    goal, trap = [2] * 3, [3] * 3
+    world = jl.make_mdp(
+        [[[1, 1, 1], [2, 3, 3], [0, 2, 3], [2, 3, 3]], [[2, 3, 3]] * 4, [goal] * 4, [trap] * 4],
+        [[[1, 0, 0], [0.49, 0.51, 0], [0.5, 0.25, 0.25], [0.5, 0.5, 0]], [[0.5, 0.5, 0]] * 4,
+         [[1, 0, 0]] * 4, [[1, 0, 0]] * 4],
+        initial=[1, 0, 0, 0], label=[[0, 0], [0, 0], [1, 0], [0, 1]], propositions=["g", "t"],
+    )
+    model = jl.product(world, task)
+    best = jl.optimal_satisfaction(model, objective=objective)
+    start = 0, int(model.initial_memory[0])
+    assert float(best.value[start]) == pytest.approx(0.5)
+    assert int(best.policy[start]) == 3
+    allowed = jl.optimal_actions(model, objective=objective).allowed[start]
+    assert allowed.tolist() == [True, False, True, True]
