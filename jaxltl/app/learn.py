@@ -39,13 +39,23 @@ from jaxltl.app.files.task import (
     synthetic_demonstrations,
 )
 from jaxltl.app.files.task import read_task as read_task
+from jaxltl.app.guarantee import (
+    Attempt,
+    Guarantee,
+    ask,
+    at_least,
+    check_formula,
+    from_starts,
+    kept,
+)
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.product import Product, lift_policy, product
 from jaxltl.core.models.restrict import restrict
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status
-from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
+from jaxltl.core.values.hitting_time import hitting_time
+from jaxltl.core.values.satisfaction import satisfaction_probability
 
 Report = Callable[[int, Mapping[str, np.ndarray]], None]
 
@@ -82,10 +92,9 @@ class Learned:
     history: Mapping[str, np.ndarray]
 
 
-def _mlirl(
-    setup: Setup, seeds: tuple[int, int], report: Report | None, checkpoint: Path | None
-) -> Learned:
-    """Inverse RL by maximum likelihood, in the world or in the product (chapter 2)."""
+def _problem(setup: Setup, allowed: np.ndarray | None) -> tuple[tuple[str, ...], mlirl.Problem]:
+    """What inverse RL learns from, in the world or in the product (chapter 2): names of features.
+    """
     spec, model, shown = setup.task.learner, setup.model, setup.demonstrations
     in_world = spec.get("in", "product") == "world"
     avoid, progress = spec.get("avoid", ()), spec.get("progress")
@@ -94,7 +103,9 @@ def _mlirl(
             model.mdp, shown, goal=spec["goal"], progress=progress or (), avoid=avoid
         )
     else:
-        features = mlirl.task_features(model, shown, avoid=avoid, progress=progress)
+        # The dissertation's learners, without a guarantee, have Table 1's alone.
+        best = None if setup.guarantee.asked == "none" else setup.guarantee.best
+        features = mlirl.task_features(model, shown, avoid=avoid, progress=progress, best=best)
     start = spec.get("start")
     if start is not None and len(start) != len(features.names):
         raise ValueError(
@@ -104,26 +115,35 @@ def _mlirl(
     problem = mlirl.make_problem(
         model.mdp if in_world else model, features.values, shown,
         start=start, satisfaction_over=spec.get("satisfaction_over", "initial"),
+        allowed=None if allowed is None else jnp.asarray(allowed),
     )
-    hparams = settings(mlirl.Hparams, spec)
+    return features.names, problem
+
+
+def _trained(
+    setup: Setup, names: tuple[str, ...], problem: mlirl.Problem, hparams: mlirl.Hparams,
+    seeds: tuple[int, int], report: Report | None, checkpoint: Path | None,
+) -> Learned:
+    """What N seeds learn of a problem."""
+    spec, model = setup.task.learner, setup.model
     found, history = run_seeds(
         mlirl, seeds, problem, hparams, report, num_steps=spec.get("steps", STEPS), keep="before",
         until=learner.gradient_vanishes(spec.get("tolerance", _TOLERANCE)), checkpoint=checkpoint,
     )
     states = found.state
-    evaluate = jax.jit(_policy_and_likelihood)
     weights = np.asarray(states.parameters)
-    each = [jax.device_get(evaluate(one, problem, hparams)) for one in weights]
+    each = [jax.device_get(_policy_and_likelihood(one, problem, hparams)) for one in weights]
     policy, nll, codes = (np.stack(column) for column in zip(*each, strict=True))
-    if in_world:
+    if spec.get("in", "product") == "world":
         policy = jax.jit(jax.vmap(lift_policy, (None, 0)))(model, policy)
     gradient_norm, status = history["gradient_norm"][-1], np.asarray(codes)
     return Learned(
         policy=np.asarray(policy),
-        weights=weights, names=features.names, loss=history["loss"][-1],
+        weights=weights, names=names, loss=history["loss"][-1],
         neg_log_likelihood=np.asarray(nll), gradient_norm=gradient_norm, status=status,
         num_steps=np.asarray(states.step),
-        converged=found.done & (status == Status.CONVERGED), history=history,
+        # Beyond contraction no value of a softmax policy has a certificate.
+        converged=found.done & (status <= Status.UNCERTIFIED), history=history,
     )
 
 
@@ -162,6 +182,59 @@ def _first_states(
     return jax.vmap(init, (0, None, None))(keys, problem, hparams)
 
 
+def _with_guarantee(
+    setup: Setup, seeds: tuple[int, int], report: Report | None, checkpoint: Path | None
+) -> tuple[Learned, int, Attempt | None]:
+    """What is learned under the guarantee, which seed is kept, and how a probability was reached.
+    """
+    guarantee = setup.guarantee
+    names, problem = _problem(setup, guarantee.allowed)
+    hparams = settings(mlirl.Hparams, setup.task.learner)
+    if isinstance(guarantee.asked, str):
+        learned = _trained(setup, names, problem, hparams, seeds, report, checkpoint)
+        return learned, _least_loss(learned), None
+    # With a weight of zero it is one program for all weights.
+    hparams = dataclasses.replace(hparams, mu=0.0 if hparams.mu is None else hparams.mu)
+    learned = _trained(setup, names, problem, hparams, seeds, report, checkpoint)
+    free = _lane(learned, _least_loss(learned))
+
+    def train(mu: float, before: Learned, problem: mlirl.Problem = problem) -> Learned:
+        start = jnp.asarray(before.weights[0], problem.features.dtype)
+        near = dataclasses.replace(problem, start=start)
+        there = dataclasses.replace(hparams, mu=mu, start_scale=0.0)
+        return _trained(setup, names, near, there, (seeds[0], 1), None, None)
+
+    def inside() -> tuple[np.ndarray, Learned]:
+        actions = guarantee.actions
+        if actions is None or not guarantee.usable:
+            return np.asarray(actions.policy if actions else free.policy[0]), free
+        one = train(0.0, free, _problem(setup, np.asarray(actions.allowed))[1])
+        return one.policy[0], one
+
+    found = at_least(
+        setup.model, guarantee, np.asarray(problem.counts), free, inside, train,
+        lambda one: one.policy[0])
+    kept = dataclasses.replace(
+        found.learned, policy=found.policy[None],
+        neg_log_likelihood=np.array([found.neg_log_likelihood]))
+    return kept, 0, found
+
+
+def _least_loss(learned: Learned) -> int:
+    """The seed that is kept: of those that converged, if any did, the one of least loss."""
+    loss = np.where(np.isfinite(learned.loss), learned.loss, np.inf)
+    return int(np.argmin(np.where(learned.converged, loss, loss + 1e12)))
+
+
+def _lane(learned: Learned, i: int) -> Learned:
+    """One of the seeds alone."""
+    one: dict[str, Any] = {
+        k: v[i : i + 1] for k, v in vars(learned).items() if isinstance(v, np.ndarray)}
+    history = {k: v if v.ndim == 1 else v[:, i : i + 1] for k, v in learned.history.items()}
+    return dataclasses.replace(learned, **one, history=history)
+
+
+@jax.jit
 def _policy_and_likelihood(
     parameters: Any, problem: mlirl.Problem, hparams: mlirl.Hparams
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -183,6 +256,8 @@ class Setup:
     model: Product
     demonstrations: Trajectories
     dropped: int
+    guarantee: Guarantee
+    trivial: str | None = None  # what is to be said of a formula that is always true
 
 
 @dataclass(frozen=True)
@@ -193,7 +268,7 @@ class Outcome:
       setup, learned: the parts.
       chosen: the seed's position whose loss is least; the policy that is kept.
       solution: the kept policy's probability of doing the task, with bounds.
-      best: the largest probability that any policy has, with bounds.
+      attempt: how a probability that was asked for was reached, if one was.
       satisfaction: ``float[N, S]``, of every seed's policy from every start.
       seed: the first of the seeds.
       seconds: spent.
@@ -203,7 +278,7 @@ class Outcome:
     learned: Learned
     chosen: int
     solution: Solution
-    best: Solution
+    attempt: Attempt | None
     satisfaction: np.ndarray
     seed: int
     seconds: float
@@ -218,10 +293,15 @@ def prepare(task: Task, seed: int) -> Setup:
     world = load_world(task)
     with errors_in(f"{task.path}: [task] "):
         model = product(world.mdp, task.formula, label_on=task.label_on)
+        trivial = check_formula(model.automaton)
     if "file" in task.demonstrations:
-        return Setup(task, world, model, load_demonstrations(task, world), 0)
-    key = jax.random.fold_in(jax.random.key(seed), 0)
-    return Setup(task, world, model, *synthetic_demonstrations(task, model, key))
+        shown, dropped = load_demonstrations(task, world), 0
+    else:
+        key = jax.random.fold_in(jax.random.key(seed), 0)
+        shown, dropped = synthetic_demonstrations(task, model, key)
+    with errors_in(f"{task.path}: [task] "):
+        asked = ask(model, world, shown, task.guarantee, task.over)
+    return Setup(task, world, model, shown, dropped, asked, trivial)
 
 
 def describe(setup: Setup) -> str:
@@ -248,7 +328,7 @@ def learn(
     report: Report | None = None,
     checkpoint: Path | None = None,
     progress: Callable[[str], None] = lambda stage: None,
-) -> tuple[Learned, int, Solution, Solution, np.ndarray]:
+) -> tuple[Learned, int, Solution, Attempt | None, np.ndarray]:
     """Learns with N seeds, keeps the best, and evaluates it; see :class:`Outcome`.
 
     What it is at is told to `report`, steps and figures, and to `progress`, the stage's name.
@@ -257,24 +337,15 @@ def learn(
       ValueError: the learner cannot work on this task.
     """
     model = setup.model
-    learned = _mlirl(setup, (seed, num_seeds), report, checkpoint)
+    learned, chosen, attempt = _with_guarantee(setup, (seed, num_seeds), report, checkpoint)
     progress("checking")
-    loss = np.where(np.isfinite(learned.loss), learned.loss, np.inf)
-    chosen = int(np.argmin(np.where(learned.converged, loss, loss + 1e12)))
     solution = satisfaction_probability(model, learned.policy[chosen])
-    best = optimal_satisfaction(model)
     at_start = functools.partial(from_starts, model)
     each = [
         solution if i == chosen else satisfaction_probability(model, learned.policy[i])
-        for i in range(num_seeds)
+        for i in range(len(learned.policy))
     ]
-    return learned, chosen, solution, best, np.stack([at_start(s.value) for s in each])
-
-
-def from_starts(model: Product, value: jax.Array | np.ndarray) -> np.ndarray:
-    """A product's value at the memory in which a run starts: ``[S]`` from ``[S, Q]``."""
-    memory = np.asarray(model.initial_memory)
-    return np.asarray(value)[np.arange(len(memory)), memory]
+    return learned, chosen, solution, attempt, np.stack([at_start(s.value) for s in each])
 
 
 def summary(outcome: Outcome) -> dict[str, Any]:
@@ -282,7 +353,8 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, world, model = setup.task, setup.world, setup.model
     starts = np.flatnonzero(np.asarray(model.mdp.initial) > 0)
-    impossible = starts[from_starts(model, outcome.best.upper)[starts] <= 0].tolist()
+    best = setup.guarantee.best
+    impossible = starts[from_starts(model, best.upper)[starts] <= 0].tolist()
     mean = outcome.satisfaction @ np.asarray(model.mdp.initial)
     least = outcome.satisfaction[:, starts].min(axis=1)
     pairs = int(np.sum(np.asarray(setup.demonstrations.length)))
@@ -297,8 +369,12 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             "synthetic": "synthetic" in task.demonstrations,
             "dropped": setup.dropped,
         },
+        "guarantee": kept(
+            setup.guarantee, outcome.attempt, model, world, setup.demonstrations, outcome.solution),
+        "trivial": setup.trivial,
+        "expected_steps": _expected_steps(outcome),
         "satisfaction": _evidence(outcome.solution, model, world, starts),
-        "best_achievable": _evidence(outcome.best, model, world, starts),
+        "best_achievable": _evidence(best, model, world, starts),
         "impossible_starts": [world.where(s) for s in impossible],
         "neg_log_likelihood": learned.neg_log_likelihood[i],
         "weights": dict(zip(learned.names, learned.weights[i].tolist(), strict=True)),
@@ -323,6 +399,22 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         **took(outcome.seconds),
     }
     return plain(result)
+
+
+def _expected_steps(outcome: Outcome) -> dict[str, Any] | None:
+    """Of a co-safe task, until it is done or lost: of what was learned and of the quickest best."""
+    model, best = outcome.setup.model, outcome.setup.guarantee.best
+    if model.automaton.acceptance != "cosafe":
+        return None
+    ended = np.asarray(model.final) | (np.asarray(best.upper) <= 0)
+    policies = {"learned": outcome.learned.policy[outcome.chosen], "quickest": best.policy}
+    weight = np.asarray(model.mdp.initial, float)
+    starts = weight > 0
+    with np.errstate(invalid="ignore"):
+        return {
+            name: from_starts(model, hitting_time(model, policy, ended))[starts] @ weight[starts]
+            for name, policy in policies.items()
+        }
 
 
 def about(task: Task) -> dict[str, Any]:

@@ -38,6 +38,8 @@ class Task:
         right kind; keys that were left out are absent.
       formula: the task.
       label_on: which label a step of the product reads, ``"entry"`` or ``"exit"``.
+      guarantee: what the policy is to guarantee: ``"best"``, ``"none"`` or a probability.
+      over: of which initial states, ``"mean"`` or ``"worst"``.
       digest: a fingerprint of the file and of every file that it names.
     """
 
@@ -50,6 +52,8 @@ class Task:
     learner: Mapping[str, Any]
     digest: str
     test: Mapping[str, Any] = field(default_factory=dict)
+    guarantee: str | float = "best"
+    over: str = "mean"
 
     @property
     def memory(self) -> str:
@@ -76,7 +80,23 @@ def make_task(
         formula=data["task"]["formula"], label_on=data["task"].get("label_on", label_on),
         demonstrations=data["demonstrations"], learner=data["learner"],
         digest=tables.digest(path, raw, named), test=data.get("test", {}),
+        guarantee=_guarantee(path, data), over=data["task"].get("over", "mean"),
     )
+
+
+def _guarantee(path: Path, data: Mapping[str, Any]) -> str | float:
+    """What a file asks for; a learner that does not see the task cannot guarantee it."""
+    task, learner = data["task"], data["learner"]
+    blind = learner.get("in") == "world" or "memory" in learner
+    asked: str | float = task.get("guarantee", "none" if blind else "best")
+    number = not isinstance(asked, str)
+    tables.reject(path, "task", (
+        (blind and asked != "none",
+         f"guarantee = {asked!r} needs a learner that sees the task: leave out "
+         + ("memory" if "memory" in learner else 'in = "world"')),
+        ("over" in task and not number, "over belongs to a guarantee that is a probability"),
+    ))
+    return asked
 
 
 class World(NamedTuple):
@@ -124,7 +144,13 @@ WORLD = {
     "legend": tables.LEGEND, "wall": TEXT, "slip": number_in(0, 1), "absorbing": NAMES,
     "initial": TEXT,
 }
-TASK = {"formula": TEXT, "label_on": choice("entry", "exit")}
+TASK = {
+    "formula": TEXT, "label_on": choice("entry", "exit"),
+    "guarantee": Rule(
+        lambda v: v in ("best", "none") or (is_list([v], int | float) and 0 < v <= 1),  # type: ignore[arg-type]
+        '"best", "none" or a probability in (0, 1]'),
+    "over": choice("mean", "worst"),
+}
 SYNTHETIC = {"synthetic": COUNT, "discount": number_in(0, 1, below=True), "length": COUNT}
 LEARNER = {"l2": number_in(0), "learning_rate": number_in(0), "steps": COUNT}
 REQUIRED: dict[str, Sequence[str]] = {

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
+
+import click
 
 from jaxltl.app.files.task import place
 from jaxltl.app.reports.live import Said, live_page
 from jaxltl.app.reports.page import Remark, certified, number, probability, rows, spread, tiles
+
+_SHORT = 0.01  # share of the best probability that may be missing without a word
+_LONG = 10  # times the quickest policy's steps, likewise
 
 
 def page(result: Mapping[str, Any], *shown: Any) -> str:
@@ -32,7 +38,50 @@ def _told(result: Mapping[str, Any]) -> list[str]:
 
 def remarks(result: Mapping[str, Any]) -> list[Remark]:
     """What the page says first."""
-    return [("warning", text) for text in warnings(result)]
+    return [*(("warning", text) for text in warnings(result)), *_notes(result)]
+
+
+def _notes(result: Mapping[str, Any]) -> list[Remark]:
+    """What holds of the policy and why, and what was left out for it."""
+    found, best, learned = [], result["best_achievable"], result["satisfaction"]
+    asked = result["guarantee"]["asked"]
+    if asked == "best":
+        if learned["minimum"]["lower"] == 1:
+            found.append(("good", (
+                "By the graph: from every initial state the policy does the task with probability "
+                "1, whatever the numbers. It takes all of the moves that keep that possible, and "
+                "no others.")))
+        else:
+            found.append(("good", (
+                "By construction no policy does the task with a greater probability, from any "
+                "initial state: this one takes all of the moves that preserve the best one "
+                f"({probability(best['mean']['value'])} on average), and no others.")))
+    elif asked != "none":
+        found.append(("good", _asked(result["guarantee"])))
+    if (lost := result["guarantee"].get("left_out")) is not None:
+        found.append(("note", (
+            f"{lost['steps']} of {lost['of']} demonstrated steps "
+            f"{'lowers' if lost['steps'] == 1 else 'lower'} the best probability and "
+            f"{'was' if lost['steps'] == 1 else 'were'} left out; first at {place(lost)} "
+            f"(demonstration {lost['demonstration']}, step {lost['step']}): from "
+            f"{probability(lost['from'])} to {probability(lost['to'])}.")))
+    if result.get("trivial"):
+        found.append(("note", result["trivial"]))
+    return found
+
+
+def _asked(guarantee: Mapping[str, Any]) -> str:
+    """How a probability that was asked for was reached."""
+    over = "on average" if guarantee["over"] == "mean" else "from the worst initial state"
+    text = (f"Asked for {probability(guarantee['asked'])} {over}, certified "
+            f"{probability(guarantee['attained'])}: ")
+    share, weight = guarantee["share"], guarantee["weight"]
+    if share:
+        other = "moves that lose nothing" if weight is None else f"the policy of mu = {weight:.3g}"
+        return f"{text}a share of {share:.3g} of {other} is mixed into the likeliest policy."
+    if weight:
+        return f"{text}the least weight of the task that reaches it is mu = {weight:.3g}."
+    return f"{text}the likeliest policy does that by itself."
 
 
 def table(result: Mapping[str, Any]) -> str:
@@ -71,7 +120,8 @@ def table(result: Mapping[str, Any]) -> str:
             f"  minimum                 {spread(seeds['minimum'])}",
             f"  negative log-likelihood {spread(seeds['neg_log_likelihood'])}",
         ]
-    lines += [f"\nwarning: {text}" for text in warnings(result)]
+    for kind, text in remarks(result):
+        lines.append("\n" + (click.style(f"warning: {text}", fg="red") if kind == "warning" else text))
     return "\n".join(lines)
 
 
@@ -88,6 +138,17 @@ def _sentence(result: Mapping[str, Any]) -> str:
 def warnings(result: Mapping[str, Any]) -> list[str]:
     """What a reader must know before trusting the figures, as sentences."""
     found = []
+    learned, best = (result[k]["mean"] for k in ("satisfaction", "best_achievable"))
+    if learned["value"] < (1 - _SHORT) * best["value"]:
+        found.append(
+            f"The policy does the task with probability {probability(learned['value'])} where "
+            f"{probability(best['value'])} is possible. " + _remedy(result))
+    steps = result["expected_steps"]
+    if steps and steps["quickest"] and not (steps["learned"] or math.inf) < _LONG * steps["quickest"]:
+        found.append(
+            f"The policy takes {'more steps than can be told' if steps['learned'] is None else number(steps['learned']) + ' steps'} on average where "
+            f"{number(steps['quickest'])} would do: it was not shown that it should hurry. A larger "
+            "discount, a smaller l2 or more demonstrations help.")
     starts, total = result["impossible_starts"], result["satisfaction"]["num_starts"]
     if starts:
         listed = "; ".join(place(s) for s in starts[:5]) + ("; ..." if len(starts) > 5 else "")
@@ -110,6 +171,16 @@ def warnings(result: Mapping[str, Any]) -> list[str]:
                 f"The solver for {what} ended with {result[key]['status']}; only its bounds hold."
             )
     return found
+
+
+def _remedy(result: Mapping[str, Any]) -> str:
+    if result["in"] == "world":
+        return 'A learner in = "product" can be held to it: leave out in, goal and progress.'
+    if (tried := result["guarantee"].get("remedy")) is not None:
+        return (
+            'With guarantee = "best" in [task] it is certified to be at least '
+            f"{probability(tried)}: tried.")
+    return 'guarantee = "best" in [task] attains it.'
 
 
 def _tiles(result: Mapping[str, Any]) -> str:
@@ -140,7 +211,7 @@ def _evidence(result: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
 
 def _evidence_table(result: Mapping[str, Any]) -> str:
     lines = [(f"{title}, {what}", *rest) for title, what, *rest in _evidence(result)]
-    return rows(("", "probability", "certified", "where", "solver"), lines) + (
+    return rows(("policy", "probability", "certified", "where", "solver"), lines) + (
         "<p class=muted>The true probability is certified to be that close.</p>"
     )
 

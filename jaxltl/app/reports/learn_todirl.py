@@ -212,7 +212,7 @@ def _evidence_table(result: Mapping[str, Any]) -> str:
                 f"{html.escape(one['worst_world']['name'])}",
                 probability(one["worst_start"]),
             ))
-    header = ("", "mean", "certified", "deviation", "worst world", "worst start")
+    header = ("who", "mean", "certified", "deviation", "worst world", "worst start")
     return rows(header, lines) + (
         "<p class=muted>The true mean over worlds and starts is certified to be that close. The "
         "deviation is over worlds; the worst start is over all starts of all worlds. The expert "

@@ -256,7 +256,7 @@ def _layer_table(part: Explorer, key: str) -> str:
     if layer.policy is None:
         caption = f"<caption>{html.escape(layer.name)}: {html.escape(part.label)}</caption>"
     if part.shape is None:
-        return rows(("state", ""), [(str(s), text) for s, text in enumerate(texts)],
+        return rows(("state", "figures"), [(str(s), text) for s, text in enumerate(texts)],
                     caption, f'data-memory="{key}"')
     down, across = part.shape
     lines = [(str(r + 1), *texts[r * across : (r + 1) * across]) for r in range(down)]
@@ -276,7 +276,7 @@ def _automaton_table(automaton: Automaton) -> str:
             kind = "first" + (f"; {kind}" if kind else "")
         lines.append((str(q), kind, f"<code>{html.escape(names[q])}</code>",
                       "<br>".join(moves.get(q, ()))))
-    return rows(("state", "", "left to satisfy", "goes on"), lines, "", 'class="told"')
+    return rows(("state", "verdict", "left to satisfy", "goes on"), lines, "", 'class="told"')
 
 
 def _run_table(part: Explorer, number: int) -> str:

@@ -196,5 +196,16 @@
     choose(key);
   }
 
+  // What scrolls can be reached by keys, for as long as it does.
+  function reach() {
+    for (const frame of document.querySelectorAll(".scroll:not(.board)")) {
+      if (frame.scrollWidth > frame.clientWidth) frame.tabIndex = 0;
+      else frame.removeAttribute("tabindex");
+    }
+  }
+  addEventListener("resize", reach);
+  for (const fold of document.querySelectorAll("details")) fold.addEventListener("toggle", reach);
+  reach();
+
   for (const data of all) explore(document.getElementById(data.name), data);
 })();
