@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import html
 import math
 from collections.abc import Iterator, Mapping
@@ -120,8 +121,9 @@ def table(result: Mapping[str, Any]) -> str:
             f"  minimum                 {spread(seeds['minimum'])}",
             f"  negative log-likelihood {spread(seeds['neg_log_likelihood'])}",
         ]
-    for kind, text in remarks(result):
-        lines.append("\n" + (click.style(f"warning: {text}", fg="red") if kind == "warning" else text))
+    red = functools.partial(click.style, fg="red")
+    lines += [f"\n{red(f'warning: {text}') if kind == 'warning' else text}"
+              for kind, text in remarks(result)]
     return "\n".join(lines)
 
 
@@ -143,12 +145,13 @@ def warnings(result: Mapping[str, Any]) -> list[str]:
         found.append(
             f"The policy does the task with probability {probability(learned['value'])} where "
             f"{probability(best['value'])} is possible. " + _remedy(result))
-    steps = result["expected_steps"]
-    if steps and steps["quickest"] and not (steps["learned"] or math.inf) < _LONG * steps["quickest"]:
+    steps = result["expected_steps"] or {"quickest": None}
+    if steps["quickest"] and (steps["learned"] or math.inf) > _LONG * steps["quickest"]:
+        much = f"{number(steps['learned'])}" if steps["learned"] else "more than can be told"
         found.append(
-            f"The policy takes {'more steps than can be told' if steps['learned'] is None else number(steps['learned']) + ' steps'} on average where "
-            f"{number(steps['quickest'])} would do: it was not shown that it should hurry. A larger "
-            "discount, a smaller l2 or more demonstrations help.")
+            f"The policy takes {much} steps on average where {number(steps['quickest'])} would "
+            "do: it was not shown that it should hurry. A larger discount, a smaller l2 or more "
+            "demonstrations help.")
     starts, total = result["impossible_starts"], result["satisfaction"]["num_starts"]
     if starts:
         listed = "; ".join(place(s) for s in starts[:5]) + ("; ..." if len(starts) > 5 else "")

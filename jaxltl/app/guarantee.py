@@ -1,0 +1,281 @@
+"""What a policy is to guarantee of its task, beside being likely, and how that is reached."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.app.files.task import World
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.models.monitor import Verdict, verdicts
+from jaxltl.core.models.product import Product, memory_along
+from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.types import Solution
+from jaxltl.core.values.optimal_actions import OptimalActions, optimal_actions
+from jaxltl.core.values.reachability import action_matrices
+from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
+
+WINDOW = 0.02  # how far above an asked probability the certified one may be
+_AIM = WINDOW / 4  # and is aimed to be
+_WEIGHTS = 10.0 ** np.arange(-3, 6)  # of the task's probability that are tried, in this order
+_HALVINGS = 30
+
+
+@dataclass(frozen=True)
+class Guarantee:
+    """What is asked, and what is known before anything is learned.
+
+    Attributes:
+      asked: ``"best"``, ``"none"`` or a probability.
+      over: of which initial states, if it is a probability: their ``"mean"`` or the ``"worst"``.
+      best: the best probability of the task.
+      actions: the actions that lose nothing of it; None where they are not asked for.
+      forbidden: ``bool[N, T]``, the demonstrated steps that are left out, as they lose something.
+      cost: of the first of them, the best probability before it and after it.
+      usable: whether each demonstration has a step that loses nothing.
+    """
+
+    asked: str | float
+    over: str
+    best: Solution
+    actions: OptimalActions | None
+    forbidden: np.ndarray
+    cost: tuple[float, float] | None
+    usable: bool = True
+
+    @property
+    def allowed(self) -> np.ndarray | None:
+        """``bool[S, Q, A]``, the actions to choose from; None: all."""
+        return np.asarray(self.actions.allowed) if self.asked == "best" and self.actions else None
+
+
+def ask(
+    model: Product, world: World, shown: Trajectories, asked: str | float, over: str = "mean"
+) -> Guarantee:
+    """What is to be guaranteed of a product's task.
+
+    Raises:
+      ValueError: the probability is more than any policy has, with what is possible and from
+        where; or a demonstration of which nothing is left.
+    """
+    best = optimal_satisfaction(model)
+    nothing = np.zeros(np.shape(shown.state), bool)
+    if asked == "none":
+        return Guarantee(asked, over, best, None, nothing, None)
+    if not isinstance(asked, str):
+        possible, where = at_starts(model, best.lower, over)
+        if possible < asked:
+            raise ValueError(
+                f"guarantee = {asked:g}: the best that can be achieved is {possible:.4g} "
+                + ("on average over the initial states" if over == "mean"
+                   else "from the worst initial state")
+                + f" (least from {world.place(where)}); ask for no more than that, or change the "
+                "task, the map or where runs start."
+            )
+    actions = optimal_actions(model, best)
+    lost, cost = _losing(model, best, np.asarray(actions.allowed), shown)
+    useless = np.flatnonzero(lost.any(1) & (lost.sum(1) == np.asarray(shown.length)))
+    if not isinstance(asked, str):
+        return Guarantee(asked, over, best, actions, nothing, None, not useless.size)
+    if useless.size:
+        n = useless[0]
+        raise ValueError(
+            f"demonstration {n + 1}: each of its {lost[n].sum()} steps lowers the best probability "
+            "of the task, so that nothing of it is left to learn from; leave it out, or write "
+            'guarantee = "none".'
+        )
+    return Guarantee(asked, over, best, actions, lost, cost)
+
+
+def _losing(
+    model: Product, best: Solution, allowed: np.ndarray, shown: Trajectories
+) -> tuple[np.ndarray, tuple[float, float] | None]:
+    """The steps that are not allowed, and the best probability before and after the first."""
+    state, action, inside = (np.asarray(x) for x in (shown.state, shown.action, shown.mask))
+    memory = memory_along(model, state)
+    lost = inside & ~allowed[state, memory, action]
+    if not lost.any():
+        return lost, None
+    first = tuple(np.argwhere(lost)[0])
+    s, q, a = state[first], memory[first], action[first]
+    value = np.asarray(best.value, float)
+    row = action_matrices(model)[a][[s * model.num_memory + q]]
+    return lost, (float(value[s, q]), float(np.asarray(row @ value.ravel()).item()))
+
+
+def at_starts(model: Product, value: Any, over: str) -> tuple[float, int]:
+    """The mean or the least of a product's value over its initial states, and where it is least."""
+    weight = np.asarray(model.mdp.initial, float)
+    starts = np.flatnonzero(weight > 0)
+    known = from_starts(model, value)[starts].astype(float)
+    found = known @ (weight[starts] / weight[starts].sum()) if over == "mean" else known.min()
+    return float(found), int(starts[known.argmin()])
+
+
+def from_starts(model: Product, value: Any) -> np.ndarray:
+    """A product's value at the memory in which a run starts: ``[S]`` from ``[S, Q]``."""
+    memory = np.asarray(model.initial_memory)
+    return np.asarray(value)[np.arange(len(memory)), memory]
+
+
+def check_formula(automaton: Automaton) -> str | None:
+    """What is to be said of a formula that is true of every run.
+
+    Raises:
+      ValueError: no run can satisfy it.
+    """
+    verdict = verdicts(automaton)[int(automaton.initial)]
+    if verdict == Verdict.VIOLATED:
+        raise ValueError(
+            "formula: nothing satisfies it, whichever cells a run visits; it contradicts itself "
+            "or asks for labels that no state of this world shows together."
+        )
+    if verdict == Verdict.SATISFIED:
+        return "The formula is true of every run in this world, so any policy does the task."
+    return None
+
+
+def kept(
+    guarantee: Guarantee, attempt: Attempt | None, model: Product, world: World,
+    shown: Trajectories, solution: Solution,
+) -> dict[str, Any]:
+    """What was asked and done, for ``result.json``."""
+    found: dict[str, Any] = {"asked": guarantee.asked, "over": guarantee.over}
+    if guarantee.asked == "best" and guarantee.actions is not None:
+        found["loss"] = guarantee.actions.loss
+    if attempt is not None:
+        found |= {"attained": attempt.attained, "weight": attempt.weight, "share": attempt.share}
+    if guarantee.forbidden.any():
+        n, t = np.argwhere(guarantee.forbidden)[0]
+        before, after = guarantee.cost or (None, None)
+        found["left_out"] = {
+            "steps": int(guarantee.forbidden.sum()), "of": int(np.sum(shown.length)),
+            "demonstration": int(n) + 1, "step": int(t) + 1, "from": before, "to": after,
+            **world.where(int(np.asarray(shown.state)[n, t])),
+        }
+    if guarantee.asked == "none":
+        missing = at_starts(model, np.subtract(guarantee.best.value, solution.value), "mean")[0]
+        if missing > 1e-3:  # what the remedy would give
+            sure = optimal_actions(model, guarantee.best).attained
+            found["remedy"] = at_starts(model, sure.lower, "mean")[0]
+    return found
+
+
+# --- a probability ---------------------------------------------------------------------------
+
+
+class Attempt(NamedTuple):
+    """A policy that was learned or mixed, ``float[S, Q, A]``.
+
+    Attributes:
+      policy: the policy.
+      neg_log_likelihood: of the demonstrations.
+      attained: its certified probability, of the mean or the worst start.
+      weight: mu, if it was learned with one.
+      share: of the actions that lose nothing, if they were mixed in.
+      learned: what it was made from.
+    """
+
+    policy: np.ndarray
+    neg_log_likelihood: float
+    attained: float
+    weight: float | None
+    share: float
+    learned: Any
+
+
+Train = Callable[[float, Any], Any]
+Mix = Callable[[Attempt, Attempt, float], Attempt]
+
+
+def at_least(
+    model: Product, guarantee: Guarantee, counts: np.ndarray, free: Any,
+    inside: Callable[[], tuple[np.ndarray, Any]],
+    train: Train, policy_of: Callable[[Any], np.ndarray],
+) -> Attempt:
+    """The most likely policy found whose certified probability is at least the one asked for.
+
+    The least weight mu of the task's probability (2.6) that reaches it is searched for, each
+    search beginning where the last one ended; where a little more weight makes the probability
+    jump, or none reaches it, policies of both sides are mixed, or the likeliest policy is with the
+    likeliest of those that lose nothing.
+
+    Args:
+      model: the product.
+      guarantee: what is asked.
+      counts: ``float[S, Q, A]``, how often each pair was demonstrated.
+      free: what is learned without any weight.
+      inside: a policy of the actions that lose nothing, and what it was learned as.
+      train: what is learned with a weight, from what was learned before.
+      policy_of: the policy ``float[S, Q, A]`` of what was learned.
+    """
+    asked = float(guarantee.asked)
+
+    def attempt(policy: np.ndarray, learned: Any, weight: float | None, share: float) -> Attempt:
+        found = satisfaction_probability(model, jnp.asarray(policy, model.dtype))
+        attained, _ = at_starts(model, found.lower, guarantee.over)
+        seen = counts > 0
+        with np.errstate(divide="ignore"):
+            loss = -np.sum(counts[seen] * np.log(policy[seen]))
+        return Attempt(policy, float(loss), attained, weight, share, learned)
+
+    def mixed(below: Attempt, above: Attempt, share: float) -> Attempt:
+        policy = (1 - share) * below.policy + share * above.policy
+        return attempt(policy, above.learned, above.weight, share)
+
+    first = attempt(policy_of(free), free, 0.0, 0.0)
+    if first.attained >= asked:
+        return first
+    below, above = first, None
+    for tried in _bracket(train, first, lambda x, mu: attempt(policy_of(x), x, mu, 0.0), asked):
+        below, above = (tried, above) if tried.attained < asked else (below, tried)
+    found = []
+    if above is not None:
+        found = [above] if above.attained <= asked + WINDOW else [
+            _between(below, above, asked, mixed)]
+    policy, learned = inside()
+    sure = attempt(policy, learned, None, 1.0)
+    found.append(_between(first, sure, asked, mixed))
+    if below is not first:
+        found.append(_between(below, sure, asked, mixed))
+    return min(found, key=lambda one: one.neg_log_likelihood)
+
+
+def _bracket(
+    train: Train, first: Attempt, judged: Callable[[Any, float], Attempt], asked: float
+) -> Iterator[Attempt]:
+    """Attempts with more and more weight until it is enough, then between the last two."""
+    low, last = 0.0, first
+    for high in map(float, _WEIGHTS):
+        last = judged(train(high, last.learned), high)
+        yield last
+        if last.attained >= asked:
+            break
+        low = high
+    else:
+        return
+    low = low or high * 1e-3
+    for _ in range(_HALVINGS):
+        if asked <= last.attained <= asked + _AIM or high / low < 1 + 1e-9:
+            return
+        middle = float(np.sqrt(low * high))
+        last = judged(train(middle, last.learned), middle)
+        yield last
+        low, high = (low, middle) if last.attained >= asked else (middle, high)
+
+
+def _between(below: Attempt, above: Attempt, asked: float, mixed: Mix) -> Attempt:
+    """The least share of the policy above by which the asked probability is reached."""
+    low, high, found = 0.0, 1.0, above
+    for _ in range(_HALVINGS):
+        if asked <= found.attained <= asked + _AIM:
+            break
+        middle = (low + high) / 2
+        tried = mixed(below, above, middle)
+        low, high, found = (low, middle, tried) if tried.attained >= asked else (
+            middle, high, found)
+    return found
