@@ -22,7 +22,7 @@ from jaxltl.app.explorer import (
     explorer,
     learned_runs,
 )
-from jaxltl.app.learn import automaton_picture, over_seeds, short_name
+from jaxltl.app.job import automaton_picture, over_seeds, short_name
 from jaxltl.core.models.batch import lift_memory
 from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.trajectories import Trajectories

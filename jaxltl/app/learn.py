@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import jaxltl
 from jaxltl.algos import learner, mlirl
-from jaxltl.algos.checkpoint import atomic_write
 from jaxltl.app.drawing import Picture, drawing
 from jaxltl.app.explorer import (
     START,
@@ -48,16 +44,28 @@ from jaxltl.app.guarantee import (
     from_starts,
     kept,
 )
-from jaxltl.core.automata.automaton import Automaton
+from jaxltl.app.job import (
+    Report,
+    about,
+    automaton_picture,
+    hyperparameters,
+    memory_arrays,
+    over_seeds,
+    plain,
+    run_seeds,
+    save_arrays,
+    settings,
+    short_name,
+    took,
+)
+from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.product import Product, lift_policy, product
 from jaxltl.core.models.restrict import restrict
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.hitting_time import hitting_time
-from jaxltl.core.values.satisfaction import satisfaction_probability
-
-Report = Callable[[int, Mapping[str, np.ndarray]], None]
+from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
 
 STEPS = 500  # at most, unless the task says otherwise
 _TOLERANCE = 1e-6  # of the gradient's norm
@@ -109,7 +117,7 @@ def _problem(setup: Setup, allowed: np.ndarray | None) -> tuple[tuple[str, ...],
     start = spec.get("start")
     if start is not None and len(start) != len(features.names):
         raise ValueError(
-            f"[learner] start has {len(start)} numbers; there are {len(features.names)} "
+            f"start has {len(start)} numbers; there are {len(features.names)} "
             f"features: {', '.join(features.names)}."
         )
     problem = mlirl.make_problem(
@@ -147,48 +155,13 @@ def _trained(
     )
 
 
-def settings(kind: Any, spec: Mapping[str, Any]) -> Any:
-    """A learner's Hparams of the keys of ``[learner]`` that it has; the method is another's."""
-    names = [field.name for field in dataclasses.fields(kind) if field.name != "method"]
-    return kind(**{name: spec[name] for name in names if name in spec})
-
-
-def run_seeds(
-    algorithm: Any, seeds: tuple[int, int], problem: Any, hparams: Any, report: Report | None,
-    **options: Any,
-) -> tuple[learner.Chunks, dict[str, np.ndarray]]:
-    """Runs of a learner from N seeds side by side, and their figures ``[T, N]`` by name.
-
-    Args:
-      algorithm: the learner's module.
-      seeds: the first, and how many.
-      options: for :func:`~jaxltl.algos.learner.run_in_chunks`.
-    """
-    states = _first_states(algorithm.init, *seeds, problem, hparams)
-    by_name = report and (lambda step, metrics: report(step, vars(metrics)))
-    found = learner.run_in_chunks(
-        algorithm.step, states, problem, hparams, lanes=True, report=by_name, **options
-    )
-    return found, {"step": found.step, **vars(found.metrics)}
-
-
-@functools.partial(jax.jit, static_argnames=("init", "num_seeds"))
-def _first_states(
-    init: Callable[..., Any], seed: int, num_seeds: int, problem: Any, hparams: Any
-) -> Any:
-    """A learner's N first states, each from a key of its own; one program."""
-    root = jax.random.fold_in(jax.random.key(seed), 1)
-    keys = jax.vmap(functools.partial(jax.random.fold_in, root))(jnp.arange(num_seeds))
-    return jax.vmap(init, (0, None, None))(keys, problem, hparams)
-
-
 def _with_guarantee(
     setup: Setup, seeds: tuple[int, int], report: Report | None, checkpoint: Path | None
 ) -> tuple[Learned, int, Attempt | None]:
     """What is learned under the guarantee, which seed is kept, and how a probability was reached.
     """
     guarantee = setup.guarantee
-    names, problem = _problem(setup, guarantee.allowed)
+    names, problem = setup.learning
     hparams = settings(mlirl.Hparams, setup.task.learner)
     if isinstance(guarantee.asked, str):
         learned = _trained(setup, names, problem, hparams, seeds, report, checkpoint)
@@ -259,6 +232,11 @@ class Setup:
     guarantee: Guarantee
     trivial: str | None = None  # what is to be said of a formula that is always true
 
+    @functools.cached_property
+    def learning(self) -> tuple[tuple[str, ...], mlirl.Problem]:
+        """The features' names, and what is learned from under the guarantee."""
+        return _problem(self, self.guarantee.allowed)
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -294,14 +272,18 @@ def prepare(task: Task, seed: int) -> Setup:
     with errors_in(f"{task.path}: [task] "):
         model = product(world.mdp, task.formula, label_on=task.label_on)
         trivial = check_formula(model.automaton)
+    best = optimal_satisfaction(model)
     if "file" in task.demonstrations:
         shown, dropped = load_demonstrations(task, world), 0
     else:
         key = jax.random.fold_in(jax.random.key(seed), 0)
-        shown, dropped = synthetic_demonstrations(task, model, key)
+        shown, dropped = synthetic_demonstrations(task, model, key, best)
     with errors_in(f"{task.path}: [task] "):
-        asked = ask(model, world, shown, task.guarantee, task.over)
-    return Setup(task, world, model, shown, dropped, asked, trivial)
+        asked = ask(model, world, shown, best, task.guarantee, task.over)
+    setup = Setup(task, world, model, shown, dropped, asked, trivial)
+    with errors_in(f"{task.path}: [learner] "):
+        _ = setup.learning  # so that its mistakes are found before the work
+    return setup
 
 
 def describe(setup: Setup) -> str:
@@ -311,13 +293,6 @@ def describe(setup: Setup) -> str:
         f"{setup.world.mdp.num_states} states, {setup.model.num_memory} memory states, "
         f"{len(lengths)} demonstrations of {int(lengths.sum())} pairs"
     )
-
-
-def fingerprint(task: Any, seed: int, num_seeds: int) -> str:
-    """What a checkpoint must agree on to be gone on from."""
-    parts = [task.digest, seed, num_seeds, jaxltl.__version__, jax.__version__,
-             str(jnp.result_type(float))]
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
 
 
 def learn(
@@ -417,22 +392,6 @@ def _expected_steps(outcome: Outcome) -> dict[str, Any] | None:
         }
 
 
-def about(task: Task) -> dict[str, Any]:
-    """What a result begins with."""
-    return {"task": task.name, "formula": task.formula, "method": task.learner["method"]}
-
-
-def hyperparameters(task: Task) -> dict[str, Any]:
-    """What a task file says of the learner."""
-    return {k: v for k, v in task.learner.items() if k != "method"}
-
-
-def took(seconds: float) -> dict[str, Any]:
-    """What a result ends with."""
-    versions = {"jaxltl": jaxltl.__version__, "jax": jax.__version__}
-    return {"seconds": round(seconds, 2), "versions": versions}
-
-
 def _evidence(
     solution: Solution, model: Product, world: World, starts: np.ndarray
 ) -> dict[str, Any]:
@@ -452,17 +411,6 @@ def _evidence(
         "status": Status(int(solution.status)).name,
         "residual": solution.residual,
     }
-
-
-def plain(value: Any) -> Any:
-    """Arrays and NumPy numbers as lists and numbers that JSON has; NaN and infinity as None."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, np.ndarray | np.generic | jax.Array):
-        return plain(np.asarray(value).tolist())
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def save(out: Path, outcome: Outcome) -> None:
@@ -489,40 +437,12 @@ def save(out: Path, outcome: Outcome) -> None:
     })
 
 
-def memory_arrays(model: Product, size: int | None = None) -> dict[str, Any]:
-    """How the memory of a policy goes on, in the first states of a product."""
-    return {
-        "initial_memory": model.initial_memory[:size],
-        "next_memory": model.next_memory[:size],
-        "label_on": model.label_on,
-    }
-
-
-def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Writes arrays as an ``.npz``, atomically.
-
-    Raises:
-      ValueError: the place cannot be written to.
-    """
-    with atomic_write(path) as file:
-        np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
-
-
 LIVE = "policy"  # the name of the page's live part
 
 
 def task_pictures(setup: Setup) -> list[Picture]:
     """The report's pictures that nothing has to be learned for."""
     return [automaton_picture(setup.model.automaton, LIVE)]
-
-
-def automaton_picture(automaton: Automaton, live: str) -> Picture:
-    """The task's automaton."""
-    return Picture(
-        "automaton.svg", "The task as an automaton", drawing("automaton", automaton),
-        "States with a double circle: the task is done, whatever follows. Grey: it has failed. "
-        "Each state is named by the formula that is left to satisfy.", live,
-    )
 
 
 _FIGURES = ("loss", "neg_log_likelihood", "satisfaction", "gradient_norm")
@@ -538,12 +458,6 @@ def pictures(outcome: Outcome) -> list[Picture]:
         "Figures of the weights before each step" + over_seeds(len(outcome.learned.loss)),
         "learning",
     )]
-
-
-def over_seeds(count: int) -> str:
-    """How the caption of learning curves ends."""
-    band = "; the line is the median over seeds, the band holds all of them"
-    return f"{band if count > 1 else ''}."
 
 
 def live(outcome: Outcome) -> list[Explorer | TooLarge | Curves]:
@@ -607,11 +521,6 @@ def _maps(outcome: Outcome, cells: np.ndarray) -> list[Picture]:
             "there. Cells that cannot be met with that memory are blank.", LIVE,
         ))
     return maps
-
-
-def short_name(text: str, width: int = 44) -> str:
-    """The text, or its beginning where it is longer than that."""
-    return text if len(text) <= width else text[: width - 1] + "…"
 
 
 def _reached(model: Product) -> np.ndarray:

@@ -42,7 +42,7 @@ from jaxltl.app.files.task_todirl import (
     load_scenes,
 )
 from jaxltl.app.files.task_todirl import read_task as read_task
-from jaxltl.app.learn import (
+from jaxltl.app.job import (
     Report,
     about,
     hyperparameters,
@@ -53,7 +53,7 @@ from jaxltl.app.learn import (
     settings,
     took,
 )
-from jaxltl.app.learn import fingerprint as fingerprint
+from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.models.batch import lift_memory, stack_products

@@ -16,7 +16,7 @@ import optax
 from jaxltl.algos import cce
 from jaxltl.algos import exponential_family as families
 from jaxltl.algos import trust_region as tr
-from jaxltl.app.learn import plain
+from jaxltl.app.job import plain
 from jaxltl.envs import lqr
 from jaxltl.envs import navigation as nav
 from jaxltl.envs.navigation_steps import Steps, stepwise

@@ -14,7 +14,8 @@ import numpy as np
 
 from jaxltl.algos import learner
 from jaxltl.algos import mlirl as irl
-from jaxltl.app.learn import from_starts, plain
+from jaxltl.app.guarantee import from_starts
+from jaxltl.app.job import plain
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, lift_policy, product
 from jaxltl.core.models.restrict import restrict

@@ -14,7 +14,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jaxltl.algos import learner, pac, rmax
-from jaxltl.app.learn import plain
+from jaxltl.app.job import plain
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.winning import almost_sure_buchi
 from jaxltl.core.models.operators import expectation

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.algos import maximin_q
-from jaxltl.app.learn import plain
+from jaxltl.app.job import plain
 from jaxltl.core.games.objective import buchi, gr1, safety
 from jaxltl.core.games.permissive import apply_strategy, permissive_strategy
 from jaxltl.core.games.winning import solve, task_game

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxltl.algos import behavioral_cloning as cloning
 from jaxltl.algos import todirl
-from jaxltl.app.learn import plain
+from jaxltl.app.job import plain
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.automata.translate import to_automaton

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.app.files.game import World, task_text
-from jaxltl.app.learn import plain, save_arrays, took
+from jaxltl.app.job import plain, save_arrays, took
 from jaxltl.app.synthesize import Play, Synthesis
 from jaxltl.core.games.objective import GR1
 from jaxltl.core.models.game import Game, is_deterministic

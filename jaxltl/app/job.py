@@ -1,0 +1,133 @@
+"""What all jobs of learning share: seeds side by side, results, files and pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxltl
+from jaxltl.algos import learner
+from jaxltl.algos.checkpoint import atomic_write
+from jaxltl.app.drawing import Picture, drawing
+from jaxltl.app.files.task import Task
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.models.product import Product
+
+Report = Callable[[int, Mapping[str, np.ndarray]], None]
+
+
+def settings(kind: Any, spec: Mapping[str, Any]) -> Any:
+    """A learner's Hparams of the keys of ``[learner]`` that it has; the method is another's."""
+    names = [field.name for field in dataclasses.fields(kind) if field.name != "method"]
+    return kind(**{name: spec[name] for name in names if name in spec})
+
+
+def run_seeds(
+    algorithm: Any, seeds: tuple[int, int], problem: Any, hparams: Any, report: Report | None,
+    **options: Any,
+) -> tuple[learner.Chunks, dict[str, np.ndarray]]:
+    """Runs of a learner from N seeds side by side, and their figures ``[T, N]`` by name.
+
+    Args:
+      algorithm: the learner's module.
+      seeds: the first, and how many.
+      options: for :func:`~jaxltl.algos.learner.run_in_chunks`.
+    """
+    states = _first_states(algorithm.init, *seeds, problem, hparams)
+    by_name = report and (lambda step, metrics: report(step, vars(metrics)))
+    found = learner.run_in_chunks(
+        algorithm.step, states, problem, hparams, lanes=True, report=by_name, **options
+    )
+    return found, {"step": found.step, **vars(found.metrics)}
+
+
+@functools.partial(jax.jit, static_argnames=("init", "num_seeds"))
+def _first_states(
+    init: Callable[..., Any], seed: int, num_seeds: int, problem: Any, hparams: Any
+) -> Any:
+    """A learner's N first states, each from a key of its own; one program."""
+    root = jax.random.fold_in(jax.random.key(seed), 1)
+    keys = jax.vmap(functools.partial(jax.random.fold_in, root))(jnp.arange(num_seeds))
+    return jax.vmap(init, (0, None, None))(keys, problem, hparams)
+
+
+def fingerprint(task: Any, seed: int, num_seeds: int) -> str:
+    """What a checkpoint must agree on to be gone on from."""
+    parts = [task.digest, seed, num_seeds, jaxltl.__version__, jax.__version__,
+             str(jnp.result_type(float))]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
+
+
+def about(task: Task) -> dict[str, Any]:
+    """What a result begins with."""
+    return {"task": task.name, "formula": task.formula, "method": task.learner["method"]}
+
+
+def hyperparameters(task: Task) -> dict[str, Any]:
+    """What a task file says of the learner."""
+    return {k: v for k, v in task.learner.items() if k != "method"}
+
+
+def took(seconds: float) -> dict[str, Any]:
+    """What a result ends with."""
+    versions = {"jaxltl": jaxltl.__version__, "jax": jax.__version__}
+    return {"seconds": round(seconds, 2), "versions": versions}
+
+
+def plain(value: Any) -> Any:
+    """Arrays and NumPy numbers as lists and numbers that JSON has; NaN and infinity as None."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return plain(np.asarray(value).tolist())
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def memory_arrays(model: Product, size: int | None = None) -> dict[str, Any]:
+    """How the memory of a policy goes on, in the first states of a product."""
+    return {
+        "initial_memory": model.initial_memory[:size],
+        "next_memory": model.next_memory[:size],
+        "label_on": model.label_on,
+    }
+
+
+def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Writes arrays as an ``.npz``, atomically.
+
+    Raises:
+      ValueError: the place cannot be written to.
+    """
+    with atomic_write(path) as file:
+        np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
+
+
+def automaton_picture(automaton: Automaton, live: str) -> Picture:
+    """The task's automaton."""
+    return Picture(
+        "automaton.svg", "The task as an automaton", drawing("automaton", automaton),
+        "States with a double circle: the task is done, whatever follows. Grey: it has failed. "
+        "Each state is named by the formula that is left to satisfy.", live,
+    )
+
+
+def over_seeds(count: int) -> str:
+    """How the caption of learning curves ends."""
+    band = "; the line is the median over seeds, the band holds all of them"
+    return f"{band if count > 1 else ''}."
+
+
+def short_name(text: str, width: int = 44) -> str:
+    """The text, or its beginning where it is longer than that."""
+    return text if len(text) <= width else text[: width - 1] + "…"
