@@ -150,10 +150,17 @@ def _decided(model: Any, target: Any, *, objective: str) -> tuple[Sets, EndCompo
 
 
 def complement(reach: Solution) -> Solution:
-    """Of the opposite event, whose probability is one minus this one."""
-    xp, value, lower, upper = namespace(reach.value, reach.lower, reach.upper)
+    """Of the opposite event, whose probability is one minus this one; bounds rounded outwards."""
+    bounds = lax.stop_gradient((reach.upper, reach.lower))
+    xp, value, (far, near) = namespace(reach.value, bounds)
     one = xp.ones((), value.dtype)
-    found = to_jax((one - value, one - upper, one - lower))
+
+    def outwards(bound: Any, end: int) -> Any:
+        rounded = one - bound
+        beyond = xp.clip(xp.nextafter(rounded, end * one), 0, 1)
+        return xp.where((bound == 0) | (bound == 1), rounded, beyond)
+
+    found = to_jax((one - value, outwards(far, -1), outwards(near, 2)))
     return replace(reach, value=found[0], lower=found[1], upper=found[2])
 
 

@@ -152,3 +152,22 @@ def test_among_equal_odds_the_short_way_and_never_worse_odds(task, objective):
     assert int(best.policy[start]) == 3
     allowed = jl.optimal_actions(model, objective=objective).allowed[start]
     assert allowed.tolist() == [True, False, True, True]
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_a_rare_danger_is_never_called_impossible(wide):
+    """One minus a small probability is rounded, and its bounds outwards."""
+    with jax.enable_x64(wide):
+        rare = 1e-17 if wide else 1e-9
+        world = jl.make_mdp(
+            [[[0, 1, 2]], [[1] * 3], [[2] * 3]],
+            np.array([[[0.5, 0.5, rare]], [[1, 0, 0]], [[1, 0, 0]]]),
+            initial=[1, 0, 0], label=[[0], [0], [1]], propositions=["danger"],
+        )
+        model = jl.product(world, "G !danger")
+        start = 0, int(model.initial_memory[0])
+        for found in (jl.optimal_satisfaction(model), jl.satisfaction_probability(
+                model, np.ones((*model.state_shape, 1)))):
+            assert int(found.status) == jl.Status.CONVERGED
+            assert 1 - 1e-6 < float(np.asarray(found.lower)[start]) < 1
+            assert float(np.asarray(found.upper)[start]) == 1
