@@ -117,10 +117,13 @@ def main() -> None:
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0, 2**31 - 1))
 @click.option("--seeds", default=1, show_default=True, type=click.IntRange(1),
               help="Learn with this many seeds side by side and keep the best.")
+@click.option("--again", is_flag=True, help="Do it again where it is done already.")
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
 @_compiling(soon=True)
 @_plain_errors
-def learn(task_file: Path, out: Path | None, seed: int, seeds: int, as_json: bool) -> None:
+def learn(
+    task_file: Path, out: Path | None, seed: int, seeds: int, again: bool, as_json: bool
+) -> None:
     """Learn a policy for a task, and say how well it does it.
 
     Writes policy.npz, result.json, report.html and pictures; by method = "todirl", the learned
@@ -133,9 +136,13 @@ def learn(task_file: Path, out: Path | None, seed: int, seeds: int, as_json: boo
     task = job.read_task(task_file)
     out = _directory(out, task.name)
     with _float64():
-        result = _learn(job, task, out, seed, seeds, alone)
+        mark = job.fingerprint(task, seed, seeds)
+        result = None if again else _finished(out, mark)
+        done = result is not None
+        result = result or _learn(job, task, out, seed, seeds, mark, alone)
     click.echo(_report(result).table(result))
-    click.echo(f"\nwrote {out}/report.html and the files beside it")
+    click.echo(f"\n{'done before: see' if done else 'wrote'} {out}/report.html and the files "
+               f"beside it{'; --again does it again' if done else ''}")
     if as_json:
         _print_json(result)
 
@@ -153,14 +160,26 @@ def _job(task_file: Path) -> Any:
     return learn
 
 
-def _learn(job: Any, task: Any, out: Path, seed: int, seeds: int, alone: bool) -> dict[str, Any]:
+def _finished(out: Path, mark: str) -> dict[str, Any] | None:
+    """The result of the same task and options, if a directory has it."""
+    try:
+        result = json.loads((out / "result.json").read_text())
+    except (OSError, ValueError):
+        return None
+    same = isinstance(result, dict) and result.get("fingerprint") == mark
+    return result if same and (out / "report.html").exists() else None
+
+
+def _learn(
+    job: Any, task: Any, out: Path, seed: int, seeds: int, mark: str, alone: bool
+) -> dict[str, Any]:
     """Does the whole job, shows how far it is, and returns what result.json holds."""
     from jaxltl.algos.checkpoint import atomic_write
 
     start = time.perf_counter()
     setup = job.prepare(task, seed)
     _say(job.describe(setup))
-    checkpoint = out / f"checkpoint-{job.fingerprint(task, seed, seeds)}.npz"
+    checkpoint = out / f"checkpoint-{mark}.npz"
     # A place that cannot be written to must be known before the work, not after.
     with atomic_write(out / "task.toml") as file:
         file.write(task.path.read_bytes())
@@ -189,7 +208,7 @@ def _learn(job: Any, task: Any, out: Path, seed: int, seeds: int, alone: bool) -
         bar.set_description_str("drawing")
         pictures += [(p, begin(p.drawing)) for p in job.pictures(outcome)]
         live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]
-        return _write(job, outcome, out, pictures, live)
+        return _write(job, outcome, out, mark, pictures, live)
 
 
 @contextlib.contextmanager
@@ -214,12 +233,13 @@ def _learning(total: int) -> Iterator[Any]:
 
 
 def _write(
-    job: Any, outcome: Any, out: Path, pictures: list[tuple[Picture, Callable[[], bytes]]],
+    job: Any, outcome: Any, out: Path, mark: str,
+    pictures: list[tuple[Picture, Callable[[], bytes]]],
     live: list[tuple[Any, dict[str, Callable[[], bytes]]]],
 ) -> dict[str, Any]:
     from jaxltl.algos.checkpoint import atomic_write
 
-    result = job.summary(outcome)
+    result = {**job.summary(outcome), "fingerprint": mark}
     job.save(out, outcome)
     shown = []
     for picture, drawn in pictures:
@@ -249,8 +269,18 @@ def _report(result: Mapping[str, Any]) -> Any:
 @_compiling(soon=True)
 @_plain_errors
 def check(task_file: Path) -> None:
-    """Check a task file and all that it names, without learning."""
+    """Check a task or game file and all that it names, without learning."""
     _begin(f"checking {task_file}")
+    from jaxltl.app.files.tables import read_toml
+
+    if "game" in read_toml(task_file, "the file")[0]:
+        from jaxltl.app.files import game
+
+        file = game.read_game(task_file)
+        world = game.load_game(file)
+        play, _ = game.load_objective(file, world)
+        click.echo(f"ok: {world.game.num_states} states, {play.num_states} with the task's memory")
+        return
     job = _job(task_file)
     with _float64():
         setup = job.prepare(job.read_task(task_file), seed=0)

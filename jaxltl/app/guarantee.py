@@ -17,7 +17,7 @@ from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution
 from jaxltl.core.values.optimal_actions import OptimalActions, optimal_actions
 from jaxltl.core.values.reachability import action_matrices
-from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
+from jaxltl.core.values.satisfaction import satisfaction_probability
 
 WINDOW = 0.02  # how far above an asked probability the certified one may be
 _AIM = WINDOW / 4  # and is aimed to be
@@ -54,7 +54,8 @@ class Guarantee:
 
 
 def ask(
-    model: Product, world: World, shown: Trajectories, asked: str | float, over: str = "mean"
+    model: Product, world: World, shown: Trajectories, best: Solution, asked: str | float,
+    over: str = "mean",
 ) -> Guarantee:
     """What is to be guaranteed of a product's task.
 
@@ -62,7 +63,6 @@ def ask(
       ValueError: the probability is more than any policy has, with what is possible and from
         where; or a demonstration of which nothing is left.
     """
-    best = optimal_satisfaction(model)
     nothing = np.zeros(np.shape(shown.state), bool)
     if asked == "none":
         return Guarantee(asked, over, best, None, nothing, None)

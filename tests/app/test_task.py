@@ -14,6 +14,7 @@ from jaxltl.app.files.task import (
     synthetic_demonstrations,
 )
 from jaxltl.core.models.product import product
+from jaxltl.core.values.satisfaction import optimal_satisfaction
 
 TASK = """
 [world]
@@ -107,7 +108,9 @@ def test_the_digest_covers_named_files(write):
     (('formula = "!r U y"', ""), r"\[task\] lacks formula"),
     (("[task]", "[tsk]"), r"has no key 'tsk'; did you mean 'task'\?"),
     (('file = "shown.json"', ""), r"either file"),
-    (('file = "shown.json"', "synthetic = 3"), r"lacks discount"),
+    (("[task]", '[task]\nguarantee = "all"'), r'"best", "none" or a probability in \(0, 1\]'),
+    (("[task]", '[task]\nguarantee = 0'), r"a probability in \(0, 1\]"),
+    (("[task]", '[task]\nover = "worst"'), r"over belongs to a guarantee that is a probability"),
     (('file = "shown.json"', 'file = "shown.json"\nlength = 3'), r"length belongs to synthetic"),
     (('file = "shown.json"', 'file = "gone.json"'), r"gone\.json': No such file"),
     (("map = '''\n. . r\nb . y\n'''", ""), r"\[world\] must have either a map or a model"),
@@ -226,12 +229,14 @@ def test_an_unknown_proposition_in_a_models_initial(write):
         load_world(task)
 
 
-def test_synthetic_demonstrations_do_the_task(write):
-    synthetic = ('file = "shown.json"', "synthetic = 5\ndiscount = 0.9\nlength = 9")
+@pytest.mark.parametrize("discount", ["discount = 0.9", ""])
+def test_synthetic_demonstrations_do_the_task(write, discount):
+    synthetic = ('file = "shown.json"', f"synthetic = 5\n{discount}\nlength = 9")
     task = read_task(write(synthetic))
     world = load_world(task)
     model = product(world.mdp, task.formula)
-    shown, dropped = synthetic_demonstrations(task, model, jax.random.key(0))
+    shown, dropped = synthetic_demonstrations(
+        task, model, jax.random.key(0), optimal_satisfaction(model))
     lengths = np.asarray(shown.length)
     assert len(lengths) + dropped == 5 and dropped == 0
     for states, actions, n in zip(shown.state, shown.action, lengths, strict=True):
@@ -244,7 +249,28 @@ def test_synthetic_demonstrations_need_a_task_that_can_be_done(write):
     task = read_task(write(synthetic, ('initial = "!r & !y"', 'initial = "b"')))
     model = product(load_world(task).mdp, task.formula)
     with pytest.raises(ValueError, match=r"none of 5 synthetic runs did the task within 1 steps"):
-        synthetic_demonstrations(task, model, jax.random.key(0))
+        synthetic_demonstrations(task, model, jax.random.key(0), optimal_satisfaction(model))
     safety = product(load_world(task).mdp, "G !r")
     with pytest.raises(ValueError, match=re.escape("takes a co-safe formula")):
-        synthetic_demonstrations(task, safety, jax.random.key(0))
+        synthetic_demonstrations(task, safety, jax.random.key(0), optimal_satisfaction(safety))
+
+
+@pytest.mark.parametrize(
+    "runs", ["synthetic = 100000000000", "synthetic = 2\nlength = 1000000000000"])
+def test_more_runs_than_memory_holds_are_refused(write, runs):
+    task = read_task(write(('file = "shown.json"', runs)))
+    model = product(load_world(task).mdp, task.formula)
+    with pytest.raises(ValueError, match=r"would take about .* GB; ask for fewer or shorter ones"):
+        synthetic_demonstrations(task, model, jax.random.key(0), optimal_satisfaction(model))
+
+
+def test_synthetic_runs_of_a_task_without_end(write):
+    """They have the asked length, and what they have to visit they visit again and again."""
+    task = read_task(write(('file = "shown.json"', "synthetic = 4\nlength = 12"),
+                           ('absorbing = ["y"]', "absorbing = []")))
+    model = product(load_world(task).mdp, "G F b & G F y & G !r")
+    shown, dropped = synthetic_demonstrations(
+        task, model, jax.random.key(0), optimal_satisfaction(model))
+    assert dropped + len(shown.length) == 4 and (np.asarray(shown.length) == 12).all()
+    for states in np.asarray(shown.state):
+        assert 2 not in states and {3, 5} <= set(states.tolist())

@@ -164,12 +164,9 @@ def check_source(path: Path, table: str, data: Mapping[str, Any], of_map: Iterab
 def check_demonstrations(
     path: Path, shown: Mapping[str, Any], file: str, wanted: str, of_synthetic: Iterable[str]
 ) -> None:
-    """Raises a ValueError unless there are files or runs to be made, with a discount."""
+    """Raises a ValueError unless there are files or runs to be made."""
     table = "demonstrations"
     require_one(path, table, shown, (file, "synthetic"), f"{wanted} or synthetic = N")
-    reject(path, table, [("synthetic" in shown and "discount" not in shown,
-                          "lacks discount, that of the reward which the synthetic demonstrator "
-                          "maximises; for example 0.95")])
     if file in shown:
         refuse(path, table, shown, of_synthetic, "synthetic = N")
 

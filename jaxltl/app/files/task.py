@@ -22,8 +22,9 @@ from jaxltl.app.files import tables
 from jaxltl.app.files.tables import COUNT, NAMES, TEXT, Rule, choice, is_list, number_in
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.mdp import MDP, from_dense, make_mdp
-from jaxltl.core.models.product import Product
+from jaxltl.core.models.product import Product, project_trajectories
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
+from jaxltl.core.types import Solution
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
 
@@ -435,51 +436,57 @@ def _read_action(value: Any, world: World) -> int:
     )
 
 
-def synthetic_demonstrations(
-    task: Task, model: Product, key: jax.Array
-) -> tuple[Trajectories, int]:
-    """Runs of a policy that maximises the discounted reward of doing the task, in the world.
+_STEP_BYTES = 128  # of a demonstrated step, while runs are made and checked
+_MOST_BYTES = 4e9
 
-    Each run ends where the task is done. A run that has not done it within the asked length,
-    and one that starts where it is done, show nothing and are dropped.
+
+def synthetic_demonstrations(
+    task: Task, model: Product, key: jax.Array, best: Solution
+) -> tuple[Trajectories, int]:
+    """Runs of the quickest of the best policies, in the world.
+
+    With a discount in ``[demonstrations]``, those of a policy that maximises the discounted reward
+    of doing a co-safe task. A run of a co-safe task ends where it is done; one that has not done
+    it within the asked length, or starts where it is done, shows nothing and is dropped. Runs of
+    other tasks have the asked length, and are dropped where the task is lost.
 
     Args:
-      task: its ``[demonstrations]`` gives the number, discount and length (default 200).
-      model: the product of the world and a co-safe task.
+      task: its ``[demonstrations]`` gives the number, length (default 200) and discount.
+      model: the product of the world and the task.
       key: a PRNG key, consumed.
+      best: of :func:`~jaxltl.core.values.satisfaction.optimal_satisfaction`.
 
     Returns:
       :class:`~jaxltl.core.models.trajectories.Trajectories` of the world, and how many were
       dropped.
 
     Raises:
-      ValueError: the task is not co-safe, or no run did it.
+      ValueError: a discount for a task that is not co-safe, more runs than memory holds, or no run
+        did it.
     """
-    # Deferred: a task with a file of demonstrations has no need of these solvers.
-    from jaxltl.core.models.operators import expectation
+    # Deferred: a task with a file of demonstrations has no need of it.
     from jaxltl.core.models.trajectories import rollout
-    from jaxltl.core.values.discounted import optimal_value
 
-    if model.automaton.acceptance != "cosafe":
-        raise ValueError(
-            "synthetic demonstrations end when the task is done, which takes a co-safe formula."
-        )
     spec = task.demonstrations
     asked, length = spec["synthetic"], spec.get("length", 200)
-    final = model.final
-    arriving = expectation(model, final.astype(model.dtype))
-    reward = jax.numpy.where(final[..., None], 0, arriving)
-    best = optimal_value(model, reward, spec["discount"])
+    if (size := asked * (length + 1) * _STEP_BYTES) > _MOST_BYTES:
+        raise ValueError(
+            f"{task.path}: [demonstrations] synthetic = {asked} runs of up to {length} steps would "
+            f"take about {size / 1e9:.3g} GB; ask for fewer or shorter ones, at most "
+            f"{_MOST_BYTES / 1e9:g} GB."
+        )
+    ends = model.automaton.acceptance == "cosafe"
+    stop = model.final if ends else jax.numpy.asarray(np.asarray(best.upper) <= 0)
     # One step more than asked tells a run that has just arrived from one that has not.
     runs = rollout(
-        model, best.policy, key, num_trajectories=asked, num_steps=length + 1, stop=final
-    )
-    states, actions = np.asarray(runs.state), np.asarray(runs.action)
-    lengths = np.asarray(runs.length)
+        model, _demonstrator(task, model, best), key, num_trajectories=asked,
+        num_steps=length + 1, stop=stop)
+    runs = project_trajectories(model, runs)
+    states, actions, lengths = (np.asarray(x) for x in (runs.state, runs.action, runs.length))
     kept = [
-        [(int(s) // model.num_memory, int(a)) for s, a in zip(x[:n], u[:n], strict=True)]
+        list(zip(x[: min(n, length)].tolist(), u[: min(n, length)].tolist(), strict=True))
         for x, u, n in zip(states, actions, lengths, strict=True)
-        if 0 < n <= length
+        if (0 < n <= length if ends else n > length)
     ]
     if not kept:
         raise ValueError(
@@ -487,3 +494,19 @@ def synthetic_demonstrations(
             f"{length} steps; raise length or discount, or check that the task can be done."
         )
     return make_trajectories(model.mdp, kept), asked - len(kept)
+
+
+def _demonstrator(task: Task, model: Product, best: Solution) -> jax.Array:
+    discount = task.demonstrations.get("discount")
+    if discount is None:
+        return best.policy
+    if model.automaton.acceptance != "cosafe":
+        raise ValueError(
+            f"{task.path}: [demonstrations] discount is that of the reward of doing a task that "
+            "ends, which takes a co-safe formula; leave it out for runs of the quickest policy.")
+    from jaxltl.core.models.operators import expectation
+    from jaxltl.core.values.discounted import optimal_value
+
+    arriving = expectation(model, model.final.astype(model.dtype))
+    reward = jax.numpy.where(model.final[..., None], 0, arriving)
+    return optimal_value(model, reward, discount).policy

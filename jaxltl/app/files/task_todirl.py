@@ -135,6 +135,11 @@ def read_task(path: str | Path) -> Task:
         tables.refuse(path, "world", world, of_text, "maps with a legend")
     of_synthetic = ("discount", "length", *_REWARDS)
     tables.check_demonstrations(path, shown, "files", "files = [...]", of_synthetic)
+    tables.reject(path, "demonstrations", [
+        ("synthetic" in shown and "discount" not in shown,
+         "lacks discount, that of the reward which the synthetic demonstrator maximises; for "
+         "example 0.95"),
+    ])
     files, number = shown.get("files", world["maps"]), len(world["maps"])
     tables.reject(path, "demonstrations", [
         (len(files) != number, f"names {len(files)} files for {number} worlds; give one for each "
