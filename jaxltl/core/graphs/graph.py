@@ -136,11 +136,16 @@ def _sweeps(graph: TracedGraph, goal, allowed, rule, among, *, chance):
 
 def graph_of(model: Any, *arguments: Any) -> Graph:
     """The graph of a model: the host's, unless the model or an argument is traced."""
-    lazy = model.mdp if isinstance(model, Game) else model
-    world = lazy.mdp if isinstance(lazy, Product) else lazy
-    if is_traced((model, arguments)) or not isinstance(world, MDP | DenseMDP):
+    if is_traced((model, arguments)) or not is_table(model):
         return TracedGraph(lax.stop_gradient(model))  # supports have no derivative
     return host_graph(model)
+
+
+def is_table(model: Any) -> bool:
+    """Whether a model's transitions are written out, in none but the library's representations."""
+    lazy = model.mdp if isinstance(model, Game) else model
+    world = lazy.mdp if isinstance(lazy, Product) else lazy
+    return isinstance(world, MDP | DenseMDP)
 
 
 def host_graph(model: Any) -> HostGraph:

@@ -19,7 +19,7 @@ from jax import lax
 
 from jaxltl.core.graphs.attractor import attract, avoid, surely
 from jaxltl.core.graphs.end_components import EndComponents, components_within
-from jaxltl.core.graphs.graph import Graph, TracedGraph, graph_of, take
+from jaxltl.core.graphs.graph import Graph, TracedGraph, graph_of, is_table, take
 from jaxltl.core.host import reach as host
 from jaxltl.core.host.quickest import quickest
 from jaxltl.core.models.concrete import is_traced, namespace, to_jax
@@ -111,7 +111,8 @@ def reachability_probability(
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
     require_shape("target", target, model.state_shape)
     traced = is_traced((model, target, policy, tolerance, max_steps))
-    small = not traced and math.prod(model.state_shape) <= _HOST_LIMIT
+    readable = not traced and is_table(model)
+    small = readable and math.prod(model.state_shape) <= _HOST_LIMIT
     if policy is not None:
         require_policy(model, policy)
         found = None
@@ -133,6 +134,8 @@ def reachability_probability(
     if found is None:
         arguments = to_jax((sets, components))
         found = _optimize(model, *arguments, tolerance, max_steps, objective=objective)
+    if not readable:
+        return found
     decided = sets.zero | (np.asarray(target) if objective == "max" else sets.one)
     action = np.asarray(found.policy)
     good = _attaining(graph, sets, components, action, ties, objective)

@@ -8,6 +8,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.core.host import reach as host
 from jaxltl.core.models.mdp import make_mdp
+from jaxltl.core.models.operators import induced_chain
 from jaxltl.core.types import Status
 from jaxltl.core.values.reachability import reachability_probability
 from tests.core.graphs.test_engines import counted_programs
@@ -116,3 +117,25 @@ def test_probabilities_of_small_tasks_compile_nothing(task):
     assert (np.asarray(found.lower) <= best.upper).all()
     attained = jl.satisfaction_probability(model, best.policy)
     np.testing.assert_allclose(attained.value, best.value, atol=1e-9)
+
+
+def test_a_model_of_ones_own_is_solved_by_its_primitives():
+    """What is no table of rows is left to the compiled engine, however small and concrete."""
+    class Walk:
+        """From 1 to 3 evenly to both sides; 0 and 4 are ends."""
+
+        state_shape, num_states, num_actions, num_successors = (5,), 5, 1, 2
+        dtype, available = jnp.result_type(float), jnp.ones((5, 1), bool)
+
+    def sides(x):
+        return jnp.append(x[:1], x[:-1]).at[4].set(x[4]), jnp.append(x[1:], x[-1]).at[0].set(x[0])
+
+    jl.expectation.register(Walk, lambda _, x: (sum(sides(x)) / 2)[:, None])
+    jl.exists_successor.register(Walk, lambda _, x: jnp.logical_or(*sides(x))[:, None])
+    jl.forall_successor.register(Walk, lambda _, x: jnp.logical_and(*sides(x))[:, None])
+    probability = np.full((5, 1, 2), 0.5)
+    successor = np.array([[0, 0], [0, 2], [1, 3], [2, 4], [4, 4]])[:, None]
+    induced_chain.register(Walk, lambda *_: make_mdp(successor, probability))
+    jax.tree_util.register_pytree_node(Walk, lambda _: ((), None), lambda *_: Walk())
+    found = reachability_probability(Walk(), np.arange(5) == 4, tolerance=1e-9)
+    np.testing.assert_allclose(found.value, [0, 0.25, 0.5, 0.75, 1], atol=1e-9)
