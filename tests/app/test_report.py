@@ -196,10 +196,10 @@ def test_tables_say_what_the_pictures_show():
 
 
 def test_a_model_without_a_map_and_a_marked_step():
-    part = made(place=None)
+    part = made(place=None, marked=[(9, 1, RIGHT)], marks="Told not to")
     assert set(part.drawings) == {"automaton"}
     text = page(part)
-    assert 'class="map"' not in text and "state 8" in text
+    assert 'class="map"' not in text and "Told not to:</b> state 9, memory 1, right" in text
 
 
 def test_what_is_too_large_is_said_and_shown_as_a_picture(monkeypatch):

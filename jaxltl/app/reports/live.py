@@ -1,4 +1,8 @@
-"""The parts of a page that move, as HTML with the same content in tables, and their data."""
+"""A report as one page: what is said, the parts that move with the same content in tables, pictures.
+
+A part that moves is HTML; the page's script finds the elements by class and data attributes, and
+what it must know in one block of JSON.
+"""
 
 from __future__ import annotations
 
@@ -92,7 +96,7 @@ def live_page(
 
 
 def _file(name: str) -> str:
-    return resources.files("jaxltl.app.reports").joinpath(name).read_text()
+    return resources.files("jaxltl.app.reports").joinpath(name).read_text("utf-8")
 
 
 def _remarks(told: Iterable[Remark]) -> str:
@@ -182,20 +186,20 @@ def _explorer(part: Explorer, drawn: Mapping[str, str]) -> str:
         panes = (
             '<div><h3>The map</h3><div class="scroll board" tabindex="0" role="group" '
             'aria-label="Map; the arrow keys go from cell to cell">'
-            f'{drawn["map"]}</div>{scale}{_marked(part)}</div>{panes}'
+            f'{drawn["map"]}</div>{scale}</div>{panes}'
         )
     return (
         f'<section class="explorer" id="{part.name}"><h2>{html.escape(part.title)}</h2>'
         f'<p class="muted">{html.escape(part.caption)}</p><div class="card">{_choice(part)}'
         f'<p class="memory" aria-live="polite"></p>{_player(part)}'
         f'<p class="readout" role="status" aria-live="polite">{hint}</p>'
-        f'<div class="panes{" two" if narrow else ""}">{panes}</div></div>'
+        f'{_marked(part)}<div class="panes{" two" if narrow else ""}">{panes}</div></div>'
         f"{''.join(folded(*fold) for fold in folds if fold[1])}</section>"
     )
 
 
 def _marked(part: Explorer) -> str:
-    """The steps that the map has in red."""
+    """The steps that the map has in red, in words."""
     steps = [
         f"{part.places.get(s, place(where(s, part.shape)))}, memory {q}, {part.actions[a]}"
         for s, q, a in part.marked
