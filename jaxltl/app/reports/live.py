@@ -1,4 +1,4 @@
-"""A report as one page: what is said, the parts that move with the same content in tables, pictures.
+"""A report as one page: what is said, the parts that move with the same in tables, and pictures.
 
 A part that moves is HTML; the page's script finds the elements by class and data attributes, and
 what it must know in one block of JSON.
