@@ -120,7 +120,10 @@ def with_softmax(
     the dtype: what a policy surely does depends on it.
     """
     q = policy_logits(model, reward, discount, solution.value)
-    least = jnp.max(q, axis=-1, keepdims=True) + _LEAST * math.log(jnp.finfo(q.dtype).tiny)
+    # As a constant: where the compiler rounds q otherwise elsewhere, no entry equals the maximum,
+    # and its derivative is 0 / 0.
+    best = lax.stop_gradient(jnp.max(q, axis=-1, keepdims=True))
+    least = best + _LEAST * math.log(jnp.finfo(q.dtype).tiny)
     q = jnp.where(model.available, jnp.maximum(q, least), q)
     return replace(solution, policy=jax.nn.softmax(q, axis=-1))
 
