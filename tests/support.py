@@ -137,20 +137,22 @@ def assert_gradients(
     def flat(arguments: dict[str, jax.Array]) -> jax.Array:
         return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(function(arguments))])
 
+    # One program, and of the derivative one copy, whose lanes are the directions.
     @jax.jit
-    def derivatives(x, tangents, cotangent):
-        _, forward = jax.linearize(flat, x)
-        (gradient,) = jax.linear_transpose(forward, x)(cotangent)
-        return [forward(tangent) for tangent in tangents], gradient
+    def derivatives(x, tangents):
+        value, forward = jax.linearize(flat, x)
+        weights = jax.random.normal(jax.random.key(0), value.shape)
+        (gradient,) = jax.linear_transpose(forward, x)(weights)
+        return value, jax.vmap(forward)(tangents), weights, gradient
 
     zero = {name: np.zeros_like(x) for name, x in point.items()}
     tangents = [{**zero, name: np.asarray(x, float)} for name, x in directions.items()]
-    shape = jax.eval_shape(flat, point).shape
-    weights = np.random.default_rng(0).normal(size=shape)
-    forward, gradient = derivatives(point, tangents, weights)
+    tangents = {name: np.stack([tangent[name] for tangent in tangents]) for name in zero}
+    _, forward, weights, gradient = derivatives(point, tangents)
+    weights = np.asarray(weights)
     for (name, direction), found in zip(directions.items(), forward, strict=True):
         ahead, behind = (
-            flat(jax.tree.map(jnp.asarray, {**point, name: point[name] + shift * direction}))
+            derivatives({**point, name: point[name] + shift * direction}, tangents)[0]
             for shift in (step, -step)
         )
         expected = (np.asarray(ahead) - np.asarray(behind)) / (2 * step)

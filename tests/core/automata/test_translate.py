@@ -114,12 +114,13 @@ def test_negation_is_complement():
 @pytest.mark.parametrize(
     ("letters", "stem", "tail", "largest"), [(["", "a"], 4, 3, 5), (["", "a", "b"], 3, 2, 4)]
 )
-def test_states_are_the_residuals_of_the_language(letters, stem, tail, largest):
+@pytest.mark.parametrize("count", [15, pytest.param(60, marks=pytest.mark.exhaustive)])
+def test_states_are_the_residuals_of_the_language(letters, stem, tail, largest, count):
     """Brute-force Myhill-Nerode, from the definition of truth alone."""
     rng = random.Random(23)
     letters = [frozenset(letter) for letter in letters]
     seen = []
-    while len(seen) < 60:
+    while len(seen) < count:
         formula = random_formula(rng, rng.randint(4, 9), "ab", rng.choice(["cosafe", "safety"]))
         states = len(to_automaton(formula, letters).delta)
         if 3 <= states <= largest:
