@@ -21,7 +21,13 @@ from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.evidence import rounding_unit
-from jaxltl.core.values.reachability import action_matrices, max_sets, min_sets
+from jaxltl.core.values.reachability import (
+    action_matrices,
+    attaining_actions,
+    complement,
+    max_sets,
+    min_sets,
+)
 from jaxltl.core.values.satisfaction import (
     Reaching,
     as_reachability,
@@ -86,8 +92,9 @@ def optimal_actions(
       :class:`OptimalActions`. An action is kept if by the bounds, and the rounding of the model's
       numbers, it can be conserving, so none is missing; an action may be kept that loses less
       than that. `loss` bounds what the uniform policy loses by them. If it is above the
-      tolerance, the mask keeps no more than the best policy's action where the probability is
-      between 0 and 1.
+      tolerance, the mask keeps, where the probability is between 0 and 1, no more than the actions
+      that are known not to lead away from a bound, of any policy on the mask; or, where these are
+      not known, than the best policy's action.
 
     Raises:
       ValueError: the model is traced, or the objective is unknown.
@@ -111,9 +118,17 @@ def optimal_actions(
                        objective, goal)
     if int(found.status) == Status.CONVERGED:
         return found
-    # The best policy's actions, and those that the graph is sure of, attain its bounds.
-    allowed, policy = _staying(problem, _of_policy(problem, solution), model.dtype)
-    return _judged(allowed, policy, solution, replace(solution, policy=policy), objective, goal)
+    # What is left of it attains bounds whatever the shares of its actions.
+    sure = attaining_actions(problem.model, problem.target, objective=problem.objective)
+    if sure is not None:
+        keeps, bounds = sure
+        bounds = complement(bounds) if problem.opposite else bounds
+        narrower = _bounded(problem, keeps, bounds, objective, goal)
+        if int(narrower.status) == Status.CONVERGED:
+            return narrower
+    graph = graph_of(problem.model)
+    chosen = np.asarray(solution.policy)[..., None] == np.arange(graph.num_actions)
+    return _bounded(problem, chosen, solution, objective, goal)
 
 
 def _conserving(problem: Reaching, solution: Solution, objective: str) -> Booleans:
@@ -150,12 +165,16 @@ def _by_bounds(model: Product, solution: Solution, objective: str) -> Booleans:
     return sign * ahead + slack >= sign * near[..., None]
 
 
-def _of_policy(problem: Reaching, solution: Solution) -> Booleans:
-    """What the graph decides, and elsewhere the action of the best policy alone."""
-    decided, keeps, _ = _on_graph(problem)
+def _bounded(
+    problem: Reaching, keeps: Booleans, bounds: Solution, objective: str, goal: float
+) -> OptimalActions:
+    """The mask of what the graph decides, and elsewhere of actions that attain the bounds."""
+    decided, sure, _ = _on_graph(problem)
     graph = graph_of(problem.model)
-    chosen = np.asarray(solution.policy)[..., None] == np.arange(graph.num_actions)
-    return graph.available & (keeps | (~decided[..., None] & chosen))
+    allowed, policy = _staying(
+        problem, graph.available & (sure | (~decided[..., None] & keeps)), problem.model.dtype)
+    return _judged(
+        allowed, policy, bounds, replace(bounds, policy=policy), objective, goal)
 
 
 def _certified(

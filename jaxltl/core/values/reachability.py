@@ -307,6 +307,37 @@ def _attaining(
     return good & graph.available
 
 
+def attaining_actions(
+    model: Any, target: Any, *, objective: str
+) -> tuple[Any, Solution] | None:
+    """Actions by which every policy that takes them all now and then attains a bound.
+
+    Where the probability is strictly between 0 and 1: those in end components, and those that do
+    not lead away from the bound. By them a policy decides almost surely, if it can.
+
+    Args:
+      model: a concrete model.
+      target: ``bool[S]``.
+      objective: ``"max"`` or ``"min"``.
+
+    Returns:
+      ``bool[S, A]``, False elsewhere, and the bounds, `lower` of a maximum, `upper` of a minimum;
+      None if that could not be shown on the host.
+    """
+    if not is_table(model) or math.prod(model.state_shape) > _HOST_LIMIT:
+        return None
+    graph = graph_of(model)
+    sets, components = _decided(model, np.asarray(target), objective=objective)
+    found, ties = _optimum_on_host(model, graph, sets, components, np.inf, objective)
+    if found is None:
+        return None
+    if components is not None:
+        ties = ties | components.inside
+    decided = sets.one | sets.zero
+    good = ties & ~decided[..., None] & graph.available
+    return (good, found) if attract(graph, decided, good).region.all() else None
+
+
 def _quickest(model: Any, graph: Graph, good: Any, decided: Any, policy: Any) -> Any:
     """The policy of some actions that decides in the least expected time.
 
