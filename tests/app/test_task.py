@@ -209,6 +209,8 @@ def test_a_model_from_successor_lists_with_initial_formula(write):
     ({"successor": [[[0]]]}, r"needs the array transition, or successor and probability"),
     ({"transition": CHAIN, "actions": ["a"]}, r"1 distinct names; the model has 2 actions"),
     ({"successor": [[[2]]], "probability": [[[1.0]]]}, r"successor 2 is out of range"),
+    ({"transition": CHAIN, "propositions": ["y"]},
+     r"m\.npz': there are propositions \('y',\) but no label, .*; give label as bool\[2, 1\]"),
 ])
 def test_mistakes_in_a_model(write, arrays, message):
     with pytest.raises(ValueError, match=message):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import chex
@@ -122,7 +122,7 @@ def make_mdp(
     *,
     available: chex.Array | None = None,
     initial: chex.Array | None = None,
-    label: chex.Array | None = None,
+    label: chex.Array | Mapping[str, Sequence[int]] | None = None,
     propositions: Sequence[str] = (),
 ) -> MDP:
     """A checked :class:`MDP` from arrays, on the host.
@@ -136,13 +136,15 @@ def make_mdp(
       probability: ``float[S, A, K]``.
       available: ``bool[S, A]``; default: the actions with a positive probability.
       initial: ``float[S]``, a distribution; default: uniform.
-      label: ``bool[S, P]``; default: no propositions.
-      propositions: P distinct names.
+      label: ``bool[S, P]``, or the states where each proposition holds, by its name, such as
+        ``{"goal": [15]}``; default: no propositions.
+      propositions: P distinct names; default: those of a label by names, in its order.
 
     Raises:
       ValueError: an array has the wrong shape, a probability is negative or not
-        finite, a row does not sum to one, a successor is out of range, or a state
-        has no action. The message names the state, the action and the value.
+        finite, a row does not sum to one, a successor is out of range, a state
+        has no action, or there are propositions without labels. The message names the state,
+        the action and the value.
 
     Example:
       >>> mdp = make_mdp([[[0, 1]], [[1, 0]]], [[[0.5, 0.5]], [[1.0, 0.0]]])
@@ -194,19 +196,24 @@ def from_dense(
     *,
     available: chex.Array | None = None,
     initial: chex.Array | None = None,
-    label: chex.Array | None = None,
+    label: chex.Array | Mapping[str, Sequence[int]] | None = None,
     propositions: Sequence[str] = (),
 ) -> MDP:
     """The :class:`MDP` of a full matrix ``transition[s, a, t]``, checked as by :func:`make_mdp`.
 
     K is the largest number of successors of any state and action.
 
+    Args:
+      transition: ``float[S, A, S]``.
+      available, initial, label, propositions: as for :func:`make_mdp`.
+
     Raises:
       ValueError: as :func:`make_mdp`, and when the matrix is not ``[S, A, S]``.
 
     Example:
-      >>> from_dense([[[0.5, 0.5]], [[0.0, 1.0]]]).successor.shape
-      (2, 1, 2)
+      >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]], label={"goal": [1]})
+      >>> mdp.successor.shape, mdp.propositions, mdp.label[:, 0].tolist()
+      ((2, 1, 2), ('goal',), [False, True])
     """
     transition = np.asarray(transition)
     if transition.ndim != 3 or transition.shape[0] != transition.shape[2]:
@@ -302,13 +309,22 @@ def _checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
 
 
 def _checked_label(
-    label: chex.Array | None, propositions: Sequence[str], num_states: int
+    label: chex.Array | Mapping[str, Sequence[int]] | None, propositions: Sequence[str],
+    num_states: int,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     names = tuple(propositions)
     if len(set(names)) != len(names):
         raise ValueError(f"propositions {names} are not distinct.")
+    if isinstance(label, Mapping):
+        return _label_by_name(label, names or tuple(label), num_states)
     if label is None:
-        label = np.zeros((num_states, len(names)), bool)
+        if names:
+            raise ValueError(
+                f"there are propositions {names} but no label, so that none would hold anywhere; "
+                f"give label as bool[{num_states}, {len(names)}], one row per state, or as the "
+                f"states where each holds, {{{names[0]!r}: [...]}}."
+            )
+        label = np.zeros((num_states, 0), bool)
     label = np.asarray(label, bool)
     if label.shape != (num_states, len(names)):
         raise ValueError(
@@ -316,3 +332,30 @@ def _checked_label(
             f"one row per state, one column per proposition {names}."
         )
     return label, names
+
+
+def _label_by_name(
+    label: Mapping[str, Sequence[int]], names: tuple[str, ...], num_states: int
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    if set(label) != set(names):
+        raise ValueError(
+            f"label names {tuple(label)}, propositions are {names}; give the states of each of "
+            "them, [] where it holds nowhere, or leave propositions out."
+        )
+    holds = np.zeros((num_states, len(names)), bool)
+    for column, name in enumerate(names):
+        states = np.asarray(label[name])
+        if states.size and (states.ndim != 1 or not np.issubdtype(states.dtype, np.integer)):
+            raise ValueError(
+                f"label[{name!r}] has dtype {states.dtype} and shape {states.shape}; it must be "
+                "a list of the numbers of the states where it holds."
+            )
+        states = states.astype(int)
+        outside = (states < 0) | (states >= num_states)
+        if outside.any():
+            raise ValueError(
+                f"label[{name!r}] has the state {states[outside][0]}; states are 0 to "
+                f"{num_states - 1}."
+            )
+        holds[states, column] = True
+    return holds, names

@@ -1,5 +1,7 @@
 """Models: what is let in, what is refused and where the message points."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -64,11 +66,30 @@ def test_successors_without_probability_are_padding():
             {"label": [[True]], "propositions": ("a",)},
             r"label has shape \(1, 1\); expected \(2, 1\)",
         ),
+        ({"propositions": ("a",)}, r"propositions \('a',\) but no label.*; give label as bool"),
+        ({"label": {"a": [2]}}, r"label\['a'\] has the state 2; states are 0 to 1"),
+        ({"label": {"a": [-1]}}, r"label\['a'\] has the state -1"),
+        ({"label": {"a": [True, False]}}, r"label\['a'\] has dtype bool .* numbers of the states"),
+        ({"label": {"a": 1}}, r"label\['a'\] has dtype int64 and shape \(\); it must be a list"),
+        ({"label": {"a": [1]}, "propositions": ("a", "b")},
+         r"label names \('a',\), propositions are \('a', 'b'\); give the states of each"),
     ],
 )
 def test_bad_arguments(arguments, message):
     with pytest.raises(ValueError, match=message):
         make_mdp(SUCCESSOR, PROBABILITY, **arguments)
+
+
+def test_labels_by_the_states_where_they_hold():
+    label = {"b": [1], "a": np.array([1, 0]), "c": []}
+    lists = partial(make_mdp, SUCCESSOR, PROBABILITY)
+    for build in (lists, partial(from_dense, [[[0.5, 0.5]]] * 2)):
+        mdp = build(label=label)
+        assert mdp.propositions == ("b", "a", "c")
+        assert mdp.label.tolist() == [[False, True, False], [True, True, False]]
+        ordered = build(label=label, propositions=["a", "b", "c"])
+        assert ordered.propositions == ("a", "b", "c")
+        assert ordered.label.tolist() == [[True, False, False], [True, True, False]]
 
 
 def test_a_state_without_any_positive_row_has_no_action():
