@@ -23,7 +23,8 @@ class Worlds(NamedTuple):
 
     Attributes:
       scenes: W worlds.
-      model: their products with the learner's memory, stacked.
+      model: their products with the learner's memory, stacked; with a guarantee, narrowed to the
+        actions that lose nothing of the task.
       judged: their products with memory and task side by side, stacked.
       observation: ``float[W, S, O]``.
     """
@@ -60,6 +61,7 @@ class Setup:
       num_training: how many there are to learn in.
       expert: ``float[W, S, Q, A]``, the policy of an expert in the judged products.
       demonstrations: in each of the training worlds.
+      left_out: how many of their steps are not among the allowed actions.
     """
 
     task: Task
@@ -69,6 +71,7 @@ class Setup:
     num_training: int
     expert: jax.Array
     demonstrations: list[Trajectories]
+    left_out: int = 0
 
     @property
     def training(self) -> Worlds:

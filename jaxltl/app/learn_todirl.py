@@ -56,10 +56,13 @@ from jaxltl.app.job import (
 from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
-from jaxltl.core.models.batch import lift_memory, stack_products
+from jaxltl.core.models.batch import lift_memory, narrow, stack_products
 from jaxltl.core.models.operators import action_mean, expectation
-from jaxltl.core.models.product import Product, product
+from jaxltl.core.models.product import Product, allowed_steps, product
+from jaxltl.core.models.restrict import with_allowed
+from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Status, status_code
+from jaxltl.core.values.optimal_actions import optimal_actions
 from jaxltl.core.values.performance import (
     Performance,
     infeasible_starts,
@@ -109,9 +112,26 @@ def prepare(task: Task, seed: int) -> Setup:
             )
             for w, scene in enumerate(scenes)
         ]
+    left_out = 0
+    if task.guarantee == "best":
+        worlds, left_out = _narrowed(task, worlds, found)
     if memory is not judge:
         expert = np.tile(expert, (1, 1, len(memory.delta), 1))  # the task's state varies fastest
-    return Setup(task, judge, memory, worlds, len(scenes), jnp.asarray(expert), found)
+    return Setup(task, judge, memory, worlds, len(scenes), jnp.asarray(expert), found, left_out)
+
+
+def _narrowed(task: Task, worlds: Worlds, shown: list[Trajectories]) -> tuple[Worlds, int]:
+    """The worlds with the actions alone that lose nothing, and how many steps took others."""
+    lanes = [part_of(worlds.model, w) for w in range(len(worlds.scenes))]
+    allowed = [np.asarray(optimal_actions(lane).allowed) for lane in lanes]
+    count = 0
+    for w, trajectories in enumerate(shown):
+        with errors_in(f"{task.path}: demonstrations in {worlds.scenes[w].name}: "):
+            size = worlds.scenes[w].mdp.num_states
+            model = product(worlds.scenes[w].mdp, lanes[w].automaton, label_on=task.label_on)
+            kept = allowed_steps(with_allowed(model, allowed[w][:size]), trajectories)
+        count += int(np.asarray(trajectories.mask).sum() - kept.sum())
+    return worlds._replace(model=narrow(worlds.model, allowed)), count
 
 
 def _stack(task: Task, scenes: list[Scene], judge: Automaton, memory: Automaton) -> Worlds:
@@ -165,9 +185,11 @@ def learn(
     model = stack_products(
         [scene.mdp for scene in scenes], setup.memory, label_on=setup.task.label_on
     )
+    masks = setup.worlds.model.allowed
     problem = todirl.make_problem(
         model, _observations(scenes, model), setup.demonstrations,
         held_out=spec.get("held_out", 0.2), network=network, horizon=spec.get("horizon"),
+        allowed=masks if masks is None else masks[: len(scenes), : model.mdp.num_states],
     )
     hparams = settings(todirl.Hparams, spec)
     found, history = run_seeds(
@@ -291,6 +313,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "label_on": task.label_on,
         "radius": task.radius,
         "horizon": task.learner.get("horizon"),
+        "guarantee": {"asked": task.guarantee, "left_out": setup.left_out},
         "num_memory": setup.worlds.model.num_memory,
         "demonstrations": {
             "number": [len(shown.length) for shown in setup.demonstrations],
@@ -414,4 +437,5 @@ def learned_reward(outcome: Outcome) -> LearnedReward:
         hidden=tuple(spec.get("hidden", (80, 80))), memory=outcome.setup.memory,
         label_on=task.label_on, discount=spec["discount"], horizon=spec.get("horizon"),
         radius=task.radius, formula=task.formula, kinds=tuple(kinds),
+        guarantee=str(task.guarantee),
     )

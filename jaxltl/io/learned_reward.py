@@ -19,6 +19,7 @@ from jaxltl.core.automata.text import from_dict, to_dict
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.types import Solution
+from jaxltl.core.values.optimal_actions import optimal_actions
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class LearnedReward:
       radius: how far around its cell it sees.
       formula: the task.
       kinds: names of what a cell of the observation can be, in the order of its one-hot parts.
+      guarantee: ``"best"``: plans take the actions alone that lose nothing of the memory's task; or
+        ``"none"``.
     """
 
     parameters: Any
@@ -46,6 +49,7 @@ class LearnedReward:
     radius: int
     formula: str
     kinds: tuple[str, ...]
+    guarantee: str = "none"
 
     @property
     def network(self) -> todirl.RewardNetwork:
@@ -83,15 +87,17 @@ def plan_in(learned: LearnedReward, world: MDP, observation: Any) -> tuple[Produ
             f"observation has shape {seen.shape}; the network reads {width} numbers in each of the "
             f"world's states: {(world.num_states, width)}."
         )
+    allowed = optimal_actions(model).allowed if learned.guarantee == "best" else None
     return model, todirl.plan(
-        learned.network, learned.parameters, model, seen, learned.hparams
+        learned.network, learned.parameters, model, seen, learned.hparams, allowed=allowed
     )
 
 
 # --- files ----------------------------------------------------------------------------------
 
 
-_ABOUT = ("hidden", "label_on", "discount", "horizon", "radius", "formula", "kinds")
+_ABOUT = ("hidden", "label_on", "discount", "horizon", "radius", "formula", "kinds",
+          "guarantee")
 
 
 def save_reward(path: str | Path, learned: LearnedReward) -> None:

@@ -1,6 +1,7 @@
 """`jaxltl learn` for a reward that carries over: the task file, the run, what it writes."""
 
 import json
+import re
 
 import jax.numpy as jnp
 import numpy as np
@@ -369,6 +370,13 @@ def test_text_maps_files_horizon_and_another_memory(tmp_path):
         np.testing.assert_allclose(file["policy"].sum(axis=-1), 1)
     assert {"memory.svg", "training_3.svg", "test_2.svg"} <= {
         path.name for path in (tmp_path / "out").iterdir()}
+    page = (tmp_path / "out" / "report.html").read_text()
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page)[1])
+    # The task decides when a run ends, the learner's memory what is shown.
+    for world in data:
+        for run in world["runs"]:
+            assert {q for _, q, _ in run["steps"]} <= {0, 1, 2} and len(run["steps"]) <= 10
+    assert max(len(run["steps"]) for run in data[0]["runs"][1:]) > 2
 
 
 def test_the_probability_within_a_horizon():
@@ -394,3 +402,17 @@ def test_the_example_is_sound():
     world = temporal_gridworld.training_world(0)
     assert np.array_equal(training[0].colored.colors, world.colors) and len(test) == 20
     assert training[0].mdp.propositions == world.mdp.propositions
+
+
+# --- the guarantee -----------------------------------------------------------------------------
+
+
+def test_the_best_is_attained_in_every_world_also_in_new_ones(learned):
+    place, printed, result = learned
+    assert result["guarantee"]["asked"] == "best" and "By construction" in printed
+    for key in ("training", "test"):
+        for world in result[key]["worlds"]:
+            assert world["infeasible_starts"] > 0 or world["minimum"]["lower"] == 1
+            assert world["minimum"]["value"] == 1 or world["infeasible_starts"] > 0
+    found = load_reward(place / "out" / "network.npz")
+    assert found.guarantee == "best"

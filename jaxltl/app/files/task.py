@@ -88,13 +88,17 @@ def make_task(
 def _guarantee(path: Path, data: Mapping[str, Any]) -> str | float:
     """What a file asks for; a learner that does not see the task cannot guarantee it."""
     task, learner = data["task"], data["learner"]
-    blind = learner.get("in") == "world" or "memory" in learner
+    blind = [k for k in ("memory", "horizon") if k in learner]
+    blind += ['in = "world"'] if learner.get("in") == "world" else []
     asked: str | float = task.get("guarantee", "none" if blind else "best")
     number = not isinstance(asked, str)
     tables.reject(path, "task", (
-        (blind and asked != "none",
-         f"guarantee = {asked!r} needs a learner that sees the task: leave out "
-         + ("memory" if "memory" in learner else 'in = "world"')),
+        (bool(blind) and asked != "none",
+         f"guarantee = {asked!r} needs a learner that sees the task and has the time for it: leave "
+         f"out {''.join(blind[:1])}"),
+        (number and learner.get("method") == "todirl",
+         f'guarantee = {asked!r} is a probability, which takes method = "mlirl"; for "todirl" '
+         'choose "best" or "none"'),
         ("over" in task and not number, "over belongs to a guarantee that is a probability"),
     ))
     return asked

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-import functools
 import html
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import click
-
 from jaxltl.app.files.task import place
 from jaxltl.app.reports.live import Said, live_page
-from jaxltl.app.reports.page import Remark, certified, number, probability, rows, spread, tiles
+from jaxltl.app.reports.page import (
+    Remark,
+    certified,
+    number,
+    probability,
+    rows,
+    spread,
+    tiles,
+    told,
+)
 
 _SHORT = 0.01  # share of the best probability that may be missing without a word
 _LONG = 10  # times the quickest policy's steps, likewise
@@ -121,10 +127,7 @@ def table(result: Mapping[str, Any]) -> str:
             f"  minimum                 {spread(seeds['minimum'])}",
             f"  negative log-likelihood {spread(seeds['neg_log_likelihood'])}",
         ]
-    red = functools.partial(click.style, fg="red")
-    lines += [f"\n{red(f'warning: {text}') if kind == 'warning' else text}"
-              for kind, text in remarks(result)]
-    return "\n".join(lines)
+    return "\n".join([*lines, *told(remarks(result))])
 
 
 def _sentence(result: Mapping[str, Any]) -> str:

@@ -8,7 +8,16 @@ from typing import Any
 
 from jaxltl.app.files.task import place
 from jaxltl.app.reports.live import Said, live_page
-from jaxltl.app.reports.page import Remark, certified, number, probability, rows, spread, tiles
+from jaxltl.app.reports.page import (
+    Remark,
+    certified,
+    number,
+    probability,
+    rows,
+    spread,
+    tiles,
+    told,
+)
 
 _WHO = {
     "learned": "learned reward", "expert": "expert, who knows the task", "random": "random moves",
@@ -39,7 +48,15 @@ def _told(result: Mapping[str, Any]) -> list[str]:
 
 def remarks(result: Mapping[str, Any]) -> list[Remark]:
     """What the page says first."""
-    return [("warning", text) for text in warnings(result)]
+    found = [("warning", text) for text in warnings(result)]
+    if result["guarantee"]["asked"] == "best":
+        found.append(("good", (
+            "By construction: in every world, new ones too, the policy takes the moves that lose "
+            "nothing of the task, all of them and no others, so that it does the task as well as "
+            "it can be done; what was learned decides how.")))
+    if lost := result["guarantee"]["left_out"]:
+        found.append(("note", f"{lost} demonstrated steps lose something and were left out."))
+    return found
 
 
 def table(result: Mapping[str, Any]) -> str:
@@ -80,8 +97,7 @@ def table(result: Mapping[str, Any]) -> str:
         ]
         if seeds["test_mean"]:
             lines.append(f"  test mean      {spread(seeds['test_mean'])}")
-    lines += [f"\nwarning: {text}" for text in warnings(result)]
-    return "\n".join(lines)
+    return "\n".join([*lines, *told(remarks(result))])
 
 
 def warnings(result: Mapping[str, Any]) -> list[str]:

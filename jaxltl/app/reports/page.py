@@ -6,7 +6,17 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import click
+
 Remark = tuple[str, str]  # its kind, "warning" (shown in red), "note" or "good", and its text
+
+
+def told(remarks: Iterable[Remark]) -> list[str]:
+    """Remarks as paragraphs for the terminal, warnings in red."""
+    return [
+        "\n" + (click.style(f"warning: {text}", fg="red") if kind == "warning" else text)
+        for kind, text in remarks
+    ]
 
 
 def rows(

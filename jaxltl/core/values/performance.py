@@ -155,10 +155,16 @@ def _summarize(model: Product, value, lower, upper, tolerance) -> Performance:
     worst_state = jnp.argmin(jnp.where(starts, value, jnp.inf)).astype(jnp.int32)
     narrow = jnp.max(jnp.where(starts, upper - lower, 0)) <= 2 * goal
     finite = jnp.all(jnp.isfinite(value))
+    def mean(x: jax.Array, slack: jax.Array) -> jax.Array:
+        # Rounding takes no mean out of the range of what it is of.
+        least, most = (f(jnp.where(starts, x, out)) for f, out in (
+            (jnp.min, jnp.inf), (jnp.max, -jnp.inf)))
+        return jnp.clip(jnp.sum(weight * x) + slack, least, most)
+
     return Performance(
-        mean=jnp.sum(weight * value),
-        lower=jnp.maximum(jnp.sum(weight * lower) - slack, 0),
-        upper=jnp.minimum(jnp.sum(weight * upper) + slack, 1),
+        mean=mean(value, 0 * slack),
+        lower=mean(lower, -slack),
+        upper=mean(upper, slack),
         worst=value[worst_state],
         worst_lower=jnp.min(jnp.where(starts, lower, jnp.inf)),
         worst_upper=jnp.min(jnp.where(starts, upper, jnp.inf)),
