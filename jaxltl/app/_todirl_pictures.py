@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.app._todirl_parts import LENGTH, Judged, Outcome, Setup, Worlds, counted_worlds, part_of
+from jaxltl.app._todirl_parts import Judged, Outcome, Setup, Worlds, counted_worlds, part_of
 from jaxltl.app.drawing import Picture, drawing
 from jaxltl.app.explorer import (
     START,
     Curves,
     Explorer,
     Layer,
+    Run,
     TooLarge,
     curves,
     demonstrated_runs,
@@ -25,12 +25,10 @@ from jaxltl.app.explorer import (
 from jaxltl.app.job import automaton_picture, over_seeds, short_name
 from jaxltl.core.models.batch import lift_memory
 from jaxltl.core.models.monitor import Verdict, verdicts
-from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.envs import temporal_gridworld
+from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.envs.gridworld import ACTIONS
 
 _PICTURES = 3  # worlds that are drawn, of each kind
-_WALKS = 3  # trajectories drawn in a world
 
 
 _FIGURES = ("per_pair", "held_out", "gradient_norm")
@@ -146,9 +144,10 @@ def _look_into(outcome: Outcome, one: _Drawn) -> Explorer | TooLarge:
     place: Any = scene.cells if scene.colored is None else part_of(scene.colored, ...)
     return explorer(
         one.live, one.title, _CAPTION.format("" if stationary else " at the first step"),
-        setup.memory, layers, [*shown, *learned_runs(model, policy, outcome.seed)],
+        setup.memory, layers, [*shown, *_runs(outcome, one)],
         size=scene.mdp.num_states, place=place, actions=ACTIONS,
         label="probability of doing the task", wall=setup.task.world.get("wall", "#"),
+        goal="the task" if setup.memory is setup.judge else "what it remembers",
     )
 
 
@@ -189,8 +188,9 @@ def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
         drawn = drawing("temporal_gridworld", part_of(scene.colored, ...), moving, memory=shown,
                         title=titles)
         found.append(Picture(f"{one.stem}.svg", one.title, drawn, caption, one.live))
-    if policy.ndim == 3:
-        walks = _walks(outcome, one.worlds, one.w, one.judged.policy[one.w])
+    pairs = [[(s, a) for s, _, a in run.steps if a is not None] for run in _runs(outcome, one)]
+    if policy.ndim == 3 and any(pairs):
+        walks = make_trajectories(scene.mdp, [each for each in pairs if each])
         found.append(Picture(
             f"{one.stem}_runs.svg", f"Runs in {scene.name}" if one.arrows else one.title,
             drawing("temporal_gridworld", part_of(scene.colored, ...), trajectories=walks),
@@ -206,15 +206,12 @@ def _memory_shown(setup: Setup) -> list[int]:
     return [int(q) for q in open_] or [0]
 
 
-def _walks(outcome: Outcome, worlds: Worlds, w: int, policy: np.ndarray) -> Trajectories:
-    setup = outcome.setup
-    array = jnp.asarray(policy)
-    lifted = array if setup.memory is setup.judge else lift_memory(array, setup.judge)
-    key = jax.random.fold_in(jax.random.key(outcome.seed), 2)
-    shown = setup.task.demonstrations
-    # As many as there were demonstrations, for which the program is there already.
-    walks = temporal_gridworld.demonstrations(
-        key, part_of(worlds.judged, w), lifted, shown.get("synthetic", _WALKS),
-        shown.get("length", LENGTH),
-    )
-    return part_of(walks, slice(_WALKS))
+def _runs(outcome: Outcome, one: _Drawn) -> list[Run]:
+    """Runs of the learned policy with the learner's memory, until the task is decided."""
+    setup, policy, count = outcome.setup, one.policy, 1
+    if setup.memory is not setup.judge:
+        # The task's state varies fastest.
+        policy, count = np.asarray(lift_memory(jnp.asarray(policy), setup.judge)), len(
+            setup.judge.delta)
+    found = learned_runs(part_of(one.worlds.judged, one.w), policy, outcome.seed)
+    return [Run(run.name, [(s, q // count, a) for s, q, a in run.steps]) for run in found]

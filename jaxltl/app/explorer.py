@@ -47,7 +47,7 @@ class Explorer(NamedTuple):
     Attributes:
       name: what its ids begin with; a picture of this name says the same.
       title, caption, label: for people; the label is what values are.
-      automaton: the policy's memory, or None.
+      automaton, goal: the policy's memory, or None; and what it tells of, for people.
       shape: rows and columns of the map, or None.
       names: S texts, what is in each cell.
       actions: A names.
@@ -64,6 +64,7 @@ class Explorer(NamedTuple):
     caption: str
     label: str
     automaton: Automaton | None
+    goal: str
     shape: tuple[int, int] | None
     names: list[str]
     actions: tuple[str, ...]
@@ -99,7 +100,7 @@ def explorer(
     name: str, title: str, caption: str, automaton: Automaton | None,
     layers: Mapping[str, Layer], runs: list[Run], *, size: int, place: Any = None,
     actions: Sequence[str] = (), label: str = "", wall: str = "#",
-    marked: Iterable[tuple[int, int, int]] = (), marks: str = "",
+    goal: str = "the task", marked: Iterable[tuple[int, int, int]] = (), marks: str = "",
     cells: Mapping[int, Sequence[int]] | None = None, places: Mapping[int, str] | None = None,
 ) -> Explorer | TooLarge:
     """What there is to see of a policy; or why that is too much for a page.
@@ -134,8 +135,8 @@ def explorer(
             marked=marked, actions=actions, wall=wall,
             pieces=max((len(each) for each in (cells or {}).values()), default=1),
         )
-    return Explorer(name, title, caption, label, automaton, shape, names, tuple(actions), layers,
-                    runs, marked, marks, cells or {}, places or {}, drawn)
+    return Explorer(name, title, caption, label, automaton, goal, shape, names, tuple(actions),
+                    layers, runs, marked, marks, cells or {}, places or {}, drawn)
 
 
 def curves(

@@ -374,9 +374,9 @@ def test_text_maps_files_horizon_and_another_memory(tmp_path):
     data = json.loads(re.search(r'id="data">(.*?)</script>', page)[1])
     # The task decides when a run ends, the learner's memory what is shown.
     for world in data:
-        for run in world["runs"]:
-            assert {q for _, q, _ in run["steps"]} <= {0, 1, 2} and len(run["steps"]) <= 10
-    assert max(len(run["steps"]) for run in data[0]["runs"][1:]) > 2
+        for played in world["runs"]:
+            assert {q for _, q, _ in played["steps"]} <= {0, 1, 2} and len(played["steps"]) <= 10
+    assert max(len(played["steps"]) for played in data[0]["runs"][1:]) > 2
 
 
 def test_the_probability_within_a_horizon():

@@ -31,12 +31,6 @@ _MARKS = {
     "buchi": " Dots: arrows to be taken again and again.",
     "parity": " Numbers: the least that is met again and again must be even.",
 }
-_VERDICTS = {
-    Verdict.SATISFIED: "the task is done", Verdict.VIOLATED: "the task has failed",
-    Verdict.UNDECIDED: "",
-}
-
-
 Part = tuple[Explorer | Curves | TooLarge, Mapping[str, str]]  # with its pictures as SVG
 
 
@@ -155,11 +149,16 @@ def _told(part: Explorer) -> dict[str, str]:
         return found
     names = part.automaton.state_names or ("",) * len(part.automaton.delta)
     for q, (name, verdict) in enumerate(zip(names, verdicts(part.automaton), strict=True)):
-        told = [_VERDICTS[Verdict(int(verdict))], name and f"left to satisfy: {name}"]
+        told = [_verdict(verdict, part.goal), name and f"left to satisfy: {name}"]
         if part.layers and str(q) not in part.layers and verdict == Verdict.UNDECIDED:
             told[0] = "nothing is shown: no policy meets this memory"
         found[str(q)] = f"Memory {q}: " + "; ".join(text for text in told if text)
     return {**found, START: f"Where a run starts: {part.label} from there"}
+
+
+def _verdict(verdict: int, goal: str) -> str:
+    return {Verdict.SATISFIED: f"{goal} is done", Verdict.VIOLATED: f"{goal} has failed"}.get(
+        Verdict(int(verdict)), "")
 
 
 def _explorer(part: Explorer, drawn: Mapping[str, str]) -> str:
@@ -167,12 +166,11 @@ def _explorer(part: Explorer, drawn: Mapping[str, str]) -> str:
     folds = [("What is shown, as a table", tables)]
     if part.automaton is not None:
         marks = _MARKS.get(part.automaton.acceptance, "")
-        folds.append(("The automaton as a table", _automaton_table(part.automaton)))
+        folds.append(("The automaton as a table", _automaton_table(part.automaton, part.goal)))
         panes = (
             '<div><h3>Its memory: the automaton</h3><div class="scroll">'
             f'{drawn["automaton"]}</div><p class="muted">Filled: the memory that is shown. Double '
-            "circle: the task is done, whatever follows. Grey: it has failed."
-            f"{marks}</p></div>"
+            f"circle: {part.goal} is done, whatever follows. Grey: it has failed.{marks}</p></div>"
         )
     runs = [_run_table(part, i) for i in range(len(part.runs))]
     folds.append(("The run as a table", "".join(runs)))
@@ -268,14 +266,14 @@ def _layer_table(part: Explorer, key: str) -> str:
     return rows(header, lines, caption, f'data-memory="{key}"')
 
 
-def _automaton_table(automaton: Automaton) -> str:
+def _automaton_table(automaton: Automaton, goal: str) -> str:
     names = automaton.state_names or ("",) * len(automaton.delta)
     moves: dict[int, list[str]] = {}
     for (q, target, _), guard in edge_guards(automaton).items():
         moves.setdefault(q, []).append(f"<code>{html.escape(guard)}</code> to {target}")
     lines = []
     for q, verdict in enumerate(verdicts(automaton)):
-        kind = _VERDICTS[Verdict(int(verdict))]
+        kind = _verdict(verdict, goal)
         if q == int(automaton.initial):
             kind = "first" + (f"; {kind}" if kind else "")
         lines.append((str(q), kind, f"<code>{html.escape(names[q])}</code>",
