@@ -77,9 +77,9 @@ def optimal_actions(
     has to leave out, of the conserving actions, only those by which a run might return to the
     accepting end component that it is in, having met a lesser, odd priority: of the actions that
     stay for ever in an end component of conserving actions around it, it keeps those of the
-    accepting component alone. For a co-safe, safety or Buchi task there are none, and the mask
-    holds every action of every best policy; so it does outside of accepting end components for
-    any task.
+    accepting component alone. For co-safe and safety tasks, and the most of a Buchi task, there
+    are none, and the mask holds every action of every best policy; so it does outside of
+    accepting end components for any task.
 
     Args:
       model: the product, concrete.
@@ -90,11 +90,11 @@ def optimal_actions(
 
     Returns:
       :class:`OptimalActions`. An action is kept if by the bounds, and the rounding of the model's
-      numbers, it can be conserving, so none is missing; an action may be kept that loses less
-      than that. `loss` bounds what the uniform policy loses by them. If it is above the
-      tolerance, the mask keeps, where the probability is between 0 and 1, no more than the actions
-      that are known not to lead away from a bound, of any policy on the mask; or, where these are
-      not known, than the best policy's action.
+      numbers, it can be conserving; so none is missing, and some may be kept that lose less than
+      that. `loss` bounds what the uniform policy loses by them. If it is above the tolerance,
+      other actions are kept where the probability is between 0 and 1: those that are proven not
+      to lead away from a lower bound, which then every policy that takes all of them attains; or,
+      where that cannot be proven, the best policy's action.
 
     Raises:
       ValueError: the model is traced, or the objective is unknown.
