@@ -338,7 +338,7 @@ def test_large_maps_show_some_places(monkeypatch, tmp_path):
     (("[task]", "[strategy]\nbound = 0\n[task]"), r"bound = 0; it must be a whole number"),
     (("[task]", '[strategy]\nmethod = "all"\n[task]'), r"it must be "
      '"auto" or "stay" or "rank" or "counter" or "parity"'),
-    (("[task]", "slip = 2\n[task]"), r"slip = 2; it must be a number in [0, 1]"),
+    (("[task]", "slip = 2\n[task]"), r"slip = 2; it must be a finite number in [0, 1]"),
     (("[task]", "system_stays = 1\n[task]"), r"system_stays = 1; it must be true or false"),
     (("[task]", 'model = "m.npz"\n[task]'), r"[game] must have either a map or a model"),
     (("[task]", 'initial = "a"\n[task]'), r"[game] initial belongs to a model"),

@@ -19,16 +19,24 @@ class Rule(NamedTuple):
     wanted: str
 
 
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number that a float can hold."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # TOML's whole numbers may have any number of digits
+        return False
+
+
 def number_in(low: float, high: float = math.inf, *, below: bool = False) -> Rule:
     """A finite number in ``[low, high]``, or below `high`."""
     def holds(value: Any) -> bool:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            return False
-        return low <= value <= high and math.isfinite(value) and not (below and value == high)
+        return is_number(value) and low <= value <= high and not (below and value == high)
 
     if high == math.inf:
-        return Rule(holds, f"a number of at least {low:g}")
-    return Rule(holds, f"a number in [{low:g}, {high:g}{')' if below else ']'}")
+        return Rule(holds, f"a finite number of at least {low:g}")
+    return Rule(holds, f"a finite number in [{low:g}, {high:g}{')' if below else ']'}")
 
 
 def choice(*options: str) -> Rule:
@@ -49,6 +57,7 @@ def _is_count(value: Any) -> bool:
 
 TEXT = Rule(lambda v: isinstance(v, str) and bool(v.strip()), "a text")
 COUNT = Rule(_is_count, "a whole number of at least 1")
+NUMBER = Rule(is_number, "a finite number")
 TRUTH = Rule(lambda v: isinstance(v, bool), "true or false")
 TABLE = Rule(lambda v: isinstance(v, dict), "a table")
 NAMES = Rule(lambda v: is_list(v, str), 'a list of propositions, such as ["r"]')

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from jaxltl.app.files import tables
-from jaxltl.app.files.tables import COUNT, NAMES, TEXT, Rule, choice, is_list, number_in
+from jaxltl.app.files.tables import COUNT, NAMES, TEXT, Rule, choice, is_list, is_number, number_in
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.mdp import MDP, from_dense, make_mdp
 from jaxltl.core.models.product import Product, project_trajectories
@@ -152,7 +152,7 @@ WORLD = {
 TASK = {
     "formula": TEXT, "label_on": choice("entry", "exit"),
     "guarantee": Rule(
-        lambda v: v in ("best", "none") or (is_list([v], int | float) and 0 < v <= 1),  # type: ignore[arg-type]
+        lambda v: v in ("best", "none") or (is_number(v) and 0 < v <= 1),
         '"best", "none" or a probability in (0, 1]'),
     "over": choice("mean", "worst"),
 }
@@ -178,7 +178,9 @@ _KEYS: dict[str, dict[str, Rule]] = {
         "adjoint": choice("exact", "approximate"),
         "optimizer": choice("lbfgs", "adam", "sgd"),
         "tolerance": number_in(0),
-        "start": Rule(lambda v: is_list(v, int | float), "a list of numbers, one per feature"),  # type: ignore[arg-type]
+        "start": Rule(
+            lambda v: isinstance(v, list) and all(map(is_number, v)),
+            "a list of finite numbers, one per feature"),
         "start_scale": number_in(0),
         "satisfaction_over": choice("initial", "all"),
         "avoid": NAMES,

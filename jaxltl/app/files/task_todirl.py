@@ -70,7 +70,6 @@ def _is_maps(value: Any) -> bool:
 
 
 _WHOLE = Rule(lambda v: is_list([v], int) and v >= 0, "a whole number of at least 0")
-_NUMBER = Rule(lambda v: is_list([v], (int, float)) and np.isfinite(v), "a number")
 _COUNTS = Rule(
     _is_counts, "a table of kinds and their colours, such as { o1 = { red = 5, black = 4 } }"
 )
@@ -91,7 +90,7 @@ _KEYS: dict[str, dict[str, Rule]] = {
     "demonstrations": {
         "files": Rule(lambda v: is_list(v, str) and len(v) > 0, "a list of files, one per world"),
         **tasks.SYNTHETIC,
-        **dict.fromkeys(_REWARDS, _NUMBER),
+        **dict.fromkeys(_REWARDS, tables.NUMBER),
     },
     "learner": {
         "method": choice("todirl"),
