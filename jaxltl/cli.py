@@ -339,7 +339,7 @@ def synthesize(
 
 def _directory(out: Path | None, name: str) -> Path:
     """The directory for results, made if it is not there."""
-    out = out or Path("out") / name.replace("/", "-").replace(" ", "_")
+    out = out or Path("out") / name.replace(" ", "_")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -105,6 +105,10 @@ def test_the_digest_covers_named_files(write):
     (("discount = 0.9", "discount = 0.9\nl2 = nan"), r"l2 = nan; it must be a finite number"),
     (("discount = 0.9", "discount = 0.9\nmu = 1" + 400 * "0"), r"it must be a finite number"),
     (("discount = 0.9", "discount = 0.9\nstart = [1, inf]"), r"a list of finite numbers, one per"),
+    (("discount = 0.9", "discount = 0.9\nlearning_rate = 0.1"),
+     r'learning_rate belongs to optimizer = "adam" or "sgd"; "lbfgs", the default, searches'),
+    (("discount = 0.9", 'discount = 0.9\noptimizer = "lbfgs"\nlearning_rate = 0.1'),
+     r"learning_rate belongs to optimizer"),
     (("[task]", "[task]\nguarantee = nan"), r"a probability in \(0, 1\]"),
     (("discount = 0.9", 'discount = 0.9\nin = "world"'), r"lacks goal"),
     (("discount = 0.9", 'discount = 0.9\nin = "world"\ngoal = ["y"]\nmu = 1'), r"mu weighs"),
@@ -126,6 +130,23 @@ def test_the_digest_covers_named_files(write):
 def test_mistakes_in_the_task_file(write, replacement, message):
     with pytest.raises(ValueError, match=message):
         read_task(write(replacement))
+
+
+@pytest.mark.parametrize(
+    "name", ["../../evil", "/tmp/evil", "a/b", "a\\\\b", ".hidden", "..", " a", "", "a\\nb", "a:b"])
+def test_names_are_plain(write, name):
+    with pytest.raises(ValueError, match=r"name = .*; it must be a plain name of letters, digits"):
+        read_task(write(("\n[world]", f'name = "{name}"\n[world]')))
+
+
+@pytest.mark.parametrize("name", ["two goals", "-1_a.b", "Größe 3"])
+def test_plain_names_are_taken(write, name):
+    assert read_task(write(("\n[world]", f'name = "{name}"\n[world]'))).name == name
+
+
+def test_a_learning_rate_of_an_optimizer_that_takes_one(write):
+    given = 'discount = 0.9\noptimizer = "adam"\nlearning_rate = 0.1'
+    assert read_task(write(("discount = 0.9", given))).learner["learning_rate"] == 0.1
 
 
 def test_a_missing_task_file(tmp_path):

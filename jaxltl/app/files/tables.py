@@ -6,6 +6,7 @@ import contextlib
 import difflib
 import hashlib
 import math
+import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -56,6 +57,12 @@ def _is_count(value: Any) -> bool:
 
 
 TEXT = Rule(lambda v: isinstance(v, str) and bool(v.strip()), "a text")
+# Results go into a folder of this name.
+NAME = Rule(
+    lambda v: isinstance(v, str) and re.fullmatch(r"[\w-][\w .-]*", v) is not None,
+    "a plain name of letters, digits, spaces, -, _ and ., that begins with neither a dot nor a "
+    "space",
+)
 COUNT = Rule(_is_count, "a whole number of at least 1")
 NUMBER = Rule(is_number, "a finite number")
 TRUTH = Rule(lambda v: isinstance(v, bool), "true or false")
@@ -89,14 +96,14 @@ def read_tables(
 
     Args:
       path: the file; `what` it is begins an error.
-      known: keys and rules by table; a file may have a ``name`` beside its tables.
+      known: keys and rules by table; a file may have a plain ``name`` beside its tables.
       required: keys that a table must have; by the empty name, the tables.
 
     Raises:
       ValueError: the file is missing or malformed, or a key is unknown, missing or wrong.
     """
     data, raw = read_toml(path, what)
-    check_table(path, "", data, {"name": TEXT, **dict.fromkeys(known, TABLE)}, required[""])
+    check_table(path, "", data, {"name": NAME, **dict.fromkeys(known, TABLE)}, required[""])
     for table in known:
         if table in data:
             check_table(path, table, data[table], known[table], required.get(table, ()))

@@ -233,6 +233,9 @@ def _check_learner(path: Path, learner: Mapping[str, Any]) -> None:
         (in_world and "mu" in learner,
          'mu weighs the probability of doing the task; it needs in = "product"'),
         (not in_world and "goal" in learner, 'goal belongs to in = "world"'),
+        ("learning_rate" in learner and learner.get("optimizer", "lbfgs") == "lbfgs",
+         'learning_rate belongs to optimizer = "adam" or "sgd"; "lbfgs", the default, searches for '
+         "its own"),
         (any(not isinstance(x, kind) for x in progress),
          f"progress = {progress!r}; it must be a list of {wanted}"),
     ))
