@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from multiprocessing import get_context, parent_process
+from multiprocessing.util import Finalize
 from typing import Any, NamedTuple
 
 _PROCESSES = 2
@@ -85,6 +86,8 @@ def artist(apart: bool) -> Iterator[Artist]:
 def _prepare() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command itself says what is to be done
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    # Else what was loaded is freed piece by piece, for half a second.
+    Finalize(None, os._exit, args=(0,), exitpriority=-1)
     import jaxltl.plot  # noqa: F401
 
 
