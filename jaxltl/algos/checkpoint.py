@@ -19,7 +19,7 @@ import types
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import jax
 import jax.numpy as jnp
@@ -52,6 +52,38 @@ def atomic_write(path: str | os.PathLike[str]):
         with contextlib.suppress(OSError):
             os.unlink(temporary)
         raise
+
+
+def read_arrays(file: BinaryIO) -> dict[str, np.ndarray]:
+    """The arrays of an ``.npz`` file, by name; nothing in it is executed.
+
+    Raises:
+      ValueError: it is none, or damaged. The message tells what is wrong and lacks the file's name.
+    """
+    start = file.read(6)
+    file.seek(0)
+    if start == np.lib.format.MAGIC_PREFIX:
+        raise ValueError(
+            "it holds a single array; numpy.savez(path, name=array) writes named ones.")
+    arrays, what = {}, "it"
+    try:
+        if not start.startswith(b"PK"):
+            raise zipfile.BadZipFile
+        with np.load(file, allow_pickle=False) as archive:
+            for name in archive.files:
+                what = f"its array {name!r}"
+                arrays[name] = archive[name]
+                if not isinstance(arrays[name], np.ndarray):  # raw bytes, where it is no array
+                    raise zipfile.BadZipFile
+    except Exception as error:  # damaged bytes make numpy and zipfile raise almost anything
+        if "Object arrays" in str(error):
+            raise ValueError(
+                f"{what} holds Python objects, such as None; save numbers, truth values or texts."
+            ) from None
+        raise ValueError(
+            f"{what} is damaged, or not written by numpy.savez(path, name=array)."
+        ) from None
+    return arrays
 
 
 def _umask() -> int:
@@ -96,10 +128,10 @@ def load(
     """
     try:
         # An open file of our own is closed even where a damaged archive is given up.
-        with open(path, "rb") as handle, np.load(handle, allow_pickle=False) as file:
-            arrays = dict(file)
+        with open(path, "rb") as file:
+            arrays = read_arrays(file)
         before = json.loads(str(arrays.pop(_GIVEN)))
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError) as error:
         raise ValueError(f"{str(path)!r} is not a saved state: {error}") from error
     leaves = []
     for name, leaf in _named(like):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.algos import todirl
-from jaxltl.algos.checkpoint import atomic_write
+from jaxltl.algos.checkpoint import atomic_write, read_arrays
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import from_dict, to_dict
 from jaxltl.core.models.mdp import MDP
@@ -123,8 +122,8 @@ def load_reward(path: str | Path) -> LearnedReward:
       ValueError: the file cannot be read, or is no such file.
     """
     try:
-        with open(path, "rb") as handle, np.load(handle, allow_pickle=False) as file:
-            arrays = dict(file)
+        with open(path, "rb") as file:
+            arrays = read_arrays(file)
         about = json.loads(str(arrays.pop("about")))
         memory = from_dict(about.pop("memory"))
         for key in ("hidden", "kinds"):
@@ -133,7 +132,7 @@ def load_reward(path: str | Path) -> LearnedReward:
         found.parameters["params"]["kernel"]  # what any reward network has
     except OSError as error:
         raise ValueError(f"the network cannot be read: {str(path)!r}: {error.strerror}.") from None
-    except (ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"{str(path)!r} is no learned reward, as save_reward writes it: {error}"
         ) from None

@@ -374,7 +374,7 @@ def test_a_start_in_a_wall(write, tmp_path):
 @pytest.mark.parametrize(("changed", "message"), [
     ({"system": [True, False]}, "State 2 has no owner."),
     ({"system": [1.0, 0.0, np.nan]}, "state 2 has no owner: system is nan there"),
-    ({"system": np.array([True, False, None])}, "array 'system' is malformed: it holds Python"),
+    ({"system": np.array([True, False, None])}, "array 'system' holds Python objects"),
     ({"system": None}, "lacks the array system: for each state True where the system moves"),
     ({"probability": [[[1.0], [1.0]], [[1.0], [0.0]], [[0.0], [0.0]]]},
      "state 2 has no available action; give it one"),

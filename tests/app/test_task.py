@@ -1,5 +1,6 @@
 """Task files: what is read, and that every mistake is named with its place and fix."""
 
+import io
 import json
 import re
 
@@ -244,12 +245,38 @@ def test_mistakes_in_a_model(write, arrays, message):
         load_world(_model_task(write, **arrays))
 
 
-def test_a_model_that_is_no_npz(write, tmp_path):
-    path = write(("map = '''\n. . r\nb . y\n'''", 'model = "m.npz"'),
-                 ('absorbing = ["y"]\ninitial = "!r & !y"', ""))
-    (tmp_path / "m.npz").write_bytes(b"nonsense")
-    with pytest.raises(ValueError, match=r"is not an \.npz of plain arrays"):
-        load_world(read_task(path))
+def _broken(name, good):
+    if name == "nonsense":
+        return b"nonsense"
+    if name == "cut":
+        return good[: len(good) // 2]
+    if name == "no array":
+        return good.replace(b"\x93NUMPY", b"\x93NOMPY")
+    if name == "header":
+        return good.replace(b"'descr'", b"'desrc'")
+    file = io.BytesIO()
+    if name == "single":
+        np.save(file, CHAIN)
+    else:
+        np.savez(file, transition=np.array([None, {}]))
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(("name", "message"), [
+    ("nonsense", "it is damaged, or not written by numpy"),
+    ("cut", "it is damaged, or not written by numpy"),
+    ("no array", "its array 'transition' is damaged, or not"),
+    ("header", "its array 'transition' is damaged, or not"),
+    ("single", "it holds a single array; numpy.savez"),
+    ("objects", "its array 'transition' holds Python objects, such as None; save numbers"),
+])
+def test_a_model_that_is_no_npz(write, tmp_path, name, message):
+    task = _model_task(write, transition=CHAIN)
+    path = tmp_path / "m.npz"
+    path.write_bytes(_broken(name, path.read_bytes()))
+    with pytest.raises(ValueError, match=rf"is not an \.npz of plain arrays: {message}") as raised:
+        load_world(task)
+    assert "pickle" not in str(raised.value)
 
 
 def test_an_unknown_proposition_in_a_models_initial(write):

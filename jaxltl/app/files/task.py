@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxltl.algos.checkpoint import read_arrays
 from jaxltl.app.files import tables
 from jaxltl.app.files.tables import COUNT, NAMES, TEXT, Rule, choice, is_list, is_number, number_in
 from jaxltl.core.logic.labels import satisfying
@@ -278,7 +278,9 @@ def load_model(
     Raises:
       ValueError: the file is no ``.npz``, or an array is unknown, missing or wrong.
     """
-    arrays = _read_arrays(path)
+    raw = tables.read_bytes(path, "the model")
+    with tables.errors_in(f"{str(path)!r} is not an .npz of plain arrays: "):
+        arrays = read_arrays(io.BytesIO(raw))
     known = (*_ARRAYS, *more)
     for name in arrays:
         if name not in known:
@@ -306,26 +308,6 @@ def load_model(
             f"{mdp.num_actions} actions."
         )
     return World(mdp, None, actions), {k: arrays[k] for k in more if k in arrays}
-
-
-def _read_arrays(path: Path) -> dict[str, np.ndarray]:
-    raw = tables.read_bytes(path, "the model")
-    arrays, what = {}, f"{str(path)!r} is not an .npz of plain arrays"
-    try:
-        file = np.load(io.BytesIO(raw), allow_pickle=False)
-        if not isinstance(file, np.lib.npyio.NpzFile):
-            raise ValueError("it holds a single array; write it by numpy.savez(path, name=...).")
-        for name in file.files:
-            what = f"{str(path)!r}: the array {name!r} is malformed"
-            arrays[name] = file[name]
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        if "Object arrays" in str(error):
-            raise ValueError(
-                f"{what}: it holds Python objects, such as None; save numbers, truth values or "
-                "texts."
-            ) from None
-        raise ValueError(f"{what}: {error}") from None
-    return arrays
 
 
 def _where_holds(formula: str, mdp: MDP) -> jax.Array:
