@@ -47,7 +47,8 @@ def random_letters(rng, names):
     return rng.sample(everything, rng.randint(1, len(everything)))
 
 
-@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("seed", [
+    pytest.param(seed, marks=[] if seed < 8 else pytest.mark.exhaustive) for seed in range(16)])
 def test_automaton_accepts_what_the_formula_says(seed):
     rng = random.Random(seed)
     accepted = []
@@ -313,7 +314,7 @@ def same_tables_up_to_kind(left, right):
     return all(np.array_equal(getattr(left, n), getattr(right, n)) for n in names)
 
 
-@pytest.mark.parametrize("seed", range(100, 106))
+@pytest.mark.parametrize("seed", range(100, 104))
 def test_random_formulas_of_all_of_the_logic(seed):
     kinds, mean = check_random_formulas(seed, 60)
     assert set(kinds) == {"cosafe", "safety", "buchi", "parity"} and 0.2 < mean < 0.8

@@ -15,7 +15,7 @@ from jaxltl.envs import temporal_gridworld as grid
 from tests import reference
 from tests.support import as_mdp, assert_encloses, mass_preserving, stack
 
-NUM_MODELS = 1000
+NUM_MODELS = 400
 SHAPE = (5, 3, 2)  # states, actions, successors
 # Dyadic, so that float32 and float64 hold them exactly.
 DISCOUNTS = (0.0, 0.5, 0.875, 0.96875, 0.9921875)
@@ -71,7 +71,8 @@ SINGLE = 200  # lanes that are repeated in single precision
 
 @pytest.mark.parametrize("tolerance", [None, 1e-6])
 def test_policy_values_are_enclosed(batch, exact_policy, tolerance):
-    solution = jax.vmap(lambda m, p, r, d: jl.policy_value(m, p, r, d, tolerance=tolerance))(*batch)
+    solution = jax.jit(jax.vmap(
+        lambda m, p, r, d: jl.policy_value(m, p, r, d, tolerance=tolerance)))(*batch)
     assert_certified(solution, exact_policy, tolerance)
 
 
@@ -79,9 +80,9 @@ def test_policy_values_are_enclosed(batch, exact_policy, tolerance):
 @pytest.mark.parametrize("method", ["modified_policy_iteration", "value_iteration"])
 def test_optimal_values_are_enclosed(cases, batch, exact_optimal, method, tolerance):
     mdps, _, rewards, discounts = batch
-    solution = jax.vmap(
+    solution = jax.jit(jax.vmap(
         lambda m, r, d: jl.optimal_value(m, r, d, method=method, tolerance=tolerance)
-    )(mdps, rewards, discounts)
+    ))(mdps, rewards, discounts)
     assert_certified(solution, exact_optimal, tolerance)
     for i in range(100):
         model, _, reward, discount = cases[i]
@@ -94,9 +95,9 @@ def test_values_are_enclosed_in_single_precision(cases, exact_policy, exact_opti
     with jax.enable_x64(False):
         mdps, policies, rewards, discounts = batch_of(cases[:SINGLE])
         assert mdps.dtype == jnp.float32
-        solution = jax.vmap(jl.policy_value)(mdps, policies, rewards, discounts)
+        solution = jax.jit(jax.vmap(jl.policy_value))(mdps, policies, rewards, discounts)
         assert_certified(solution, exact_policy[:SINGLE])
-        solution = jax.vmap(jl.optimal_value)(mdps, rewards, discounts)
+        solution = jax.jit(jax.vmap(jl.optimal_value))(mdps, rewards, discounts)
         assert_certified(solution, exact_optimal[:SINGLE])
 
 
@@ -122,9 +123,9 @@ def soft(cases):
 def test_soft_values_are_enclosed(batch, soft, method, tolerance):
     mdps, _, rewards, _ = batch
     discounts, exact = soft
-    solution = jax.vmap(
+    solution = jax.jit(jax.vmap(
         lambda m, r, d: jl.soft_value(m, r, d, method=method, tolerance=tolerance)
-    )(mdps, rewards, jnp.asarray(discounts))
+    ))(mdps, rewards, jnp.asarray(discounts))
     assert_certified(solution, exact, tolerance)
     np.testing.assert_allclose(solution.policy.sum(-1), 1, atol=1e-12)
     assert not np.asarray(solution.policy)[~np.asarray(mdps.available)].any()
@@ -134,7 +135,7 @@ def test_soft_values_are_enclosed_in_single_precision(cases, soft):
     discounts, exact = soft
     with jax.enable_x64(False):
         mdps, _, rewards, _ = batch_of(cases[:SINGLE])
-        solution = jax.vmap(jl.soft_value)(mdps, rewards, jnp.asarray(discounts[:SINGLE]))
+        solution = jax.jit(jax.vmap(jl.soft_value))(mdps, rewards, jnp.asarray(discounts[:SINGLE]))
         assert_certified(solution, exact[:SINGLE])
 
 
@@ -143,7 +144,7 @@ def test_boltzmann_values_are_enclosed_where_the_operator_contracts(cases, batch
     discounts = np.array([min(d, 0.6875) for *_, d in cases])
     assert discounts.max() * boltzmann_expansion(SHAPE[1]) < 1
     exact = smooth_reference(cases, discounts, "boltzmann", 600)
-    solution = jax.vmap(jl.boltzmann_value)(mdps, rewards, jnp.asarray(discounts))
+    solution = jax.jit(jax.vmap(jl.boltzmann_value))(mdps, rewards, jnp.asarray(discounts))
     assert_certified(solution, exact)
 
 
@@ -260,7 +261,7 @@ def test_random_models_beyond_contraction():
         jnp.asarray(transition), jnp.asarray(available), jnp.full((150, 6), 1 / 6),
         jnp.zeros((150, 6, 0), bool),
     )
-    solution = jax.vmap(jl.boltzmann_value, (0, 0, None))(dense, jnp.asarray(reward), 0.95)
+    solution = jax.jit(jax.vmap(jl.boltzmann_value, (0, 0, None)))(dense, jnp.asarray(reward), 0.95)
     value = np.asarray(solution.value)
     q = reward + 0.95 * np.einsum("nsat,nt->nsa", transition, value)
     residual = np.abs(reference.soft_maximum(q, available, "boltzmann") - value).max(axis=1)

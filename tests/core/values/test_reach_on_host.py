@@ -74,7 +74,7 @@ def test_both_engines_give_the_same_bounds_and_regions(objective, dense_limit, m
 
     traced = jax.jit(solve)
     compared = 0
-    for _ in range(40):
+    for _ in range(20):
         model, goal = random_case(rng, 7)
         policy = jnp.asarray(rng.dirichlet(np.ones(2), 7))
         one, other = solve(model, goal, policy), traced(model, goal, policy)
@@ -88,7 +88,7 @@ def test_both_engines_give_the_same_bounds_and_regions(objective, dense_limit, m
             attained = reachability_probability(model, goal, policy=one.policy)
             reached = attained.upper >= one.lower - 1e-12
             assert (reached if objective == "max" else attained.lower <= one.upper + 1e-12).all()
-    assert compared > 10
+    assert compared > 5
 
 
 def test_end_components_choose_together():

@@ -19,7 +19,7 @@ from tests.support import (
     stack,
 )
 
-NUM_MODELS = 1000
+NUM_MODELS = 400
 DEFAULT = float(np.sqrt(np.finfo(float).eps))
 
 
@@ -91,9 +91,9 @@ def test_the_examples_are_not_trivial(cases, exact):
         for (m, _, _), value in zip(cases[:300], exact["max"], strict=False)
     )
     several = sum(t.sum() > 1 for _, t, _ in cases)
-    assert inner > 250
+    assert inner > 100
     assert collapsing > 10
-    assert several > 250
+    assert several > 100
 
 
 @pytest.mark.parametrize("tolerance", [None, 1e-12])
@@ -159,17 +159,17 @@ def exact_satisfaction(lazy, explicit, policy):
 
 
 @pytest.mark.parametrize(
-    ("acceptance", "label_on"),
+    ("acceptance", "label_on", "count"),
     [
-        ("cosafe", "entry"),
-        ("safety", "exit"),
-        pytest.param("cosafe", "exit", marks=pytest.mark.exhaustive),
-        pytest.param("safety", "entry", marks=pytest.mark.exhaustive),
+        ("cosafe", "entry", 150),
+        ("safety", "exit", 150),
+        pytest.param("cosafe", "exit", 500, marks=pytest.mark.exhaustive),
+        pytest.param("safety", "entry", 500, marks=pytest.mark.exhaustive),
     ],
 )
-def test_satisfaction_is_enclosed_and_attained(acceptance, label_on):
+def test_satisfaction_is_enclosed_and_attained(acceptance, label_on, count):
     rng = np.random.default_rng(1)
-    some = [random_product(rng, acceptance=acceptance, label_on=label_on) for _ in range(500)]
+    some = [random_product(rng, acceptance=acceptance, label_on=label_on) for _ in range(count)]
     policies = [reference.random_policy(rng, explicit) for _, explicit in some]
     lazy = stack([p for p, _ in some])
     shape = (3, 3, 2)
