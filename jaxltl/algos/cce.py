@@ -191,8 +191,8 @@ def make_problem(
         unconstrained method. Give arrays that it needs by
         ``jax.tree_util.Partial(function, *arrays)``: what a function closes over is compiled in.
       family: the first distribution, such as ``diagonal_gaussian(mean, std)``.
-      limit: feasible is ``cost <= limit``, a number or ``float[C]``; infinite for none. None:
-        no constraint.
+      limit: feasible is ``cost <= limit``: a number for one cost, ``float[C]`` for several;
+        infinite for none. None: no constraint.
       scale: what violations are divided by before the largest counts, a number or ``float[C]``;
         default ``|limit|``, or 1 where that is zero or infinite. Of no effect with one cost.
 
@@ -219,6 +219,11 @@ def make_problem(
         raise ValueError(
             f"limit={limit}, but evaluate returns no cost; return (objective, cost), or give no "
             "limit."
+        )
+    if num_costs > 1 and limit is not None and np.ndim(limit) == 0:
+        raise ValueError(
+            f"limit={limit}, but evaluate returns {num_costs} costs; give one limit for each, "
+            f"float[{num_costs}], infinite where there is none."
         )
     limits = per_cost("limit", math.inf if limit is None else limit, num_costs)
     if np.isnan(limits).any() or (limits == -np.inf).any():

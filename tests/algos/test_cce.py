@@ -435,6 +435,8 @@ def test_worlds_travel_as_arguments():
      r"a cost of shape \(1, 2\)"),
     (lambda: cce.make_problem(lambda x, k: (0.0, 0.0, x), start(), limit=0), "returned 3 things"),
     (lambda: cce.make_problem(lambda x, k: x[0], start(), limit=0.0), "returns no cost"),
+    (lambda: cce.make_problem(lambda x, k: (x[0], x), start(), limit=0.5),
+     r"limit=0\.5, but evaluate returns 2 costs; give one limit for each, float\[2\]"),
     (lambda: problem(limit=[0.0, 1.0]), r"limit has shape \(2,\); expected \(1,\)"),
     (lambda: problem(limit=math.nan), r"limit=\[nan\]"),
     (lambda: problem(limit=-math.inf), r"limit=\[-inf\]; no cost is at most"),
