@@ -139,6 +139,17 @@ def check_formula(automaton: Automaton) -> str | None:
     return None
 
 
+def left_out(
+    model: Product, guarantee: Guarantee, shown: Trajectories
+) -> list[tuple[int, int, int]]:
+    """State, memory and action of the demonstrated steps that are left out, each once."""
+    state, action = np.asarray(shown.state), np.asarray(shown.action)
+    if not guarantee.forbidden.any():
+        return []
+    steps = np.stack([state, memory_along(model, state), action], -1)[guarantee.forbidden]
+    return [(s, q, a) for s, q, a in np.unique(steps, axis=0).tolist()]
+
+
 def kept(
     guarantee: Guarantee, attempt: Attempt | None, model: Product, world: World,
     shown: Trajectories, solution: Solution,

@@ -43,6 +43,7 @@ from jaxltl.app.guarantee import (
     check_formula,
     from_starts,
     kept,
+    left_out,
 )
 from jaxltl.app.job import (
     Report,
@@ -474,6 +475,8 @@ def live(outcome: Outcome) -> list[Explorer | TooLarge | Curves]:
              *learned_runs(model, policy, outcome.seed)],
             size=setup.world.mdp.num_states, place=setup.world.cells, actions=setup.world.actions,
             label=_LABEL, wall=setup.task.world.get("wall", "#"),
+            marked=left_out(model, setup.guarantee, setup.demonstrations),
+            marks="Demonstrated steps that lower the best probability and were left out",
         ),
         curves("learning", "Learning", caption, outcome.learned.history, _FIGURES),
     ]

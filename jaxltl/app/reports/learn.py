@@ -21,6 +21,7 @@ from jaxltl.app.reports.page import (
 )
 
 _SHORT = 0.01  # share of the best probability that may be missing without a word
+_LITTLE = 0.05  # a weight of which nothing is to be said
 _LONG = 10  # times the quickest policy's steps, likewise
 
 
@@ -107,11 +108,14 @@ def table(result: Mapping[str, Any]) -> str:
         f"  {title:16} {what:8} {value:>9}   certified {bounds:15} {where}".rstrip()
         for title, what, value, bounds, where, _ in _evidence(result)
     ]
-    weights = "  ".join(f"{k} {number(v)}" for k, v in result["weights"].items())
+    weights = result["weights"]
+    width = max(map(len, weights))
     lines += [
         "",
         f"negative log-likelihood  {number(result['neg_log_likelihood'])}",
-        f"weights                  {weights}",
+        "weights",
+        *(f"  {name:{width}} {number(weight):>9}  {meaning(name, weight)}"
+          for name, weight in weights.items()),
     ]
     if training["converged"]:
         lines.append(
@@ -223,9 +227,27 @@ def _evidence_table(result: Mapping[str, Any]) -> str:
 
 
 def _weights_table(result: Mapping[str, Any]) -> str:
-    weights = result["weights"]
-    return rows(("feature", *map(html.escape, weights)),
-                [("weight", *(number(v) for v in weights.values()))])
+    lines = [(html.escape(name), number(weight), meaning(name, weight))
+             for name, weight in result["weights"].items()]
+    return rows(("feature", "weight", "what it says"), lines)
+
+
+_MEANING = {
+    "demonstrated": ("does what was shown", "does other than what was shown"),
+    "goal": ("drawn to where the task is done", "kept away from where the task is done"),
+    "progress": ("drawn to the next part of the task", "kept away from the next part of the task"),
+    "accepting": ("drawn to what is to be visited again and again", "kept away from it"),
+    "avoid": ("kept away from them", "drawn to them"),
+    "time": ("hurries", "takes its time"),
+    "nearer": ("takes short ways", "takes long ways"),
+}
+
+
+def meaning(name: str, weight: float | None) -> str:
+    """What a weight's sign says of the policy; nothing where it hardly weighs."""
+    if weight is None or abs(weight) < _LITTLE:
+        return "hardly counts"
+    return _MEANING[name][weight < 0]
 
 
 def _seeds(result: Mapping[str, Any]) -> str:
