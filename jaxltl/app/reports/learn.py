@@ -157,8 +157,8 @@ def warnings(result: Mapping[str, Any]) -> list[str]:
         much = f"{number(steps['learned'])}" if steps["learned"] else "more than can be told"
         found.append(
             f"The policy takes {much} steps on average where {number(steps['quickest'])} would "
-            "do: it was not shown that it should hurry. A larger discount, a smaller l2 or more "
-            "demonstrations help.")
+            "do: it goes round where it earns what was shown again and again. A smaller discount "
+            "in [learner] helps; with 0 each action counts for itself.")
     starts, total = result["impossible_starts"], result["satisfaction"]["num_starts"]
     if starts:
         listed = "; ".join(place(s) for s in starts[:5]) + ("; ..." if len(starts) > 5 else "")
