@@ -1,12 +1,18 @@
 """The shape of the package: which way imports flow, what is public, and what importing does."""
 
 import ast
+import functools
+import importlib
+import inspect
 import subprocess
 import sys
+import types
+import typing
 from functools import cache
 from pathlib import Path
 
 import pytest
+from jax.tree_util import Partial
 
 import jaxltl
 
@@ -156,6 +162,27 @@ def test_public_names_are_as_agreed():
 def test_public_names_are_documented(name):
     assert (getattr(jaxltl, name).__doc__ or "").strip()
     assert not getattr(jaxltl, name).__doc__.startswith(f"{name}("), "a generated docstring"
+
+
+LEARNER_MODULES = [
+    n for n in MODULES if n.startswith("jaxltl.algos.") and not n.startswith("jaxltl.algos._")]
+
+
+def public_callables(module):
+    """By name: what a module defines, and what it has built, such as partial functions."""
+    for name, found in vars(module).items():
+        is_ours = str(getattr(found, "__module__", "")).startswith("jaxltl.")
+        if not name.startswith("_") and callable(found) and typing.get_origin(found) is None and (
+                is_ours or not isinstance(found, type | types.FunctionType)):
+            yield name, found
+
+
+@pytest.mark.parametrize("name", ["jaxltl._public", *LEARNER_MODULES])
+def test_what_is_called_has_help_of_its_own(name):
+    lent = {inspect.getdoc(functools.partial), inspect.getdoc(Partial), None, ""}
+    bare = [called for called, found in public_callables(importlib.import_module(name))
+            if inspect.getdoc(found) in lent or inspect.getdoc(found).startswith(f"{called}(")]
+    assert not bare
 
 
 def test_importing_changes_no_setting_and_stays_light():

@@ -8,7 +8,6 @@ learned holds where things look as they did in the demonstrations.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import chex
@@ -337,7 +336,4 @@ def _optimizer(hparams: Hparams) -> optax.GradientTransformation:
     return optax.chain(optax.scale_by_adam(), rate)
 
 
-run = partial(learner.run, step)
-train = partial(learner.train, init, step)
-run_until = partial(learner.run_until, step)
-train_until = partial(learner.train_until, init, step)
+run, train, run_until, train_until = learner.bind(init, step)

@@ -327,16 +327,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     )
 
 
-run = partial(learner.run, step)
-
-
-train = partial(learner.train, init, step)
-
-
-run_until = partial(learner.run_until, step)
-
-
-train_until = partial(learner.train_until, init, step)
+run, train, run_until, train_until = learner.bind(init, step)
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:

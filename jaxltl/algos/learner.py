@@ -1,12 +1,9 @@
 """What all learners share: one loop, ended early or not, progress, and resuming bitwise.
 
 A learner is a module with ``init(key, problem, hparams) -> State`` and
-``step(state, problem, hparams) -> (State, Metrics)``, both pure. From these follow::
+``step(state, problem, hparams) -> (State, Metrics)``, both pure. From these follows the rest::
 
-    run = partial(learner.run, step)
-    train = partial(learner.train, init, step)
-    run_until = partial(learner.run_until, step)
-    train_until = partial(learner.train_until, init, step)
+    run, train, run_until, train_until = learner.bind(init, step)
 
 What was learned is ``policy(state, problem, hparams)``. The root key stays in the state: what step
 n draws comes from ``step_key(state)``, the key with n folded in, and what ``init`` draws from
@@ -59,22 +56,7 @@ def count(total: jax.Array, more: jax.Array | int) -> jax.Array:
 def run(
     step: Step, state: Any, problem: Any, hparams: Any, *, num_steps: int, max_rows: int = 1000
 ) -> tuple[Any, Any]:
-    """`num_steps` steps of a learner, compiled as one loop.
-
-    Args:
-      step: the learner's step.
-      state: where to go on from.
-      problem, hparams: arrays; new values do not recompile.
-      num_steps: a number; another one with as many rows does not recompile.
-      max_rows: metrics are kept of at most this many evenly spaced steps, always
-        including the last, so memory does not grow with `num_steps`.
-
-    Returns:
-      The state after the last step, and metrics with a leading axis of rows.
-
-    Raises:
-      ValueError: num_steps or max_rows is not positive.
-    """
+    """`num_steps` steps of a learner's `step`; the rest is as for the ``run`` of :func:`bind`."""
     if num_steps < 1 or max_rows < 1:
         raise ValueError(f"num_steps={num_steps}, max_rows={max_rows}; both must be at least 1.")
     stride = -(-num_steps // max_rows)
@@ -100,21 +82,6 @@ def _no_metrics(step: Step, *arguments: Any) -> Any:
     # One trace of the step serves all: two could be compiled to different roundings.
     _, shape = jax.eval_shape(step, *arguments)
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
-
-
-def train(
-    init: Init,
-    step: Step,
-    key: chex.PRNGKey,
-    problem: Any,
-    hparams: Any,
-    *,
-    num_steps: int,
-    max_rows: int = 1000,
-) -> tuple[Any, Any]:
-    """:func:`run` from a fresh state; ``vmap`` it over keys for a sweep of seeds."""
-    state = init(key, problem, hparams)
-    return run(step, state, problem, hparams, num_steps=num_steps, max_rows=max_rows)
 
 
 # --- ended early ----------------------------------------------------------------------------
@@ -156,30 +123,12 @@ def run_until(
     keep: str = "after",
     idle: bool = False,
 ) -> Learned:
-    """Steps until a condition is met, or `num_steps` of them. Under ``jit`` and ``vmap``.
-
-    Under ``vmap`` a run that has ended stays as it is while others go on.
+    """Steps until a condition is met: as the ``run_until`` of :func:`bind`, but for these.
 
     Args:
       step: the learner's step.
-      state: where to go on from.
-      problem, hparams: arrays; new values do not recompile.
-      until: ``(before, after, metrics) -> bool[]``: the states before and after some steps and
-        the metrics of the last of them. Traced numbers go into
-        ``jax.tree_util.Partial(function, *numbers)``, with which new ones do not recompile; a new
-        function does.
-      num_steps: steps at most; traced.
-      check_every: steps between `before` and `after`; static.
-      keep: which state a run ends with that met the condition, ``"after"`` or ``"before"``: the
-        one that the learner's metrics describe; static.
       idle: whether the step takes another argument, ``bool[]``, and by itself leaves alone a
         state for which that is False; else its arrays are chosen one by one; static.
-
-    Returns:
-      :class:`Learned`.
-
-    Raises:
-      ValueError: an unknown `keep`, or a number below 1.
     """
     if keep not in ("after", "before"):
         raise ValueError(f'keep={keep!r}; choose "after" or "before".')
@@ -191,13 +140,6 @@ def run_until(
     until = until if isinstance(until, Partial) else Partial(until)
     most = jnp.asarray(num_steps, jnp.int32)
     return _run_until(step, state, problem, hparams, until, most, check_every, keep, idle)
-
-
-def train_until(
-    init: Init, step: Step, key: chex.PRNGKey, problem: Any, hparams: Any, **options: Any
-) -> Learned:
-    """:func:`run_until` from a fresh state; ``vmap`` it over keys for a sweep of seeds."""
-    return run_until(step, init(key, problem, hparams), problem, hparams, **options)
 
 
 @struct.dataclass
@@ -242,7 +184,6 @@ def _run_until(step, state, problem, hparams, until, most, check_every, keep, id
     return Learned(found.state, found.metrics, found.count, worst(status, said))
 
 
-@Partial
 def has_stopped(before: Any, after: Any, metrics: Any) -> jax.Array:
     """A condition for :func:`run_until`: the learner has stopped early, as its state says."""
     return after.stopped
@@ -290,6 +231,138 @@ def while_active(
         return found, jax.tree.map(lambda _: True, lanes)
 
     return loop(carry, given)
+
+
+# --- the functions of a learner --------------------------------------------------------------
+
+
+class Bound(NamedTuple):
+    """What follows from a learner's ``init`` and ``step``; each has its own help."""
+
+    run: Callable[..., tuple[Any, Any]]
+    train: Callable[..., tuple[Any, Any]]
+    run_until: Callable[..., Learned]
+    train_until: Callable[..., Learned]
+
+
+def bind(init: Init, step: Step, *, step_if: Step | None = None, keep: str = "after") -> Bound:
+    """The functions that run and train a learner, to the end or until a condition is met.
+
+    They are plain functions of the module that `step` is of, and are to stand there by these names.
+
+    Args:
+      init: ``(key, problem, hparams) -> State``.
+      step: ``(state, problem, hparams) -> (State, Metrics)``.
+      step_if: a step that takes another argument, ``bool[]``, and by itself leaves alone a state
+        for which that is False; for runs that end early. Default: arrays are chosen one by one.
+      keep: the default of that argument.
+    """
+    both = (*_whole(init, step), *_early(init, step if step_if is None else step_if, keep,
+                                         step_if is not None))
+    for name, function in zip(Bound._fields, both, strict=True):
+        function.__name__ = function.__qualname__ = name
+        function.__module__ = step.__module__
+    return Bound(*both)
+
+
+def _whole(init: Init, step: Step) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    def from_state(
+        state: Any, problem: Any, hparams: Any, *, num_steps: int, max_rows: int = 1000
+    ) -> tuple[Any, Any]:
+        """`num_steps` steps from a state, compiled as one loop.
+
+        Args:
+          state: where to go on from.
+          problem, hparams: arrays; new values do not recompile.
+          num_steps: a number; another one with as many rows does not recompile.
+          max_rows: metrics are kept of at most this many evenly spaced steps, always
+            including the last, so memory does not grow with `num_steps`.
+
+        Returns:
+          The ``State`` after the last step, and ``Metrics`` with a leading axis of rows.
+
+        Raises:
+          ValueError: num_steps or max_rows is not positive.
+        """
+        return run(step, state, problem, hparams, num_steps=num_steps, max_rows=max_rows)
+
+    def from_key(
+        key: chex.PRNGKey, problem: Any, hparams: Any, *, num_steps: int, max_rows: int = 1000
+    ) -> tuple[Any, Any]:
+        """A fresh state and `num_steps` steps from it; ``vmap`` it over keys for many seeds.
+
+        Args:
+          key: of ``init(key, problem, hparams)``; the state keeps it.
+          problem, hparams, num_steps, max_rows: as for ``run``.
+
+        Returns:
+          The ``State`` after the last step, and ``Metrics`` with a leading axis of rows.
+
+        Raises:
+          ValueError: num_steps or max_rows is not positive.
+        """
+        state = init(key, problem, hparams)
+        return from_state(state, problem, hparams, num_steps=num_steps, max_rows=max_rows)
+
+    return from_state, from_key
+
+
+def _early(
+    init: Init, step: Step, kept: str, idle: bool
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    def from_state(
+        state: Any, problem: Any, hparams: Any, *, until: Until, num_steps: chex.Numeric,
+        check_every: int = 1, keep: str = kept,
+    ) -> Learned:
+        """Steps until a condition is met, or `num_steps` of them. Under ``jit`` and ``vmap``.
+
+        Under ``vmap`` a run that has ended stays as it is while others go on.
+
+        Args:
+          state: where to go on from.
+          problem, hparams: arrays; new values do not recompile.
+          until: ``(before, after, metrics) -> bool[]``: the states before and after some steps
+            and the metrics of the last of them. Traced numbers go into
+            ``jax.tree_util.Partial(function, *numbers)``, with which new ones do not recompile; a
+            new function does.
+          num_steps: steps at most; traced.
+          check_every: steps between `before` and `after`; static.
+          keep: which state a run ends with that met the condition, ``"after"`` or ``"before"``:
+            the one that the learner's metrics describe; static.
+
+        Returns:
+          :class:`~jaxltl.algos.learner.Learned`: the state, its metrics, the number of steps and
+          the status; :func:`~jaxltl.check` accepts it.
+
+        Raises:
+          ValueError: an unknown `keep`, or a number below 1.
+        """
+        return run_until(
+            step, state, problem, hparams, until=until, num_steps=num_steps,
+            check_every=check_every, keep=keep, idle=idle)
+
+    def from_key(
+        key: chex.PRNGKey, problem: Any, hparams: Any, *, until: Until, num_steps: chex.Numeric,
+        check_every: int = 1, keep: str = kept,
+    ) -> Learned:
+        """A fresh state and steps until a condition is met; ``vmap`` it over keys for many seeds.
+
+        Args:
+          key: of ``init(key, problem, hparams)``; the state keeps it.
+          problem, hparams, until, num_steps, check_every, keep: as for ``run_until``.
+
+        Returns:
+          :class:`~jaxltl.algos.learner.Learned`: the state, its metrics, the number of steps and
+          the status; :func:`~jaxltl.check` accepts it.
+
+        Raises:
+          ValueError: an unknown `keep`, or a number below 1.
+        """
+        return from_state(
+            init(key, problem, hparams), problem, hparams, until=until, num_steps=num_steps,
+            check_every=check_every, keep=keep)
+
+    return from_state, from_key
 
 
 # --- in chunks, on the host -----------------------------------------------------------------

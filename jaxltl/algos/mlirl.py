@@ -8,7 +8,6 @@ that the policy does the task (2.6).
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import chex
@@ -333,11 +332,8 @@ def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
     return learner.optimizer(hparams.optimizer, hparams.learning_rate)
 
 
-run = partial(learner.run, step)
-train = partial(learner.train, init, step)
 # The metrics, and so their gradient, are of the state before a step.
-run_until = partial(learner.run_until, step, keep="before")
-train_until = partial(learner.train_until, init, step, keep="before")
+run, train, run_until, train_until = learner.bind(init, step, keep="before")
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:

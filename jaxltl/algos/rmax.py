@@ -327,16 +327,7 @@ def _step_if(
     return state, measure(state, problem, hparams)
 
 
-run = partial(learner.run, step)
-
-
-train = partial(learner.train, init, step)
-
-
-run_until = partial(learner.run_until, _step_if, idle=True)
-
-
-train_until = partial(learner.train_until, init, _step_if, idle=True)
+run, train, run_until, train_until = learner.bind(init, step, step_if=_step_if)
 
 
 def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:

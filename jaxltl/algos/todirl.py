@@ -516,10 +516,7 @@ def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
     return learner.optimizer(hparams.optimizer, hparams.learning_rate)
 
 
-run = partial(learner.run, step)
-train = partial(learner.train, init, step)
-run_until = partial(learner.run_until, step)
-train_until = partial(learner.train_until, init, step)
+run, train, run_until, train_until = learner.bind(init, step)
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:

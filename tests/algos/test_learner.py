@@ -7,6 +7,7 @@ of as many rows: their number of steps is an argument.
 from __future__ import annotations
 
 import inspect
+import pickle
 from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -74,9 +75,7 @@ def toy_step(state, problem, hparams):
 
 TOY = SimpleNamespace(
     init=toy_init, step=toy_step, policy=lambda state, problem, hparams: state.position,
-    run=partial(learner.run, toy_step), train=partial(learner.train, toy_init, toy_step),
-    run_until=partial(learner.run_until, toy_step),
-    train_until=partial(learner.train_until, toy_init, toy_step),
+    **learner.bind(toy_init, toy_step)._asdict(),
 )
 
 
@@ -371,8 +370,23 @@ def test_every_learner_is_called_alike(name):
         for kind in ("Problem", "Hparams", "State", "Metrics"):
             assert inspect.isclass(getattr(module, kind))
         assert isinstance(hparams, module.Hparams) and isinstance(problem, module.Problem)
-    for function in (module.run, module.train, module.run_until, module.train_until):
-        assert isinstance(function, partial) and function.func.__module__ == learner.__name__
+    whole = {"num_steps": inspect.Parameter.empty, "max_rows": 1000}
+    early = {"until": inspect.Parameter.empty, "num_steps": inspect.Parameter.empty,
+             "check_every": 1, "keep": "before" if module is mlirl else "after"}
+    for function, first, options, returned in (
+        (module.run, "state", whole, "``Metrics``"), (module.train, "key", whole, "``Metrics``"),
+        (module.run_until, "state", early, "Learned"),
+        (module.train_until, "key", early, "Learned"),
+    ):
+        given = inspect.signature(function).parameters.values()
+        assert [x.name for x in given if x.kind == x.POSITIONAL_OR_KEYWORD] == [
+            first, "problem", "hparams"]
+        assert {x.name: x.default for x in given if x.kind == x.KEYWORD_ONLY} == options
+        assert f"  {first}: " in function.__doc__
+        assert returned in inspect.getdoc(function).split("Returns:")[1]
+        if name != "toy":
+            assert function is getattr(module, function.__name__)
+            assert pickle.loads(pickle.dumps(function)) is function
     state, metrics = four_steps(name)
     assert_bitwise(state.key, start(name).key)
     assert metrics.status.shape == (2,), "as many rows as were asked for, after any steps"
@@ -497,8 +511,8 @@ def test_lanes_end_each_for_itself():
 def test_runs_that_make_no_sense_are_refused(options, message):
     module, problem, hparams, _ = case("toy")
     with pytest.raises(ValueError, match=message):
-        module.run_until(start("toy"), problem, hparams,
-                         **{"until": Partial(reaches, 1), "num_steps": 3, **options})
+        learner.run_until(module.step, start("toy"), problem, hparams,
+                          **{"until": Partial(reaches, 1), "num_steps": 3, **options})
 
 
 def test_a_loop_of_lanes_is_a_while_loop():
