@@ -66,7 +66,7 @@ def test_steps_add_up_to_the_scores(task):
     world = nav.navigation(start=((-1.5, 0.0), (2.0, 1.5)))
     steps = stepwise(world, task)
     key, noise = jax.random.split(jax.random.key(task))
-    places = jax.vmap(steps.reset)(jax.random.split(key, 50))
+    places = jax.jit(jax.vmap(steps.reset))(jax.random.split(key, 50))
     actions = jax.random.uniform(noise, (world.horizon, 50, 2), minval=-1, maxval=1)
 
     def move(places, action):

@@ -166,7 +166,7 @@ def test_a_step_is_4_14(share):
     state = cce.init(jax.random.key(5), given, hparams)
     draw_key, _ = jax.random.split(jax.random.fold_in(state.key, 0))
     x = np.asarray(ef.sample(start(), draw_key, 15))
-    objective, cost = map(np.asarray, jax.vmap(lambda v: quadratic(v, None))(x))
+    objective, cost = map(np.asarray, jax.jit(jax.vmap(lambda v: quadratic(v, None)))(x))
     elites, _ = slow_elites(objective, cost[:, None], 0.0, 5)
     weights = np.exp(objective[elites] / 2)
     weights /= weights.sum()
@@ -196,7 +196,7 @@ def test_later_samples_are_masked():
         return quick_step(state, problem(), few)[0].family.mean
 
     x = ef.sample(start(), jax.random.split(jax.random.fold_in(jax.random.key(1), 0))[0], 20)
-    objective, cost = map(np.asarray, jax.vmap(lambda v: quadratic(v, None))(x))
+    objective, cost = map(np.asarray, jax.jit(jax.vmap(lambda v: quadratic(v, None)))(x))
     for num in (7, 12):
         elites, enough = slow_elites(
             objective[:num], cost[:num, None], 1.0, cce.num_elites(0.3, num))
@@ -356,7 +356,7 @@ def test_noise_and_its_margin():
 def test_intervals_cover_as_often_as_they_say():
     given = problem(noisy)
     point = jnp.array([0.3, 0.7])
-    look = jax.vmap(lambda k: cce.assess(given, point, k, num_evaluations=5))
+    look = jax.jit(jax.vmap(lambda k: cce.assess(given, point, k, num_evaluations=5)))
     seen = look(jax.random.split(jax.random.key(3), 2000))
     inside = (seen.lower[:, 0] <= 1.0) & (seen.upper[:, 0] >= 1.0)
     assert abs(inside.mean() - 0.95) < 0.02, "Student's interval of five"
@@ -400,8 +400,8 @@ def test_all_samples_without_a_number_are_an_error():
 def test_a_batch_of_runs_is_refused_by_result_and_its_lanes_are_not():
     given, hparams = problem(), Hparams(rate=0.3)
     keys = jax.random.split(jax.random.key(0), 3)
-    start = jax.vmap(lambda k: cce.init(k, given, hparams))(keys)
-    many = jax.vmap(partial(cce.run, num_steps=3), (0, None, None))
+    start = jax.jit(jax.vmap(lambda k: cce.init(k, given, hparams)))(keys)
+    many = jax.jit(jax.vmap(partial(cce.run, num_steps=3), (0, None, None)))
     states, _ = jax.jit(many, compiler_options=QUICK)(start, given, hparams)
     with pytest.raises(ValueError, match=r"a batch of \(3,\) runs; take one"):
         cce.result(states, given, hparams, keys[0])

@@ -465,8 +465,8 @@ def test_what_rare_bad_moves_cost():  # lemma 7
     bound = 10 ** rng.uniform(-1, 2, TRIALS)
     reward, tolerance = reward * bound[:, None, None, None], tolerance * bound
     optimal = best_value(game, reward, discount)
-    q = jax.vmap(action_values)(game, reward, discount, optimal.value)
-    near = np.asarray(jax.vmap(pac.near_optimal)(q, game.available, tolerance))
+    q = jax.jit(jax.vmap(action_values))(game, reward, discount, optimal.value)
+    near = np.asarray(jax.jit(jax.vmap(pac.near_optimal))(q, game.available, tolerance))
     bad = np.asarray(game.available) & ~near
     share = np.where(bad.any(-1), p[:, None] * rng.choice([0.5, 1.0], (TRIALS, STATES)), 0)
     strategy = (1 - share)[..., None] * random_rows(rng, near)
@@ -519,9 +519,9 @@ def test_what_the_hat_strategy_costs():  # lemma 8
     tolerance = rng.choice([0, 0.01, 0.3], TRIALS) * rng.random(TRIALS)
     reward = reward / (1 - discount)[:, None, None, None]
     optimal = best_value(game, reward, discount)
-    q = jax.vmap(action_values)(game, reward, discount, optimal.value)
-    near = jax.vmap(pac.near_optimal)(q, game.available, tolerance)
-    strategy = jax.vmap(pac.hat_strategy)(near, game.available, p)
+    q = jax.jit(jax.vmap(action_values))(game, reward, discount, optimal.value)
+    near = jax.jit(jax.vmap(pac.near_optimal))(q, game.available, tolerance)
+    strategy = jax.jit(jax.vmap(pac.hat_strategy))(near, game.available, p)
     gap = certain_gap(optimal, worst_value(game, strategy, reward, discount))
     limit = np.asarray(pac.hat_gap(p, tolerance, discount, 1.0))
     assert (gap <= limit * (1 + 1e-9) + 1e-9).all()

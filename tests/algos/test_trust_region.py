@@ -362,7 +362,7 @@ def test_fisher_products_are_those_of_the_hessian(small):
 
     @jax.jit
     def products(x, directions):
-        return jax.vmap(fisher_product(divergence, x))(directions)
+        return jax.jit(jax.vmap(fisher_product(divergence, x)))(directions)
 
     hessian = jax.jit(jax.hessian(divergence))(flat)
     np.testing.assert_allclose(products(flat, jnp.eye(flat.size)), hessian, atol=1e-12)
@@ -646,9 +646,9 @@ def test_a_circle_from_several_seeds(method, low, high, reward):
     hparams = CIRCLE.replace(method=method, num_trajectories=100)
     keys = jax.random.split(jax.random.key(0), 5)
     with jax.enable_x64(False):
-        _, metrics = jax.vmap(
+        _, metrics = jax.jit(jax.vmap(
             partial(trust_region.train, num_steps=100), (0, None, None)
-        )(keys, circle(), hparams)
+        ))(keys, circle(), hparams)
     cost = metrics.cost[:, -30:].mean(1)
     assert ((cost > low) & (cost < high)).all(), cost
     assert (metrics.reward[:, -1] > reward).all(), metrics.reward[:, -1]

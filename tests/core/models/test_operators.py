@@ -10,6 +10,10 @@ from jaxltl.core.models import operators
 from tests import reference
 from tests.support import REPRESENTATIONS, assert_gradients, mass_preserving, random_representation
 
+# Compiled as a whole, which takes less long than operation by operation.
+expectation, pushforward, exists_successor, forall_successor = map(
+    jax.jit, (jl.expectation, jl.pushforward, jl.exists_successor, jl.forall_successor))
+
 
 @pytest.mark.parametrize("kind", REPRESENTATIONS)
 @pytest.mark.parametrize("num_successors", [1, 3, 20])  # short rows are summed term by term
@@ -23,18 +27,18 @@ def test_primitives_equal_loops(kind, num_successors):
         mass = jnp.asarray(rng.random((size, explicit.num_actions)))
         shape, actions = model.state_shape, (*model.state_shape, model.num_actions)
         pairs = [
-            (jl.expectation(model, value.reshape(shape)), reference.expectation(explicit, value)),
-            (jl.pushforward(model, mass.reshape(actions)), reference.pushforward(explicit, mass)),
+            (expectation(model, value.reshape(shape)), reference.expectation(explicit, value)),
+            (pushforward(model, mass.reshape(actions)), reference.pushforward(explicit, mass)),
         ]
         for found, expected in pairs:
             np.testing.assert_allclose(np.ravel(found), expected.ravel(), rtol=0, atol=1e-14)
         region_ = region.reshape(shape)
         np.testing.assert_array_equal(
-            jl.exists_successor(model, region_).reshape(size, -1),
+            exists_successor(model, region_).reshape(size, -1),
             reference.exists_successor(explicit, region),
         )
         np.testing.assert_array_equal(
-            jl.forall_successor(model, region_).reshape(size, -1),
+            forall_successor(model, region_).reshape(size, -1),
             reference.forall_successor(explicit, region),
         )
 
@@ -48,12 +52,12 @@ def test_products_with_few_and_many_memory_states(label_on, num_memory):
     )
     value = jnp.asarray(rng.normal(size=explicit.num_states))
     mass = jnp.asarray(rng.random((explicit.num_states, explicit.num_actions)))
-    found = jl.expectation(model, value.reshape(model.state_shape))
+    found = expectation(model, value.reshape(model.state_shape))
     np.testing.assert_allclose(
         found.reshape(mass.shape), reference.expectation(explicit, value), atol=1e-14
     )
     np.testing.assert_allclose(
-        jl.pushforward(model, mass.reshape(found.shape)).ravel(),
+        pushforward(model, mass.reshape(found.shape)).ravel(),
         reference.pushforward(explicit, mass), atol=1e-14,
     )
 
@@ -64,19 +68,19 @@ def test_padding_and_unavailable_actions(kind):
     nowhere, everywhere = jnp.zeros(model.state_shape, bool), jnp.ones(model.state_shape, bool)
     closed = ~model.available
     assert closed.any(), "the example has an unavailable action"
-    assert jl.forall_successor(model, nowhere)[closed].all()
-    assert not jl.exists_successor(model, everywhere)[closed].any()
-    assert not jl.expectation(model, jnp.ones(model.state_shape))[closed].any()
+    assert forall_successor(model, nowhere)[closed].all()
+    assert not exists_successor(model, everywhere)[closed].any()
+    assert not expectation(model, jnp.ones(model.state_shape))[closed].any()
 
 
 @pytest.mark.parametrize("kind", REPRESENTATIONS)
 def test_numpy_arrays_are_taken(kind):
     model, _ = random_representation(np.random.default_rng(3), kind)
     ones = np.ones(model.state_shape)
-    expected = jl.expectation(model, jnp.asarray(ones))
-    np.testing.assert_array_equal(jl.expectation(model, ones), expected)
-    assert jl.exists_successor(model, ones > 0).dtype == bool
-    assert jl.forall_successor(model, ones > 0).all()
+    expected = expectation(model, jnp.asarray(ones))
+    np.testing.assert_array_equal(expectation(model, ones), expected)
+    assert exists_successor(model, ones > 0).dtype == bool
+    assert forall_successor(model, ones > 0).all()
 
 
 @pytest.mark.parametrize("kind", REPRESENTATIONS)
@@ -85,8 +89,8 @@ def test_pushforward_is_the_transpose_of_expectation(kind):
     model, _ = random_representation(rng, kind)
     value = rng.normal(size=model.state_shape)
     mass = rng.normal(size=(*model.state_shape, model.num_actions))
-    left = jnp.vdot(jl.expectation(model, jnp.asarray(value)), mass)
-    right = jnp.vdot(value, jl.pushforward(model, jnp.asarray(mass)))
+    left = jnp.vdot(expectation(model, jnp.asarray(value)), mass)
+    right = jnp.vdot(value, pushforward(model, jnp.asarray(mass)))
     np.testing.assert_allclose(left, right, rtol=1e-13)
 
 
@@ -99,7 +103,7 @@ def test_induced_chain_follows_the_policy(kind):
     value = rng.normal(size=explicit.num_states)
     expected = reference.expectation(explicit, value)[np.arange(policy.size), policy]
     np.testing.assert_allclose(
-        jl.expectation(chain, jnp.asarray(value))[:, 0], expected, atol=1e-14
+        expectation(chain, jnp.asarray(value))[:, 0], expected, atol=1e-14
     )
     np.testing.assert_array_equal(chain.initial, explicit.initial)
 
@@ -110,7 +114,8 @@ def test_samples_have_the_rows_frequencies(kind):
     transition = explicit.transition
     s, a = np.argwhere((transition > 0).sum(-1) > 1)[0]
     keys = jax.random.split(jax.random.key(0), 20_000)
-    draw = jax.vmap(lambda key: jl.sample_successor(model, key, jnp.int32(s), jnp.int32(a)))
+    draw = jax.jit(jax.vmap(
+        lambda key: jl.sample_successor(model, key, jnp.int32(s), jnp.int32(a))))
     frequency = np.bincount(draw(keys), minlength=explicit.num_states) / len(keys)
     # Five standard deviations of a frequency.
     assert np.abs(frequency - transition[s, a]).max() < 5 * np.sqrt(0.25 / len(keys))
@@ -129,7 +134,7 @@ def test_expectation_and_pushforward_are_differentiable(kind):
     def both(x):
         changed = world.replace(**{field: x["probability"]})
         changed = model.replace(mdp=changed) if kind == "product" else changed
-        return jl.expectation(changed, x["value"]), jl.pushforward(changed, x["mass"])
+        return expectation(changed, x["value"]), pushforward(changed, x["mass"])
 
     assert_gradients(
         both,

@@ -114,7 +114,7 @@ def test_minimax_values_are_those_of_all_strategy_pairs(batch, exact, method, pe
 def test_without_a_tolerance_the_enclosure_is_as_narrow_as_floats_allow(cases, exact, double):
     with jax.enable_x64(double):
         games, rewards, discounts = batch_of(cases[:SINGLE])
-        solution = jax.vmap(lambda g, r, d: minimax_value(g, r, d, per="system_move"))(
+        solution = jax.jit(jax.vmap(lambda g, r, d: minimax_value(g, r, d, per="system_move")))(
             games, rewards, jnp.asarray(discounts)
         )
         assert solution.value.dtype == (jnp.float64 if double else jnp.float32)
@@ -189,10 +189,10 @@ def test_discounts_near_one_do_not_keep_any_method_from_ending():
         rewards.append(reference.random_reward(rng, 8, 3))
     games, rewards = stack(games), stack(rewards)
     found = {
-        method: jax.vmap(
+        method: jax.jit(jax.vmap(
             lambda g, r, m=method: minimax_value(
                 g, r, 0.99, per="system_move", method=m, tolerance=1e-5, max_steps=1_000_000)
-        )(games, rewards)
+        ))(games, rewards)
         for method in METHODS
     }
     for method in METHODS:
@@ -322,9 +322,9 @@ def test_worst_cases_of_strategies(cases, method, per):
     rng = np.random.default_rng(5)
     drawn = [reference.random_policy(rng, case[0]) for case in cases[:150]]
     games, rewards, discounts = batch_of(cases[:150])
-    mixed = jax.vmap(
+    mixed = jax.jit(jax.vmap(
         lambda g, p, r, d: strategy_value(g, p, r, d, per=per, method=method)
-    )(games, stack(drawn), rewards, discounts)
+    ))(games, stack(drawn), rewards, discounts)
     assert_certified(mixed, np.stack([
         brute.strategy_value(model, system, policy, reward, discount, per)
         for (model, system, reward, discount), policy in zip(cases, drawn, strict=False)

@@ -34,9 +34,8 @@ def batch_of(cases):
 
 @pytest.mark.parametrize("tolerance", [None, 1e-6])
 def test_occupancies_are_enclosed(cases, tolerance):
-    solution = jax.vmap(lambda m, p, d: jl.occupancy_measure(m, p, d, tolerance=tolerance))(
-        *batch_of(cases)
-    )
+    solution = jax.jit(jax.vmap(
+        lambda m, p, d: jl.occupancy_measure(m, p, d, tolerance=tolerance)))(*batch_of(cases))
     assert (solution.status == Status.CONVERGED).all()
     assert_encloses(solution, np.stack([reference.exact_occupancy(*case) for case in cases]))
     assert (solution.upper - solution.lower).max() <= (2 * tolerance if tolerance else 1e-9)
@@ -47,7 +46,7 @@ def test_occupancies_are_enclosed(cases, tolerance):
 
 def test_occupancies_are_enclosed_in_single_precision(cases):
     with jax.enable_x64(False):
-        solution = jax.vmap(jl.occupancy_measure)(*batch_of(cases[:200]))
+        solution = jax.jit(jax.vmap(jl.occupancy_measure))(*batch_of(cases[:200]))
         assert solution.value.dtype == jnp.float32
         assert (solution.status == Status.CONVERGED).all()
         assert_encloses(

@@ -210,7 +210,7 @@ def three_worlds():
 
 def test_infeasible_starts_are_found():
     models, _ = three_worlds()
-    found = jax.vmap(tp.infeasible_starts)(models)
+    found = jax.jit(jax.vmap(tp.infeasible_starts))(models)
     assert found.tolist() == [[False] * 3, [True, False, False], [True, True, False]]
     with pytest.raises(ValueError, match="co-safe"):
         tp.infeasible_starts(jl.product(jl.gridworld("g ."), "G F g"))

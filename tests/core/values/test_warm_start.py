@@ -66,11 +66,11 @@ def test_lanes_are_as_if_alone_however_they_are_nested():
         probability, gain, guess, discount, enough, active, strict=True)]
     lanes = (probability, gain, guess, discount, enough, active)
     shared = (None, None, 0, 0, 0, 0, 0, 0)
-    flat = jax.vmap(solve, shared)(game, allowed, *lanes)
+    flat = jax.jit(jax.vmap(solve, shared))(game, allowed, *lanes)
     pairs = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), lanes)
-    nested = jax.vmap(jax.vmap(solve, shared), shared)(game, allowed, *pairs)
+    nested = jax.jit(jax.vmap(jax.vmap(solve, shared), shared))(game, allowed, *pairs)
     own = jax.tree.map(lambda x: jnp.stack([x] * 6), (game, allowed))
-    graphs = jax.vmap(solve)(*own, *lanes)
+    graphs = jax.jit(jax.vmap(solve))(*own, *lanes)
     for i, expected in enumerate(alone):
         for found in (flat, jax.tree.map(lambda x: x.reshape(6, *x.shape[2:]), nested), graphs):
             for x, y in zip(found, expected, strict=True):
