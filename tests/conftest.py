@@ -7,6 +7,7 @@ optimises, and what one worker or run has compiled is read by the next. What the
 stands: ``XLA_FLAGS= pytest`` tests the programs as users get them.
 """
 
+import atexit
 import gc
 import getpass
 import hashlib
@@ -54,6 +55,10 @@ jax.config.update("jax_enable_x64", True)
 # Among as many objects as compiled programs leave, a tenth of the time would go into looking for
 # circles of some hundred new ones.
 gc.set_threshold(50_000, 20, 20)
+
+# Freeing thousands of compiled programs one by one takes seconds, for a worker that ends anyway.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    atexit.register(os._exit, 0)
 
 _MAPS = Path("/proc/self/maps")
 _MANY = 15_000

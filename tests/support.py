@@ -33,7 +33,16 @@ def stack(trees: Sequence[Any]) -> Any:
 
 
 def lane(tree: Any, i: int) -> Any:
-    return jax.tree.map(lambda x: x[i], tree)
+    """One of several, taken on the host; slices of arrays would each be compiled."""
+
+    def one(x: Any) -> Any:
+        if isinstance(x, np.ndarray):
+            return x[i]
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(np.asarray(jax.random.key_data(x))[i])
+        return jnp.asarray(np.asarray(x)[i])
+
+    return jax.tree.map(one, tree)
 
 
 def bit_labels(letter: np.ndarray, num_bits: int) -> np.ndarray:

@@ -35,7 +35,7 @@ from jaxltl.algos.exponential_family import diagonal_gaussian
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.types import Status
-from tests.support import counted_traces
+from tests.support import counted_traces, lane
 
 
 class Case(NamedTuple):
@@ -243,16 +243,6 @@ def starts(name: str):
 
 def start(name: str, i: int = 0):
     return lane(starts(name), i)
-
-
-def lane(tree, i):
-    """One of several, on the host; slices of arrays would each be compiled."""
-    def one(x):
-        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
-            return jax.random.wrap_key_data(np.asarray(jax.random.key_data(x))[i])
-        return jnp.asarray(np.asarray(x)[i])
-
-    return jax.tree.map(one, tree)
 
 
 def steps(name: str, state, num_steps, problem=None, hparams=None):

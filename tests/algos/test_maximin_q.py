@@ -157,7 +157,7 @@ def test_one_chain_takes_as_many_moves_as_a_plain_loop():
     hparams = maximin_q.Hparams(discount=0.9, num_chains=1, moves_per_step=500)
     learn = partial(maximin_q.train, num_steps=250, max_rows=250)
     keys = jax.random.split(jax.random.key(0), 4)
-    _, metrics = jax.vmap(learn, (0, None, None))(keys, problem, hparams)
+    _, metrics = jax.jit(jax.vmap(learn, (0, None, None)))(keys, problem, hparams)
     needed = 500 * (1 + np.argmax(np.asarray(metrics.error) < 1e-3, axis=1))
     assert 4e4 < np.median(needed) < 1e5
     assert len(set(metrics.residual[:, 3].tolist())) > 1, "seeds differ"

@@ -78,7 +78,7 @@ def test_batches_are_single_evaluations(spec):
     for place in np.ndindex(3, 2, 4):
         alone = evaluate(parameters[place], keys[place])
         np.testing.assert_allclose([x[place] for x in found], alone, rtol=1e-8, atol=1e-12)
-    across = jax.vmap(evaluate, (1, None))(parameters[0, 0].T, keys[0, 0, 0])
+    across = jax.jit(jax.vmap(evaluate, (1, None)))(parameters[0, 0].T, keys[0, 0, 0])
     np.testing.assert_allclose(across, [x[0, 0] for x in found], rtol=1e-8, atol=1e-12)
 
 
@@ -96,10 +96,10 @@ def test_batches_of_worlds():
     parameters = jnp.asarray(0.4 * RNG.normal(size=(4, 9)))
 
     def population(world, parameters):
-        return jax.vmap(evaluator(world, "2-2-1"), (0, None))(parameters, None)
+        return jax.jit(jax.vmap(evaluator(world, "2-2-1"), (0, None)))(parameters, None)
 
-    found = jax.vmap(population, (0, None))(both, parameters)
-    paired = jax.vmap(lambda w, p: evaluator(w, "2-2-1")(p, None))(both, parameters[:2])
+    found = jax.jit(jax.vmap(population, (0, None)))(both, parameters)
+    paired = jax.jit(jax.vmap(lambda w, p: evaluator(w, "2-2-1")(p, None)))(both, parameters[:2])
     for i, world in enumerate(worlds):
         np.testing.assert_allclose(
             [x[i] for x in found], population(world, parameters), rtol=1e-9, atol=1e-12)
@@ -108,7 +108,7 @@ def test_batches_of_worlds():
 
 def test_new_worlds_and_parameters_do_not_retrace():
     def population(evaluate, parameters):
-        return jax.vmap(evaluate, (0, None))(parameters, None)
+        return jax.jit(jax.vmap(evaluate, (0, None)))(parameters, None)
 
     jitted = jax.jit(population)
     one = jitted(evaluator(lqr(), "2-2-1"), jnp.ones((3, 9)))
@@ -121,7 +121,7 @@ def test_new_worlds_and_parameters_do_not_retrace():
 def test_runs_that_overflow_are_worst():
     wild = jnp.full((1, 9), 50.0, jnp.float32)
     parameters = jnp.concatenate([wild, jnp.zeros((1, 9), jnp.float32)])
-    objective, cost = jax.vmap(evaluator(lqr(), "2-2-1"), (0, None))(parameters, None)
+    objective, cost = jax.jit(jax.vmap(evaluator(lqr(), "2-2-1"), (0, None)))(parameters, None)
     assert objective.dtype == cost.dtype == jnp.float32
     assert objective.tolist() == [-np.inf, -1] and cost.tolist() == [np.inf, 0]
 

@@ -96,7 +96,7 @@ def test_patches_are_cut_out_of_the_colours():
 def test_worlds_can_be_stacked():
     worlds = [tg.training_world(seed) for seed in (0, 1)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *worlds)
-    seen = jax.vmap(tg.observations)(stacked)
+    seen = jax.jit(jax.vmap(tg.observations))(stacked)
     assert seen.shape == (2, 100, 45)
     np.testing.assert_array_equal(seen[1], tg.observations(worlds[1]))
 

@@ -17,7 +17,7 @@ def explicit_transition(lazy):
     """The product's transition matrix, read off the primitive one unit value at a time."""
     size = lazy.num_states
     units = jnp.eye(size).reshape(size, *lazy.state_shape)
-    columns = jax.vmap(lambda v: jl.expectation(lazy, v))(units)
+    columns = jax.jit(jax.vmap(lambda v: jl.expectation(lazy, v)))(units)
     return np.moveaxis(np.asarray(columns).reshape(size, size, -1), 0, -1)
 
 
@@ -173,7 +173,7 @@ def test_a_projected_policy_by_sampling():
         (_, memory), _ = jax.lax.scan(step, (state, memory), jax.random.split(key, 200))
         return jnp.asarray(lazy.automaton.final)[memory]
 
-    share = jax.vmap(run)(jax.random.split(jax.random.key(0), 4000)).mean()
+    share = jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(0), 4000)).mean()
     expected = float(jnp.sum(lazy.initial * best.value))
     assert abs(share - expected) < 5 * np.sqrt(0.25 / 4000)
 
@@ -243,7 +243,7 @@ def test_products_are_batched_like_any_tree():
     pairs = [random_product(rng) for _ in range(5)]
     batch = stack([lazy for lazy, _ in pairs])
     value = jnp.asarray(rng.normal(size=(5, 3, 3)))
-    found = jax.vmap(jl.expectation)(batch, value)
+    found = jax.jit(jax.vmap(jl.expectation))(batch, value)
     for i, (_, explicit) in enumerate(pairs):
         expected = reference.expectation(explicit, np.asarray(value[i]).ravel())
         np.testing.assert_allclose(found[i].reshape(expected.shape), expected, atol=1e-14)
