@@ -197,7 +197,8 @@ def followed(key, problem, hparams, num_steps):
 @pytest.mark.parametrize("seeds", [8, pytest.param(100, marks=pytest.mark.exhaustive)])
 def test_every_strategy_on_the_example_wins_almost_surely(seeds):
     keys = jax.random.split(jax.random.key(0), seeds)
-    run = jax.vmap(lambda k: followed(k, example(), settings(), 300))
+    problem, hparams = example(), settings()
+    run = jax.jit(jax.vmap(lambda k: followed(k, problem, hparams, 300)))
     states, won = run(keys)
     assert won.all() and states.always_almost_sure.all()
     assert (states.num_updates > 200).all()
@@ -208,7 +209,8 @@ def test_every_strategy_in_random_games_wins_almost_surely(games):
     problems = [random_problem(seed)[0] for seed in range(games)]
     keys = jax.random.split(jax.random.key(1), games)
     hparams = settings(known_after=5, moves_per_step=20)
-    states, won = jax.vmap(lambda k, p: followed(k, p, hparams, 150))(keys, stack(problems))
+    run = jax.jit(jax.vmap(lambda k, p: followed(k, p, hparams, 150)))
+    states, won = run(keys, stack(problems))
     assert won.all() and states.always_almost_sure.all()
     assert (states.num_updates >= 2).all()
     for i, problem in enumerate(problems):
@@ -241,7 +243,7 @@ def test_the_graph_check_refuses_what_does_not_win():
 def test_with_restarts_nearly_all_states_become_optimal():
     problem, hparams = example(), settings()
     keys = jax.random.split(jax.random.key(7), 10)
-    learned = jax.vmap(lambda k: learn(k, problem, hparams, 10_000))(keys)
+    learned = jax.jit(jax.vmap(lambda k: learn(k, problem, hparams, 10_000)))(keys)
     jl.check(learned)
     for i in range(10):
         found = rmax.evidence(lane(learned.state, i), problem, hparams)
@@ -349,7 +351,8 @@ def test_lanes_of_different_settings_are_as_if_alone():
         moves_per_step=10)
     keys = jax.random.split(jax.random.key(0), 2)
     train = partial(rmax.train_until, until=rmax.strategy_rests(200), num_steps=2000)
-    nested = jax.vmap(jax.vmap(train, (None, None, axes)), (0, None, None))(keys, problem, hparams)
+    nested = jax.jit(jax.vmap(jax.vmap(train, (None, None, axes)), (0, None, None)))(
+        keys, problem, hparams)
     for i in range(2):
         for j in range(3):
             own = hparams.replace(known_after=hparams.known_after[j], epsilon=hparams.epsilon[j])
