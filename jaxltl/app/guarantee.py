@@ -280,13 +280,17 @@ def _bracket(
 
 
 def _between(below: Attempt, above: Attempt, asked: float, mixed: Mix) -> Attempt:
-    """The least share of the policy above by which the asked probability is reached."""
+    """The least share of the policy above by which the asked probability is reached.
+
+    Never all of it if less is enough: steps that lose something would then be impossible.
+    """
     low, high, found = 0.0, 1.0, above
+    aim = asked + min(_AIM, (above.attained - asked) / 64)
     for _ in range(_HALVINGS):
-        if asked <= found.attained <= asked + _AIM:
-            break
         middle = (low + high) / 2
         tried = mixed(below, above, middle)
         low, high, found = (low, middle, tried) if tried.attained >= asked else (
             middle, high, found)
+        if found.share < 1 and found.attained <= aim:
+            break
     return found

@@ -133,17 +133,22 @@ def random_task(rng, kind, label_on, num_worlds=1):
 # --- what a policy attains ---------------------------------------------------------------------
 
 
-def evaluate(model, policy):
-    """The probability of the task ``[S, Q]``, and where it is 1 for sure.
+def bottoms(model, policy):
+    """The chain of a policy on pairs of state and memory, and where it ends.
 
-    The chain of the policy on pairs of state and memory ends in bottom components, each of which is
-    accepting if the least priority read in it is even.
+    In bottom components, each of which is accepting if the least priority read in it is even.
+
+    Returns:
+      The chain ``[N, N]``, accepting and other bottom components ``bool[N]``, and the pairs from
+      which the others cannot be reached ``bool[S, Q]``.
     """
     world, task = jax.tree.map(np.asarray, (model.mdp, model.automaton))
     letter, policy = np.asarray(model.letter), np.asarray(policy)
-    chain = np.zeros((S, Q, S, Q), np.longdouble)
-    step, read = np.zeros((S, Q, S, Q), bool), np.full((S, Q, S, Q), 99)
-    for s, q, a, k in np.ndindex(S, Q, A, K):
+    shape = model.state_shape
+    size = shape[0] * shape[1]
+    chain = np.zeros(shape * 2, np.longdouble)
+    step, read = np.zeros(shape * 2, bool), np.full(shape * 2, 99)
+    for s, q, a, k in np.ndindex(*policy.shape, world.successor.shape[-1]):
         if policy[s, q, a] > 0 and world.probability[s, a, k] > 0:
             assert world.available[s, a]
             t = world.successor[s, a, k]
@@ -151,21 +156,25 @@ def evaluate(model, policy):
             place = s, q, t, task.delta[q, shown]
             chain[place] += np.longdouble(policy[s, q, a]) * world.probability[s, a, k]
             step[place], read[place] = True, task.priority[q, shown]
-    chain, step, read = (x.reshape(S * Q, S * Q) for x in (chain, step, read))
+    chain, step, read = (x.reshape(size, size) for x in (chain, step, read))
     assert step.any(1).all() and np.abs(chain.sum(1) - 1).max() < 1e-6
-    count, component = connected_components(
-        scipy.sparse.csr_array(step), connection="strong")
-    inside = component[:, None] == component
-    left = (step & ~inside).any(1)
-    good, bad = np.zeros(S * Q, bool), np.zeros(S * Q, bool)
+    links = scipy.sparse.csr_array(step)
+    count, component = connected_components(links, connection="strong")
+    left = (step & (component[:, None] != component)).any(1)
+    good, bad = np.zeros(size, bool), np.zeros(size, bool)
     for c in range(count):
         here = component == c
         if not left[here].any():
             accepted = read[step & here[:, None]].min() % 2 == 0
             good, bad = (good | here, bad) if accepted else (good, bad | here)
-    linked = np.isfinite(shortest_path(scipy.sparse.csr_array(step), unweighted=True))
-    sure = ~linked[:, bad].any(1)
-    return absorbed(chain, good, bad).reshape(S, Q).astype(float), sure.reshape(S, Q)
+    reached = np.isfinite(shortest_path(links, unweighted=True))
+    return chain, good, bad, ~reached[:, bad].any(1).reshape(shape)
+
+
+def evaluate(model, policy):
+    """The probability of the task ``[S, Q]``, and where it is 1 for sure."""
+    chain, good, bad, sure = bottoms(model, policy)
+    return absorbed(chain, good, bad).reshape(sure.shape).astype(float), sure
 
 
 def absorbed(chain, good, bad):

@@ -1,0 +1,217 @@
+"""What a task file asks of its policy is what the policy has, and the report says why."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxltl as jl
+from jaxltl.app import learn as job
+from jaxltl.app.guarantee import WINDOW, at_starts
+from jaxltl.app.reports.learn import remarks
+from tests.algos.test_guaranteed import bottoms, evaluate
+from tests.app.test_task import write  # noqa: F401
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def learned(path, seed=0):
+    """The outcome of a task file, and its summary."""
+    setup = job.prepare(job.read_task(path), seed)
+    outcome = job.Outcome(setup, *job.learn(setup, seed, 1), seed=seed, seconds=0.0)
+    return outcome, job.summary(outcome)
+
+
+def kept_policy(outcome):
+    return np.asarray(outcome.learned.policy[outcome.chosen])
+
+
+# --- the examples ------------------------------------------------------------------------------
+
+
+def likeliest_routes(model, policy, start, num_steps, ending):
+    """The two most likely sequences of actions that end in a set of pairs: logarithms, the first.
+
+    In a world without chance, by dynamic programming from behind.
+
+    Args:
+      start: state and memory.
+      ending: ``bool[S, Q]``.
+    """
+    assert (np.asarray(model.mdp.probability) == [1] + [0] * (model.num_successors - 1)).all()
+    after = np.asarray(model.mdp.successor)[:, :, 0]
+    read = after if model.label_on == "entry" else np.arange(len(after))[:, None]
+    memory = np.asarray(model.next_memory)[read].swapaxes(1, 2)  # [S, Q, A]
+    with np.errstate(divide="ignore"):
+        step = np.log(policy)[..., None]
+    best = np.where(ending[..., None], [0, -np.inf], -np.inf)
+    choices = []
+    for _ in range(num_steps):
+        ways = (step + best[after[:, None], memory]).reshape(*ending.shape, -1)
+        order = np.argsort(-ways, axis=-1, kind="stable")
+        choices.append(order[..., 0] // 2)
+        best = np.take_along_axis(ways, order[..., :2], -1)
+    first, (s, q) = [], start
+    for choice in reversed(choices):
+        first.append(int(choice[s, q]))
+        s, q = after[s, first[-1]], memory[s, q, first[-1]]
+    return best[start], first
+
+
+def check_demonstrated_route(outcome, ending):
+    """No other route of its length that ends well is as likely as the one demonstrated."""
+    model, shown = outcome.setup.model, outcome.setup.demonstrations
+    s = int(shown.state[0, 0])
+    start = s, int(model.initial_memory[s])
+    values, route = likeliest_routes(
+        model, kept_policy(outcome), start, int(shown.length[0]), ending)
+    assert route == np.asarray(shown.action)[0].tolist()
+    assert values[0] > values[1] + 1
+    return np.exp(values)
+
+
+@pytest.fixture(scope="module")
+def fetched():
+    return learned(EXAMPLES / "one_demonstration.toml")
+
+
+def test_one_demonstration_is_enough(fetched):
+    outcome, result = fetched
+    assert result["satisfaction"]["minimum"]["lower"] == 1
+    assert ("good", "By the graph: from every initial state the policy does the task with "
+            "probability 1, whatever the numbers. It takes all of the moves that keep that "
+            "possible, and no others.") in remarks(result)
+    *_, sure = bottoms(outcome.setup.model, kept_policy(outcome))
+    start = int(outcome.setup.demonstrations.state[0, 0])
+    assert sure[start, int(outcome.setup.model.initial_memory[start])]
+
+
+def test_the_demonstrated_route_is_the_most_likely_one(fetched):
+    outcome, _ = fetched
+    first, second = check_demonstrated_route(outcome, np.asarray(outcome.setup.model.final))
+    assert first > 0.9 and second < 0.01
+
+
+# --- a probability -----------------------------------------------------------------------------
+
+FORMULAS = ("!r U y", "F(a & X F y)", "!r U (a | y)", "F y & (!r U y)")
+RISKY = """
+[world]
+map = '''
+{map}
+'''
+slip = {slip}
+absorbing = ["y"]
+initial = "!r & !y"
+
+[task]
+formula = "{formula}"
+guarantee = {asked}
+
+[demonstrations]
+file = "shown.json"
+
+[learner]
+method = "mlirl"
+discount = 0.9
+steps = 60
+"""
+STEPS = 8
+
+
+def careless_walk(rng, world):
+    """Straight on, mostly, whatever is in the way."""
+    s, straight, states, actions = int(rng.integers(world.num_states)), rng.integers(4), [], []
+    for _ in range(STEPS):
+        a = int(straight if rng.random() < 0.5 else rng.integers(4))
+        states.append(s)
+        actions.append(a)
+        s = int(rng.choice(np.asarray(world.successor)[s, a],
+                           p=np.asarray(world.probability)[s, a]))
+    return {"states": states, "actions": actions}
+
+
+def risky_task(rng, place, over):
+    """A task file that asks for some share of the optimum, which not every policy has."""
+    while True:
+        cells = rng.choice(list(".ary"), size=(3, 3), p=[0.55, 0.15, 0.2, 0.1])
+        if {*cells.ravel()} != {*".ary"}:
+            continue
+        text = "\n".join(map(" ".join, cells))
+        given = {"map": text, "slip": rng.choice([0.1, 0.2, 0.4]), "formula": rng.choice(FORMULAS)}
+        world = jl.gridworld(text, slip=given["slip"], absorbing=["y"], initial="!r & !y")
+        model = jl.product(world, str(given["formula"]))
+        best, _ = at_starts(model, jl.optimal_satisfaction(model).lower, over)
+        if best < 0.05:
+            continue
+        asked = best * float(rng.choice([rng.uniform(0.6, 1), 1 - 10 ** rng.uniform(-4, -1)]))
+        runs = {"demonstrations": [careless_walk(rng, world) for _ in range(3)]}
+        (place / "shown.json").write_text(json.dumps(runs))
+        worst = f'{asked}\nover = "worst"' if over == "worst" else asked
+        (place / "risky.toml").write_text(RISKY.format(**given, asked=worst))
+        return place / "risky.toml", asked
+
+
+def weighed(outcome, weights_of_task):
+    """Policies learned with weights of the task, each from the one before."""
+    setup = outcome.setup
+    names, problem = setup.learning
+    hparams = job.settings(job.mlirl.Hparams, setup.task.learner)
+    hparams = replace(hparams, mu=0.0)
+    one = job._trained(setup, names, problem, hparams, (0, 1), None, None)
+    for mu in weights_of_task:
+        near = replace(problem, start=jnp.asarray(one.weights[0]))
+        there = replace(hparams, mu=float(mu), start_scale=0.0)
+        one = job._trained(setup, names, near, there, (0, 1), None, None)
+        yield one
+
+
+def check_risky(rng, place, over, weights_of_task):
+    path, asked = risky_task(rng, place, over)
+    outcome, result = learned(path)
+    attempt, model, task = outcome.attempt, outcome.setup.model, outcome.setup.task
+    assert (task.guarantee, task.over) == (pytest.approx(asked, rel=1e-15), over)
+    value, _ = evaluate(model, kept_policy(outcome))
+    attained, _ = at_starts(model, value, over)
+    by_itself = attempt.weight == 0 and attempt.share == 0
+    assert asked - 1e-12 <= attained and attempt.attained >= asked
+    assert attempt.attained <= asked + WINDOW or by_itself
+    assert attempt.attained == pytest.approx(attained, abs=1e-9)
+    assert result["guarantee"]["attained"] == attempt.attained
+    certified = result["satisfaction"]["mean" if over == "mean" else "minimum"]["lower"]
+    assert certified >= asked - 1e-15
+
+    def loss(one, nll):  # without a weight, what is minimised has the prior
+        return float(nll + by_itself * np.sum(one.weights[0] ** 2) * 1e-3 / 2)
+
+    found = loss(attempt.learned, attempt.neg_log_likelihood)
+    np.testing.assert_allclose(outcome.learned.neg_log_likelihood[outcome.chosen],
+                               attempt.neg_log_likelihood)
+    for one in weighed(outcome, weights_of_task):
+        solution = jl.satisfaction_probability(model, one.policy[0])
+        if at_starts(model, solution.lower, over)[0] >= asked:
+            assert found <= loss(one, one.neg_log_likelihood[0]) * (1 + 1e-6)
+    return attempt
+
+
+@pytest.mark.parametrize(("count", "grid"), [
+    (3, np.logspace(-2, 2, 4)),
+    pytest.param(50, np.logspace(-3, 5, 64), marks=pytest.mark.exhaustive),
+])
+def test_a_probability_is_reached_and_nothing_given_away(tmp_path, count, grid):
+    rng = np.random.default_rng(count)
+    found = [check_risky(rng, tmp_path, "mean", grid) for _ in range(count)]
+    assert any(x.weight or x.share for x in found)
+
+
+@pytest.mark.parametrize(("count", "grid"), [
+    (1, np.logspace(-2, 2, 4)),
+    pytest.param(8, np.logspace(-3, 5, 64), marks=pytest.mark.exhaustive),
+])
+def test_a_probability_is_reached_from_the_worst_start(tmp_path, count, grid):
+    rng = np.random.default_rng([count, 1])
+    for _ in range(count):
+        check_risky(rng, tmp_path, "worst", grid)
