@@ -464,9 +464,11 @@ def test_a_run_ends_with_the_step_that_meets_the_condition():
     run = partial(module.run_until, start("toy"), problem, hparams)
     found = jl.check(run(until=Partial(reaches, 5), num_steps=20))
     whole, metrics = module.run(start("toy"), problem, hparams, num_steps=6, max_rows=1)
-    assert_bitwise(found.state, whole)
+    # Another program, which the compiler may round in another way.
+    for x, y in zip(leaves((found.state, found.metrics.x)), leaves((whole, metrics.x[0])),
+                    strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-12)
     assert (found.num_steps, found.metrics.at) == (6, 5)
-    assert found.metrics.x == metrics.x[0]
     with counted_traces() as traced:
         late = run(until=Partial(reaches, 50), num_steps=9)
     assert not traced, "numbers are arguments"
