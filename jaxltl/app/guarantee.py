@@ -21,7 +21,7 @@ from jaxltl.core.values.satisfaction import satisfaction_probability
 
 WINDOW = 0.02  # how far above an asked probability the certified one may be
 _AIM = WINDOW / 4  # and is aimed to be
-_WEIGHTS = 10.0 ** np.arange(-3, 6)  # of the task's probability that are tried, in this order
+_WEIGHTS = 10.0 ** np.arange(-1, 5.5, 0.5)  # of the task's probability, tried in this order
 _HALVINGS = 30
 
 
@@ -70,23 +70,26 @@ def ask(
         possible, where = at_starts(model, best.lower, over)
         if possible < asked:
             raise ValueError(
-                f"guarantee = {asked:g}: the best that can be achieved is {possible:.4g} "
+                f"guarantee = {asked}: the best that can be achieved is "
+                f"{np.floor(possible * 1e6) / 1e6:g} "
                 + ("on average over the initial states" if over == "mean"
                    else "from the worst initial state")
                 + f" (least from {world.place(where)}); ask for no more than that, or change the "
                 "task, the map or where runs start."
             )
+        if asked == 1:  # which the best policies alone have
+            asked = "best"
     actions = optimal_actions(model, best)
     lost, cost = _losing(model, best, np.asarray(actions.allowed), shown)
     useless = np.flatnonzero(lost.any(1) & (lost.sum(1) == np.asarray(shown.length)))
     if not isinstance(asked, str):
         return Guarantee(asked, over, best, actions, nothing, None, not useless.size)
     if useless.size:
-        n = useless[0]
+        n, count = useless[0], int(lost[useless[0]].sum())
+        what = "its only step" if count == 1 else f"each of its {count} steps"
         raise ValueError(
-            f"demonstration {n + 1}: each of its {lost[n].sum()} steps lowers the best probability "
-            "of the task, so that nothing of it is left to learn from; leave it out, or write "
-            'guarantee = "none".'
+            f"demonstration {n + 1}: {what} lowers the best probability of the task, so that "
+            "nothing of it is left to learn from; leave it out, or write guarantee = \"none\"."
         )
     return Guarantee(asked, over, best, actions, lost, cost)
 
@@ -112,8 +115,12 @@ def at_starts(model: Product, value: Any, over: str) -> tuple[float, int]:
     weight = np.asarray(model.mdp.initial, float)
     starts = np.flatnonzero(weight > 0)
     known = from_starts(model, value)[starts].astype(float)
-    found = known @ (weight[starts] / weight[starts].sum()) if over == "mean" else known.min()
-    return float(found), int(starts[known.argmin()])
+    least, place = known.min(), int(starts[known.argmin()])
+    if over == "worst":
+        return float(least), place
+    # Rounding does not take a mean out of what it is a mean of.
+    mean = known @ (weight[starts] / weight[starts].sum())
+    return float(np.clip(mean, least, known.max())), place
 
 
 def from_starts(model: Product, value: Any) -> np.ndarray:
@@ -210,10 +217,10 @@ def at_least(
 ) -> Attempt:
     """The most likely policy found whose certified probability is at least the one asked for.
 
-    The least weight mu of the task's probability (2.6) that reaches it is searched for, each
-    search beginning where the last one ended; where a little more weight makes the probability
-    jump, or none reaches it, policies of both sides are mixed, or the likeliest policy is with the
-    likeliest of those that lose nothing.
+    The least weight mu of the task's probability (2.6) that reaches it is searched for. Where a
+    little more weight makes the probability jump, or none reaches it, policies of both sides are
+    mixed; and the likeliest policy is with the likeliest of those that lose nothing, or, if that
+    gives no probability near the one asked for, with the quickest of them.
 
     Args:
       model: the product.
@@ -241,32 +248,42 @@ def at_least(
     first = attempt(policy_of(free), free, 0.0, 0.0)
     if first.attained >= asked:
         return first
-    below, above = first, None
+    below, above, found = first, None, []
     for tried in _bracket(train, first, lambda x, mu: attempt(policy_of(x), x, mu, 0.0), asked):
-        below, above = (tried, above) if tried.attained < asked else (below, tried)
-    found = []
-    if above is not None:
-        found = [above] if above.attained <= asked + WINDOW else [
-            _between(below, above, asked, mixed)]
+        if tried.attained < asked:
+            below = tried
+        else:
+            above = tried
+            found.append(tried)
+    if above is not None and above.attained > asked + WINDOW:
+        found.append(_between(below, above, asked, mixed))
     policy, learned = inside()
     sure = attempt(policy, learned, None, 1.0)
-    found.append(_between(first, sure, asked, mixed))
-    if below is not first:
-        found.append(_between(below, sure, asked, mixed))
+    found += [_between(x, sure, asked, mixed) for x in ([first] if below is first else
+                                                        [first, below])]
+    if all(one.attained > asked + WINDOW for one in found):
+        # Where what was learned takes its time, any share of steps that lose is too much.
+        quick = np.asarray(guarantee.best.policy)[..., None] == np.arange(policy.shape[-1])
+        sure = attempt(quick.astype(float), learned, None, 1.0)
+        found.append(_between(first, sure, asked, mixed))
     return min(found, key=lambda one: one.neg_log_likelihood)
 
 
 def _bracket(
     train: Train, first: Attempt, judged: Callable[[Any, float], Attempt], asked: float
 ) -> Iterator[Attempt]:
-    """Attempts with more and more weight until it is enough, then between the last two."""
-    low, last = 0.0, first
+    """Attempts with more and more weight until it is enough, then between the last two.
+
+    Each is learned from the one of the next lesser weight: the likelihood has other maxima, and
+    those that are found from too great a weight are lesser ones.
+    """
+    low, below = 0.0, first
     for high in map(float, _WEIGHTS):
-        last = judged(train(high, last.learned), high)
+        last = judged(train(high, below.learned), high)
         yield last
         if last.attained >= asked:
             break
-        low = high
+        low, below = high, last
     else:
         return
     low = low or high * 1e-3
@@ -274,9 +291,12 @@ def _bracket(
         if asked <= last.attained <= asked + _AIM or high / low < 1 + 1e-9:
             return
         middle = float(np.sqrt(low * high))
-        last = judged(train(middle, last.learned), middle)
+        last = judged(train(middle, below.learned), middle)
         yield last
-        low, high = (low, middle) if last.attained >= asked else (middle, high)
+        if last.attained >= asked:
+            high = middle
+        else:
+            low, below = middle, last
 
 
 def _between(below: Attempt, above: Attempt, asked: float, mixed: Mix) -> Attempt:

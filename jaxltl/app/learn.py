@@ -40,6 +40,7 @@ from jaxltl.app.guarantee import (
     Guarantee,
     ask,
     at_least,
+    at_starts,
     check_formula,
     from_starts,
     kept,
@@ -399,11 +400,10 @@ def _evidence(
     value, lower, upper = (
         from_starts(model, x) for x in (solution.value, solution.lower, solution.upper)
     )
-    weight = np.where(np.isin(np.arange(len(value)), starts), np.asarray(model.mdp.initial), 0)
-    weight = weight / weight.sum()
     worst = int(starts[np.argmin(value[starts])])
+    names = ("value", "lower", "upper")
     return {
-        "mean": {"value": weight @ value, "lower": weight @ lower, "upper": weight @ upper},
+        "mean": {name: at_starts(model, getattr(solution, name), "mean")[0] for name in names},
         "minimum": {
             "value": value[worst], "lower": lower[starts].min(), "upper": upper[worst],
             **world.where(worst),
