@@ -169,6 +169,48 @@ def test_learn_writes_its_results(learned):
     assert "http" not in page and "prefers-color-scheme: dark" in page
 
 
+def test_what_is_done_is_told_and_not_done_again(learned, monkeypatch):
+    place, first = learned
+    task, out = place / "task.toml", place / "out"
+
+    def begun(*_):
+        raise ValueError("begun anew")
+
+    monkeypatch.setattr("jaxltl.app.learn.prepare", begun)
+    result = run("learn", task, "--out", out, "--seeds", 2, "--json")
+    assert result.exit_code == 0, result.output
+    assert f"done before: see {out}/report.html" in result.stdout
+    assert "--again does it again" in result.stdout and "compiling" not in result.stderr
+    told, shown = (x.stdout.partition("\nwrote ")[0].partition("\ndone before")[0]
+                   for x in (first, result))
+    assert told == shown
+    assert json.loads(result.stdout.splitlines()[-1]) == json.loads(first.stdout.splitlines()[-1])
+    for more in (["--again"], ["--seed", 1], ["--out", place / "empty"]):
+        options = ["--out", out, "--seeds", 2, *more]
+        assert failure("learn", task, *options) == "error: begun anew\n"
+    task.write_text(task.read_text() + "\n# another\n")
+    assert failure("learn", task, "--out", out, "--seeds", 2) == "error: begun anew\n"
+    task.write_text(task.read_text().removesuffix("\n# another\n"))
+
+
+def test_what_falls_short_is_told_in_red_with_what_helps(write, tmp_path):  # noqa: F811
+    path = write(("[task]", '[task]\nguarantee = "none"'), shown={"demonstrations": [
+        {"cells": [[2, 1], [2, 2], [1, 2]], "actions": ["right", "up", "right"]}]})
+    arguments = ["learn", str(path), "--out", str(tmp_path / "out"), "--json"]
+    result = CliRunner().invoke(main, arguments, color=True)
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout.splitlines()[-1])
+    value = found["satisfaction"]["mean"]["value"]
+    assert value < 0.5 and found["guarantee"]["remedy"] == 1
+    warning = (
+        f"warning: The policy does the task with probability {value:.4f} where 1.0000 is possible."
+        ' With guarantee = "best" in [task] it is certified to be at least 1.0000: tried.')
+    assert f"\033[31m{warning}\033[0m" in result.stdout
+    assert "By the graph" not in result.stdout and "By construction" not in result.stdout
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert warning.removeprefix("warning: ").partition(" With")[0] in page
+
+
 def test_the_written_policy_runs_alone(learned):
     place, _ = learned
     with np.load(place / "out" / "policy.npz") as file:
@@ -277,8 +319,19 @@ def test_check(write):  # noqa: F811
 
 
 def test_the_examples_are_sound():
-    for name in ("two_goals", "slippery_delivery"):
+    for name in ("two_goals", "slippery_delivery", "one_demonstration", "patrol_two"):
         assert run("check", f"examples/{name}.toml").stdout.startswith("ok: ")
+
+
+def test_check_reads_games_too(tmp_path):
+    sizes = {"robots": "512 states, 1024 with the task's memory",
+             "patrol": "512 states, 512 with the task's memory"}
+    for name, size in sizes.items():
+        assert run("check", f"examples/{name}.toml").stdout == f"ok: {size}\n"
+    text = Path("examples/robots.toml").read_text()
+    (tmp_path / "wrong.toml").write_text(text.replace("G !collision", "G !colision"))
+    assert "colision" in failure("check", tmp_path / "wrong.toml")
+    assert not list(tmp_path.glob("out*"))
 
 
 def alone(code, tmp_path, **environment):
