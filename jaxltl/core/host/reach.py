@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 
 DENSE_LIMIT = 1024  # states up to which matrices are dense
 _MAX_ROUNDS = 200
+_NOISE = 1e-11  # relative gain that may be rounding
+_SMALL = 1e-8  # and one with which bounds are still worth a try
+_PATIENCE = 3  # rounds with no more than that
+_LOSSES = (1e-12, 1e-9, 1e-6, np.inf)
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -164,46 +168,90 @@ def optimum(
     """
     choices = _Choices(rows, allowed.T, group)
     target = one.astype(float)
-    found = _iterate(choices, undecided, target, np.zeros(len(one)), sign)
-    # How long a run can stay undecided at most: errors grow with it.
-    time = _iterate(choices, undecided, np.zeros(len(one)), np.ones(len(one)), 1)
-    if found is None or time is None:
+    first = _getting_out(choices, one) if sign > 0 else None
+    found = _iterate(choices, undecided, target, np.zeros(len(one)), sign, first)
+    if found is None:
         return None
     value, rounds = found
     image, chosen, action = choices.best(value, sign)
     residual = np.abs(image - value)[undecided].max(initial=0)
-    margin = np.where(undecided, (2 * residual + 2 * unit) * time[0], 0)
-    lower, upper = np.maximum(value - margin, 0), value + margin
-    below = choices.best(lower, sign)[0] * (1 - unit) >= lower
-    above = choices.best(upper, sign)[0] * (1 + unit) <= upper
-    if not (below & above)[undecided].all():
-        return None
-    exits = undecided & (chosen == np.arange(len(one)))
-    return Bounds(
-        np.where(undecided, np.clip(value, 0, 1), target), lower, np.minimum(upper, 1),
-        float(residual), rounds + time[1], action.astype(np.int32), exits)
+    loss = sign * (image - np.stack([row @ value for row in rows]))
+    for most in _LOSSES:
+        # How long a run can stay undecided at most: errors grow with it. Runs that take what loses
+        # more than the errors grow by need not be counted: that they need not is proven below.
+        near = choices._replace(allowed=choices.allowed & (loss <= most))
+        time = _iterate(near, undecided, np.zeros(len(one)), np.ones(len(one)), 1)
+        if time is None or (time[0] < 0).any():
+            continue
+        margin = np.where(undecided, (2 * residual + 2 * unit) * time[0], 0)
+        lower, upper = np.maximum(value - margin, 0), value + margin
+        below = choices.best(lower, sign)[0] * (1 - unit) >= lower
+        above = choices.best(upper, sign)[0] * (1 + unit) <= upper
+        if (below & above)[undecided].all():
+            exits = undecided & (chosen == np.arange(len(one)))
+            return Bounds(
+                np.where(undecided, np.clip(value, 0, 1), target), lower, np.minimum(upper, 1),
+                float(residual), rounds + time[1], action.astype(np.int32), exits)
+    return None
 
 
 def _iterate(
-    choices: _Choices, open_: Booleans, known: Floats, cost: Floats, sign: int
+    choices: _Choices, open_: Booleans, known: Floats, cost: Floats, sign: int,
+    first: tuple[Integers, Integers] | None = None,
 ) -> tuple[Floats, int] | None:
-    """The optimum of ``x = cost + row @ x`` on the open states, `known` on the others."""
-    value = known
-    places = np.flatnonzero(open_)
-    for round_ in range(_MAX_ROUNDS):
-        image, chosen, action = choices.best(value, sign)
-        gain = sign * (cost + image - value)[open_]
-        if round_ and (gain <= 1e-15 * np.abs(value[open_])).all():
-            return value, round_
-        leader = chosen[places]
-        row = choices.taken(leader, action[leader])
-        known_part = row @ np.where(open_, 0, known)
-        found = solved(_minus(row[:, places]), cost[places] + known_part)
+    """The optimum of ``x = cost + row @ x`` on the open states, `known` on the others.
+
+    Args:
+      first: whose action each state takes at first, and which, so that it surely gets out.
+    """
+    value, places = known, np.flatnonzero(open_)
+    leader, taken = choices.best(value, sign)[1:] if first is None else first
+    if first is None:
+        taken = taken[leader]
+    best, least, noisy = value, np.inf, 0
+    for round_ in range(1, _MAX_ROUNDS + 1):
+        row = choices.taken(leader[places], taken[places])
+        found = solved(_minus(row[:, places]), cost[places] + row @ np.where(open_, 0, known))
         if found is None:
             return None
+        size = np.abs(found).max(initial=0)
+        if round_ > 1 and (sign * (found - value[places]) < -_NOISE * size).any():
+            break  # a policy that hardly ever gets out, whose system is too near to a singular one
         value = known.copy()
         value[places] = found
-    return value, _MAX_ROUNDS
+        image, chosen, action = choices.best(value, sign)
+        gain = sign * (cost + image - value)
+        if (gain[places] <= 1e-15 * np.abs(found)).all():
+            return value, round_
+        if (most := gain[places].max(initial=0) / size) < least:
+            best, least = value, most
+        # Actions that tie but for rounding may take turns for ever.
+        noisy += most <= _NOISE
+        if noisy > _PATIENCE:
+            break
+        # Only who gains changes, by which a policy that gets out is followed by such a one.
+        better = gain > 1e-15 * np.abs(value)
+        leader = np.where(better, chosen, leader)
+        taken = np.where(better, action[chosen], taken)
+    return (best, round_) if least <= _SMALL else None
+
+
+def _getting_out(choices: _Choices, goal: Booleans) -> tuple[Integers, Integers]:
+    """Whose action each state takes, and which, so that each may get to a goal."""
+    near = goal.copy()
+    leader, taken = np.arange(len(goal)), np.zeros(len(goal), int)
+    while True:
+        hit = choices.allowed & np.stack([row @ near.astype(float) > 0 for row in choices.rows])
+        new = hit.any(0) & ~near
+        if not new.any():
+            return leader, taken
+        of_group = np.full(choices.group.max() + 1, -1)
+        of_group[choices.group[new]] = np.flatnonzero(new)
+        chosen = of_group[choices.group]
+        joins = (chosen >= 0) & ~near
+        leader = np.where(joins, chosen, leader)
+        taken = np.where(joins, hit.argmax(0)[chosen], taken)
+        near |= joins
 
 
 def _minus(inner: Any) -> Any:
