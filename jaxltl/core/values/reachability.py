@@ -43,6 +43,7 @@ from jaxltl.core.values.iterate import in_turn, iterate
 from jaxltl.core.values.linear import Inverse, System, solver
 
 _POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
+_FINER = 8  # how much nearer a guess is, once the bounds are near
 _FAR_SWEEPS = 6  # sweeps of a guess, or of interval iteration after one that failed
 _HOST_LIMIT = 4096  # states up to which a concrete model is solved on the host, by elimination
 QUICK_LIMIT = 100_000  # states of a concrete model up to which its quickest policy is looked for
@@ -83,8 +84,9 @@ def reachability_probability(
       objective: ``"max"`` or ``"min"``; ignored when a policy is given.
       method: for a given policy: ``"direct"`` (elimination, however slowly the policy
         makes progress), ``"iterative"`` (Krylov), or ``"auto"``, direct for small models.
-      tolerance: half the width of the enclosure asked for; default the square root of
-        the dtype's precision.
+      tolerance: half the width of the enclosure asked for. Default: the square root of the
+        dtype's precision must be met, and an optimum is then enclosed as closely as the dtype
+        allows, until a round of sweeps gains less than rounding takes.
       max_steps: sweeps at most.
 
     Returns:
@@ -442,25 +444,34 @@ class _Bounds(NamedTuple):
     far: jax.Array
     failed: jax.Array  # whether the last guess was no bound
     moved: jax.Array
+    rests: jax.Array  # whether a round gained less than rounding takes
+
+    @property
+    def half(self) -> jax.Array:
+        return jnp.max(jnp.abs(self.far - self.near)) / 2
 
 
-def _tighter(sign: int, table: None, carry: _Bounds, search: _Search) -> _Bounds:
+def _tighter(sign: int, finest: bool, table: None, carry: _Bounds, search: _Search) -> _Bounds:
     """One round: a sweep and some under the greedy policy for `near`, a guess or sweeps for `far`.
 
     A value that the operator does not carry away from the optimum is a bound, because the fixed
     point is unique where end components are collapsed; so `far` is guessed, and where the guess
-    fails, plain interval iteration goes on.
+    fails, plain interval iteration goes on. Where the bounds are to be the finest, this goes on
+    beyond the goal: a guess is then a bound of the same shape that is `_FINER` times as near.
     """
-    near, far, failed, _ = carry
+    near, far, failed, *_ = carry
     image, action = search.best(sign, near)
-    settled = jnp.max(jnp.abs(image - near)) <= search.goal / 32
+    close = jnp.bool_(finest) & (carry.half <= search.goal)
+    aim = jnp.where(close, carry.half / _FINER, search.goal)
+    settled = jnp.max(jnp.abs(image - near)) <= aim / 32
     new_near = search.nearer(sign, near, image)
     if search.cheap:
         new_near = _followed(sign, search, new_near, action)
 
     def guess() -> tuple[jax.Array, jax.Array]:
         # `near` moved by almost the tolerance; some sweeps give it its shape.
-        offered = jnp.clip(new_near + sign * 1.8 * search.goal, 0, 1)
+        beyond = jnp.where(close, (far - new_near) / _FINER, sign * 1.8 * search.goal)
+        offered = jnp.clip(new_near + beyond, 0, 1)
         offered = jnp.where(search.undecided, offered, search.one)
 
         def sweep(_, pair: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -475,10 +486,13 @@ def _tighter(sign: int, table: None, carry: _Bounds, search: _Search) -> _Bounds
             0, _FAR_SWEEPS, lambda _, y: search.closer(sign, y, search.best(sign, y)[0]), far)
         return step, jnp.bool_(False)
 
+    gain = jnp.max(jnp.abs(new_near - near))
+    rests = close & (gain <= search.slack / 8)
     new_far, failed = lax.cond(
-        settled, lambda: lax.cond(failed, sweeps, guess), lambda: (far, failed))
-    moved = jnp.any((new_near != near) | (new_far != far)) | failed
-    return _Bounds(new_near, new_far, failed, moved)
+        settled | rests, lambda: lax.cond(failed | ~settled, sweeps, guess), lambda: (far, failed))
+    far_gain = jnp.max(jnp.abs(new_far - far))
+    rests &= ~failed & (far_gain <= search.slack / 8)
+    return _Bounds(new_near, new_far, failed, (gain > 0) | (far_gain > 0) | failed, rests)
 
 
 def _followed(sign: int, search: _Search, near: jax.Array, action: jax.Array) -> jax.Array:
@@ -491,8 +505,8 @@ def _followed(sign: int, search: _Search, near: jax.Array, action: jax.Array) ->
     return lax.fori_loop(0, _POLICY_SWEEPS, sweep, near)
 
 
-def _narrow(carry: _Bounds, search: _Search) -> jax.Array:
-    return (jnp.max(jnp.abs(carry.far - carry.near)) <= 2 * search.goal) | ~carry.moved
+def _ended(finest: bool, carry: _Bounds, search: _Search) -> jax.Array:
+    return (carry.rests if finest else carry.half <= search.goal) | ~carry.moved
 
 
 @partial(jax.jit, static_argnames=("objective",))
@@ -510,9 +524,12 @@ def _optimize(model, sets: Sets, components, tolerance, max_steps, *, objective)
     search = _Search(model, undecided, one, components, goal)
     top = jnp.where(undecided, 1, one)
     near, far = (one, top) if objective == "max" else (top, one)
-    start = _Bounds(near, far, jnp.bool_(False), jnp.bool_(True))
-    (near, far, *_), n = iterate(
-        partial(_tighter, sign), _narrow, None, start, search, max_steps=max_steps)
+    finest, no = tolerance is None, jnp.bool_(False)
+    start = _Bounds(near, far, no, ~no, no)
+    bounds, n = iterate(
+        partial(_tighter, sign, finest), partial(_ended, finest), None, start, search,
+        max_steps=max_steps)
+    near, far = bounds.near, bounds.far
     still = lax.stop_gradient(search)
     action = still.best(sign, near)[1]
     if components is not None:
@@ -526,7 +543,7 @@ def _optimize(model, sets: Sets, components, tolerance, max_steps, *, objective)
     policy = jnp.where(undecided, action, sets.action)
     solution = Solution(
         value=value, policy=policy, lower=lower, upper=upper, residual=residual, num_steps=n,
-        status=status_code(jnp.max(upper - lower) <= 2 * goal, jnp.isfinite(residual)),
+        status=status_code(bounds.half <= goal, jnp.isfinite(residual)),
     )
     solution = jax.tree.map(lax.stop_gradient, solution)
 

@@ -44,8 +44,7 @@ def satisfaction_probability(
     Args:
       model: the product.
       policy: ``float[S, Q, A]`` or ``int32[S, Q]``.
-      method: as in :func:`reachability_probability`.
-      tolerance: half the width of the enclosure asked for.
+      method, tolerance: as in :func:`reachability_probability`.
 
     Returns:
       :class:`Solution`; `value` is ``float[S, Q]``. The probability from the start is
@@ -103,7 +102,8 @@ def optimal_satisfaction(
     Args:
       model: the product.
       objective: ``"max"`` or ``"min"``.
-      tolerance: half the width of the enclosure asked for.
+      tolerance: half the width of the enclosure asked for; default as in
+        :func:`reachability_probability`, as closely as the dtype allows.
       max_steps: sweeps at most.
 
     Returns:

@@ -9,6 +9,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl import Status
+from jaxltl.core.values.evidence import rounding_unit
 from tests import reference
 from tests.support import (
     as_mdp,
@@ -84,6 +85,17 @@ def assert_attained(cases, solution, objective, count):
             assert (value <= reference.FRACTION(np.ravel(solution.upper[i]))).all()
 
 
+def assert_finest(cases, exact, solution, unit):
+    """Half as wide as a few roundings of each step that the policy is expected to make."""
+    for i, ((model, *_), value) in enumerate(zip(cases, exact, strict=True)):
+        undecided = np.array([0 < x < 1 for x in value])
+        policy = np.asarray(solution.policy[i])
+        moves = model.transition[np.arange(len(policy)), policy][np.ix_(undecided, undecided)]
+        steps = np.linalg.solve(np.eye(len(moves)) - moves, np.ones(len(moves)))
+        half = (solution.upper[i] - solution.lower[i]).max() / 2
+        assert half <= 4 * unit * steps.max(initial=0)
+
+
 def test_the_examples_are_not_trivial(cases, exact):
     inner = sum(any(0 < x < 1 for x in value) for value in exact["max"])
     collapsing = sum(
@@ -104,6 +116,8 @@ def test_optima_are_enclosed_and_attained(cases, exact, objective, tolerance):
         m, t, objective=objective, tolerance=tolerance)))(mdps, targets)
     assert_certified(solution, exact[objective], tolerance or DEFAULT)
     assert_attained(cases, solution, objective, NUM_MODELS)
+    if tolerance is None:
+        assert_finest(cases, exact[objective], solution, rounding_unit(mdps))
 
 
 @pytest.mark.parametrize("tolerance", [None, 1e-12])
@@ -137,6 +151,7 @@ def test_enclosures_in_single_precision(cases, exact):
                 m, t, objective=o)))(mdps, targets)
             assert solution.value.dtype == jnp.float32
             assert_certified(solution, exact[objective][:200], tolerance)
+            assert_finest(few, exact[objective][:200], solution, rounding_unit(mdps))
             assert_attained(few, solution, objective, 200)
         solution = jax.jit(jax.vmap(lambda m, t, p: jl.reachability_probability(
             m, t, policy=p)))(mdps, targets, policies)
