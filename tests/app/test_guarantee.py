@@ -336,3 +336,49 @@ def test_to_ask_for_certainty_is_to_ask_for_the_best(write):  # noqa: F811
     weight = np.asarray(setup.model.mdp.initial)
     assert np.ones(10) @ weight[weight > 0] < 1 and setup.guarantee.asked == "best"
     assert at_starts(setup.model, np.ones(setup.model.state_shape), "mean")[0] == 1
+
+
+def test_steps_that_lose_nothing_by_themselves_are_left_out_truly_told(write):  # noqa: F811
+    """From a, where it may stay for ever, on to b; but back and forth it would fail."""
+    path = write((". . r\nb . y", "a . b"), ('"y"', '"b"'), ("!r & !y", "a"),
+                 ("!r U y", "F G a | F b"),
+                 shown={"demonstrations": [{"cells": [[1, 1], [1, 2]], "actions": ["right"] * 2}]})
+    _, result = learned(path)
+    assert result["guarantee"]["left_out"]["to"] == 1
+    (text,) = (text for kind, text in remarks(result) if kind == "note")
+    assert text == (
+        "1 of 2 demonstrated steps leaves what does the task and may come back, which again and "
+        "again would fail it, and was left out; first at row 1, column 1 (demonstration 1, step "
+        "1).")
+    assert result["satisfaction"]["minimum"]["lower"] == 1
+
+
+def test_where_what_was_learned_dawdles_the_quickest_policy_is_mixed_in(write):  # noqa: F811
+    """Up and down for ever is what was shown, so that any share of a loss would come to pass."""
+    shown = {"demonstrations": [ERRING["demonstrations"][1]]}
+    outcome, result = learned(write(asking('0.9\nover = "worst"'), shown=shown))
+    found = result["guarantee"]
+    assert 0.9 <= found["attained"] <= 0.9 + WINDOW and 0 < found["share"] < 1
+    value, _ = evaluate(outcome.setup.model, kept_policy(outcome))
+    assert at_starts(outcome.setup.model, value, "worst")[0] == pytest.approx(found["attained"])
+    assert np.isfinite(result["neg_log_likelihood"])
+    (text,) = (text for kind, text in remarks(result) if kind == "good")
+    assert text.startswith("Asked for 0.9000 from the worst initial state, certified 0.9")
+    assert text.endswith("mixed into the likeliest policy.")
+
+
+def test_where_any_loss_is_all_the_sure_policy_is_what_there_is(write):  # noqa: F811
+    shown = {"demonstrations": [ERRING["demonstrations"][1]]}
+    outcome, result = learned(write(asking(0.5), ("!r U y", "G F b & G !r"), shown=shown))
+    assert result["guarantee"]["share"] == 1 and result["guarantee"]["attained"] == 1
+    assert result["neg_log_likelihood"] is None  # a demonstrated step is never taken
+    (text,) = (text for kind, text in remarks(result) if kind == "good")
+    assert "no policy was found to reach it but one of moves that lose nothing alone." in text
+    _, sure = evaluate(outcome.setup.model, kept_policy(outcome))
+    assert sure[3, int(outcome.setup.model.initial_memory[3])]
+
+
+def test_a_weight_is_not_both_given_and_sought(write):  # noqa: F811
+    path = write(asking(0.5), ("discount = 0.9", "discount = 0.9\nmu = 1"))
+    with pytest.raises(ValueError, match=r"leave mu out of \[learner\]"):
+        job.read_task(path)

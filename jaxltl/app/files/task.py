@@ -100,6 +100,8 @@ def _guarantee(path: Path, data: Mapping[str, Any]) -> str | float:
          f'guarantee = {asked!r} is a probability, which takes method = "mlirl"; for "todirl" '
          'choose "best" or "none"'),
         ("over" in task and not number, "over belongs to a guarantee that is a probability"),
+        (number and "mu" in learner,
+         f"guarantee = {asked} finds the weight mu that reaches it: leave mu out of [learner]"),
     ))
     return asked
 

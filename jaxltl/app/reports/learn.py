@@ -67,15 +67,25 @@ def _notes(result: Mapping[str, Any]) -> list[Remark]:
     elif asked != "none":
         found.append(("good", _asked(result["guarantee"])))
     if (lost := result["guarantee"].get("left_out")) is not None:
-        found.append(("note", (
-            f"{lost['steps']} of {lost['of']} demonstrated steps "
-            f"{'lowers' if lost['steps'] == 1 else 'lower'} the best probability and "
-            f"{'was' if lost['steps'] == 1 else 'were'} left out; first at {place(lost)} "
-            f"(demonstration {lost['demonstration']}, step {lost['step']}): from "
-            f"{probability(lost['from'])} to {probability(lost['to'])}.")))
+        found.append(("note", _left_out(lost)))
     if result.get("trivial"):
         found.append(("note", result["trivial"]))
     return found
+
+
+def _left_out(lost: Mapping[str, Any]) -> str:
+    """Which demonstrated steps were not learned from, and why not."""
+    one = lost["steps"] == 1
+    why, figures = f"{'lowers' if one else 'lower'} the best probability", (
+        f": from {probability(lost['from'])} to {probability(lost['to'])}")
+    if lost["from"] - lost["to"] < 1e-9:  # by itself it loses nothing
+        why = (f"{'leaves' if one else 'leave'} what does the task and may come back, which again "
+               "and again would fail it,")
+        figures = ""
+    return (
+        f"{lost['steps']} of {lost['of']} demonstrated steps {why} and {'was' if one else 'were'} "
+        f"left out; first at {place(lost)} (demonstration {lost['demonstration']}, step "
+        f"{lost['step']}){figures}.")
 
 
 def _asked(guarantee: Mapping[str, Any]) -> str:
@@ -86,6 +96,10 @@ def _asked(guarantee: Mapping[str, Any]) -> str:
     share, weight = guarantee["share"], guarantee["weight"]
     if share:
         other = "moves that lose nothing" if weight is None else f"the policy of mu = {weight:.3g}"
+        if share == 1:
+            return f"{text}no policy was found to reach it but one of {other} alone."
+        if share > 0.99:
+            return f"{text}a share of {1 - share:.2g} of the likeliest policy is left in {other}."
         return f"{text}a share of {share:.3g} of {other} is mixed into the likeliest policy."
     if weight:
         return f"{text}the least weight of the task that reaches it is mu = {weight:.3g}."
