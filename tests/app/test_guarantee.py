@@ -367,6 +367,7 @@ def test_where_what_was_learned_dawdles_the_quickest_policy_is_mixed_in(write): 
     assert text.endswith("mixed into the likeliest policy.")
 
 
+@pytest.mark.exhaustive
 def test_where_any_loss_is_all_the_sure_policy_is_what_there_is(write):  # noqa: F811
     shown = {"demonstrations": [ERRING["demonstrations"][1]]}
     outcome, result = learned(write(asking(0.5), ("!r U y", "G F b & G !r"), shown=shown))
