@@ -68,6 +68,7 @@ from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.hitting_time import hitting_time
 from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
+from jaxltl.core.values.soft import softmax_policy
 
 STEPS = 500  # at most, unless the task says otherwise
 _TOLERANCE = 1e-6  # of the gradient's norm
@@ -140,9 +141,10 @@ def _trained(
         mlirl, seeds, problem, hparams, report, num_steps=spec.get("steps", STEPS), keep="before",
         until=learner.gradient_vanishes(spec.get("tolerance", _TOLERANCE)), checkpoint=checkpoint,
     )
-    states = found.state
-    weights = np.asarray(states.parameters)
-    each = [jax.device_get(_policy_and_likelihood(one, problem, hparams)) for one in weights]
+    states = jax.device_get(dataclasses.replace(found.state, key=None))
+    weights = states.parameters
+    lanes = [jax.tree.map(lambda x, i=i: x[i], states) for i in range(len(weights))]
+    each = [jax.device_get(_policy_and_likelihood(one, problem, hparams)) for one in lanes]
     policy, nll, codes = (np.stack(column) for column in zip(*each, strict=True))
     if spec.get("in", "product") == "world":
         policy = jax.jit(jax.vmap(lift_policy, (None, 0)))(model, policy)
@@ -209,8 +211,28 @@ def _lane(learned: Learned, i: int) -> Learned:
     return dataclasses.replace(learned, **one, history=history)
 
 
-@jax.jit
 def _policy_and_likelihood(
+    state: mlirl.State, problem: mlirl.Problem, hparams: mlirl.Hparams
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Of one seed's weights: the policy, its negative log-likelihood, and its solver's status."""
+    if hparams.optimizer == "lbfgs" and state.optimizer.known:
+        # The last evaluation was at these weights, so that there is nothing left to solve.
+        parts = state.optimizer.point.parts
+        policy = _softmax_policy(state.parameters, parts.value, problem, hparams)
+        return policy, parts.neg_log_likelihood, parts.status
+    return _solved(state.parameters, problem, hparams)
+
+
+@jax.jit
+def _softmax_policy(
+    parameters: Any, value: jax.Array, problem: mlirl.Problem, hparams: mlirl.Hparams
+) -> jax.Array:
+    reward = problem.reward(parameters, problem.features)
+    return softmax_policy(problem.model, reward, hparams.discount, value)
+
+
+@jax.jit
+def _solved(
     parameters: Any, problem: mlirl.Problem, hparams: mlirl.Hparams
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     solution = mlirl.solve(parameters, problem, hparams)

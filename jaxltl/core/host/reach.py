@@ -168,6 +168,8 @@ def optimum(
     """
     choices = _Choices(rows, allowed.T, group)
     target = one.astype(float)
+    if not undecided.any():
+        return Bounds(target, target, target, 0.0, 1, np.zeros(len(one), np.int32), undecided)
     first = _getting_out(choices, one) if sign > 0 else None
     found = _iterate(choices, undecided, target, np.zeros(len(one)), sign, first)
     if found is None:

@@ -114,18 +114,25 @@ def policy_logits(
 def with_softmax(
     model: Any, reward: jax.Array, discount: jax.Array, solution: Solution
 ) -> Solution:
-    """The solution with the softmax of its action values as its policy.
+    """The solution with the softmax of its action values as its policy."""
+    return replace(solution, policy=softmax_policy(model, reward, discount, solution.value))
+
+
+def softmax_policy(
+    model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
+) -> jax.Array:
+    """The softmax of the action values of a value, ``float[S, A]``.
 
     Every available action has a positive probability, also where its exponential is too small for
     the dtype: what a policy surely does depends on it.
     """
-    q = policy_logits(model, reward, discount, solution.value)
+    q = policy_logits(model, reward, discount, value)
     # As a constant: where the compiler rounds q otherwise elsewhere, no entry equals the maximum,
     # and its derivative is 0 / 0.
     best = lax.stop_gradient(jnp.max(q, axis=-1, keepdims=True))
     least = best + _LEAST * math.log(jnp.finfo(q.dtype).tiny)
     q = jnp.where(model.available, jnp.maximum(q, least), q)
-    return replace(solution, policy=jax.nn.softmax(q, axis=-1))
+    return jax.nn.softmax(q, axis=-1)
 
 
 def soft_policy_adjoint(

@@ -1,0 +1,32 @@
+"""What `jaxltl learn` computes: the policy that belongs to the weights that it keeps."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from jaxltl.algos import learner, mlirl
+from jaxltl.app import learn
+from jaxltl.app.files.task import read_task
+from tests.app.test_task import write  # noqa: F401
+
+
+@pytest.mark.parametrize("optimizer", ["lbfgs", "adam"])
+def test_the_policy_is_that_of_the_weights(write, optimizer):  # noqa: F811
+    """Whether or not the last evaluation was at them, before the first step too."""
+    setup = learn.prepare(read_task(write()), 0)
+    _, problem = setup.learning
+    hparams = mlirl.Hparams(discount=0.9, optimizer=optimizer)
+    state = mlirl.init(jax.random.key(0), problem, hparams)
+    for _ in range(2):
+        host = jax.device_get(dataclasses.replace(state, key=None))
+        policy, loss, status = learn._policy_and_likelihood(host, problem, hparams)
+        expected = mlirl.solve(state.parameters, problem, hparams)
+        np.testing.assert_allclose(policy, expected.policy, atol=1e-9)
+        counts = np.asarray(problem.counts)
+        seen = counts > 0
+        by_hand = -np.sum(counts[seen] * np.log(np.asarray(expected.policy)[seen]))
+        np.testing.assert_allclose(loss, by_hand, rtol=1e-9)
+        assert status == expected.status
+        state, _ = learner.run(mlirl.step, state, problem, hparams, num_steps=3)
