@@ -271,6 +271,7 @@ class Outcome:
       chosen: the seed's position whose loss is least; the policy that is kept.
       solution: the kept policy's probability of doing the task, with bounds.
       attempt: how a probability that was asked for was reached, if one was.
+      expected_steps: by who acts, from the initial states; None if a task does not end.
       satisfaction: ``float[N, S]``, of every seed's policy from every start.
       seed: the first of the seeds.
       seconds: spent.
@@ -281,6 +282,7 @@ class Outcome:
     chosen: int
     solution: Solution
     attempt: Attempt | None
+    expected_steps: dict[str, Any] | None
     satisfaction: np.ndarray
     seed: int
     seconds: float
@@ -327,7 +329,7 @@ def learn(
     report: Report | None = None,
     checkpoint: Path | None = None,
     progress: Callable[[str], None] = lambda stage: None,
-) -> tuple[Learned, int, Solution, Attempt | None, np.ndarray]:
+) -> tuple[Learned, int, Solution, Attempt | None, dict[str, Any] | None, np.ndarray]:
     """Learns with N seeds, keeps the best, and evaluates it; see :class:`Outcome`.
 
     What it is at is told to `report`, steps and figures, and to `progress`, the stage's name.
@@ -344,7 +346,9 @@ def learn(
         solution if i == chosen else satisfaction_probability(model, learned.policy[i])
         for i in range(len(learned.policy))
     ]
-    return learned, chosen, solution, attempt, np.stack([at_start(s.value) for s in each])
+    expected_steps = _expected_steps(setup, learned.policy[chosen])
+    values = np.stack([at_start(s.value) for s in each])
+    return learned, chosen, solution, attempt, expected_steps, values
 
 
 def summary(outcome: Outcome) -> dict[str, Any]:
@@ -371,7 +375,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "guarantee": kept(
             setup.guarantee, outcome.attempt, model, world, setup.demonstrations, outcome.solution),
         "trivial": setup.trivial,
-        "expected_steps": _expected_steps(outcome),
+        "expected_steps": outcome.expected_steps,
         "satisfaction": _evidence(outcome.solution, model, world, starts),
         "best_achievable": _evidence(best, model, world, starts),
         "impossible_starts": [world.where(s) for s in impossible],
@@ -400,13 +404,13 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     return plain(result)
 
 
-def _expected_steps(outcome: Outcome) -> dict[str, Any] | None:
+def _expected_steps(setup: Setup, learned: np.ndarray) -> dict[str, Any] | None:
     """Of a co-safe task, until it is done or lost: of what was learned and of the quickest best."""
-    model, best = outcome.setup.model, outcome.setup.guarantee.best
+    model, best = setup.model, setup.guarantee.best
     if model.automaton.acceptance != "cosafe":
         return None
     ended = np.asarray(model.final) | (np.asarray(best.upper) <= 0)
-    policies = {"learned": outcome.learned.policy[outcome.chosen], "quickest": best.policy}
+    policies = {"learned": learned, "quickest": best.policy}
     weight = np.asarray(model.mdp.initial, float)
     starts = weight > 0
     with np.errstate(invalid="ignore"):
