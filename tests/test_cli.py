@@ -313,7 +313,7 @@ def test_places_that_cannot_be_used(write, tmp_path):  # noqa: F811
 
 def test_check(write):  # noqa: F811
     result = run("check", write())
-    assert result.stdout == "ok: 6 states, 3 memory states, 1 demonstrations of 2 pairs\n"
+    assert result.stdout == "ok: 6 states, 3 memory states, 1 demonstration of 2 pairs\n"
     assert "demonstration 1, step 1" in failure(
         "check", write(shown={"demonstrations": [{"cells": [[9, 9]], "actions": ["up"]}]}))
 

@@ -32,6 +32,7 @@ from jaxltl.app.files.task import (
     World,
     load_demonstrations,
     load_world,
+    many,
     synthetic_demonstrations,
 )
 from jaxltl.app.files.task import read_task as read_task
@@ -177,9 +178,16 @@ def _with_guarantee(
 
     def train(mu: float, before: Learned, problem: mlirl.Problem = problem) -> Learned:
         start = jnp.asarray(before.weights[0], problem.features.dtype)
-        near = dataclasses.replace(problem, start=start)
-        there = dataclasses.replace(hparams, mu=mu, start_scale=0.0)
-        return _trained(setup, names, near, there, (seeds[0], 1), None, None)
+        there = dataclasses.replace(hparams, mu=mu)
+        # The likelihood has several maxima: on from the last weights, and from the first ones.
+        found = [
+            _trained(setup, names, one, scaled, (seeds[0], 1), None, None)
+            for one, scaled in (
+                (dataclasses.replace(problem, start=start),
+                 dataclasses.replace(there, start_scale=0.0)),
+                (problem, there))
+        ]
+        return found[int(np.argmin([np.nan_to_num(one.loss[0], nan=np.inf) for one in found]))]
 
     def inside() -> tuple[np.ndarray, Learned]:
         actions = guarantee.actions
@@ -317,7 +325,7 @@ def describe(setup: Setup) -> str:
     lengths = np.asarray(setup.demonstrations.length)
     return (
         f"{setup.world.mdp.num_states} states, {setup.model.num_memory} memory states, "
-        f"{len(lengths)} demonstrations of {int(lengths.sum())} pairs"
+        f"{many(len(lengths), 'demonstration')} of {many(int(lengths.sum()), 'pair')}"
     )
 
 

@@ -143,6 +143,11 @@ def place(where: Mapping[str, int]) -> str:
     return f"state {where['state']}"
 
 
+def many(number: int, what: str) -> str:
+    """A number of things, in words."""
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
 # --- the keys of each table -----------------------------------------------------------------
 
 

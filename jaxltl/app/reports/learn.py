@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from jaxltl.app.files.task import place
+from jaxltl.app.files.task import many, place
 from jaxltl.app.reports.live import Said, live_page
 from jaxltl.app.reports.page import (
     Remark,
@@ -112,11 +112,11 @@ def table(result: Mapping[str, Any]) -> str:
     dropped = f", {shown['dropped']} unfinished dropped" if shown["dropped"] else ""
     lines = [
         f"{result['task']}: {result['num_states']} states x {result['num_memory']} memory states, "
-        f"{shown['number']} {'synthetic ' * shown['synthetic']}demonstrations "
-        f"({shown['pairs']} pairs{dropped}), {result['method']} in the {result['in']}",
+        f"{many(shown['number'], 'synthetic ' * shown['synthetic'] + 'demonstration')} "
+        f"({many(shown['pairs'], 'pair')}{dropped}), {result['method']} in the {result['in']}",
         "",
         "probability of doing the task, over "
-        f"{result['satisfaction']['num_starts']} initial states",
+        f"{many(result['satisfaction']['num_starts'], 'initial state')}",
     ]
     lines += [
         f"  {title:16} {what:8} {value:>9}   certified {bounds:15} {where}".rstrip()
@@ -150,11 +150,11 @@ def table(result: Mapping[str, Any]) -> str:
 
 def _sentence(result: Mapping[str, Any]) -> str:
     shown = result["demonstrations"]
-    kind = "synthetic demonstrations" if shown["synthetic"] else "demonstrations"
+    kind = "synthetic demonstration" if shown["synthetic"] else "demonstration"
     return (
         f"{html.escape(result['method'])} in the {result['in']}: {result['num_states']} states × "
-        f"{result['num_memory']} memory states, {shown['number']} {kind} "
-        f"({shown['pairs']} state-action pairs)"
+        f"{result['num_memory']} memory states, {many(shown['number'], kind)} "
+        f"({many(shown['pairs'], 'state-action pair')})"
     )
 
 
@@ -214,7 +214,7 @@ def _tiles(result: Mapping[str, Any]) -> str:
            else "<span class=bad>not converged</span>")
     return tiles([
         (probability(learned["mean"]["value"]),
-         f"mean probability over {learned['num_starts']} initial states"),
+         f"mean probability over {many(learned['num_starts'], 'initial state')}"),
         (probability(learned["minimum"]["value"]),
          f"minimum, from {html.escape(place(learned['minimum']))}"),
         (probability(best["mean"]["value"]), "best achievable mean"),
