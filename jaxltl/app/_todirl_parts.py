@@ -62,6 +62,7 @@ class Setup:
       expert: ``float[W, S, Q, A]``, the policy of an expert in the judged products.
       demonstrations: in each of the training worlds.
       left_out: how many of their steps are not among the allowed actions.
+      loss: what taking those alike is certified to lose at most, in any world.
     """
 
     task: Task
@@ -72,6 +73,7 @@ class Setup:
     expert: jax.Array
     demonstrations: list[Trajectories]
     left_out: int = 0
+    loss: float = 0.0
 
     @property
     def training(self) -> Worlds:

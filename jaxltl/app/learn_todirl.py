@@ -112,18 +112,21 @@ def prepare(task: Task, seed: int) -> Setup:
             )
             for w, scene in enumerate(scenes)
         ]
-    left_out = 0
+    left_out, loss = 0, 0.0
     if task.guarantee == "best":
-        worlds, left_out = _narrowed(task, worlds, found)
+        worlds, left_out, loss = _narrowed(task, worlds, found)
     if memory is not judge:
         expert = np.tile(expert, (1, 1, len(memory.delta), 1))  # the task's state varies fastest
-    return Setup(task, judge, memory, worlds, len(scenes), jnp.asarray(expert), found, left_out)
+    return Setup(task, judge, memory, worlds, len(scenes), jnp.asarray(expert), found, left_out,
+                 loss)
 
 
-def _narrowed(task: Task, worlds: Worlds, shown: list[Trajectories]) -> tuple[Worlds, int]:
-    """The worlds with the actions alone that lose nothing, and how many steps took others."""
+def _narrowed(task: Task, worlds: Worlds, shown: list[Trajectories]) -> tuple[Worlds, int, float]:
+    """The worlds with the actions alone that lose nothing, how many steps took others, and what
+    those actions are certified to lose at most."""
     lanes = [part_of(worlds.model, w) for w in range(len(worlds.scenes))]
-    allowed = [np.asarray(optimal_actions(lane).allowed) for lane in lanes]
+    found = [optimal_actions(lane) for lane in lanes]
+    allowed = [np.asarray(one.allowed) for one in found]
     count = 0
     for w, trajectories in enumerate(shown):
         with errors_in(f"{task.path}: demonstrations in {worlds.scenes[w].name}: "):
@@ -131,7 +134,8 @@ def _narrowed(task: Task, worlds: Worlds, shown: list[Trajectories]) -> tuple[Wo
             model = product(worlds.scenes[w].mdp, lanes[w].automaton, label_on=task.label_on)
             kept = allowed_steps(with_allowed(model, allowed[w][:size]), trajectories)
         count += int(np.asarray(trajectories.mask).sum() - kept.sum())
-    return worlds._replace(model=narrow(worlds.model, allowed)), count
+    loss = max(float(one.loss) for one in found)
+    return worlds._replace(model=narrow(worlds.model, allowed)), count, loss
 
 
 def _stack(task: Task, scenes: list[Scene], judge: Automaton, memory: Automaton) -> Worlds:
@@ -313,7 +317,8 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "label_on": task.label_on,
         "radius": task.radius,
         "horizon": task.learner.get("horizon"),
-        "guarantee": {"asked": task.guarantee, "left_out": setup.left_out},
+        "guarantee": {"asked": task.guarantee, "left_out": setup.left_out,
+                      "loss": setup.loss},
         "num_memory": setup.worlds.model.num_memory,
         "demonstrations": {
             "number": [len(shown.length) for shown in setup.demonstrations],

@@ -10,7 +10,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.app import learn as job
 from jaxltl.app.guarantee import WINDOW, at_starts
-from jaxltl.app.reports.learn import remarks
+from jaxltl.app.reports.learn import _nearly_best, remarks
 from tests.algos.test_guaranteed import bottoms, evaluate
 from tests.app.test_task import write  # noqa: F401
 
@@ -81,8 +81,8 @@ def test_one_demonstration_is_enough(fetched):
     outcome, result = fetched
     assert result["satisfaction"]["minimum"]["lower"] == 1
     assert ("good", "By the graph: from every initial state the policy does the task with "
-            "probability 1, whatever the numbers. It takes all of the moves that keep that "
-            "possible, and no others.") in remarks(result)
+            "probability 1, whatever the numbers. It takes moves that keep that possible, and no "
+            "others.") in remarks(result)
     *_, sure = bottoms(outcome.setup.model, kept_policy(outcome))
     start = int(outcome.setup.demonstrations.state[0, 0])
     assert sure[start, int(outcome.setup.model.initial_memory[start])]
@@ -244,6 +244,16 @@ def test_a_probability_is_reached_and_nothing_given_away(tmp_path, count, grid):
 ])
 def test_a_probability_is_reached_from_the_worst_start(tmp_path, count, grid):
     check_many(count, grid, "worst", tmp_path)
+
+
+@pytest.mark.parametrize(("lower", "upper", "kind", "words"), [
+    (0.5, 0.5 + 1e-9, "good", "certified to lose at most 1.0e-09 on average"),
+    (0.5, 0.6, "warning", "the policy is certified to lose at most 0.1 on average"),
+    (None, 0.6, "warning", "the policy is certified of nothing on average"),
+])
+def test_no_more_is_said_than_is_certified(lower, upper, kind, words):
+    found, text = _nearly_best(lower, {"value": 0.5, "upper": upper})
+    assert found == kind and words in text
 
 
 # --- what is refused, left out, said -----------------------------------------------------------

@@ -21,6 +21,7 @@ from jaxltl.app.reports.page import (
 )
 
 _SHORT = 0.01  # share of the best probability that may be missing without a word
+_PROVEN = 1e-6  # what a policy may be certified to lose and still be called best
 _LITTLE = 0.05  # a weight of which nothing is to be said
 _LONG = 10  # times the quickest policy's steps, likewise
 
@@ -57,13 +58,9 @@ def _notes(result: Mapping[str, Any]) -> list[Remark]:
         if learned["minimum"]["lower"] == 1:
             found.append(("good", (
                 "By the graph: from every initial state the policy does the task with probability "
-                "1, whatever the numbers. It takes all of the moves that keep that possible, and "
-                "no others.")))
+                "1, whatever the numbers. It takes moves that keep that possible, and no others.")))
         else:
-            found.append(("good", (
-                "By construction no policy does the task with a greater probability, from any "
-                "initial state: this one takes all of the moves that preserve the best one "
-                f"({probability(best['mean']['value'])} on average), and no others.")))
+            found.append(_nearly_best(learned["mean"]["lower"], best["mean"]))
     elif asked != "none":
         found.append(("good", _asked(result["guarantee"])))
     if (lost := result["guarantee"].get("left_out")) is not None:
@@ -86,6 +83,20 @@ def _left_out(lost: Mapping[str, Any]) -> str:
         f"{lost['steps']} of {lost['of']} demonstrated steps {why} and {'was' if one else 'were'} "
         f"left out; first at {place(lost)} (demonstration {lost['demonstration']}, step "
         f"{lost['step']}){figures}.")
+
+
+def _nearly_best(lower: float | None, best: Mapping[str, Any]) -> Remark:
+    """How near to the best probability the policy is proven to be; it may be no proof of best."""
+    gap = math.inf if lower is None or best["upper"] is None else best["upper"] - lower
+    if gap > _PROVEN:
+        how = f"to lose at most {number(gap)}" if math.isfinite(gap) else "of nothing"
+        return "warning", (
+            "Bounds do not tell the moves that preserve the best probability from others that are "
+            f"near to it: the policy is certified {how} on average.")
+    return "good", (
+        "By construction no policy does the task with a greater probability: this one takes moves "
+        f"that preserve the best one ({probability(best['value'])} on average), and no others. "
+        f"It is certified to lose at most {number(max(gap, 0.0))} on average.")
 
 
 def _asked(guarantee: Mapping[str, Any]) -> str:

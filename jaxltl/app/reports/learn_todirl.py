@@ -51,9 +51,9 @@ def remarks(result: Mapping[str, Any]) -> list[Remark]:
     found = [("warning", text) for text in warnings(result)]
     if result["guarantee"]["asked"] == "best":
         found.append(("good", (
-            "By construction: in every world, new ones too, the policy takes the moves that lose "
-            "nothing of the task, all of them and no others, so that it does the task as well as "
-            "it can be done; what was learned decides how.")))
+            "By construction: in every world, new ones too, the policy takes moves that lose "
+            "nothing of the task, and no others; what was learned decides how. Taken alike, they "
+            f"are certified to lose at most {number(result['guarantee']['loss'])} here.")))
     if lost := result["guarantee"]["left_out"]:
         found.append(("note", f"{lost} demonstrated steps lose something and were left out."))
     return found
