@@ -23,6 +23,7 @@ from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor, avoi
 from jaxltl.core.graphs.end_components import end_components
 from jaxltl.core.logic.ltl import Formula, holds_on_lasso, parse_ltl
 from jaxltl.core.models.batch import lift_memory, stack_products
+from jaxltl.core.models.convert import to_padded, to_sparse
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp, to_dense
 from jaxltl.core.models.monitor import Monitor, Verdict, make_monitor, monitor_step, verdict
@@ -44,6 +45,7 @@ from jaxltl.core.models.product import (
     project_trajectories,
 )
 from jaxltl.core.models.restrict import restrict, with_allowed
+from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse, row_reward
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, rollout
 from jaxltl.core.types import NotConverged, Solution, Status, check
 from jaxltl.core.values.boltzmann import boltzmann_fixed_points, boltzmann_value
@@ -83,7 +85,9 @@ __all__ = [
     "Parity",
     "Permissive",
     "Product",
+    "Rewards",
     "Solution",
+    "SparseMDP",
     "Status",
     "Trajectories",
     "Verdict",
@@ -121,6 +125,7 @@ __all__ = [
     "make_game",
     "make_mdp",
     "make_monitor",
+    "make_sparse",
     "make_trajectories",
     "mean_payoff",
     "minimax_value",
@@ -142,6 +147,7 @@ __all__ = [
     "read_hoa",
     "restrict",
     "rollout",
+    "row_reward",
     "safety",
     "sample_successor",
     "satisfaction_probability",
@@ -155,6 +161,8 @@ __all__ = [
     "task_performances",
     "to_automaton",
     "to_dense",
+    "to_padded",
+    "to_sparse",
     "verdict",
     "verify",
     "winning_region",

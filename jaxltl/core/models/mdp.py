@@ -180,12 +180,12 @@ def make_mdp(
     dtype = jnp.result_type(float)
     used &= available[:, :, None]
     probability = np.where(used, probability * scale[:, :, None], 0).astype(dtype)
-    label, names = _checked_label(label, propositions, num_states)
+    label, names = checked_label(label, propositions, num_states)
     return MDP(
         successor=to_jax(np.where(used, successor, 0).astype(np.int32)),
         probability=to_jax(probability),
         available=to_jax(available),
-        initial=to_jax(_checked_initial(initial, num_states).astype(dtype)),
+        initial=to_jax(checked_initial(initial, num_states).astype(dtype)),
         label=to_jax(label),
         propositions=names,
     )
@@ -292,7 +292,7 @@ def _checked_available(available: chex.Array, shape: tuple[int, int]) -> np.ndar
     return available
 
 
-def _checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
+def checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
     if initial is None:
         return np.full(num_states, 1 / num_states)
     initial = np.asarray(initial, np.float64)
@@ -308,7 +308,7 @@ def _checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
     return initial / initial.sum()
 
 
-def _checked_label(
+def checked_label(
     label: chex.Array | Mapping[str, Sequence[int]] | None, propositions: Sequence[str],
     num_states: int,
 ) -> tuple[np.ndarray, tuple[str, ...]]:

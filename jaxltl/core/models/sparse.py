@@ -1,0 +1,367 @@
+"""Models as they come: choices and successors without padding, with named rewards."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import chex
+import numpy as np
+from flax import struct
+
+from jaxltl.core.host.sparse import HostMDP
+from jaxltl.core.models.mdp import checked_initial, checked_label
+
+Array = Any  # NumPy's in double precision as it is read, or JAX's
+
+
+@struct.dataclass
+class Rewards:
+    """A reward structure; what is absent is zero.
+
+    Attributes:
+      state: ``float[S]``, earned by each step from a state.
+      choice: ``float[R]``, earned by a choice.
+      transition: ``float[T]``, earned by an entry.
+    """
+
+    state: Array | None = None
+    choice: Array | None = None
+    transition: Array | None = None
+
+
+@struct.dataclass
+class SparseMDP:
+    """A labelled decision process whose states have as many choices as they have.
+
+    The choices of state s are the rows ``row_start[s]`` to ``row_start[s + 1] - 1``, and row r
+    leads to ``successor[e]`` with ``probability[e]`` for the entries e from ``entry_start[r]`` to
+    ``entry_start[r + 1] - 1``. Quantities on actions have a number for each row, ``[R]``. A Markov
+    chain has one row in each state. Build one with :func:`make_sparse`, which checks it; its
+    arrays are NumPy's, in double precision, whatever JAX's default.
+
+    Attributes:
+      row_start: ``int32[S + 1]``.
+      entry_start: ``int32[R + 1]`` (``int64`` beyond 2^31 entries).
+      successor: ``int32[T]``, ascending and without repetition within a row.
+      probability: ``float[T]``, positive; rows sum to one.
+      initial: ``float[S]``, the initial distribution.
+      label: ``bool[S, P]``, which propositions hold in a state.
+      rewards: named :class:`Rewards`.
+      action: ``int32[R]``, the number of each row's action, or None.
+      valuation: the values of named variables in each state, ``[S]`` each.
+      propositions: the P names, static.
+      action_names: the names of actions by their number, static; empty if they have none.
+    """
+
+    row_start: Array
+    entry_start: Array
+    successor: Array
+    probability: Array
+    initial: Array
+    label: Array
+    rewards: dict[str, Rewards] = struct.field(default_factory=dict)
+    action: Array | None = None
+    valuation: dict[str, Array] = struct.field(default_factory=dict)
+    propositions: tuple[str, ...] = struct.field(pytree_node=False, default=())
+    action_names: tuple[str, ...] = struct.field(pytree_node=False, default=())
+
+    @property
+    def num_states(self) -> int:
+        return self.row_start.shape[-1] - 1
+
+    @property
+    def num_rows(self) -> int:
+        return self.entry_start.shape[-1] - 1
+
+    @property
+    def num_transitions(self) -> int:
+        return self.successor.shape[-1]
+
+    @property
+    def is_chain(self) -> bool:
+        """Whether every state has one choice."""
+        return self.num_rows == self.num_states
+
+    @property
+    def state_shape(self) -> tuple[int, ...]:
+        """The shape of a value: ``(S,)``."""
+        return (self.num_states,)
+
+    @property
+    def dtype(self) -> Any:
+        return self.probability.dtype
+
+    @property
+    def host(self) -> HostMDP:
+        """The transitions as the host engine takes them."""
+        row_start, entry_start, successor = (
+            np.asarray(x) for x in (self.row_start, self.entry_start, self.successor))
+        probability = np.asarray(self.probability, np.float64)
+        return HostMDP(row_start, entry_start, successor, probability)
+
+    def states_where(self, proposition: str) -> Array:
+        """``bool[S]``, where a proposition holds.
+
+        Raises:
+          ValueError: there is no such proposition.
+        """
+        if proposition not in self.propositions:
+            raise ValueError(f"there is no label {proposition!r}; the model has "
+                             f"{', '.join(self.propositions) or 'none'}.")
+        return self.label[:, self.propositions.index(proposition)]
+
+
+def row_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = None) -> np.ndarray:
+    """The expected reward of each choice, ``r(s) + r(s, a) + sum_t P(t | s, a) r(s, a, t)``.
+
+    Args:
+      model: a concrete sparse model.
+      reward: the name of one of its rewards, a structure, or an array on states ``[S]``, on
+        choices ``[R]`` or on entries ``[T]``, taken for the first of these that fits. None is the
+        only reward that the model has.
+
+    Returns:
+      ``float64[R]``.
+
+    Raises:
+      ValueError: there is no such reward, or its shape fits nothing.
+    """
+    if reward is None:
+        if len(model.rewards) != 1:
+            raise ValueError(f"name the reward: the model has {_listed(model.rewards)}.")
+        reward = next(iter(model.rewards))
+    if isinstance(reward, str):
+        if reward not in model.rewards:
+            raise ValueError(f"there is no reward {reward!r}; the model has "
+                             f"{_listed(model.rewards)}.")
+        reward = model.rewards[reward]
+    if not isinstance(reward, Rewards):
+        reward = _shaped(model, np.asarray(reward, np.float64))
+    host = model.host
+    total = np.zeros(host.num_rows)
+    if reward.state is not None:
+        total += np.asarray(reward.state, np.float64)[host.state]
+    if reward.choice is not None:
+        total += np.asarray(reward.choice, np.float64)
+    if reward.transition is not None:
+        earned = host.probability * np.asarray(reward.transition, np.float64)
+        total += np.add.reduceat(earned, host.entry_start[:-1])
+    return total
+
+
+def _listed(names: Mapping[str, Any]) -> str:
+    return ", ".join(map(repr, names)) or "none"
+
+
+def _shaped(model: SparseMDP, reward: np.ndarray) -> Rewards:
+    for size, name in ((model.num_states, "state"), (model.num_rows, "choice"),
+                       (model.num_transitions, "transition")):
+        if reward.shape == (size,):
+            return Rewards(**{name: reward})
+    raise ValueError(
+        f"reward has shape {reward.shape}; give one number for each of the {model.num_states} "
+        f"states, {model.num_rows} choices or {model.num_transitions} transitions.")
+
+
+def make_sparse(
+    row_start: chex.Array | None,
+    entry_start: chex.Array,
+    successor: chex.Array,
+    probability: chex.Array,
+    *,
+    initial: chex.Array | None = None,
+    label: chex.Array | Mapping[str, Sequence[int]] | None = None,
+    propositions: Sequence[str] = (),
+    rewards: Mapping[str, Rewards] | None = None,
+    action: chex.Array | None = None,
+    action_names: Sequence[str] = (),
+    valuation: Mapping[str, chex.Array] | None = None,
+) -> SparseMDP:
+    """A checked :class:`SparseMDP` from arrays, on the host.
+
+    Successors are put into ascending order, and those that stand twice in a row become one, with
+    the sum of their probabilities and the mean of their rewards. Entries of probability zero are
+    dropped. Rows that sum to one but for rounding stay as they are, bit for bit; others within
+    1e-6 are scaled.
+
+    Args:
+      row_start: ``int[S + 1]``; None for a Markov chain, whose rows are its states.
+      entry_start: ``int[R + 1]``.
+      successor: ``int[T]``, in ``[0, S)``.
+      probability: ``float[T]``.
+      initial: ``float[S]``, a distribution; default: uniform.
+      label, propositions: as for :func:`~jaxltl.core.models.mdp.make_mdp`.
+      rewards: named structures.
+      action: ``int[R]``.
+      action_names: the names of the actions.
+      valuation: values of named variables, ``[S]`` each.
+
+    Raises:
+      ValueError: naming the state, the choice and the value: a shape is wrong, starts do not
+        ascend, a state has no choice, a choice no successor, a successor is out of range, a
+        probability is negative or not finite, or a row does not sum to one.
+
+    Example:
+      >>> model = make_sparse([0, 2, 3], [0, 2, 3, 4], [0, 1, 1, 1], [0.5, 0.5, 1, 1])
+      >>> model.num_states, model.num_rows, model.num_transitions, model.is_chain
+      (2, 3, 4, False)
+    """
+    successor, probability = np.asarray(successor), np.asarray(probability, np.float64)
+    if successor.ndim != 1 or successor.shape != probability.shape:
+        raise ValueError(
+            f"successor has shape {successor.shape} and probability {probability.shape}; "
+            "both must be [transitions].")
+    if not np.issubdtype(successor.dtype, np.integer):
+        raise ValueError(f"successor has dtype {successor.dtype}; it must hold integers.")
+    entry_start = _starts("entry_start", entry_start, successor.size, "transitions")
+    num_rows = entry_start.size - 1
+    if row_start is None:
+        row_start = np.arange(num_rows + 1)
+    row_start = _starts("row_start", row_start, num_rows, "choices")
+    num_states = row_start.size - 1
+    if num_states == 0:
+        raise ValueError("the model has no state; it needs at least one.")
+    _check_entries(row_start, entry_start, successor, probability)
+    rewards = {name: _checked_rewards(name, x, num_states, num_rows, successor.size)
+               for name, x in (rewards or {}).items()}
+    label, names = checked_label(label, propositions, num_states)
+    action = None if action is None else _checked_action(action, num_rows, tuple(action_names))
+    for name, x in (valuation or {}).items():
+        if np.shape(x) != (num_states,):
+            raise ValueError(f"valuation {name!r} has shape {np.shape(x)}; expected "
+                             f"({num_states},), a value for each state.")
+    parts = _canonical(row_start, entry_start, successor, probability, rewards)
+    start, successor, probability, rewards = parts
+    return SparseMDP(
+        row_start=row_start.astype(np.int32), entry_start=start, successor=successor,
+        probability=_scaled(row_start, start, probability),
+        initial=checked_initial(initial, num_states), label=label, rewards=rewards,
+        action=action, valuation={n: np.asarray(x) for n, x in (valuation or {}).items()},
+        propositions=names, action_names=tuple(action_names))
+
+
+def _starts(name: str, start: Any, total: int, of: str) -> np.ndarray:
+    start = np.asarray(start)
+    if start.ndim != 1 or not start.size or not np.issubdtype(start.dtype, np.integer):
+        raise ValueError(f"{name} is {start.dtype}{list(start.shape)}; expected integers, one more "
+                         "than there are spans.")
+    if start[0] != 0 or start[-1] != total:
+        raise ValueError(f"{name} goes from {start[0]} to {start[-1]}; it must go from 0 to the "
+                         f"number of {of}, {total}.")
+    if (np.diff(start) < 0).any():
+        i = int(np.flatnonzero(np.diff(start) < 0)[0])
+        raise ValueError(f"{name} falls from {start[i]} to {start[i + 1]} at {i + 1}; it must "
+                         "ascend.")
+    return start
+
+
+def _place(row_start: np.ndarray, row: int) -> str:
+    """A choice by its state and rank, for messages."""
+    state = int(np.searchsorted(row_start, row, "right")) - 1
+    return f"state {state}, choice {row - int(row_start[state])}"
+
+
+def _check_entries(
+    row_start: np.ndarray, entry_start: np.ndarray, successor: np.ndarray, probability: np.ndarray
+) -> None:
+    num_states = row_start.size - 1
+    if (np.diff(row_start) == 0).any():
+        raise ValueError(f"state {np.flatnonzero(np.diff(row_start) == 0)[0]} has no choice; give "
+                         "it one, for example a loop to itself.")
+    if (np.diff(entry_start) == 0).any():
+        row = int(np.flatnonzero(np.diff(entry_start) == 0)[0])
+        raise ValueError(f"{_place(row_start, row)} leads nowhere; give it a successor.")
+    if successor.min() < 0 or successor.max() >= num_states:
+        e = int(np.flatnonzero((successor < 0) | (successor >= num_states))[0])
+        row = int(np.searchsorted(entry_start, e, "right")) - 1
+        raise ValueError(f"{_place(row_start, row)}: successor {successor[e]} is out of range; "
+                         f"states are 0 to {num_states - 1}.")
+    # A sum is NaN or infinite if any of it is.
+    if not probability.min() >= 0 or not np.isfinite(probability.sum()):
+        e = int(np.flatnonzero(~(probability >= 0) | np.isinf(probability))[0])
+        row = int(np.searchsorted(entry_start, e, "right")) - 1
+        raise ValueError(f"{_place(row_start, row)}: probability {probability[e]}; probabilities "
+                         "must be finite and not negative.")
+
+
+def _checked_rewards(
+    name: str, reward: Rewards, num_states: int, num_rows: int, num_transitions: int
+) -> Rewards:
+    parts: dict[str, Any] = {}
+    sizes = {"state": num_states, "choice": num_rows, "transition": num_transitions}
+    for part, size in sizes.items():
+        given = getattr(reward, part)
+        if given is None:
+            continue
+        given = np.asarray(given, np.float64)
+        if given.shape != (size,):
+            raise ValueError(f"reward {name!r} has shape {given.shape} on its {part} part; "
+                             f"expected ({size},).")
+        if np.isnan(given).any():
+            place = f"{part} {np.flatnonzero(np.isnan(given))[0]}"
+            raise ValueError(f"reward {name!r} is NaN at {place}; give a number.")
+        parts[part] = given
+    return Rewards(**parts)
+
+
+def _checked_action(action: Any, num_rows: int, names: tuple[str, ...]) -> np.ndarray:
+    action = np.asarray(action)
+    if action.shape != (num_rows,) or not np.issubdtype(action.dtype, np.integer):
+        raise ValueError(f"action is {action.dtype}{list(action.shape)}; expected integers "
+                         f"[{num_rows}], the action of each choice.")
+    if action.size and (action.min() < 0 or (names and action.max() >= len(names))):
+        raise ValueError(f"actions go from {action.min()} to {action.max()}; there are "
+                         f"{len(names)} names, for 0 to {len(names) - 1}.")
+    return action.astype(np.int32)
+
+
+def _canonical(
+    row_start: np.ndarray, entry_start: np.ndarray, successor: np.ndarray,
+    probability: np.ndarray, rewards: dict[str, Rewards],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Rewards]]:
+    """Entries in ascending order, without repetitions and zeros."""
+    index: Any = np.int32 if successor.size < 2**31 else np.int64
+    first = np.zeros(successor.size + 1, bool)
+    first[entry_start] = True
+    ascends = successor[1:] > successor[:-1]
+    if (ascends | first[1:-1]).all() and probability.min(initial=1) > 0:
+        return (entry_start.astype(index), successor.astype(np.int32), probability, rewards)
+    row = np.repeat(np.arange(entry_start.size - 1), np.diff(entry_start))
+    used = np.flatnonzero(probability > 0)
+    order = used[np.lexsort((successor[used], row[used]))]
+    row, target, weight = row[order], successor[order], probability[order]
+    new = np.ones(order.size, bool)
+    new[1:] = (row[1:] != row[:-1]) | (target[1:] != target[:-1])
+    start = np.flatnonzero(new)
+    merged = np.add.reduceat(weight, start) if start.size else weight
+    found = {}
+    for name, reward in rewards.items():
+        if reward.transition is not None:
+            earned = np.add.reduceat(weight * reward.transition[order], start) / merged
+            # What stands alone keeps its reward bit for bit.
+            alone = np.diff(np.append(start, order.size)) == 1
+            reward = replace(
+                reward, transition=np.where(alone, reward.transition[order][start], earned))
+        found[name] = reward
+    count = np.bincount(row[start], minlength=entry_start.size - 1)
+    if (count == 0).any():
+        place = _place(row_start, int(np.flatnonzero(count == 0)[0]))
+        raise ValueError(f"{place}: the probabilities sum to 0, not 1; correct the row.")
+    starts = np.concatenate([[0], count.cumsum()]).astype(index)
+    return starts, target[start].astype(np.int32), merged, found
+
+
+def _scaled(row_start: np.ndarray, entry_start: np.ndarray, probability: np.ndarray) -> np.ndarray:
+    total = np.add.reduceat(probability, entry_start[:-1])
+    off = np.abs(total - 1)
+    if off.max() > 1e-6:
+        row = int(np.flatnonzero(off > 1e-6)[0])
+        raise ValueError(f"{_place(row_start, row)}: the probabilities sum to {total[row]:.9g}, "
+                         "not 1; correct the row.")
+    count = np.diff(entry_start)
+    wrong = off > (count + 2) * np.finfo(np.float64).eps
+    if not wrong.any():
+        return probability
+    return probability / np.repeat(np.where(wrong, total, 1), count)
