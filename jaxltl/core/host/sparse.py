@@ -63,6 +63,11 @@ class HostMDP:
         return np.repeat(np.arange(self.num_rows, dtype=np.int32), np.diff(self.entry_start))
 
     @cached_property
+    def predecessors(self) -> tuple[Integers, Integers]:
+        """The rows that lead to state t, one an entry: ``row[start[t] : start[t + 1]]``."""
+        return self.support.predecessors
+
+    @cached_property
     def support(self) -> Rows:
         """Which states a row leads to."""
         return Rows(self.entry_start, self.successor, self.num_states)
@@ -73,9 +78,7 @@ class HostMDP:
         from scipy import sparse  # a tenth of a second that only those need who multiply
 
         arrays = self.probability, self.successor, self.entry_start
-        found = sparse.csr_array(arrays, shape=(self.num_rows, self.num_states))
-        found.has_sorted_indices = found.has_canonical_format = True
-        return found
+        return sparse.csr_array(arrays, shape=(self.num_rows, self.num_states))
 
     def expectation(self, value: Floats) -> Floats:
         """The expected value of the next state, ``float64[R]``."""

@@ -1,0 +1,73 @@
+"""Sparse graph questions give the answers of the padded ones, whatever the sizes."""
+
+import numpy as np
+import pytest
+
+from jaxltl.core.graphs.attractor import attract, avoid, surely
+from jaxltl.core.graphs.end_components import components_within
+from jaxltl.core.graphs.graph import host_graph
+from jaxltl.core.host import rows, sparse_graph
+from jaxltl.core.models.convert import to_padded, to_sparse
+from tests.core.models.test_sparse import random_padded
+
+
+def models(count=60):
+    rng = np.random.default_rng(0)
+    for i in range(count):
+        # Few successors make chains and components, many a graph that is one.
+        padded = random_padded(rng, int(rng.integers(2, 40)), 1 + i % 3, 1 + i % 2)
+        sparse = to_sparse(padded)
+        yield rng, sparse, to_padded(sparse)
+
+
+def on_rows(sparse, mask):
+    """``bool[R]`` of a mask ``bool[S, A]``."""
+    return np.asarray(mask)[sparse.host.state, sparse.action]
+
+
+@pytest.fixture(params=["python", "numpy", "scipy"])
+def way(request, monkeypatch):
+    """The same by each way of searching, which sizes choose."""
+    monkeypatch.setattr(sparse_graph, "_FEW", 0 if request.param == "numpy" else 1000)
+    if request.param == "scipy":
+        monkeypatch.setattr(rows, "LARGE", 0)
+        monkeypatch.setattr(sparse_graph, "LARGE", 0)
+
+
+@pytest.mark.usefixtures("way")
+def test_searches():
+    for rng, sparse, padded in models():
+        graph, host = host_graph(padded), sparse.host
+        goal = rng.random(host.num_states) < 0.15
+        allowed = graph.available & (rng.random(graph.available.shape) < 0.8)
+        kept = on_rows(sparse, allowed)
+        for mask, pairs in ((None, None), (kept, allowed)):
+            found = sparse_graph.reaching(host, goal, mask)
+            np.testing.assert_array_equal(found, attract(graph, goal, pairs).region)
+            found, stays = sparse_graph.surely_reaching(host, goal, mask)
+            np.testing.assert_array_equal(found, surely(graph, goal, pairs).region)
+            inside = found[host.state] & ~host.support.lead_to(~found)
+            np.testing.assert_array_equal(stays, inside if mask is None else inside & mask)
+        np.testing.assert_array_equal(sparse_graph.forced(host, goal), ~avoid(graph, goal))
+        among = rng.random(host.num_states) < 0.8
+        slow = goal.copy()
+        for _ in range(host.num_states):
+            hit = host.support.lead_to(slow) | ~kept
+            slow |= among & host.over_choices(np.logical_and, hit)
+        np.testing.assert_array_equal(sparse_graph.forced(host, goal, kept, among), slow)
+
+
+@pytest.mark.usefixtures("way")
+def test_end_components():
+    some = 0
+    for rng, sparse, padded in models():
+        graph, host = host_graph(padded), sparse.host
+        states = rng.random(host.num_states) < 0.9
+        allowed = graph.available & (rng.random(graph.available.shape) < 0.8)
+        theirs = components_within(graph, states, allowed)
+        ours = sparse_graph.end_components(host, states, on_rows(sparse, allowed))
+        np.testing.assert_array_equal(ours.component, theirs.component)
+        np.testing.assert_array_equal(ours.inside, on_rows(sparse, theirs.inside))
+        np.testing.assert_array_equal(ours.region(host), np.asarray(theirs.inside).any(-1))
+        some += ours.inside.any()
+    assert some > 10
