@@ -1,0 +1,135 @@
+"""Files as bytes: compressed or not, of bounded size, and written whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import lzma
+import os
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO, Literal
+
+from jaxltl.algos.checkpoint import atomic_write
+
+Compression = Literal["gzip", "xz"]
+
+MAX_BYTES = 2**34  # of a file, after decompression
+MAX_RATIO = 300  # a compressed file may grow by this, after the first ALWAYS_ALLOWED bytes
+ALWAYS_ALLOWED = 2**28
+_XZ_MEMORY = 2**28  # what a decoder may take; `xz -9` asks for 65 MB
+_STEP = 2**20  # bytes that come out at a time
+_FED = 2**14  # bytes that go in
+
+_BEGINS: dict[Compression, bytes] = {"gzip": b"\x1f\x8b", "xz": b"\xfd7zXZ\x00"}
+_SUFFIX: dict[str, Compression] = {".gz": "gzip", ".xz": "xz"}
+
+
+def read_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
+    """The bytes of a file, decompressed if it begins as gzip or xz does, whatever its name.
+
+    What a compressed file may grow to is bounded: by `limit`, and beyond 256 MiB by 300 times its
+    size. Nothing beyond the bound is ever held.
+
+    Raises:
+      ValueError: naming the file: it cannot be read, is damaged, or is larger than allowed.
+    """
+    name, parts, size = str(path), [], 0
+    try:
+        with open(path, "rb") as file:
+            while size <= limit and (part := file.read(2**24)):
+                parts.append(part)
+                size += len(part)
+        data = parts[0] if len(parts) == 1 else b"".join(parts)
+    except (OSError, ValueError, MemoryError) as error:  # ValueError: a null byte in the name
+        reason = getattr(error, "strerror", None) or str(error) or "too large for the memory"
+        raise ValueError(f"cannot read {name!r}: {reason}.") from None
+    if size > limit:
+        raise ValueError(f"{name!r} has more than {limit} bytes, the most that are read.")
+    kind = compression_of(data)
+    if kind is None:
+        return data
+    allowed = min(limit, ALWAYS_ALLOWED + MAX_RATIO * len(data))
+    try:
+        return _decompressed(data, kind, allowed, name)
+    except (zlib.error, lzma.LZMAError, EOFError, MemoryError) as error:
+        raise ValueError(f"{name!r} begins as {kind} does and is damaged: "
+                         f"{error or 'out of memory'}.") from None
+
+
+def compression_of(data: bytes) -> Compression | None:
+    """How bytes are compressed, by how they begin."""
+    return next((kind for kind, begin in _BEGINS.items() if data.startswith(begin)), None)
+
+
+def compression_by_name(path: str | os.PathLike[str]) -> Compression | None:
+    """How a file is compressed, by the end of its name."""
+    return _SUFFIX.get(Path(path).suffix.lower())
+
+
+def _decompressed(data: bytes, kind: Compression, allowed: int, name: str) -> bytes:
+    parts, size, place = [], 0, 0
+    while place < len(data):  # several streams may follow one another, and zeros pad the last
+        if not data.startswith(_BEGINS[kind], place):
+            rest = data[place:]
+            if rest.count(0) == len(rest):
+                break
+            raise ValueError(f"{name!r}: {len(rest)} bytes follow the {kind} data; remove them.")
+        pieces = _stream(data, place, kind)
+        for part, place in pieces:
+            size += len(part)
+            if size > allowed:
+                raise ValueError(
+                    f"{name!r}, {len(data)} bytes of {kind}, holds more than {allowed} bytes; if "
+                    "that is right, decompress it and read what comes out.")
+            parts.append(part)
+    return b"".join(parts)
+
+
+def _stream(data: bytes, place: int, kind: Compression) -> Iterator[tuple[bytes, int]]:
+    """The pieces of the stream that begins at a place, each with the place that is reached."""
+    unpack: Any
+    if kind == "gzip":
+        unpack = zlib.decompressobj(wbits=31)
+    else:
+        unpack = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY)
+    held = b""
+    while not unpack.eof:
+        given = held
+        if not held and getattr(unpack, "needs_input", True):  # lzma's holds its input itself
+            given = data[place : place + _FED]
+            place += len(given)
+            if not given:
+                raise EOFError("it ends before its end is marked")
+        part = unpack.decompress(given, _STEP)
+        held = getattr(unpack, "unconsumed_tail", b"")
+        yield part, place - len(unpack.unused_data)
+
+
+@contextlib.contextmanager
+def write_bytes(
+    path: str | os.PathLike[str], compression: Compression | Literal["by name"] | None = "by name"
+) -> Iterator[BinaryIO]:
+    """A binary file to write to, compressed on the way, that appears only when complete.
+
+    The same bytes give the same file: no time is written.
+
+    Args:
+      path: the file.
+      compression: "gzip", "xz", None, or by the end of the name, ``.gz`` or ``.xz``.
+
+    Raises:
+      ValueError: the place cannot be written to.
+    """
+    if compression == "by name":
+        compression = compression_by_name(path)
+    with atomic_write(path) as file:
+        if compression == "gzip":
+            with gzip.GzipFile("", "wb", 6, fileobj=file, mtime=0) as packed:
+                yield packed  # type: ignore[misc]
+        elif compression == "xz":
+            with lzma.LZMAFile(file, "wb", preset=3) as packed:
+                yield packed  # type: ignore[misc]
+        else:
+            yield file
