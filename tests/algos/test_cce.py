@@ -520,7 +520,7 @@ SHARDED = """
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 from jaxltl.algos import cce
-from jaxltl.core import exponential_family as ef
+from jaxltl.algos import exponential_family as ef
 
 jax.config.update("jax_enable_x64", True)
 mesh = jax.make_mesh((2,), ("population",), axis_types=(jax.sharding.AxisType.Auto,))
