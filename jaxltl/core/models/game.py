@@ -15,6 +15,7 @@ from flax import struct
 from jaxltl.core.models import operators
 from jaxltl.core.models.concrete import namespace, to_jax
 from jaxltl.core.models.mdp import support
+from jaxltl.core.models.padded import to_padded
 from jaxltl.core.models.sparse import SparseMDP
 
 
@@ -23,7 +24,8 @@ class Game:
     """A turn-based game of the system against the environment, stochastic or deterministic.
 
     Attributes:
-      mdp: the model: an MDP, a DenseMDP or a Product, in which each state's player chooses.
+      mdp: the model: an MDP, a DenseMDP, a SparseMDP or a Product, in which each state's player
+        chooses.
       system: ``bool[S]`` (``[S, Q]`` in a product): True where the system moves, who
         maximises; False where the environment does.
     """
@@ -136,10 +138,15 @@ def _owners(system: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def as_game(model: Any) -> Game:
-    """A game as it is; any other model as the game in which the system always moves."""
-    if isinstance(model, Game):
-        return model
-    return Game(model, to_jax(np.ones(model.state_shape, bool)))
+    """A game as solvers take it; any other model as the game in which the system always moves.
+
+    Sparse models are padded (:func:`~jaxltl.core.models.padded.to_padded`).
+    """
+    if not isinstance(model, Game):
+        model = Game(model, to_jax(np.ones(model.state_shape, bool)))
+    if isinstance(model.mdp, SparseMDP):
+        model = replace(model, mdp=to_padded(model.mdp))
+    return model
 
 
 def is_deterministic(model: Any) -> bool:

@@ -1,0 +1,50 @@
+"""A sparse model with padded successor lists."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxltl.core.models.mdp import MDP, make_mdp
+from jaxltl.core.models.sparse import SparseMDP
+
+_LARGEST = 8 * 2**30  # bytes of the largest model that is padded
+
+
+def to_padded(model: SparseMDP) -> MDP:
+    """The same process with padded successor lists, for batches and the compiled solvers.
+
+    An action of the padded model is the number of a choice's action where actions have numbers
+    without names, as :func:`to_sparse` gives them, else its rank among the choices of its state.
+
+    Raises:
+      ValueError: padding would take more than 8 GB, with the size; or two choices of a state have
+        one number.
+    """
+    host = model.host
+    column = np.arange(host.num_rows) - host.row_start[host.state]
+    if model.action is not None and not model.action_names:
+        column = np.asarray(model.action)
+    width = int(np.diff(host.entry_start).max())
+    num_actions = int(column.max()) + 1
+    shape = (host.num_states, num_actions, width)
+    if 12 * np.prod(shape, dtype=float) > _LARGEST:
+        raise ValueError(
+            f"padded to {shape[1]} actions of {width} successors, {shape[0]} states would take "
+            f"{12 * np.prod(shape, dtype=float) / 2**30:.0f} GB; solve the sparse model instead."
+        )
+    available = np.zeros(shape[:2], bool)
+    available[host.state, column] = True
+    if available.sum() != host.num_rows:
+        raise ValueError("two choices of a state have the same action; number them apart.")
+    successor, probability = np.zeros(shape, np.int32), np.zeros(shape)
+    rank = np.arange(host.num_transitions) - host.entry_start[host.row]
+    place = host.state[host.row], column[host.row], rank
+    successor[place], probability[place] = host.successor, host.probability
+    return make_mdp(
+        successor,
+        probability,
+        available=available,
+        initial=np.asarray(model.initial),
+        label=np.asarray(model.label),
+        propositions=model.propositions,
+    )

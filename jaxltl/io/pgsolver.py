@@ -1,0 +1,368 @@
+"""Parity games in the text format of PGSolver.
+
+The format is that of Friedmann and Lange's PGSolver ("The PGSolver collection of parity game
+solvers", 2010), which Oink, Knor and the tools around them read: vertices with a priority, an
+owner, successors and perhaps a name. The largest priority met infinitely often decides; if it is
+even, player 0 wins, who is the system here.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.games.objective import Parity
+from jaxltl.core.models.concrete import to_jax
+from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models.mdp import support
+from jaxltl.core.models.sparse import SparseMDP, make_sparse
+from jaxltl.io._files import read_bytes, write_bytes
+
+MAX_NUMBER = 2**31 - 1  # of vertices and of priorities
+
+
+class ParityGame(NamedTuple):
+    """A game and what the system is to achieve in it.
+
+    Attributes:
+      game: a Game over a :class:`~jaxltl.core.models.sparse.SparseMDP`; its game solvers, such as
+        ``winning_region``, pad it.
+      objective: the parity objective, min-even, of the fewest priorities that say the same.
+    """
+
+    game: Game
+    objective: Parity
+
+
+def read_pgsolver(path: str | os.PathLike[str]) -> ParityGame:
+    """The parity game of a file, plain or compressed.
+
+    A vertex is a state and an edge is a choice, in the order of the file. The model's `valuation`
+    keeps what the file says of a state: ``"vertex"``, its number there, ``"priority"``, which is
+    max-even, and ``"name"`` if any vertex has one. The start, if the file has one, is the initial
+    state; without one all states are, uniformly.
+
+    Returns:
+      :class:`ParityGame`.
+
+    Raises:
+      ValueError: naming the file, the line and what was expected there: text that breaks the
+        format, a vertex that is defined twice or not at all, or a number beyond 2^31.
+
+    Example:
+      >>> import tempfile
+      >>> from jaxltl.core.games.winning import winning_region
+      >>> with tempfile.NamedTemporaryFile("w", suffix=".pg") as file:
+      ...     _ = file.write('parity 2; start 0; 0 1 0 1,2 "a"; 1 2 1 0; 2 3 1 2;')
+      ...     file.flush()
+      ...     game, objective = read_pgsolver(file.name)
+      >>> game.mdp.valuation["priority"].tolist(), objective.priority.tolist()
+      ([1, 2, 3], [3, 2, 1])
+      >>> winning_region(game, objective).region.tolist()
+      [True, True, False]
+    """
+    name, data = str(path), read_bytes(path)
+    try:
+        text = data.decode()
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise ValueError(
+            f"{name}, line {line}: byte {data[error.start]:#x} is no UTF-8 text; "
+            "a game of PGSolver's format is expected."
+        ) from None
+    return _Reader(name, text).game()
+
+
+def min_even(priority: NDArray[Any], neutral: NDArray[np.bool_] | None = None) -> NDArray[Any]:
+    """Max-even priorities as min-even ones, as few as can be.
+
+    The order turns round, and neighbours of one parity become one number.
+
+    Args:
+      priority: ``int[S]``, at least 0.
+      neutral: ``bool[S]``, states that decide nothing, or None.
+
+    Example:
+      >>> min_even(np.array([7, 4, 2, 5, 0, 1])).tolist()
+      [1, 2, 2, 1, 4, 3]
+    """
+    decides = np.ones(priority.shape, bool) if neutral is None else ~neutral
+    values = np.unique(priority[decides])[::-1]
+    changes = np.concatenate([values[:1] % 2, (np.diff(values) % 2 != 0).astype(np.int64)])
+    number = changes.cumsum()
+    found = np.full(priority.shape, number[-1] if number.size else 0, np.int32)
+    found[decides] = number[::-1][np.searchsorted(values[::-1], priority[decides])]
+    return found
+
+
+def parity_objective(priority: NDArray[Any]) -> Parity:
+    """The objective of min-even priorities ``int32[S]``."""
+    none = to_jax(np.zeros(priority.shape, bool))
+    return Parity(to_jax(priority), none, none, int(priority.max(initial=0)) + 1)
+
+
+_SPACE = re.compile(r"(?:\s+|//[^\n]*)*")
+_HEAD = re.compile(r"parity\s+([0-9]+)\s*;")
+_START = re.compile(r"start\s+([0-9]+)\s*;")
+_VERTEX = re.compile(
+    r"([0-9]{1,18})\s+([0-9]{1,18})\s+([01])\s+([0-9]+(?:\s*,\s*[0-9]+)*)"
+    r'(?:\s*"([^"]*)")?\s*;\s*'
+)
+_EXPECTED = (
+    (re.compile(r"[0-9]+\s*"), "the number of a vertex"),
+    (re.compile(r"[0-9]+\s*"), "its priority, a number of at least 0"),
+    (re.compile(r"[01](?![0-9])\s*"), "its owner, 0 or 1"),
+    (re.compile(r"[0-9]+\s*(?:,\s*[0-9]+\s*)*(?![\s,])"), "its successors, as in 1,2"),
+    (re.compile(r'(?:"[^"]*"\s*)?(?=;)'), 'a name in double quotes, or ";"'),
+)
+
+
+class _Reader:
+    """A text with what is found in it."""
+
+    def __init__(self, name: str, text: str) -> None:
+        self.name, self.text = name, text
+        self.start: int | None = None
+        self.place: list[int] = []  # where each vertex is defined
+        self.vertex: list[int] = []
+        self.priority: list[int] = []
+        self.owner: list[bool] = []
+        self.successors: list[str] = []
+        self.names: list[str] = []
+
+    def error(self, place: int, problem: str) -> ValueError:
+        line = self.text.count("\n", 0, place) + 1
+        return ValueError(f"{self.name}, line {line}: {problem}")
+
+    def game(self) -> ParityGame:
+        self._statements()
+        if not self.vertex:
+            raise self.error(
+                len(self.text),
+                "the game has no vertex; expected one such as '0 2 1 0,1 \"name\";'.",
+            )
+        vertex, priority = np.array(self.vertex), np.array(self.priority)
+        for values, what in ((vertex, "vertex"), (priority, "priority")):
+            if values.max() > MAX_NUMBER:
+                i = int(np.argmax(values > MAX_NUMBER))
+                raise self.error(
+                    self.place[i], f"{what} {values[i]} is beyond {MAX_NUMBER}; number them from 0."
+                )
+        order = np.argsort(vertex, kind="stable")
+        known = vertex[order]
+        if (twice := np.flatnonzero(known[1:] == known[:-1])).size:
+            first, again = order[twice[0]], order[twice[0] + 1]
+            line = self.text.count("\n", 0, self.place[first]) + 1
+            raise self.error(
+                self.place[again],
+                f"vertex {vertex[again]} is defined a second time, "
+                f"first in line {line}; keep one of them.",
+            )
+        degree = np.array([text.count(",") + 1 for text in self.successors])
+        target = self._targets(degree)
+        where = np.searchsorted(known, target)
+        missing = (where == known.size) | (known[np.minimum(where, known.size - 1)] != target)
+        if missing.any():
+            edge = int(np.argmax(missing))
+            source = int(np.searchsorted(degree.cumsum(), edge, "right"))
+            raise self.error(
+                self.place[source],
+                f"vertex {vertex[source]} leads to vertex "
+                f"{target[edge]}, which is not defined; define it.",
+            )
+        return self._made(vertex, priority, degree, order[where])
+
+    def _targets(self, degree: NDArray[Any]) -> NDArray[Any]:
+        try:
+            return np.array([int(x) for x in ",".join(self.successors).split(",")], np.int64)
+        except (ValueError, OverflowError):  # thousands of digits, or beyond 2^63
+            long = next(i for i, text in enumerate(self.successors) if re.search("[0-9]{11}", text))
+            raise self.error(
+                self.place[long],
+                f"a successor is beyond {MAX_NUMBER}; give the number of a vertex.",
+            ) from None
+
+    def _made(
+        self,
+        vertex: NDArray[Any],
+        priority: NDArray[Any],
+        degree: NDArray[Any],
+        successor: NDArray[Any],
+    ) -> ParityGame:
+        valuation = {"vertex": vertex, "priority": priority}
+        if any(self.names):
+            valuation["name"] = np.array(self.names, object)
+        initial = None
+        if self.start is not None:
+            initial = (vertex == self.start).astype(np.float64)
+        model = make_sparse(
+            np.concatenate([[0], degree.cumsum()]),
+            np.arange(successor.size + 1),
+            successor,
+            np.ones(successor.size),
+            initial=initial,
+            valuation=valuation,
+        )
+        return ParityGame(
+            make_game(model, np.array(self.owner)), parity_objective(min_even(priority))
+        )
+
+    def _statements(self) -> None:
+        text = self.text
+        at = self._skipped(0)
+        if head := _HEAD.match(text, at):
+            at = self._skipped(head.end())
+        start = _START.match(text, at)
+        start_place = at
+        if start:
+            at = self._skipped(start.end())
+        while at < len(text):
+            found = _VERTEX.match(text, at)
+            if found is None:
+                raise self._broken(at)
+            number, priority, owner, successors, name = found.groups()
+            self.place.append(at)
+            self.vertex.append(int(number))
+            self.priority.append(int(priority))
+            self.owner.append(owner == "0")
+            self.successors.append(successors)
+            self.names.append(name or "")
+            at = found.end()
+            if text.startswith("/", at):
+                at = self._skipped(at)
+        if start:
+            digits = start[1]
+            self.start = int(digits) if len(digits) < 19 else MAX_NUMBER + 1
+            if self.start not in self.vertex:
+                raise self.error(
+                    start_place, f"the start, vertex {digits:.30}, is not defined; define it."
+                )
+
+    def _skipped(self, at: int) -> int:
+        found = _SPACE.match(self.text, at)
+        return at if found is None else found.end()
+
+    def _broken(self, at: int) -> ValueError:
+        """What is wrong with the statement that begins at a place."""
+        text, begin = self.text, at
+        if not self.vertex and re.match("[a-z]", text[at]):
+            return self.error(
+                at,
+                f"found {text[at : at + 20]!r}; expected 'parity MAX;', "
+                "'start VERTEX;', or the number of a vertex.",
+            )
+        for pattern, wanted in _EXPECTED:
+            found = pattern.match(text, at)
+            if found is None:
+                shown = repr(text[at : at + 20]) if at < len(text) else "the end of the file"
+                return self.error(at, f"found {shown}; expected {wanted}.")
+            at = found.end()
+        return self.error(
+            begin,
+            f"a number of this vertex has more than 18 digits; numbers go up to {MAX_NUMBER}.",
+        )
+
+
+def write_pgsolver(
+    path: str | os.PathLike[str], game: Game, objective: Parity | None = None
+) -> None:
+    """Writes a deterministic game as a parity game.
+
+    What :func:`read_pgsolver` read is written with the vertices' numbers, priorities and names
+    that it had. Other games count states from 0, and their priorities are turned into max-even
+    ones. A state that decides the run has a loop to itself alone. If one state has all of the
+    initial distribution, it is the start.
+
+    Args:
+      path: the file, compressed if it ends in ``.gz`` or ``.xz``.
+      game: a Game over an MDP, a DenseMDP or a SparseMDP.
+      objective: what the system is to achieve; default that of the file that the game is from.
+
+    Raises:
+      ValueError: the game has a random move, no objective is known, or a name has a quote in it.
+    """
+    row_start, successor = edges_of(game, "write_pgsolver")
+    valuation = game.mdp.valuation if isinstance(game.mdp, SparseMDP) else {}
+    priority, stays = _max_even(valuation, objective)
+    count = row_start.size - 1
+    vertex = np.asarray(valuation.get("vertex", np.arange(count)))
+    names = [str(x) for x in np.asarray(valuation.get("name", np.full(count, ""))).tolist()]
+    for i, name in enumerate(names):
+        if '"' in name:
+            raise ValueError(
+                f"state {i} has the name {name!r}; the format has no way to write a "
+                "quote in a name."
+            )
+    target = [str(x) for x in vertex[successor].tolist()]
+    owner = np.where(np.asarray(game.system), "0", "1").tolist()
+    starts = row_start.tolist()
+    lines = [f"parity {vertex.max()};"]
+    initial = np.asarray(game.initial)
+    if (initial > 0).sum() == 1 and count > 1:
+        lines.append(f"start {vertex[np.argmax(initial)]};")
+    for i, (v, p, loops) in enumerate(
+        zip(vertex.tolist(), priority.tolist(), stays.tolist(), strict=True)
+    ):
+        leads = str(v) if loops else ",".join(target[starts[i] : starts[i + 1]])
+        quoted = f' "{names[i]}"' if names[i] else ""
+        lines.append(f"{v} {p} {owner[i]} {leads}{quoted};")
+    with write_bytes(path) as file:
+        file.write("\n".join([*lines, ""]).encode())
+
+
+def edges_of(game: Game, place: str) -> tuple[NDArray[Any], NDArray[Any]]:
+    """The moves of a deterministic game: where those of each state start, and where they lead.
+
+    Returns:
+      ``int[S + 1]`` and ``int[R]``.
+
+    Raises:
+      ValueError: a move is random.
+    """
+    model = game.mdp
+    if isinstance(model, SparseMDP):
+        row_start, width = np.asarray(model.row_start), np.diff(np.asarray(model.entry_start))
+        state = model.host.state
+        successor = np.asarray(model.successor)[np.asarray(model.entry_start)[:-1]]
+    else:
+        used = support(model)
+        state, action = np.nonzero(np.asarray(model.available))
+        width, rank = used.sum(-1)[state, action], used.argmax(-1)[state, action]
+        successor = rank
+        if hasattr(model, "successor"):
+            successor = np.asarray(model.successor)[state, action, rank]
+        row_start = np.searchsorted(state, np.arange(game.num_states + 1))
+    if (width > 1).any():
+        s = state[np.argmax(width > 1)]
+        raise ValueError(
+            f"{place}: state {s} has a move that leads to several states; the format "
+            "has no chance. Solve the game with chance='adversarial', or make the "
+            "environment choose."
+        )
+    return row_start, successor
+
+
+def _max_even(
+    valuation: dict[str, Any], objective: Parity | None
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Priorities as the format has them, and the states that decide the run."""
+    given = valuation.get("priority")
+    if objective is None:
+        if given is None:
+            raise ValueError(
+                "write_pgsolver: the game says nothing of its objective; pass one, "
+                "such as buchi(game, ...)."
+            )
+        return np.asarray(given), np.zeros(len(given), bool)
+    priority = np.asarray(objective.priority).ravel()
+    won, lost = np.asarray(objective.won).ravel(), np.asarray(objective.lost).ravel()
+    decided = won | lost
+    if given is not None and not decided.any() and (min_even(np.asarray(given)) == priority).all():
+        return np.asarray(given), decided
+    most = int(priority.max(initial=0))
+    turned = most + most % 2 - priority
+    return np.where(decided, np.where(won & ~lost, 0, 1), turned), decided
