@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.app.files.task import World
@@ -15,12 +14,17 @@ from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.product import Product, memory_along
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution
+from jaxltl.core.values.mixture import (
+    WINDOW,
+    at_starts,
+    attained,
+    least_mixture,
+    require_attainable,
+)
 from jaxltl.core.values.optimal_actions import OptimalActions, optimal_actions
 from jaxltl.core.values.reachability import action_matrices
-from jaxltl.core.values.satisfaction import satisfaction_probability
 
-WINDOW = 0.02  # how far above an asked probability the certified one may be
-_AIM = WINDOW / 4  # and is aimed to be
+_AIM = WINDOW / 4  # how far above an asked probability the certified one is aimed to be
 _WEIGHTS = 10.0 ** np.arange(-1, 5.5, 0.5)  # of the task's probability, tried in this order
 _HALVINGS = 30
 
@@ -67,16 +71,7 @@ def ask(
     if asked == "none":
         return Guarantee(asked, over, best, None, nothing, None)
     if not isinstance(asked, str):
-        possible, where = at_starts(model, best.lower, over)
-        if possible < asked:
-            raise ValueError(
-                f"guarantee = {asked}: the best that can be achieved is "
-                f"{np.floor(possible * 1e6) / 1e6:g} "
-                + ("on average over the initial states" if over == "mean"
-                   else "from the worst initial state")
-                + f" (least from {world.place(where)}); ask for no more than that, or change the "
-                "task, the map or where runs start."
-            )
+        require_attainable(model, best, asked, over, world.place)
         if asked == 1:  # which the best policies alone have
             asked = "best"
     actions = optimal_actions(model, best)
@@ -108,25 +103,6 @@ def _losing(
     value = np.asarray(best.value, float)
     row = action_matrices(model)[a][[s * model.num_memory + q]]
     return lost, (float(value[s, q]), float(np.asarray(row @ value.ravel()).item()))
-
-
-def at_starts(model: Product, value: Any, over: str) -> tuple[float, int]:
-    """The mean or the least of a product's value over its initial states, and where it is least."""
-    weight = np.asarray(model.mdp.initial, float)
-    starts = np.flatnonzero(weight > 0)
-    known = from_starts(model, value)[starts].astype(float)
-    least, place = known.min(), int(starts[known.argmin()])
-    if over == "worst":
-        return float(least), place
-    # Rounding does not take a mean out of what it is a mean of.
-    mean = known @ (weight[starts] / weight[starts].sum())
-    return float(np.clip(mean, least, known.max())), place
-
-
-def from_starts(model: Product, value: Any) -> np.ndarray:
-    """A product's value at the memory in which a run starts: ``[S]`` from ``[S, Q]``."""
-    memory = np.asarray(model.initial_memory)
-    return np.asarray(value)[np.arange(len(memory)), memory]
 
 
 def check_formula(automaton: Automaton) -> str | None:
@@ -207,7 +183,6 @@ class Attempt(NamedTuple):
 
 
 Train = Callable[[float, Any], Any]
-Mix = Callable[[Attempt, Attempt, float], Attempt]
 
 
 def at_least(
@@ -233,17 +208,20 @@ def at_least(
     """
     asked = float(guarantee.asked)
 
-    def attempt(policy: np.ndarray, learned: Any, weight: float | None, share: float) -> Attempt:
-        found = satisfaction_probability(model, jnp.asarray(policy, model.dtype))
-        attained, _ = at_starts(model, found.lower, guarantee.over)
+    def loss_of(policy: np.ndarray) -> float:
         seen = counts > 0
         with np.errstate(divide="ignore"):
-            loss = -np.sum(counts[seen] * np.log(policy[seen]))
-        return Attempt(policy, float(loss), attained, weight, share, learned)
+            return float(-np.sum(counts[seen] * np.log(policy[seen])))
 
-    def mixed(below: Attempt, above: Attempt, share: float) -> Attempt:
-        policy = (1 - share) * below.policy + share * above.policy
-        return attempt(policy, above.learned, above.weight, share)
+    def attempt(policy: np.ndarray, learned: Any, weight: float | None, share: float) -> Attempt:
+        reached = attained(model, policy, guarantee.over)
+        return Attempt(policy, loss_of(policy), reached, weight, share, learned)
+
+    def between(below: Attempt, above: Attempt) -> Attempt:
+        found = least_mixture(model, below.policy, above.policy, asked, over=guarantee.over)
+        return above if found.share == 1 else Attempt(
+            found.policy, loss_of(found.policy), found.attained, above.weight, found.share,
+            above.learned)
 
     first = attempt(policy_of(free), free, 0.0, 0.0)
     if first.attained >= asked:
@@ -256,16 +234,15 @@ def at_least(
             above = tried
             found.append(tried)
     if above is not None and above.attained > asked + WINDOW:
-        found.append(_between(below, above, asked, mixed))
+        found.append(between(below, above))
     policy, learned = inside()
     sure = attempt(policy, learned, None, 1.0)
-    found += [_between(x, sure, asked, mixed) for x in ([first] if below is first else
-                                                        [first, below])]
+    found += [between(x, sure) for x in ([first] if below is first else [first, below])]
     if all(one.attained > asked + WINDOW for one in found):
         # Where what was learned takes its time, any share of steps that lose is too much.
         quick = np.asarray(guarantee.best.policy)[..., None] == np.arange(policy.shape[-1])
         sure = attempt(quick.astype(float), learned, None, 1.0)
-        found.append(_between(first, sure, asked, mixed))
+        found.append(between(first, sure))
     return min(found, key=lambda one: one.neg_log_likelihood)
 
 
@@ -297,20 +274,3 @@ def _bracket(
             high = middle
         else:
             low, below = middle, last
-
-
-def _between(below: Attempt, above: Attempt, asked: float, mixed: Mix) -> Attempt:
-    """The least share of the policy above by which the asked probability is reached.
-
-    Never all of it if less is enough: steps that lose something would then be impossible.
-    """
-    low, high, found = 0.0, 1.0, above
-    aim = asked + min(_AIM, (above.attained - asked) / 64)
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        tried = mixed(below, above, middle)
-        low, high, found = (low, middle, tried) if tried.attained >= asked else (
-            middle, high, found)
-        if found.share < 1 and found.attained <= aim:
-            break
-    return found

@@ -41,9 +41,7 @@ from jaxltl.app.guarantee import (
     Guarantee,
     ask,
     at_least,
-    at_starts,
     check_formula,
-    from_starts,
     kept,
     left_out,
 )
@@ -68,6 +66,7 @@ from jaxltl.core.models.restrict import restrict
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.hitting_time import hitting_time
+from jaxltl.core.values.mixture import at_starts, from_starts
 from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
 from jaxltl.core.values.soft import softmax_policy
 

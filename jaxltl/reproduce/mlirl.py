@@ -14,13 +14,13 @@ import numpy as np
 
 from jaxltl.algos import learner
 from jaxltl.algos import mlirl as irl
-from jaxltl.app.guarantee import from_starts
 from jaxltl.app.job import plain
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, lift_policy, product
 from jaxltl.core.models.restrict import restrict
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.types import NotConverged, Status, check
+from jaxltl.core.values.mixture import from_starts
 from jaxltl.core.values.satisfaction import satisfaction_probability
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 

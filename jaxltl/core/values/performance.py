@@ -20,9 +20,10 @@ import numpy as np
 from flax import struct
 from jax import lax
 
-from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.graphs.graph import TracedGraph
+from jaxltl.core.graphs.acceptance import accepting_bottom_components
+from jaxltl.core.graphs.graph import TracedGraph, graph_of, take
 from jaxltl.core.models.batch import is_stacked, num_worlds
+from jaxltl.core.models.concrete import namespace, to_jax
 from jaxltl.core.models.operators import (
     action_mean,
     expectation,
@@ -35,8 +36,8 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.types import Status, require_shape, status_code
 from jaxltl.core.values.evidence import m_matrix_error
 from jaxltl.core.values.linear import inverse
-from jaxltl.core.values.reachability import policy_sets
-from jaxltl.core.values.satisfaction import satisfaction_probability
+from jaxltl.core.values.reachability import max_sets, min_sets, policy_sets
+from jaxltl.core.values.satisfaction import as_reachability, satisfaction_probability
 
 _BLOCK_LIMIT = 1024  # world states up to which a block is inverted
 _MAX_SWEEPS = 1000  # of automata with cycles; one without needs at most Q
@@ -248,10 +249,11 @@ def task_performances(
 ) -> Performance:
     """:func:`task_performance` in each of several worlds, on the host.
 
-    One compiled program for all. What it cannot certify in the models' precision, because
-    the policy hardly ever leaves some set, is done again in double precision by an
-    elimination without subtractions (Grassmann, Taksar and Heyman 1985), whose relative
-    error is bounded whatever the chain (O'Cinneide 1993).
+    Co-safe and safety tasks by one compiled program for all; other tasks one world after the
+    other, on the graph and by a system in what it leaves open. What that cannot certify in the
+    models' precision, because the policy hardly ever leaves some set, is done again in double
+    precision by an elimination without subtractions (Grassmann, Taksar and Heyman 1985), whose
+    relative error is bounded whatever the chain (O'Cinneide 1993).
 
     Args:
       models: stacked products, see :func:`~jaxltl.core.models.batch.stack_products`.
@@ -274,13 +276,15 @@ def task_performances(
     if policies.shape == shape[1:]:
         policies = jnp.broadcast_to(policies, shape)
     require_shape("policies", policies, shape)
-    found = _batched(models, policies, tolerance, batch=batch)
+    if models.automaton.acceptance in ("cosafe", "safety"):
+        found = _batched(models, policies, tolerance, batch=batch)
+    else:
+        found = _one_by_one(models, policies, tolerance)
     status = np.asarray(found.status)
     for w in np.flatnonzero(status == Status.INVALID):
         require_policy(*jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies)))
-    kind = models.automaton.acceptance
     redone = np.flatnonzero((status != Status.CONVERGED) & (status != Status.INVALID))
-    if not redone.size or kind not in ("cosafe", "safety") or math.prod(states[1:]) > _EXACT_LIMIT:
+    if not redone.size or math.prod(states[1:]) > _EXACT_LIMIT:
         return found
     columns = jax.tree.map(np.array, found)
     for w in redone:
@@ -306,6 +310,19 @@ def _batched(models: Product, policies: jax.Array, tolerance, *, batch: int) -> 
     return jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *parts)
 
 
+def _one_by_one(models: Product, policies: jax.Array, tolerance) -> Performance:
+    """World after world on the host, where the components of a chain are found quickest."""
+    parts = []
+    for w in range(num_worlds(models)):
+        model, policy = jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies))
+        found = satisfaction_probability(model, policy, tolerance=tolerance)
+        parts.append(_summarized(model, found.value, found.lower, found.upper, tolerance))
+    return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *parts)
+
+
+_summarized = jax.jit(_summarize)
+
+
 @jax.jit
 def _together(models: Product, policies: jax.Array, tolerance) -> Performance:
     return jax.vmap(partial(task_performance, tolerance=tolerance))(models, policies)
@@ -319,8 +336,12 @@ def _by_elimination(
     States are eliminated one by one. Each weight stays a sum of products of weights, so
     its relative error is small however rare a transition is.
     """
-    safety = model.automaton.acceptance == "safety"
-    target = np.asarray(~model.final if safety else model.final).ravel()
+    kind = model.automaton.acceptance
+    safety = kind == "safety"
+    if kind in ("cosafe", "safety"):
+        target = np.asarray(~model.final if safety else model.final).ravel()
+    else:
+        target = np.asarray(accepting_bottom_components(model, policy)).ravel()
     weight = _chain(model, policy)
     reaching = _reaching(weight, target)
     doomed = _reaching(np.where(target[:, None], 0, weight), ~reaching)
@@ -390,21 +411,30 @@ def _reaching(weight: np.ndarray, goal: np.ndarray) -> np.ndarray:
 # --- what the worlds have in common -----------------------------------------------------------
 
 
-@jax.jit
 def infeasible_starts(model: Product) -> jax.Array:
-    """Starts from which no policy can do a co-safe task, ``bool[S]``; decided on the graph.
+    """Starts from which no policy can do the task, ``bool[S]``; decided on the graph.
+
+    From there the best probability is zero: no final state of a co-safe task can be reached, those
+    of a safety task cannot but be left, or no accepting end component can be reached.
 
     Args:
-      model: one product with a co-safe task; ``vmap`` over stacked ones.
+      model: one product; on the host if it is concrete, else under ``jit`` and ``vmap``.
 
-    Raises:
-      ValueError: the task is not co-safe.
+    Example:
+      >>> from jaxltl.envs.gridworld import gridworld
+      >>> infeasible_starts(product(gridworld("g # ."), "G F g")).tolist()
+      [False, False, True]
     """
-    if model.automaton.acceptance != "cosafe":
-        raise ValueError("infeasible_starts is for co-safe tasks, which have final states.")
-    some = attractor(model, model.final).region
-    here = jnp.take_along_axis(some, model.initial_memory[:, None], axis=1)[:, 0]
-    return (model.mdp.initial > 0) & ~here
+    problem = as_reachability(model, "max")
+    graph = graph_of(problem.model)
+    target = take(graph, problem.target)
+    if problem.objective == "max":
+        never = max_sets(graph, target).zero
+    else:
+        never = min_sets(graph, target).one
+    xp, never, memory, initial = namespace(never, model.initial_memory, model.mdp.initial)
+    here = xp.take_along_axis(never, memory[:, None], axis=1)[:, 0]
+    return to_jax((initial > 0) & here)
 
 
 class Summary(NamedTuple):
@@ -464,9 +494,9 @@ def summarize(
     kept = np.array([name not in leave_out for name in names])
     if not kept.any():
         raise ValueError("leave_out names every world; leave at least one in.")
-    infeasible = np.zeros(count, bool)
-    if models.automaton.acceptance == "cosafe":
-        infeasible[:] = np.asarray(jax.vmap(infeasible_starts)(models)).any(1)
+    infeasible = np.array([
+        np.asarray(infeasible_starts(jax.tree.map(lambda x, w=w: np.asarray(x)[w], models))).any()
+        for w in range(count)])
     mean = np.asarray(performance.mean, np.float64)
     worst = int(np.argmin(np.where(kept, mean, np.inf)))
 

@@ -17,6 +17,7 @@ from jaxltl.core.models.batch import stack_models, stack_products, world
 from jaxltl.core.types import Solution
 from jaxltl.core.values import performance as tp
 from tests import reference
+from tests.algos.test_guaranteed import A, evaluate, random_automaton, random_world
 from tests.support import as_mdp, assert_encloses, bit_labels, counted_traces, lane, stack
 
 NUM_MODELS = 60
@@ -212,8 +213,81 @@ def test_infeasible_starts_are_found():
     models, _ = three_worlds()
     found = jax.jit(jax.vmap(tp.infeasible_starts))(models)
     assert found.tolist() == [[False] * 3, [True, False, False], [True, True, False]]
-    with pytest.raises(ValueError, match="co-safe"):
-        tp.infeasible_starts(jl.product(jl.gridworld("g ."), "G F g"))
+    for w in range(3):  # as on the host
+        assert tp.infeasible_starts(lane(models, w)).tolist() == found[w].tolist()
+
+
+KINDS = ("cosafe", "safety", "buchi", "parity")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_starts_from_which_nothing_does_any_task_are_found(kind):
+    rng = np.random.default_rng(KINDS.index(kind))
+    count = []
+    for _ in range(20):
+        model = jl.product(random_world(rng), random_automaton(rng, kind),
+                           label_on=rng.choice(["entry", "exit"]))
+        starts = np.flatnonzero(np.asarray(model.mdp.initial) > 0)
+        memory = np.asarray(model.initial_memory)[starts]
+        never = np.asarray(tp.infeasible_starts(model))
+        best, _ = evaluate(model, one_hot(jl.optimal_satisfaction(model).policy))
+        np.testing.assert_array_equal(never[starts], best[starts, memory] == 0)
+        for _ in range(5):
+            value, _ = evaluate(model, one_hot(random_choice(rng, model)))
+            assert not value[starts, memory][never[starts]].any()
+        count.append(int(never.sum()))
+    assert 0 in count and max(count) > 0
+
+
+def one_hot(policy):
+    return np.eye(A)[np.asarray(policy)]
+
+
+def random_choice(rng, model):
+    available = np.asarray(model.available)
+    return (rng.random(available.shape) * available).argmax(-1)
+
+
+@pytest.mark.parametrize("kind", ["buchi", "parity"])
+def test_tasks_without_end_are_enclosed_in_every_world(kind):
+    rng = np.random.default_rng(len(kind))
+    between = 0
+    for _ in range(8):
+        automaton = random_automaton(rng, kind)
+        worlds = [random_world(rng) for _ in range(4)]
+        models = stack([jl.product(w, automaton, label_on="exit") for w in worlds])
+        policies = np.stack([
+            np.asarray(m.available) * rng.dirichlet(np.ones(A), m.state_shape) *
+            (rng.random((*m.state_shape, A)) < 0.6) + 1e-300 * one_hot(random_choice(rng, m))
+            for m in (lane(models, w) for w in range(4))])
+        policies /= policies.sum(-1, keepdims=True)
+        found = tp.task_performances(models, jnp.asarray(policies))
+        assert (found.status == Status.CONVERGED).all()
+        for w in range(4):
+            model = lane(models, w)
+            value, _ = evaluate(model, policies[w])
+            value = value[np.arange(len(value)), np.asarray(model.initial_memory)]
+            np.testing.assert_allclose(found.value[w], value, atol=1e-12)
+            mean = value @ np.asarray(model.mdp.initial)
+            assert found.lower[w] - 1e-15 <= mean <= found.upper[w] + 1e-15
+            assert found.upper[w] - found.lower[w] < 1e-9
+            between += ((value > 0) & (value < 1)).any()
+    assert between > 4
+
+
+def test_tasks_without_end_of_policies_that_hardly_ever_get_out_are_certified_too():
+    """As `reluctant`, for ever after."""
+    leaving = 1e-18
+    mdp = jl.make_mdp(
+        [[[1], [2], [3]], [[0], [2], [3]], [[2]] * 3, [[3]] * 3], np.ones((4, 3, 1)),
+        label=[[0], [0], [1], [0]], propositions=["g"], initial=[0.5, 0.5, 0, 0])
+    models = stack_products([mdp], "G F g")
+    policy = np.array([1 - 4 * leaving, leaving, 3 * leaving])
+    found = tp.task_performances(
+        models, jnp.asarray(np.broadcast_to(policy, (1, 4, models.num_memory, 3))))
+    assert found.status.tolist() == [Status.CONVERGED]
+    np.testing.assert_allclose(found.mean, [0.25], rtol=1e-12)
+    assert found.lower[0] <= 0.25 <= found.upper[0]
 
 
 def test_worlds_are_left_out_by_name_alone():
