@@ -35,6 +35,16 @@ def read_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
     Raises:
       ValueError: naming the file: it cannot be read, is damaged, or is larger than allowed.
     """
+    data = raw_bytes(path, limit)
+    return b"".join(pieces(data, str(path), limit)) if compression_of(data) else data
+
+
+def raw_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
+    """The bytes of a file as they are, at most `limit`.
+
+    Raises:
+      ValueError: naming the file: it cannot be read, or is larger than allowed.
+    """
     name, parts, size = str(path), [], 0
     try:
         with open(path, "rb") as file:
@@ -47,12 +57,22 @@ def read_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
         raise ValueError(f"cannot read {name!r}: {reason}.") from None
     if size > limit:
         raise ValueError(f"{name!r} has more than {limit} bytes, the most that are read.")
+    return data
+
+
+def pieces(data: bytes, name: str, limit: int = MAX_BYTES) -> Iterator[bytes]:
+    """What the bytes of a file hold, piece by piece, bounded as in :func:`read_bytes`.
+
+    Raises:
+      ValueError: naming the file: it is damaged, or holds more than allowed.
+    """
     kind = compression_of(data)
     if kind is None:
-        return data
+        yield from (data[i : i + _STEP] for i in range(0, len(data), _STEP))
+        return
     allowed = min(limit, ALWAYS_ALLOWED + MAX_RATIO * len(data))
     try:
-        return _decompressed(data, kind, allowed, name)
+        yield from _decompressed(data, kind, allowed, name)
     except (zlib.error, lzma.LZMAError, EOFError, MemoryError) as error:
         raise ValueError(f"{name!r} begins as {kind} does and is damaged: "
                          f"{error or 'out of memory'}.") from None
@@ -68,23 +88,21 @@ def compression_by_name(path: str | os.PathLike[str]) -> Compression | None:
     return _SUFFIX.get(Path(path).suffix.lower())
 
 
-def _decompressed(data: bytes, kind: Compression, allowed: int, name: str) -> bytes:
-    parts, size, place = [], 0, 0
+def _decompressed(data: bytes, kind: Compression, allowed: int, name: str) -> Iterator[bytes]:
+    size = place = 0
     while place < len(data):  # several streams may follow one another, and zeros pad the last
         if not data.startswith(_BEGINS[kind], place):
             rest = data[place:]
             if rest.count(0) == len(rest):
                 break
             raise ValueError(f"{name!r}: {len(rest)} bytes follow the {kind} data; remove them.")
-        pieces = _stream(data, place, kind)
-        for part, place in pieces:
+        for part, place in _stream(data, place, kind):  # noqa: B007 - the loop goes on there
             size += len(part)
             if size > allowed:
                 raise ValueError(
                     f"{name!r}, {len(data)} bytes of {kind}, holds more than {allowed} bytes; if "
                     "that is right, decompress it and read what comes out.")
-            parts.append(part)
-    return b"".join(parts)
+            yield part
 
 
 def _stream(data: bytes, place: int, kind: Compression) -> Iterator[tuple[bytes, int]]:
