@@ -96,7 +96,7 @@ def _decompressed(data: bytes, kind: Compression, allowed: int, name: str) -> It
             if rest.count(0) == len(rest):
                 break
             raise ValueError(f"{name!r}: {len(rest)} bytes follow the {kind} data; remove them.")
-        for part, place in _stream(data, place, kind):  # noqa: B007 - the loop goes on there
+        for part, place in _stream(data, place, kind):  # noqa: B007, B020 - the place moves on
             size += len(part)
             if size > allowed:
                 raise ValueError(
