@@ -13,6 +13,11 @@ from jaxltl.core.logic.ltl import Formula, as_formula, holds_on_lasso, subformul
 _BOOLEAN = frozenset(("true", "false", "ap", "!", "&", "|", "->", "<->", "xor"))
 
 
+def is_boolean(formula: Formula) -> bool:
+    """Whether a formula is without temporal operators, so that a single state decides it."""
+    return all(f.operator in _BOOLEAN for f in subformulas(formula))
+
+
 def require_known(needed: Collection[str], known: Sequence[str], place: str) -> None:
     """Raises a ValueError that names the first proposition that is not known.
 

@@ -258,6 +258,18 @@ def _syntax_error(text: str, error: UnexpectedInput) -> str:
         )
     else:
         found = "the end of the formula" if token.type == "$END" else repr(str(token))
+    return pointed("parse_ltl", text, position, found, wanted)
+
+
+def pointed(place: str, text: str, position: int, found: str, wanted: str) -> str:
+    """What is wrong at a position of a text, with a caret under it.
+
+    Args:
+        place: What read the text, the subject of the message.
+        text: All of it.
+        position: Of the error.
+        found, wanted: In words.
+    """
     line_start = text.rfind("\n", 0, position) + 1
     line = text[line_start:].split("\n")[0]
     column = position - line_start
@@ -265,7 +277,7 @@ def _syntax_error(text: str, error: UnexpectedInput) -> str:
     left = max(0, column - 60)
     row = f"line {text.count(chr(10), 0, position) + 1}, " if "\n" in text else ""
     return (
-        f"parse_ltl: {row}column {column + 1}: found {found}, expected {wanted}.\n"
+        f"{place}: {row}column {column + 1}: found {found}, expected {wanted}.\n"
         f"  {line[left : left + 78]}\n  {' ' * (column - left)}^"
     )
 
