@@ -1,0 +1,393 @@
+"""The index of a UMB file: what the model has, and how large each member must be."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+_SIZES = {  # of types, in bits, where none is given
+    "bool": 1,
+    "int": 64,
+    "uint": 64,
+    "int-interval": 128,
+    "uint-interval": 128,
+    "double": 64,
+    "double-interval": 128,
+    "rational": 128,
+    "rational-interval": 256,
+    "string": 64,
+}
+PARTS = {"states": "state", "choices": "choice", "branches": "transition"}  # as Rewards names them
+# Groups of ours. Labels that others take for their own have their place among all as their id.
+OTHER_LABELS = "other-aps"
+INITIAL = "initial"  # an initial distribution that is not uniform
+_MOST_STATES = 2**31 - 2  # states and choices are numbered with 32 bits
+_MOST_STRING = 2**10  # bytes of an action's name, on the average
+_STRINGS_ALLOWED = 2**20
+_MOST_RECORD = 2**16  # bytes of one state's valuation
+
+
+@dataclass(frozen=True)
+class Type:
+    """A type of values, by its name and its size in bits."""
+
+    name: str
+    size: int
+
+
+@dataclass(frozen=True)
+class Annotation:
+    """Values on states, choices or branches; `name` is the one for people."""
+
+    group: str
+    id: str
+    name: str
+    applies_to: tuple[str, ...]
+    type: Type
+
+    def member(self, part: str) -> str:
+        return f"annotations/{self.group}/{self.id}/{part}/values.bin"
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A variable of a state, at a place in bits in its record; `presence` is before it or None."""
+
+    name: str
+    type: Type
+    offset: int
+    start: int
+    presence: int | None
+
+
+@dataclass(frozen=True)
+class Record:
+    """The variables of one class of states and the bytes that they take."""
+
+    variables: tuple[Variable, ...]
+    size: int
+
+
+@dataclass(frozen=True)
+class Index:
+    """What is said of a model: counts, types, annotations and variables."""
+
+    players: int
+    states: int
+    choices: int
+    branches: int
+    actions: int
+    probability: Type | None
+    annotations: tuple[Annotation, ...]
+    records: tuple[Record, ...]
+    player_names: tuple[str, ...] = ()
+
+    def bounds(self) -> dict[str, tuple[int, int]]:
+        """The least and the largest size in bytes of each member that is read."""
+        counts = {"states": self.states, "choices": self.choices, "branches": self.branches}
+        sizes = {
+            "state-to-choices.bin": 8 * (self.states + 1),
+            "state-is-initial.bin": bit_bytes(self.states),
+            "choice-to-branches.bin": 8 * (self.choices + 1),
+            "branch-to-target.bin": 8 * self.branches,
+        }
+        if self.players:
+            sizes["state-to-player.bin"] = 4 * self.states
+        if self.probability:
+            sizes["branch-to-probability.bin"] = self.branches * self.probability.size // 8
+        if self.actions:
+            sizes["actions/choices/values.bin"] = 4 * self.choices
+            sizes["actions/choices/string-mapping.bin"] = 8 * (self.actions + 1)
+        for one in self.annotations:
+            for part in one.applies_to:
+                sizes[one.member(part)] = (
+                    bit_bytes(counts[part])
+                    if one.type.name == "bool"
+                    else counts[part] * one.type.size // 8
+                )
+        found = {name: (size, size) for name, size in sizes.items()}
+        if self.actions:
+            found["actions/choices/strings.bin"] = (
+                0,
+                _STRINGS_ALLOWED + _MOST_STRING * self.actions,
+            )
+        if self.records:
+            widths = [record.size for record in self.records]
+            found["valuations/states/valuations.bin"] = (
+                self.states * min(widths),
+                self.states * max(widths),
+            )
+            found["valuations/states/valuation-to-class.bin"] = (4 * self.states, 4 * self.states)
+        return found
+
+
+def bit_bytes(count: int) -> int:
+    """The bytes of so many bits, in words of 64."""
+    return -(-count // 64) * 8
+
+
+def parse_index(content: bytes, place: str) -> Index:
+    """Reads and checks an index; `place` begins what is told of an error.
+
+    Raises:
+      ValueError: it is no JSON, lacks a key, a value is of the wrong kind, or the model is of a
+        kind that is not read, named.
+    """
+    try:
+        data = json.loads(content.decode())
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{place}this is not JSON: {error}.") from None
+    data = _table(data, "the index", place)
+    if (version := _count(data, "format-version", place)) != 1:
+        raise ValueError(f"{place}format-version is {version}; version 1 is read.")
+    system = _table(_get(data, "transition-system", place), "transition-system", place)
+    counts = {
+        name: _count(system, f"#{name}", place)
+        for name in ("players", "states", "choices", "branches", "choice-actions", "observations")
+    }
+    names = system.get("player-names", [])
+    if not isinstance(names, list) or not all(isinstance(x, str) for x in names):
+        raise ValueError(f"{place}player-names is {_shown(names)}; expected a list of texts.")
+    _check_kind(system, counts, place)
+    probability = None
+    if "branch-probability-type" in system:
+        probability = _type(system["branch-probability-type"], "branch-probability-type", place)
+        _check_number(probability, "branch-probability-type", place)
+    annotations = _annotations(data.get("annotations", {}), place)
+    for one in annotations:
+        if one.type.name not in ("bool", "int", "uint"):
+            _check_number(one.type, f"the annotation {one.name!r}", place)
+    return Index(
+        counts["players"],
+        counts["states"],
+        counts["choices"],
+        counts["branches"],
+        counts["choice-actions"],
+        probability,
+        annotations,
+        _records(data.get("valuations", {}), place),
+        tuple(names),
+    )
+
+
+def _check_kind(system: Mapping[str, Any], counts: Mapping[str, int], place: str) -> None:
+    time = _get(system, "time", place)
+    if time != "discrete":
+        raise ValueError(
+            f"{place}time is {_shown(time)}; models in discrete time are read, none with rates."
+        )
+    if counts["observations"]:
+        raise ValueError(
+            f"{place}the model has {counts['observations']} observations; models "
+            "whose states are seen are read, no POMDPs."
+        )
+    if not counts["states"]:
+        raise ValueError(f"{place}#states is 0; a model needs at least one.")
+    for name in ("states", "choices"):
+        if counts[name] > _MOST_STATES:
+            raise ValueError(f"{place}#{name} is {counts[name]}; at most {_MOST_STATES} are read.")
+    if counts["choice-actions"] > _MOST_STATES:
+        raise ValueError(
+            f"{place}#choice-actions is {counts['choice-actions']}; at most "
+            f"{_MOST_STATES} are read."
+        )
+    if counts["branches"] >= 2**60:
+        raise ValueError(f"{place}#branches is {counts['branches']}; no file holds so many.")
+
+
+def _annotations(data: Any, place: str) -> tuple[Annotation, ...]:
+    """Labels, rewards and what we write beside them; other groups are passed over."""
+    found: list[Annotation] = []
+    for group in ("aps", OTHER_LABELS, "rewards", INITIAL):
+        table = _table(
+            _table(data, "annotations", place).get(group, {}), f"the group {group}", place
+        )
+        found += [_annotation(group, key, value, place) for key, value in table.items()]
+    for labels in (True, False):
+        names = [
+            x.name
+            for x in found
+            if (x.group in ("aps", OTHER_LABELS)) == labels and x.group != INITIAL
+        ]
+        if len(set(names)) < len(names):
+            twice = next(x for x in names if names.count(x) > 1)
+            raise ValueError(
+                f"{place}two annotations are named {twice!r}; expected distinct names."
+            )
+    return tuple(found)
+
+
+def _annotation(group: str, key: str, value: Any, place: str) -> Annotation:
+    what = f"annotations/{group}/{key}"
+    if not re.fullmatch(r"[0-9a-z_-]{1,100}", key):
+        raise ValueError(
+            f"{place}{_shown(what)}: expected an id of 0-9, a-z, _ and -, at most 100 of them."
+        )
+    value = _table(value, what, place)
+    name = value.get("alias", key)
+    if not isinstance(name, str):
+        raise ValueError(f"{place}{what}: alias is {_shown(name)}; expected a text.")
+    applies = _get(value, "applies-to", f"{place}{what}: ")
+    known = ["states"] if group != "rewards" else list(PARTS)
+    if (
+        not isinstance(applies, list)
+        or not applies
+        or any(x not in known for x in applies)
+        or len(set(applies)) < len(applies)
+    ):
+        raise ValueError(
+            f"{place}{what}: applies-to is {_shown(applies)}; expected a list of "
+            f"{', '.join(known)}."
+        )
+    if "probability-type" in value:
+        raise ValueError(f"{place}{what}: its values are drawn at random; expected numbers.")
+    kind = _type(_get(value, "type", f"{place}{what}: "), what, place)
+    wanted = {"rewards": ("double", "rational", "int", "uint"), INITIAL: ("double",)}.get(
+        group, ("bool",)
+    )
+    if kind.name.endswith("-interval"):
+        raise ValueError(
+            f"{place}{what}: its values are intervals ({kind.name}); single numbers are read."
+        )
+    if kind.name not in wanted or (kind.name != "rational" and kind.size != _SIZES[kind.name]):
+        raise ValueError(
+            f"{place}{what}: its type is {kind.name} of {kind.size} bits; expected "
+            f"{' or '.join(wanted)} of the usual size."
+        )
+    return Annotation(group, key, name, tuple(applies), kind)
+
+
+def _records(data: Any, place: str) -> tuple[Record, ...]:
+    states = _table(data, "valuations", place).get("states")
+    if states is None:
+        return ()
+    what = "valuations/states"
+    classes = _get(_table(states, what, place), "classes", f"{place}{what}: ")
+    if not isinstance(classes, list) or not classes:
+        raise ValueError(f"{place}{what}: classes is {_shown(classes)}; expected a list.")
+    return tuple(_record(one, f"{place}{what}: ") for one in classes)
+
+
+def _record(data: Any, place: str) -> Record:
+    variables = _get(_table(data, "a class", place), "variables", place)
+    if not isinstance(variables, list):
+        raise ValueError(f"{place}variables is {_shown(variables)}; expected a list.")
+    found: list[Variable] = []
+    start = 0
+    for one in variables:
+        one = _table(one, "a variable", place)
+        if "padding" in one:
+            start += _count(one, "padding", place)
+        else:
+            name = _get(one, "name", place)
+            if not isinstance(name, str) or any(name == other.name for other in found):
+                raise ValueError(
+                    f"{place}a variable is named {_shown(name)}; expected distinct texts."
+                )
+            kind = _type(_get(one, "type", place), f"the variable {name!r}", place)
+            offset, optional = one.get("offset", 0), one.get("is-optional", False)
+            if type(offset) is not int or not -(2**63) <= offset < 2**63:
+                raise ValueError(
+                    f"{place}the offset of {name!r} is {_shown(offset)}; expected a "
+                    "whole number of 64 bits."
+                )
+            if not isinstance(optional, bool):
+                raise ValueError(
+                    f"{place}is-optional of {name!r} is {_shown(optional)}; expected true or false."
+                )
+            presence, start = (start, start + 1) if optional else (None, start)
+            found.append(Variable(name, kind, offset, start, presence))
+            start += kind.size
+        if start > 8 * _MOST_RECORD:
+            raise ValueError(
+                f"{place}a state's variables take more than {8 * _MOST_RECORD} bits; "
+                "no more are read."
+            )
+    if start % 8:
+        raise ValueError(
+            f"{place}a state's variables take {start} bits; expected a multiple of 8, with padding."
+        )
+    return Record(tuple(found), start // 8)
+
+
+def _type(data: Any, what: str, place: str) -> Type:
+    data = _table(data, f"the type of {what}", place)
+    name = _get(data, "type", f"{place}{what}: ")
+    if not isinstance(name, str) or name not in _SIZES:
+        raise ValueError(
+            f"{place}{what}: the type is {_shown(name)}; expected one of {', '.join(_SIZES)}."
+        )
+    size = _count(data, "size", f"{place}{what}: ") if "size" in data else _SIZES[name]
+    if not 0 < size < 2**32 or (name in ("double", "string") and size != _SIZES[name]):
+        raise ValueError(f"{place}{what}: a {name} of {size} bits; expected {_SIZES[name]}.")
+    if name == "rational" and size % 2:
+        raise ValueError(f"{place}{what}: a rational of {size} bits; expected an even number.")
+    return Type(name, size)
+
+
+def _check_number(kind: Type, what: str, place: str) -> None:
+    """Raises a ValueError unless a type is of single numbers in whole words."""
+    if kind.name.endswith("-interval"):
+        raise ValueError(
+            f"{place}{what} is {kind.name}: the probabilities are intervals; models "
+            "with single numbers are read."
+        )
+    if kind.name not in ("double", "rational") or kind.size % _SIZES[kind.name]:
+        raise ValueError(
+            f"{place}{what} is {kind.name} of {kind.size} bits; expected double of 64 "
+            "or rational of a multiple of 128."
+        )
+
+
+def _table(data: Any, what: str, place: str) -> Mapping[str, Any]:
+    if not isinstance(data, dict):
+        raise ValueError(f"{place}{what} is {_shown(data)}; expected an object.")
+    return data
+
+
+def _get(data: Mapping[str, Any], key: str, place: str) -> Any:
+    if key not in data:
+        raise ValueError(f"{place}{key!r} is missing.")
+    return data[key]
+
+
+def _count(data: Mapping[str, Any], key: str, place: str) -> int:
+    value = _get(data, key, place)
+    if type(value) is not int or not 0 <= value < 2**64:
+        raise ValueError(
+            f"{place}{key} is {_shown(value)}; expected a whole number from 0 to 2^64 - 1."
+        )
+    return value
+
+
+def _shown(value: Any) -> str:
+    """A value for people, cut short; of what is nested only its kind."""
+    if isinstance(value, dict):
+        return "an object"
+    if isinstance(value, list):
+        return (
+            f"a list of {len(value)}"
+            if any(isinstance(x, list | dict) for x in value)
+            else (f"{value[:9]!r:.60}")
+        )
+    if type(value) is int and abs(value) >= 10**30:
+        return "a huge number"
+    return f"{value!r:.60}"
+
+
+# --- writing --------------------------------------------------------------------------------
+
+
+def ids_for(names: Sequence[str], prefix: str) -> list[str]:
+    """Distinct ids, each the name itself where that may be one."""
+    found: dict[str, None] = {}
+    taken = set(names)
+    for i, name in enumerate(names):
+        one = name if re.fullmatch(r"[0-9a-z_-]{1,60}", name) else f"{prefix}{i}"
+        while one in found or (one != name and one in taken):
+            one += "-"
+        found[one] = None
+    return list(found)

@@ -1,0 +1,304 @@
+"""Tar archives as streams: the members one by one, and archives whose bytes are always the same.
+
+Read are POSIX (ustar) archives with the common ways to long names and large sizes. A member's
+header is believed only so far as bytes follow it, and nothing is ever written where it says.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, BinaryIO
+
+_BLOCK = 512
+_LONGEST_NAME = 2**16  # bytes of an extended header
+_REGULAR = b"0\x007"
+_NO_DATA = b"123456"  # links, devices and directories
+
+
+class Stream:
+    """Bytes that come in pieces, read in any portions.
+
+    Attributes:
+      place: what a message about the archive begins with.
+      position: how many bytes were taken.
+    """
+
+    def __init__(self, pieces: Iterator[bytes], place: str):
+        self._pieces, self._held, self.place, self.position = pieces, memoryview(b""), place, 0
+
+    def _some(self, most: int) -> memoryview:
+        """Between one byte and `most`; none at the end."""
+        while not self._held:
+            piece = next(self._pieces, None)
+            if piece is None:
+                return self._held
+            self._held = memoryview(piece)
+        some, self._held = self._held[:most], self._held[most:]
+        self.position += len(some)
+        return some
+
+    def fill(self, target: Any, what: str) -> None:
+        """Fills a writable array of uint8 or a bytearray; `what` it is goes into the error.
+
+        Raises:
+          ValueError: the bytes end before.
+        """
+        view, done = memoryview(target), 0
+        while done < len(view):
+            some = self._some(len(view) - done)
+            if not some:
+                raise ValueError(
+                    f"{self.place}{what}: the archive ends after {done} of "
+                    f"{len(view)} bytes; it is cut off."
+                )
+            view[done : done + len(some)] = some
+            done += len(some)
+
+    def skip(self, count: int, what: str) -> None:
+        """Passes over bytes.
+
+        Raises:
+          ValueError: the bytes end before.
+        """
+        end = self.position + count
+        while self.position < end:
+            if not self._some(end - self.position):
+                raise ValueError(f"{self.place}{what}: the archive ends within it; it is cut off.")
+
+    def drain(self) -> None:
+        """Passes over what is left, so that a checksum at its end is looked at."""
+        while self._some(2**20):
+            pass
+
+
+def members(stream: Stream) -> Iterator[tuple[str, int]]:
+    """The names and sizes of the regular files of a tar archive, in order.
+
+    After each the stream stands at its content, of which as much as wanted may be taken.
+
+    Raises:
+      ValueError: it is no such archive, is cut off, or a name leads outside.
+    """
+    long_name: str | None = None
+    long_size: int | None = None
+    first = True
+    while True:
+        header = bytearray(_BLOCK)
+        stream.fill(header, "its first header" if first else "the header of a member")
+        if not any(header):
+            break
+        kind, name, size = _read_header(bytes(header), stream.place, first)
+        first = False
+        if kind in b"xL":
+            content = _extension(stream, name, size)
+            if kind == b"L":
+                long_name = _text(content.split(b"\0")[0], stream.place)
+            else:
+                long_name, long_size = _extended(content, stream.place, long_name)
+            continue
+        if kind in b"gK":
+            _extension(stream, name, size)
+            continue
+        if kind in _NO_DATA:
+            size = 0
+        elif long_size is not None:
+            size = long_size
+        name = _checked_name(name if long_name is None else long_name, stream.place)
+        long_name = long_size = None
+        end = stream.position + size + -size % _BLOCK
+        if kind in _REGULAR and not name.endswith("/"):
+            yield name, size
+        stream.skip(end - stream.position, f"{name!r}")
+    stream.drain()
+
+
+def _read_header(header: bytes, place: str, first: bool) -> tuple[bytes, str, int]:
+    """The type, name and size that a header gives."""
+    if header[257:262] != b"ustar":
+        if first:
+            raise ValueError(f"{place}this is no tar archive: 'ustar' is missing at byte 257.")
+        raise ValueError(f"{place}the header of a member lacks 'ustar'; the archive is damaged.")
+    name = header[:100].split(b"\0")[0]
+    if header[257:263] == b"ustar\0" and header[345]:
+        name = header[345:500].split(b"\0")[0] + b"/" + name
+    shown = _text(name, place)
+    given = _number(header[148:156], f"{place}{shown!r}: its checksum")
+    found = sum(header) - sum(header[148:156]) + 8 * 32
+    if given != found:
+        raise ValueError(
+            f"{place}{shown!r}: the checksum of its header is {given}, expected "
+            f"{found}; the archive is damaged."
+        )
+    return header[156:157], shown, _number(header[124:136], f"{place}{shown!r}: its size")
+
+
+def _number(field: bytes, what: str) -> int:
+    """A number in octal digits, or in binary where the first bit is set."""
+    if field[0] == 0x80:
+        return int.from_bytes(field[1:], "big")
+    digits = field.split(b"\0")[0].strip(b" ")
+    if not re.fullmatch(rb"[0-7]*", digits):
+        raise ValueError(f"{what} is {digits!r}; expected octal digits.")
+    return int(digits or b"0", 8)
+
+
+def _text(name: bytes, place: str) -> str:
+    try:
+        return name.decode()
+    except UnicodeDecodeError:
+        raise ValueError(f"{place}a member is named {name[:60]!r}, which is not UTF-8.") from None
+
+
+def _extension(stream: Stream, name: str, size: int) -> bytes:
+    """The content of a header that tells of the next member."""
+    if size > _LONGEST_NAME:
+        raise ValueError(
+            f"{stream.place}{name!r}: an extended header of {size} bytes; at most "
+            f"{_LONGEST_NAME} are read."
+        )
+    content = bytearray(size)
+    stream.fill(content, f"{name!r}")
+    stream.skip(-size % _BLOCK, f"{name!r}")
+    return bytes(content)
+
+
+def _extended(content: bytes, place: str, name: str | None) -> tuple[str | None, int | None]:
+    """The name and the size that a POSIX extended header gives its member, if it does."""
+    size = None
+    while content:
+        record = re.match(rb"([0-9]{1,6}) ([^=\n]+)=", content)
+        length = int(record[1]) if record else 0
+        if not record or not record.end() < length <= len(content):
+            raise ValueError(
+                f"{place}an extended header reads {content[:40]!r}; expected records "
+                "of a length, a key and a value."
+            )
+        value, content = content[record.end() : length - 1], content[length:]
+        if record[2] == b"path":
+            name = _text(value, place)
+        elif record[2] == b"size":
+            if not re.fullmatch(rb"[0-9]{1,19}", value):
+                raise ValueError(
+                    f"{place}an extended header gives the size {value[:40]!r}; expected digits."
+                )
+            size = int(value)
+    return name, size
+
+
+def _checked_name(name: str, place: str) -> str:
+    """A name without ./ before it, if it stays within the archive."""
+    parts = name.split("/")
+    while parts[0] == ".":
+        del parts[0]
+        if not parts:
+            return "/"
+    inner = parts[:-1] if parts[-1] == "" else parts
+    if any(part in ("", "..") for part in inner) or re.search(r"[\0-\x1f\x7f\\:]", name):
+        raise ValueError(
+            f"{place}a member is named {name[:100]!r}; expected a path within the "
+            "archive, of plain names and /."
+        )
+    return "/".join(parts)
+
+
+# --- writing --------------------------------------------------------------------------------
+
+
+def tar_pieces(contents: Sequence[tuple[str, Any]]) -> Iterator[memoryview]:
+    """The bytes of an archive of named contents, bytes or arrays of uint8, piece by piece."""
+    for name, content in contents:
+        view = memoryview(content)
+        yield memoryview(_header(name, len(view)))
+        yield view
+        yield memoryview(bytes(-len(view) % _BLOCK))
+    yield memoryview(bytes(2 * _BLOCK))
+
+
+def _header(name: str, size: int) -> bytes:
+    encoded = name.encode()
+    prefix = b""
+    if len(encoded) > 100:
+        cut = encoded.rindex(b"/", 0, min(len(encoded), 156))
+        prefix, encoded = encoded[:cut], encoded[cut + 1 :]
+    assert len(encoded) <= 100 and len(prefix) <= 155, name
+    length = b"%011o\0" % size if size < 8**11 else b"\x80" + size.to_bytes(11, "big")
+    header = b"".join(
+        (
+            encoded.ljust(100, b"\0"),
+            b"0000644\0",
+            b"0000000\0",
+            b"0000000\0",
+            length,
+            b"00000000000\0",
+            b" " * 8,
+            b"0",
+            bytes(100),
+            b"ustar\x0000",
+            bytes(64),
+            b"0000000\0",
+            b"0000000\0",
+            prefix.ljust(155, b"\0"),
+            bytes(12),
+        )
+    )
+    return header[:148] + b"%06o\0 " % sum(header) + header[156:]
+
+
+_GZIP_BLOCK = 2**20
+_PROBED = 2**15
+
+
+def write_gzip(file: BinaryIO, pieces: Iterator[memoryview], threads: int = 4) -> None:
+    """Writes one gzip stream, block by block in several threads.
+
+    Blocks are cut at fixed places and hold no time, so that the same bytes give the same file
+    however many threads there are.
+    """
+    file.write(b"\x1f\x8b\x08\0\0\0\0\0\0\xff")
+    checksum = size = 0
+    with ThreadPoolExecutor(threads) as pool:
+        waiting: list[Any] = []
+        for block in _blocks(pieces):
+            waiting.append(pool.submit(_deflated, block))
+            checksum, size = zlib.crc32(block, checksum), size + len(block)
+            if len(waiting) > 2 * threads:
+                file.write(waiting.pop(0).result())
+        for done in waiting:
+            file.write(done.result())
+    file.write(b"\x03\x00")  # an empty last block
+    file.write(checksum.to_bytes(4, "little") + (size % 2**32).to_bytes(4, "little"))
+
+
+def _blocks(pieces: Iterator[memoryview]) -> Iterator[Any]:
+    """Large pieces cut into blocks, small ones put together."""
+    held = bytearray()
+    for piece in pieces:
+        if len(piece) < _GZIP_BLOCK:
+            held += piece
+        else:
+            if held:
+                yield bytes(held)
+                held.clear()
+            yield from (piece[i : i + _GZIP_BLOCK] for i in range(0, len(piece), _GZIP_BLOCK))
+        if len(held) >= _GZIP_BLOCK:
+            yield bytes(held)
+            held.clear()
+    if held:
+        yield bytes(held)
+
+
+def _deflated(block: Any) -> bytes:
+    """A block that ends at a byte, so that another may follow."""
+
+    def deflate(data: Any, strategy: int) -> bytes:
+        packer: Any = zlib.compressobj(1, zlib.DEFLATED, -15, 9, strategy)
+        return packer.compress(data) + packer.flush(zlib.Z_SYNC_FLUSH)
+
+    # Searching for repetitions takes long where there are none, as in random probabilities.
+    middle = (len(block) - _PROBED) // 2
+    probe = block[max(middle, 0) : max(middle, 0) + _PROBED]
+    repeats = len(deflate(probe, zlib.Z_DEFAULT_STRATEGY)) < 0.7 * len(probe)
+    return deflate(block, zlib.Z_DEFAULT_STRATEGY if repeats or middle <= 0 else zlib.Z_RLE)
