@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,21 +101,62 @@ class Table:
     sink: int | None
 
 
+class Algebra(Protocol):
+    """Sets of letters, in whatever form."""
+
+    def constant(self, value: bool) -> Any:
+        """All letters, or none."""
+
+    def proposition(self, number: int) -> Any:
+        """The letters in which a proposition holds."""
+
+    def letter(self, number: int) -> Any:
+        """One letter, with proposition p as bit p."""
+
+    def negation(self, guard: Any) -> Any: ...
+
+    def both(self, left: Any, right: Any) -> Any: ...
+
+    def either(self, left: Any, right: Any) -> Any: ...
+
+
+@dataclass(frozen=True)
+class _Letters:
+    """Sets of the letters that are the rows of a table `[L, P]`, as `bool[L]`."""
+
+    columns: NDArray[np.bool_]
+    negation = staticmethod(np.logical_not)
+    both = staticmethod(np.logical_and)
+    either = staticmethod(np.logical_or)
+
+    def constant(self, value: bool) -> NDArray[np.bool_]:
+        return np.full(len(self.columns), value)
+
+    def proposition(self, number: int) -> NDArray[np.bool_]:
+        return self.columns[:, number]
+
+    @cached_property
+    def _numbers(self) -> NDArray[Any]:
+        return self.columns @ (1 << np.arange(self.columns.shape[1]))
+
+    def letter(self, number: int) -> NDArray[np.bool_]:
+        return self._numbers == number
+
+
 def read_table(header: Header, states: list[State], columns: NDArray[np.bool_]) -> Table:
     """The transitions of the body as arrays over the letters."""
-    truth = _label_truth(header, columns)
+    algebra = _Letters(columns)
+    truth = label_reader(header, algebra)
     edge_of = np.full((len(states), len(columns)), -1, np.int64)
     edges: list[Edge] = []
     marks: list[frozenset[int]] = []
     for q, state in enumerate(states):
-        on_state = {set_number(number, header.sets) for number in state.marks}
-        for edge, taken in _guarded(state, columns, truth):
+        for edge, taken in guarded_edges(header, state, algebra, truth):
             for letter in np.flatnonzero(taken & (edge_of[q] >= 0))[:1]:
-                raise _nondeterminism(header, q, edge, edges[edge_of[q, letter]], columns[letter])
+                raise nondeterminism(header, q, edge, edges[edge_of[q, letter]], columns[letter])
             edge_of[q, taken] = len(edges)
             edges.append(edge)
-            own = {set_number(number, header.sets) for number in edge.marks}
-            marks.append(frozenset(on_state | own))
+            marks.append(marks_of(header, state, edge))
     target = [int(edge.targets[0]) for edge in edges]
     names = [state.name or "" for state in states]
     sink = None
@@ -128,9 +171,15 @@ def read_table(header: Header, states: list[State], columns: NDArray[np.bool_]) 
     return Table(edge_of, np.array(target, np.int64), marks, tuple(names) if named else (), sink)
 
 
-def _nondeterminism(
+def marks_of(header: Header, state: State, edge: Edge) -> frozenset[int]:
+    """The acceptance sets of an edge, its own and those of its state."""
+    return frozenset(set_number(number, header.sets) for number in [*state.marks, *edge.marks])
+
+
+def nondeterminism(
     header: Header, q: int, edge: Edge, other: Edge, letter: NDArray[np.bool_]
 ) -> ValueError:
+    """The error of two edges that one letter takes, to be raised."""
     return error_at(
         edge.line,
         f"state {q} has two edges for the letter {letter_text(header.propositions, letter)}, to "
@@ -139,10 +188,10 @@ def _nondeterminism(
     )
 
 
-def _guarded(
-    state: State, columns: NDArray[np.bool_], truth: Callable[[Tree], NDArray[np.bool_]]
-) -> Iterator[tuple[Edge, NDArray[np.bool_]]]:
-    """Each edge of a state, and the letters `[L]` that take it."""
+def guarded_edges(
+    header: Header, state: State, algebra: Algebra, truth: Callable[[Tree], Any]
+) -> Iterator[tuple[Edge, Any]]:
+    """Each edge of a state, and the letters that take it."""
     labelled = sum(edge.label is not None for edge in state.edges)
     if state.label is not None:
         if labelled:
@@ -163,7 +212,7 @@ def _guarded(
                 )
             yield edge, truth(edge.label)
     elif state.edges:
-        width = columns.shape[1]
+        width = len(header.propositions)
         if len(state.edges) != 2**width:
             raise error_at(
                 state.line,
@@ -171,20 +220,18 @@ def _guarded(
                 f"{len(state.edges)}, expected 2^{width}, one for each set of propositions "
                 f"(AP: counts {width}). Correct them, or label them.",
             )
-        numbers = columns @ (1 << np.arange(width))
-        yield from ((edge, numbers == i) for i, edge in enumerate(state.edges))
+        yield from ((edge, algebra.letter(i)) for i, edge in enumerate(state.edges))
 
 
-def _label_truth(
-    header: Header, columns: NDArray[np.bool_]
-) -> Callable[[Tree], NDArray[np.bool_]]:
-    """The function from a label to the letters `[L]` in which it holds."""
-    aliases: dict[str, NDArray[np.bool_]] = {}
+def label_reader(header: Header, algebra: Algebra) -> Callable[[Tree], Any]:
+    """The function from a label to the letters in which it holds."""
+    aliases: dict[str, Any] = {}
+    width = len(header.propositions)
 
-    def truth(label: Tree) -> NDArray[np.bool_]:
+    def truth(label: Tree) -> Any:
         operator, *operands = label
         if operator in ("true", "false"):
-            return np.full(len(columns), operator == "true")
+            return algebra.constant(operator == "true")
         if operator == "alias":
             if operands[0] not in aliases:
                 raise error_at(
@@ -194,16 +241,16 @@ def _label_truth(
                 )
             return aliases[operands[0]]
         if operator == "proposition":
-            if int(operands[0]) >= columns.shape[1]:
+            if int(operands[0]) >= width:
                 raise error_at(
                     operands[0].line,
                     f"proposition {operands[0]} is out of range, since AP: counts "
-                    f"{columns.shape[1]}. Correct the one or the other.",
+                    f"{width}. Correct the one or the other.",
                 )
-            return columns[:, int(operands[0])]
+            return algebra.proposition(int(operands[0]))
         if operator == "not":
-            return ~truth(operands[0])
-        combine = np.logical_and if operator == "and" else np.logical_or
+            return algebra.negation(truth(operands[0]))
+        combine = algebra.both if operator == "and" else algebra.either
         result = truth(operands[0])
         for operand in operands[1:]:
             result = combine(result, truth(operand))

@@ -136,12 +136,12 @@ def write_hoa(automaton: Automaton, name: str = "") -> str:
     names = automaton.propositions
     lines = ["HOA: v1", 'tool: "jaxltl"']
     if name:
-        lines.append(f"name: {_quoted(name)}")
+        lines.append(f"name: {quoted(name)}")
     lines += [f"States: {len(automaton.delta)}", f"Start: {int(automaton.initial)}"]
-    lines.append(" ".join([f"AP: {len(names)}", *map(_quoted, names)]))
+    lines.append(" ".join([f"AP: {len(names)}", *map(quoted, names)]))
     if automaton.acceptance == "parity":
         count = int(automaton.priority.max()) + 1
-        lines += [f"acc-name: parity min even {count}", f"Acceptance: {count} {_min_even(count)}"]
+        lines += [f"acc-name: parity min even {count}", f"Acceptance: {count} {parity_text(count)}"]
     else:
         lines += ["acc-name: Buchi", "Acceptance: 1 Inf(0)"]
     lines.append("properties: " + " ".join(_properties(automaton)))
@@ -170,15 +170,15 @@ def _properties(automaton: Automaton) -> list[str]:
     return words
 
 
-def _min_even(count: int) -> str:
-    """The formula of min-even parity with sets 0..count-1, as Spot and Owl write it."""
+def parity_text(count: int, style: str = "min") -> str:
+    """The formula of min-even or max-even parity with sets 0..count-1, as Spot and Owl write it."""
     if count > MAX_PRIORITIES:
         raise ValueError(
             f"write_hoa: priority {count - 1} takes an acceptance formula of {count} sets; the "
             f"limit is {MAX_PRIORITIES}. Renumber the priorities, keeping their order and parity."
         )
     text = ""
-    for i in reversed(range(count)):
+    for i in range(count) if style == "max" else reversed(range(count)):
         atom, operator = (f"Inf({i})", "|") if i % 2 == 0 else (f"Fin({i})", "&")
         inner = f"({text})" if " " in text else text
         text = f"{atom} {operator} {inner}" if text else atom
@@ -191,7 +191,7 @@ def _written_state(automaton: Automaton, q: int) -> Iterator[str]:
     priorities = automaton.priority[q]
     head = f"State: {q}"
     if automaton.state_names:
-        head += f" {_quoted(automaton.state_names[q])}"
+        head += f" {quoted(automaton.state_names[q])}"
     if on_state and priorities[0] == 0:
         head += " {0}"
     yield head
@@ -219,7 +219,8 @@ def _edges(automaton: Automaton, q: int) -> Iterator[tuple[int, int, list[Cube]]
         yield *pair, prime_cover(chosen, set(numbers) - chosen, width)
 
 
-def _quoted(text: str) -> str:
+def quoted(text: str) -> str:
+    """A text as the format quotes it."""
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 

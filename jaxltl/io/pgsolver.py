@@ -207,9 +207,8 @@ class _Reader:
             initial=initial,
             valuation=valuation,
         )
-        return ParityGame(
-            make_game(model, np.array(self.owner)), parity_objective(min_even(priority))
-        )
+        game = make_game(model, np.array(self.owner))
+        return ParityGame(game, objective_of(game))
 
     def _statements(self) -> None:
         text = self.text
@@ -287,7 +286,7 @@ def write_pgsolver(
     """
     row_start, successor = edges_of(game, "write_pgsolver")
     valuation = game.mdp.valuation if isinstance(game.mdp, SparseMDP) else {}
-    priority, stays = _max_even(valuation, objective)
+    priority, stays = max_even(valuation, objective)
     count = row_start.size - 1
     vertex = np.asarray(valuation.get("vertex", np.arange(count)))
     names = [str(x) for x in np.asarray(valuation.get("name", np.full(count, ""))).tolist()]
@@ -312,6 +311,16 @@ def write_pgsolver(
         lines.append(f"{v} {p} {owner[i]} {leads}{quoted};")
     with write_bytes(path) as file:
         file.write("\n".join([*lines, ""]).encode())
+
+
+def objective_of(game: Game) -> Parity:
+    """The objective that came with a game's file.
+
+    Raises:
+      ValueError: the game is from no file that says one.
+    """
+    valuation = game.mdp.valuation if isinstance(game.mdp, SparseMDP) else {}
+    return parity_objective(min_even(max_even(valuation, None)[0]))
 
 
 def edges_of(game: Game, place: str) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -346,16 +355,23 @@ def edges_of(game: Game, place: str) -> tuple[NDArray[Any], NDArray[Any]]:
     return row_start, successor
 
 
-def _max_even(
+def max_even(
     valuation: dict[str, Any], objective: Parity | None
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Priorities as the format has them, and the states that decide the run."""
+    """Max-even priorities of an objective, and the states that decide the run.
+
+    Args:
+      valuation: of the game's model; the priorities in it are kept if they say the same.
+      objective: default what the valuation says.
+
+    Raises:
+      ValueError: neither is there.
+    """
     given = valuation.get("priority")
     if objective is None:
         if given is None:
             raise ValueError(
-                "write_pgsolver: the game says nothing of its objective; pass one, "
-                "such as buchi(game, ...)."
+                "the game says nothing of its objective; pass one, such as buchi(game, ...)."
             )
         return np.asarray(given), np.zeros(len(given), bool)
     priority = np.asarray(objective.priority).ravel()

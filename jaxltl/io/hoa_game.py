@@ -1,0 +1,548 @@
+"""Games of reactive synthesis in the extended Hanoi format.
+
+A deterministic automaton whose header says by `controllable-AP:` which propositions the system
+chooses (Pérez 2019, "The extended HOA format for synthesis"): in each step the environment chooses
+its propositions, then the system, who sees them, its own; the run of the automaton decides.
+SYNTCOMP has its parity games in it; Strix, Knor and ltlsynt write and read it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.automata.text import prime_cover
+from jaxltl.core.games.objective import Parity
+from jaxltl.core.logic.diagram import FALSE, TRUE, Diagrams, prime_cubes
+from jaxltl.core.logic.ltl import Formula, parse_ltl, proposition_text, subformulas
+from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models.sparse import SparseMDP, make_sparse
+from jaxltl.io._files import read_bytes
+from jaxltl.io._hoa_acceptance import condition_given, decisive_sets, edge_priority
+from jaxltl.io._hoa_grammar import Edge, State, error_at, parse_tokens, split_texts
+from jaxltl.io._hoa_header import Header, read_header
+from jaxltl.io._hoa_table import (
+    by_number,
+    guarded_edges,
+    label_reader,
+    marks_of,
+    nondeterminism,
+)
+from jaxltl.io.hoa import parity_text, quoted
+from jaxltl.io.pgsolver import edges_of, max_even, min_even, objective_of
+
+if TYPE_CHECKING:
+    from lark import Token
+
+MAX_MOVES = 2**22
+_MAX_NODES = 2**20  # of the diagrams of all guards
+
+
+class HoaGame(NamedTuple):
+    """A game, what the system is to achieve, and who chooses which propositions.
+
+    Attributes:
+      game: a Game over a :class:`~jaxltl.core.models.sparse.SparseMDP`; its game solvers, such as
+        ``winning_region``, pad it.
+      objective: the parity objective.
+      inputs: the propositions that the environment chooses.
+      outputs: those that the system chooses.
+    """
+
+    game: Game
+    objective: Parity
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+def read_hoa_game(source: str | os.PathLike[str]) -> HoaGame:
+    """The game of a deterministic automaton with `controllable-AP:`.
+
+    The environment moves in the automaton's states, one for each colour by which a state is
+    entered. Its inputs are put together where they leave the system the same choices; each such
+    class leads to a state of the system's, whose moves are the classes of outputs. The names of
+    actions are the conditions on inputs and outputs; the model's `valuation` holds in ``"state"``
+    the automaton's state (-1 for the lost state that missing edges lead to) and in ``"priority"``
+    max-even priorities. Guards are kept as decision diagrams, so that many propositions are no
+    matter where few classes are made of them. States that no run comes to are left out.
+
+    Args:
+      source: a file, plain or compressed, or the text itself, which begins with ``HOA:``.
+
+    Returns:
+      :class:`HoaGame`.
+
+    Raises:
+      ValueError: naming the file, the line and what was expected: text that breaks the format, an
+        automaton that is not deterministic, a condition that is no parity condition, no
+        `controllable-AP:`, or guards of too many classes.
+
+    Example:
+      >>> from jaxltl.core.games.winning import winning_region
+      >>> text = '''HOA: v1 States: 1 Start: 0 AP: 2 "request" "grant" controllable-AP: 1
+      ...   acc-name: parity max even 3 Acceptance: 3 Inf(2) | (Fin(1) & Inf(0))
+      ...   --BODY-- State: 0 [0 & 1] 0 {2} [0 & !1] 0 {1} [!0] 0 {0} --END--'''
+      >>> found = read_hoa_game(text)
+      >>> found.inputs, found.outputs, found.game.mdp.action_names
+      (('request',), ('grant',), ('!request', 'request', 'true', 'grant', '!grant'))
+      >>> bool(winning_region(found.game, found.objective).realizable)
+      True
+    """
+    if isinstance(source, str) and ("\n" in source or source.lstrip()[:4] in ("HOA:", "/*")):
+        place, text = "read_hoa_game", source
+    else:
+        place, data = str(source), read_bytes(source)
+        try:
+            text = data.decode()
+        except UnicodeDecodeError as error:
+            line = data.count(b"\n", 0, error.start) + 1
+            raise ValueError(
+                f"{place}, line {line}: byte {data[error.start]:#x} is no UTF-8 text; a game in "
+                "the Hanoi format is expected."
+            ) from None
+    try:
+        found = split_texts(text)
+        if len(found) != 1:
+            raise ValueError(f"the text holds {len(found)} automata, expected exactly one.")
+        return _read(found[0])
+    except ValueError as error:
+        raise ValueError(f"{place}: {str(error).removeprefix('read_hoa: ')}") from None
+
+
+def _read(tokens: list[Token]) -> HoaGame:
+    try:
+        (version, items), states = parse_tokens(tokens)
+        header = read_header(version, items)
+        outputs = _controllable(items, header)
+        return _Reader(header, outputs).game(by_number(header, states))
+    except RecursionError:  # guards are walked as deep as they nest
+        raise error_at(
+            tokens[0].line, "a label or the acceptance formula nests hundreds of levels deep, or "
+            "there are hundreds of propositions. Write it flatter."
+        ) from None  # fmt: skip
+
+
+def _controllable(items: list[list[Any]], header: Header) -> list[int]:
+    """The numbers of the propositions that the system chooses."""
+    given = [values for values in items if values[0] == "controllable-AP:"]
+    if len(given) != 1:
+        raise error_at(
+            given[1][0].line if given else header.line,
+            "the header controllable-AP: is given twice. Keep one of them." if given else
+            "the header controllable-AP: is missing. Add it, with the numbers of the propositions "
+            "that the system chooses.",
+        )  # fmt: skip
+    key, *values = given[0]
+    for value in values:
+        if value.type != "INT" or int(value) >= len(header.propositions):
+            raise error_at(
+                key.line, f"controllable-AP: names {value}, expected numbers of propositions, "
+                f"below {len(header.propositions)} (AP:)."
+            )  # fmt: skip
+    return sorted({int(value) for value in values})
+
+
+class _TooMany(ValueError):
+    """The guards make more of diagrams or moves than are kept."""
+
+
+class _Guards(Diagrams):
+    """Conditions as decision diagrams, the environment's propositions before the system's."""
+
+    def __init__(self, variable: list[int]) -> None:
+        super().__init__()
+        self.variable = variable  # of each proposition
+
+    def node(self, variable: int, low: int, high: int) -> int:
+        if len(self.nodes) > _MAX_NODES:
+            raise _TooMany
+        return super().node(variable, low, high)
+
+    def constant(self, value: bool) -> int:
+        return TRUE if value else FALSE
+
+    def proposition(self, number: int) -> int:
+        return self.node(self.variable[number], FALSE, TRUE)
+
+    def letter(self, number: int) -> int:
+        guard = TRUE
+        for p, v in sorted(enumerate(self.variable), key=lambda pair: -pair[1]):
+            guard = self.node(v, *((FALSE, guard) if number >> p & 1 else (guard, FALSE)))
+        return guard
+
+
+class _Split:
+    """What inputs leave of guards: the classes of inputs, each with a condition of its own.
+
+    Args:
+      guards: the diagrams.
+      width: variables below it are inputs.
+    """
+
+    def __init__(self, guards: Diagrams, width: int) -> None:
+        self.guards, self.width, self.work = guards, width, 0
+        self.known: dict[tuple[int, ...], dict[tuple[int, ...], int]] = {}
+
+    def of(self, parts: tuple[int, ...]) -> dict[tuple[int, ...], int]:
+        """The different parts that inputs leave, each with the condition on inputs for it."""
+        if parts in self.known:
+            return self.known[parts]
+        top = min(self.guards.nodes[part][0] for part in parts)
+        if top >= self.width:
+            return {parts: TRUE}
+        low, high = zip(*[self.guards.cofactors(part, top) for part in parts], strict=True)
+        sides = self.of(low), self.of(high)
+        self.work += sum(map(len, sides)) * len(parts)
+        if self.work > 16 * MAX_MOVES:
+            raise _TooMany
+        found = {
+            rest: self.guards.node(top, sides[0].get(rest, FALSE), sides[1].get(rest, FALSE))
+            for rest in {**sides[0], **sides[1]}
+        }
+        self.known[parts] = found
+        return found
+
+
+_Entry = tuple[int, int]  # a state, with the priority of the edge by which it is entered
+
+
+class _Reader:
+    """A header with what is made of the states under it."""
+
+    def __init__(self, header: Header, outputs: list[int]) -> None:
+        inputs = [p for p in range(len(header.propositions)) if p not in set(outputs)]
+        order = inputs + outputs
+        self.header = header
+        self.inputs = tuple(header.propositions[p] for p in inputs)
+        self.outputs = tuple(header.propositions[p] for p in outputs)
+        self.names = self.inputs + self.outputs
+        self.guards = _Guards([order.index(p) for p in range(len(order))])
+        self.texts: dict[int, str] = {}
+        found = decisive_sets(condition_given(header.condition, -1, True))
+        if found is None:
+            raise error_at(
+                header.line, "the acceptance formula is no parity condition. Let the tool that "
+                "wrote it turn it into one."
+            )  # fmt: skip
+        self.order = found
+
+    def game(self, states: list[State]) -> HoaGame:
+        try:
+            return self._made(*self._moves(states))
+        except _TooMany:
+            raise error_at(
+                self.header.line,
+                f"the guards have too many classes, for diagrams of {_MAX_NODES} nodes and a game "
+                f"of {MAX_MOVES} moves. Solve it by a symbolic tool.",
+            ) from None
+
+    def _moves(self, states: list[State]) -> tuple[list[dict[_Entry, int]], bool]:
+        """Where each state leads, and by what; and whether the last one is an added lost one."""
+        truth = label_reader(self.header, self.guards)
+        found: list[dict[_Entry, int]] = []
+        lost = (len(states), 1)
+        for q, state in enumerate(states):
+            taken = FALSE
+            seen: list[tuple[Edge, int]] = []
+            moves: dict[_Entry, int] = {}
+            for edge, guard in guarded_edges(self.header, state, self.guards, truth):
+                if both := self.guards.both(guard, taken):
+                    other, g = next(x for x in seen if self.guards.both(x[1], both))
+                    letter = self._letter(self.guards.both(g, both))
+                    raise nondeterminism(self.header, q, edge, other, letter)
+                taken = self.guards.either(taken, guard)
+                seen.append((edge, guard))
+                marks = marks_of(self.header, state, edge)
+                entry = int(edge.targets[0]), edge_priority(marks, self.header.sets, *self.order)
+                moves[entry] = self.guards.either(moves.get(entry, FALSE), guard)
+            if taken != TRUE:
+                moves[lost] = self.guards.negation(taken)
+            found.append({entry: guard for entry, guard in moves.items() if guard != FALSE})
+        incomplete = any(lost in moves for moves in found)
+        return [*found, {lost: TRUE}] if incomplete else found, incomplete
+
+    def _letter(self, guard: int) -> NDArray[np.bool_]:
+        """A letter that a guard holds in, by the numbers of propositions."""
+        held: set[int] = set()
+        while guard != TRUE:
+            variable, low, high = self.guards.nodes[guard]
+            held |= {variable} if high != FALSE else set()
+            guard = high if high != FALSE else low
+        return np.array([v in held for v in self.guards.variable], bool)
+
+    def _made(self, moves: list[dict[_Entry, int]], incomplete: bool) -> HoaGame:
+        start = int(self.header.start)
+        seen, stack = {start}, [start]
+        while stack:
+            new = {q for q, _ in moves[stack.pop()]} - seen
+            seen |= new
+            stack += new
+        # What no run comes to is left out.
+        moves = [to if q in seen else {} for q, to in enumerate(moves)]
+        entries = sorted({entry for to in moves for entry in to})
+        if all(q != start for q, _ in entries):  # no run comes back to it, so any priority does
+            entries = sorted([*entries, (start, max(p for _, p in entries))])
+        split = _Split(self.guards, len(self.inputs))
+        classes = [split.of(tuple(to.values())) if to else {} for to in moves]
+        size = sum(len(classes[q]) for q, _ in entries)
+        size += sum(len(to) * len(c) for to, c in zip(moves, classes, strict=True))
+        if size > MAX_MOVES:
+            raise _TooMany
+        # The environment's states first, the system's behind them, in the order of the automaton's.
+        number = {entry: i for i, entry in enumerate(entries)}
+        first = len(entries) + np.concatenate([[0], np.cumsum([len(c) for c in classes])])
+        rows: list[list[tuple[int, str]]] = []
+        for q, _ in entries:
+            leave = enumerate(classes[q].values(), int(first[q]))
+            rows.append([(i, self._text(guard)) for i, guard in leave])
+        for to, parts in zip(moves, classes, strict=True):
+            targets = [number[entry] for entry in to]
+            for rest in parts:
+                pairs = zip(targets, rest, strict=True)
+                rows.append([(t, self._text(guard)) for t, guard in pairs if guard != FALSE])
+        state = np.array([q for q, _ in entries] + [q for q, c in enumerate(classes) for _ in c])
+        priority = np.array([p for _, p in entries])
+        most = int(priority.max())
+        neutral = np.full(len(rows) - priority.size, most)  # the system's states decide nothing
+        model = _model(rows, {
+            "state": np.where(incomplete & (state == len(moves) - 1), -1, state),
+            "priority": most + most % 2 - np.append(priority, neutral),
+        }, next(i for i, (q, _) in enumerate(entries) if q == start))  # fmt: skip
+        game = make_game(model, np.arange(len(rows)) >= len(entries))
+        return HoaGame(game, objective_of(game), self.inputs, self.outputs)
+
+    def _text(self, guard: int) -> str:
+        """A condition as a formula."""
+        if guard not in self.texts:
+            cubes, _ = prime_cubes(guard, guard, self.guards)
+            self.texts[guard] = _disjunction(
+                [[("" if v else "!") + proposition_text(self.names[p]) for p, v in cube]
+                 for cube in cubes], "true")  # fmt: skip
+        return self.texts[guard]
+
+
+def _model(rows: list[list[tuple[int, str]]], valuation: dict[str, Any], start: int) -> SparseMDP:
+    """A deterministic model of the moves of each state, with their names."""
+    moves = [move for row in rows for move in row]
+    number = {text: i for i, text in enumerate(dict.fromkeys(text for _, text in moves))}
+    return make_sparse(
+        np.cumsum([0, *map(len, rows)]),
+        np.arange(len(moves) + 1),
+        np.array([target for target, _ in moves]),
+        np.ones(len(moves)),
+        initial=np.arange(len(rows)) == start,
+        action=np.array([number[text] for _, text in moves]),
+        action_names=tuple(number),
+        valuation=valuation,
+    )
+
+
+def _disjunction(cubes: Sequence[Sequence[str]], true: str) -> str:
+    texts = [" & ".join(cube) for cube in cubes]
+    if len(texts) > 1:
+        texts = [f"({text})" if " & " in text else text for text in texts]
+    return " | ".join(texts) or true
+
+
+def write_hoa_game(
+    game: Game,
+    objective: Parity | None = None,
+    inputs: Sequence[str] = (),
+    outputs: Sequence[str] = (),
+    *,
+    name: str = "",
+) -> str:
+    """A deterministic game as an automaton in the extended Hanoi format, of max-even parity.
+
+    If the players take turns and the system's states decide nothing, each pair of moves is an edge;
+    else each state of the game is one of the automaton, whose edges read the owner's propositions
+    only. Where the names of a state's actions are conditions of which exactly one holds at a time,
+    as :func:`read_hoa_game` makes them, they are the guards; else moves are numbered in binary by
+    propositions ``i0, i1, ...`` of the environment and ``o0, o1, ...`` of the system, and the last
+    one has the numbers that are left. Who wins is kept.
+
+    Args:
+      game: a Game over an MDP, a DenseMDP or a SparseMDP with one initial state.
+      objective: what the system is to achieve; default that of the file that the game is from.
+      inputs, outputs: propositions of the environment and the system, for guards by name; default
+        those that occur.
+      name: of the automaton.
+
+    Raises:
+      ValueError: the game has a random move, several initial states or more than 256 priorities, or
+        no objective is known.
+    """
+    row_start, successor = edges_of(game, "write_hoa_game")
+    valuation = game.mdp.valuation if isinstance(game.mdp, SparseMDP) else {}
+    priority, stays = max_even(valuation, objective)
+    least = min_even(priority)
+    color = int(least.max()) + int(least.max()) % 2 - least
+    starts = np.flatnonzero(np.asarray(game.initial) > 0)
+    if starts.size != 1:
+        raise ValueError(f"write_hoa_game: the game has {starts.size} initial states, expected one;"
+                         " replace its model's initial distribution.")  # fmt: skip
+    system = np.asarray(game.system)
+    labels = _named(game, row_start, inputs, outputs) or _numbered(row_start, system)
+    arena = _Arena(row_start, successor, system, color, stays, labels.text)
+    number, edges = arena.paired(int(starts[0])) or arena.plain()
+    count = int(color.max()) + 1
+    names = (*labels.inputs, *labels.outputs)
+    lines = ["HOA: v1", 'tool: "jaxltl"', *([f"name: {quoted(name)}"] if name else [])]
+    lines += [f"States: {len(edges)}", f"Start: {number[starts[0]]}"]
+    lines.append(" ".join([f"AP: {len(names)}", *map(quoted, names)]))
+    chosen = range(len(labels.inputs), len(names))
+    lines.append(" ".join(["controllable-AP:", *map(str, chosen)]))
+    lines += [f"acc-name: parity max even {count}", f"Acceptance: {count} "
+              f"{parity_text(count, 'max')}"]  # fmt: skip
+    lines.append("properties: trans-labels explicit-labels trans-acc colored complete "
+                 "deterministic")  # fmt: skip
+    lines.append("--BODY--")
+    for i, leave in enumerate(edges):
+        lines.append(f"State: {i}")
+        lines += [f"[{label}] {target} {{{mark}}}" for label, target, mark in leave]
+    return "\n".join([*lines, "--END--", ""])
+
+
+_Edges = list[list[tuple[str, int, int]]]  # of each state: label, successor, colour
+
+
+class _Arena(NamedTuple):
+    """A deterministic game with the labels of its moves."""
+
+    row_start: NDArray[Any]
+    successor: NDArray[Any]
+    system: NDArray[np.bool_]
+    color: NDArray[Any]
+    stays: NDArray[np.bool_]
+    label: list[str]
+
+    def plain(self) -> tuple[NDArray[Any], _Edges]:
+        """Each state as one of the automaton; with the number of each."""
+        number = np.arange(self.system.size)
+        edges: _Edges = []
+        for v in number.tolist():
+            moves = [("t", v)] if self.stays[v] else self._moves(v)
+            edges.append([(label, w, int(self.color[v])) for label, w in moves])
+        return number, edges
+
+    def paired(self, start: int) -> tuple[NDArray[Any], _Edges] | None:
+        """The environment's states, equal ones as one; None where the game is not of that kind."""
+        source = np.repeat(self.system, np.diff(self.row_start))
+        takes_turns = (source != self.system[self.successor]).all() and not self.system[start]
+        system, environment = self.color[self.system], self.color[~self.system]
+        if not takes_turns or self.stays.any() or system.max() > environment.min():
+            return None
+        number = np.full(self.system.size, -1)
+        known: dict[Any, int] = {}
+        edges: list[list[tuple[str, int]]] = []
+        for v in np.flatnonzero(~self.system).tolist():
+            moves = self._moves(v)
+            number[v] = known.setdefault(tuple(moves), len(known))
+            if number[v] == len(edges):
+                edges.append(moves)
+        return number, [
+            [
+                (_both(given, label), int(number[t]), int(self.color[t]))
+                for given, w in moves for label, t in self._moves(w)
+            ]
+            for moves in edges
+        ]  # fmt: skip
+
+    def _moves(self, v: int) -> list[tuple[str, int]]:
+        rows = slice(self.row_start[v], self.row_start[v + 1])
+        return list(zip(self.label[rows], self.successor[rows].tolist(), strict=True))
+
+
+def _both(left: str, right: str) -> str:
+    if "t" in (left, right):
+        return right if left == "t" else left
+    return " & ".join(f"({x})" if "|" in x else x for x in (left, right))
+
+
+class _Labels(NamedTuple):
+    """The label of each move, over the numbers of propositions."""
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    text: list[str]
+
+
+def _numbered(row_start: NDArray[Any], system: NDArray[np.bool_]) -> _Labels:
+    """The moves of each state numbered in binary."""
+    count = np.diff(row_start)
+    widths = [max([(int(n) - 1).bit_length() for n in np.unique(count[owned])], default=0)
+              for owned in (~system, system)]  # fmt: skip
+    text: list[str] = []
+    for n, own in zip(count.tolist(), system.tolist(), strict=True):
+        bits, shift = (n - 1).bit_length(), widths[0] if own else 0
+        cubes = [[tuple((b, bool(i >> b & 1)) for b in range(bits))] for i in range(n - 1)]
+        cubes.append(prime_cover(set(range(n - 1, 1 << bits)), set(range(n - 1)), bits))
+        for chosen in cubes:
+            literals = [[f"{'' if v else '!'}{b + shift}" for b, v in cube] for cube in chosen]
+            text.append(_disjunction(literals, "t"))
+    names = [tuple(f"{x}{b}" for b in range(w)) for x, w in zip("io", widths, strict=True)]
+    return _Labels(names[0], names[1], text)
+
+
+def _named(
+    game: Game, row_start: NDArray[Any], inputs: Sequence[str], outputs: Sequence[str]
+) -> _Labels | None:
+    """The names of actions as guards; None where they are none."""
+    model = game.mdp
+    if not isinstance(model, SparseMDP) or model.action is None or not model.action_names:
+        return None
+    try:
+        formulas = [parse_ltl(text) for text in model.action_names]
+    except ValueError:
+        return None
+    system, action = np.asarray(game.system), np.asarray(model.action)
+    source = np.repeat(system, np.diff(row_start))
+    sides = []
+    for own, given in ((False, inputs), (True, outputs)):
+        used = [formulas[a] for a in np.unique(action[source == own])]
+        found = dict.fromkeys(p for formula in used for p in formula.propositions)
+        sides.append(tuple(dict.fromkeys([*given, *found])))
+    names = sides[0] + sides[1]
+    if len(set(names)) < len(names):
+        return None
+    place = {name: i for i, name in enumerate(names)}
+    guards = _Guards(list(range(len(names))))
+    read = [_read_guard(formula, place, guards) for formula in formulas]
+    for s in range(system.size):
+        taken = FALSE
+        for a in action[row_start[s] : row_start[s + 1]]:
+            guard = read[a]
+            if guard is None or guards.both(taken, guard[1]) != FALSE:
+                return None
+            taken = guards.either(taken, guard[1])
+        if taken != TRUE:
+            return None
+    return _Labels(sides[0], sides[1], [read[a][0] for a in action])
+
+
+def _read_guard(formula: Formula, place: dict[str, int], guards: _Guards) -> tuple[str, int] | None:
+    """A condition as a label and as a diagram; None where it is not made of ``! & |``."""
+    found: dict[Formula, tuple[str, int]] = {}
+    for node in subformulas(formula):
+        parts = [found[x] for x in node.operands]
+        if node.operator == "ap":
+            p = place[node.proposition]
+            found[node] = str(p), guards.proposition(p)
+        elif node.operator in ("true", "false"):
+            found[node] = node.operator[0], guards.constant(node.operator == "true")
+        elif node.operator == "!":
+            found[node] = f"!({parts[0][0]})" if " " in parts[0][0] else f"!{parts[0][0]}", (
+                guards.negation(parts[0][1]))  # fmt: skip
+        elif node.operator in ("&", "|"):
+            combine, whole = (guards.both if node.operator == "&" else guards.either), parts[0][1]
+            for _, guard in parts[1:]:
+                whole = combine(whole, guard)
+            grouped = [f"({text})" if " " in text else text for text, _ in parts]
+            found[node] = f" {node.operator} ".join(grouped), whole
+        else:
+            return None
+    return found[formula]
