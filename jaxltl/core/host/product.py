@@ -122,6 +122,7 @@ def _reached(world: _World, start: Integers) -> Booleans:
     seen = np.zeros(host.num_states * world.num_memory, bool)
     seen[start] = True
     first_entry = host.entry_start[host.row_start]
+    scratch = np.empty(seen.size, np.int32) if seen.size <= _DENSE else None
     frontier, rounds, work = np.flatnonzero(seen), 0, 0
     while frontier.size:
         state, memory = np.divmod(frontier, world.num_memory)
@@ -133,8 +134,12 @@ def _reached(world: _World, start: Integers) -> Booleans:
             host.successor[entry], np.repeat(state, count), np.repeat(memory, count))
         follower = follower[~seen[follower]]
         seen[follower] = True
-        # Repetitions are few; sorting finds them without a pass over all pairs.
-        frontier = np.unique(follower)
+        if scratch is None:
+            frontier = np.unique(follower)
+        else:  # of each pair's repetitions the last one stays
+            place = np.arange(follower.size, dtype=np.int32)
+            scratch[follower] = place
+            frontier = follower[scratch[follower] == place]
         rounds, work = rounds + 1, work + follower.size
         if rounds == _ROUNDS:
             if work < _NARROW * rounds and (
