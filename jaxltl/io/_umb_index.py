@@ -24,8 +24,9 @@ PARTS = {"states": "state", "choices": "choice", "branches": "transition"}  # as
 # Groups of ours. Labels that others take for their own have their place among all as their id.
 OTHER_LABELS = "other-aps"
 INITIAL = "initial"  # an initial distribution that is not uniform
+ACTIONS, VALUATIONS = "actions/choices", "valuations/states"  # folders
 _MOST_STATES = 2**31 - 2  # states and choices are numbered with 32 bits
-_MOST_STRING = 2**10  # bytes of an action's name, on the average
+_MOST_STRING = 2**10  # bytes of a text, on the average
 _STRINGS_ALLOWED = 2**20
 _MOST_RECORD = 2**16  # bytes of one state's valuation
 
@@ -83,6 +84,7 @@ class Index:
     probability: Type | None
     annotations: tuple[Annotation, ...]
     records: tuple[Record, ...]
+    texts: int  # that variables have by their numbers
     player_names: tuple[str, ...] = ()
 
     def bounds(self) -> dict[str, tuple[int, int]]:
@@ -99,8 +101,7 @@ class Index:
         if self.probability:
             sizes["branch-to-probability.bin"] = self.branches * self.probability.size // 8
         if self.actions:
-            sizes["actions/choices/values.bin"] = 4 * self.choices
-            sizes["actions/choices/string-mapping.bin"] = 8 * (self.actions + 1)
+            sizes[f"{ACTIONS}/values.bin"] = 4 * self.choices
         for one in self.annotations:
             for part in one.applies_to:
                 sizes[one.member(part)] = (
@@ -109,18 +110,15 @@ class Index:
                     else counts[part] * one.type.size // 8
                 )
         found = {name: (size, size) for name, size in sizes.items()}
-        if self.actions:
-            found["actions/choices/strings.bin"] = (
-                0,
-                _STRINGS_ALLOWED + _MOST_STRING * self.actions,
-            )
         if self.records:
             widths = [record.size for record in self.records]
-            found["valuations/states/valuations.bin"] = (
-                self.states * min(widths),
-                self.states * max(widths),
-            )
-            found["valuations/states/valuation-to-class.bin"] = (4 * self.states, 4 * self.states)
+            most = self.states * max(widths)
+            found[f"{VALUATIONS}/valuations.bin"] = (self.states * min(widths), most)
+            found[f"{VALUATIONS}/valuation-to-class.bin"] = (4 * self.states, 4 * self.states)
+        for folder, count in ((ACTIONS, self.actions), (VALUATIONS, self.texts)):
+            if count:
+                found[f"{folder}/string-mapping.bin"] = (8 * (count + 1), 8 * (count + 1))
+                found[f"{folder}/strings.bin"] = (0, _STRINGS_ALLOWED + _MOST_STRING * count)
         return found
 
 
@@ -168,7 +166,7 @@ def parse_index(content: bytes, place: str) -> Index:
         counts["choice-actions"],
         probability,
         annotations,
-        _records(data.get("valuations", {}), place),
+        *_records(data.get("valuations", {}), place),
         tuple(names),
     )
 
@@ -260,15 +258,20 @@ def _annotation(group: str, key: str, value: Any, place: str) -> Annotation:
     return Annotation(group, key, name, tuple(applies), kind)
 
 
-def _records(data: Any, place: str) -> tuple[Record, ...]:
+def _records(data: Any, place: str) -> tuple[tuple[Record, ...], int]:
+    """The classes of states, and how many texts their variables have."""
     states = _table(data, "valuations", place).get("states")
     if states is None:
-        return ()
-    what = "valuations/states"
-    classes = _get(_table(states, what, place), "classes", f"{place}{what}: ")
+        return (), 0
+    classes = _get(_table(states, VALUATIONS, place), "classes", f"{place}{VALUATIONS}: ")
     if not isinstance(classes, list) or not classes:
-        raise ValueError(f"{place}{what}: classes is {_shown(classes)}; expected a list.")
-    return tuple(_record(one, f"{place}{what}: ") for one in classes)
+        raise ValueError(f"{place}{VALUATIONS}: classes is {_shown(classes)}; expected a list.")
+    texts = _count(states, "#strings", f"{place}{VALUATIONS}: ") if "#strings" in states else 0
+    if texts > _MOST_STATES:
+        raise ValueError(
+            f"{place}{VALUATIONS}: #strings is {texts}; at most {_MOST_STATES} are read."
+        )
+    return tuple(_record(one, f"{place}{VALUATIONS}: ") for one in classes), texts
 
 
 def _record(data: Any, place: str) -> Record:

@@ -14,6 +14,7 @@ from jaxltl.io._umb_index import Record, Type, Variable, bit_bytes
 Bytes = NDArray[np.uint8]
 
 _EXACT = 2**53  # whole numbers up to this are doubles
+_MOST_TEXT = 2**30  # bytes of the texts of one variable
 
 
 def read_bits(content: Bytes, count: int) -> NDArray[np.bool_]:
@@ -111,23 +112,26 @@ def read_variables(
     of_class: NDArray[np.uint32] | None,
     records: Sequence[Record],
     count: int,
+    texts: Sequence[str],
     place: str,
 ) -> dict[str, NDArray[Any]]:
     """The variables of states, ``[S]`` each, by name.
 
     Whole numbers are int32 or, where the type is larger, int64 (or uint64); what is absent in
-    some state is a double, NaN there. Texts, and whole numbers of more than 64 bits, are left out.
+    some state is a double, NaN there, or an empty text. Whole numbers of more than 64 bits, and
+    texts that would take more than 1 GB, are left out.
 
     Args:
       content: the records of the states, one after the other.
       of_class: which record a state has; None: all the first.
       records: the classes.
       count: the number of states.
+      texts: those that variables have by their numbers.
       place: what an error begins with.
 
     Raises:
-      ValueError: the content has another size than the records, a class does not exist, or a
-        variable has a type of intervals, two kinds of types or values beyond 64 bits.
+      ValueError: the content has another size than the records, a class or a text does not exist,
+        or a variable has a type of intervals, two kinds of types or values beyond 64 bits.
     """
     if of_class is None:
         of_class = np.zeros(count, np.uint32)
@@ -139,53 +143,67 @@ def read_variables(
             f"{place}it has {content.size} bytes; expected {end[-1]}, the records of "
             f"the {count} states."
         )
-    states: list[NDArray[Any] | slice] = [slice(None)]
-    if len(records) > 1:
-        states = [np.flatnonzero(of_class == i) for i in range(len(records))]
-    parts: dict[str, list[tuple[Any, NDArray[Any], NDArray[np.bool_] | None]]] = {}
-    for record, chosen in zip(records, states, strict=False):
-        if record.size == 0:
+    parts: dict[str, list[_Part]] = {}
+    for i, record in enumerate(records):
+        chosen = np.arange(count) if len(records) == 1 else np.flatnonzero(of_class == i)
+        if record.size == 0 or chosen.size == 0:
             continue
-        if isinstance(chosen, slice):
+        if chosen.size == count:
             raw = content.reshape(count, record.size)
         else:
-            first = end[chosen] - record.size
-            raw = content[first[:, None] + np.arange(record.size)]
+            raw = content[(end[chosen] - record.size)[:, None] + np.arange(record.size)]
         for variable in record.variables:
-            values = _read_variable(raw, variable, place)
-            if values is not None:
-                parts.setdefault(variable.name, []).append((chosen, *values))
-    return {name: _joined(part, count) for name, part in parts.items()}
+            what = f"{place}the variable {variable.name!r} "
+            values = _read_variable(raw, variable, texts, what)
+            if values is None:
+                continue
+            if variable.presence is not None:
+                there = _field(raw, variable.presence, 1)[:, 0] > 0
+                parts.setdefault(variable.name, []).append((chosen[there], values[there]))
+            else:
+                parts.setdefault(variable.name, []).append((chosen, values))
+    return {
+        name: _joined(part, count, f"{place}the variable {name!r} ") for name, part in parts.items()
+    }
+
+
+_Part = tuple[NDArray[np.intp], NDArray[Any]]  # some states, and the values there
 
 
 def _read_variable(
-    raw: Bytes, variable: Variable, place: str
-) -> tuple[NDArray[Any], NDArray[np.bool_] | None] | None:
-    """A variable's values and where they are present (None: everywhere), or None if left out."""
-    kind, what = variable.type, f"{place}the variable {variable.name!r} "
+    raw: Bytes, variable: Variable, texts: Sequence[str], what: str
+) -> NDArray[Any] | None:
+    """A variable's value in each record, or None if it is left out."""
+    kind = variable.type
     if kind.name.endswith("-interval"):
         raise ValueError(f"{what}is {kind.name}; expected single values.")
-    if kind.name == "string" or (kind.name in ("int", "uint") and kind.size > 64):
+    if kind.name in ("int", "uint") and kind.size > 64:
         return None
     field = _field(raw, variable.start, kind.size)
-    values: Any
     if kind.name == "bool":
-        values = np.any(field, axis=1)
-    elif kind.name == "double":
-        values = np.ascontiguousarray(field).view("<f8")[:, 0].astype(np.float64, copy=False)
-    elif kind.name == "rational":
-        if kind.size % 16:
-            raise ValueError(f"{what}is a rational of {kind.size} bits; expected whole bytes.")
-        present = None if variable.presence is None else _field(raw, variable.presence, 1)[:, 0] > 0
-        values = np.full(len(raw), np.nan)
-        where = slice(None) if present is None else present
-        values[where] = _read_rationals(field[where], what)
-        return values, present
-    else:
-        values = _whole_numbers(field, variable, what)
-    if variable.presence is None:
-        return values, None
-    return values, _field(raw, variable.presence, 1)[:, 0] > 0
+        return np.asarray(field.any(axis=1))
+    if kind.name == "double":
+        return np.ascontiguousarray(field).view("<f8")[:, 0].astype(np.float64, copy=False)
+    if kind.name == "string":
+        return _texts(np.ascontiguousarray(field).view("<u8")[:, 0], texts, what)
+    if kind.name != "rational":
+        return _whole_numbers(field, variable, what)
+    if kind.size % 16:
+        raise ValueError(f"{what}is a rational of {kind.size} bits; expected whole bytes.")
+    values = np.full(len(raw), np.nan)
+    there = np.ones(len(raw), bool)
+    if variable.presence is not None:  # what is absent may have the denominator 0
+        there = _field(raw, variable.presence, 1)[:, 0] > 0
+    values[there] = _read_rationals(field[there], what)
+    return values
+
+
+def _texts(number: NDArray[np.uint64], texts: Sequence[str], what: str) -> NDArray[Any] | None:
+    if number.max() >= len(texts):
+        raise ValueError(f"{what}has the text {number.max()}; there are {len(texts)}.")
+    if 4 * max(number.size, len(texts)) * max(map(len, texts)) > _MOST_TEXT:
+        return None
+    return np.array(texts)[number.astype(np.int64)]
 
 
 def _field(raw: Bytes, start: int, size: int) -> Bytes:
@@ -230,43 +248,49 @@ def _whole_numbers(field: Bytes, variable: Variable, what: str) -> NDArray[Any]:
     raise ValueError(f"{what}goes from {least} to {most}; expected numbers of 64 bits.")
 
 
-def _joined(
-    parts: Sequence[tuple[Any, NDArray[Any], NDArray[np.bool_] | None]], count: int
-) -> NDArray[Any]:
+def _joined(parts: Sequence[_Part], count: int, what: str) -> NDArray[Any]:
     """A variable's values from all classes of states."""
-    if len(parts) == 1 and isinstance(parts[0][0], slice):
-        _, values, present = parts[0]
-        if present is None or present.all():
-            return values
-        return np.where(present, values, np.nan)
-    there = np.zeros(count, bool)
-    for chosen, _, present in parts:
-        there[chosen] = True if present is None else present
-    dtype = np.result_type(*(values.dtype for _, values, _ in parts))
-    found = np.full(count, np.nan) if not there.all() else np.zeros(count, dtype)
-    for chosen, values, present in parts:
-        found[chosen] = values if present is None else np.where(present, values, found[chosen])
+    if len(parts) == 1 and parts[0][0].size == count:
+        return parts[0][1]
+    kinds = {values.dtype.kind for _, values in parts}
+    if "U" in kinds and len(kinds) > 1:
+        raise ValueError(f"{what}is a text in some states only; expected one type.")
+    dtype = np.result_type(*(values.dtype for _, values in parts))
+    found: NDArray[Any] = np.zeros(count, dtype)
+    if sum(states.size for states, _ in parts) < count and "U" not in kinds:
+        found = np.full(count, np.nan)
+    for states, values in parts:
+        found[states] = values
     return found
 
 
-def write_variables(valuation: Mapping[str, Any], place: str) -> tuple[list[Any], Bytes]:
-    """The description of variables and the records of all states; each begins at a whole byte.
+def write_variables(valuation: Mapping[str, Any], place: str) -> tuple[list[Any], Bytes, list[str]]:
+    """Variables described, the records of all states, and texts that they have by their numbers.
+
+    Each variable begins at a whole byte.
 
     Raises:
-      ValueError: a variable holds neither truth values nor numbers.
+      ValueError: a variable holds neither truth values, nor numbers, nor texts.
     """
     described: list[Any] = []
     fields: list[NDArray[Any]] = []
+    texts: list[str] = []
     for name, values in valuation.items():
         values = np.asarray(values)
-        kind = {"b": "bool", "i": "int", "u": "uint", "f": "double"}.get(values.dtype.kind)
-        if kind is None or values.dtype.itemsize > 8:
+        kind = {"b": "bool", "i": "int", "u": "uint", "f": "double", "U": "string"}.get(
+            values.dtype.kind
+        )
+        if kind is None or (kind != "string" and values.dtype.itemsize > 8):
             raise ValueError(
                 f"{place}the variable {name!r} holds {values.dtype}; UMB files hold "
-                "truth values and numbers of up to 64 bits."
+                "truth values, numbers of up to 64 bits and texts."
             )
         if kind == "double":
             values = values.astype(np.float64)
+        if kind == "string":
+            different, number = np.unique(values, return_inverse=True)
+            values = number.ravel().astype(np.uint64) + np.uint64(len(texts))
+            texts += map(str, different)
         size = 1 if kind == "bool" else 8 * values.dtype.itemsize
         described.append({"name": name, "type": {"type": kind, "size": size}})
         if kind == "bool":
@@ -276,4 +300,17 @@ def write_variables(valuation: Mapping[str, Any], place: str) -> tuple[list[Any]
     records = np.zeros(fields[0].size, layout)
     for i, field in enumerate(fields):
         records[f"v{i}"] = field
-    return described, records.view(np.uint8)
+    return described, records.view(np.uint8), texts
+
+
+def write_texts(texts: Sequence[str], place: str) -> tuple[Bytes, bytes]:
+    """Where texts start, and the texts.
+
+    Raises:
+      ValueError: one is no Unicode.
+    """
+    try:
+        encoded = [text.encode() for text in texts]
+    except UnicodeEncodeError as error:
+        raise ValueError(f"{place}a text is no Unicode: {error}.") from None
+    return np.cumsum([0, *map(len, encoded)], dtype="<u8").view(np.uint8), b"".join(encoded)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -19,7 +20,16 @@ from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import checked_initial
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.io._files import Compression, compression_by_name, pieces, raw_bytes, write_bytes
-from jaxltl.io._umb_index import INITIAL, OTHER_LABELS, PARTS, Index, ids_for, parse_index
+from jaxltl.io._umb_index import (
+    ACTIONS,
+    INITIAL,
+    OTHER_LABELS,
+    PARTS,
+    VALUATIONS,
+    Index,
+    ids_for,
+    parse_index,
+)
 from jaxltl.io._umb_tar import Stream, members, tar_pieces, write_gzip
 from jaxltl.io._umb_values import (
     Bytes,
@@ -29,6 +39,7 @@ from jaxltl.io._umb_values import (
     read_texts,
     read_variables,
     write_bits,
+    write_texts,
     write_variables,
 )
 
@@ -45,9 +56,10 @@ def read_umb(path: str | os.PathLike[str]) -> SparseMDP | Game:
     Player 0 of a game is the system. Where no state is initial, the initial distribution is
     uniform over all.
 
-    Left out, as nothing follows from them: who made the file, actions of branches, annotations
-    other than labels and rewards, variables of choices and branches, and variables that are texts
-    or have more than 64 bits. A variable that some state lacks is a double, NaN there.
+    Left out, as nothing follows from them: who made the file, the players' names, actions of
+    branches, annotations other than labels and rewards, variables of choices and branches, and
+    variables that are whole numbers of more than 64 bits or texts of more than 1 GB. A variable
+    that some state lacks is a double, NaN there, or an empty text.
 
     Args:
       path: the file.
@@ -132,15 +144,8 @@ def _model(found: dict[str, Bytes], index: Index, place: str) -> SparseMDP | Gam
     options: dict[str, Any] = {"rewards": _rewards(found, index, place)}
     if index.actions:
         options |= _actions(found, index, place)
-    if "valuations/states/valuations.bin" in found:
-        of_class = found.get("valuations/states/valuation-to-class.bin")
-        options["valuation"] = read_variables(
-            found.pop("valuations/states/valuations.bin"),
-            None if of_class is None else of_class.view("<u4"),
-            index.records,
-            index.states,
-            f"{place}valuations/states/valuations.bin: ",
-        )
+    if f"{VALUATIONS}/valuations.bin" in found:
+        options["valuation"] = _valuation(found, index, place)
     probability = _probability(found, index, entry_start, place)
     initial = _initial(found, index)
     owner = _owners(found, index, row_start, place)
@@ -224,7 +229,7 @@ def _rewards(found: dict[str, Bytes], index: Index, place: str) -> dict[str, Rew
 
 def _actions(found: dict[str, Bytes], index: Index, place: str) -> dict[str, Any]:
     """The number of each choice's action, and the names."""
-    member = "actions/choices/values.bin"
+    member = f"{ACTIONS}/values.bin"
     action = np.zeros(index.choices, np.int32)
     if member in found:
         action = found.pop(member).view("<u4")
@@ -233,12 +238,29 @@ def _actions(found: dict[str, Bytes], index: Index, place: str) -> dict[str, Any
                 f"{place}{member}: a choice has the action {action.max()}; expected 0 "
                 f"to {index.actions - 1}."
             )
-    mapping, strings = (f"actions/choices/{x}.bin" for x in ("string-mapping", "strings"))
+    return {"action": action, "action_names": _texts(found, ACTIONS, place)}
+
+
+def _texts(found: dict[str, Bytes], folder: str, place: str) -> tuple[str, ...]:
+    """The texts of a folder by their numbers; none if it has none."""
+    mapping, strings = f"{folder}/string-mapping.bin", f"{folder}/strings.bin"
     if mapping not in found:
-        return {"action": action}
+        return ()
     content = _needed(found, strings, place)
     start = read_starts(found[mapping], content.size, f"{place}{mapping}: ")
-    return {"action": action, "action_names": read_texts(start, content, f"{place}{strings}: ")}
+    return read_texts(start, content, f"{place}{strings}: ")
+
+
+def _valuation(found: dict[str, Bytes], index: Index, place: str) -> dict[str, NDArray[Any]]:
+    of_class = found.get(f"{VALUATIONS}/valuation-to-class.bin")
+    return read_variables(
+        found.pop(f"{VALUATIONS}/valuations.bin"),
+        None if of_class is None else of_class.view("<u4"),
+        index.records,
+        index.states,
+        _texts(found, VALUATIONS, place),
+        f"{place}{VALUATIONS}/valuations.bin: ",
+    )
 
 
 def _probability(
@@ -324,8 +346,8 @@ def write_umb(
         gzip.
 
     Raises:
-      ValueError: a variable is neither truth values nor numbers, a name is no Unicode, or the
-        place cannot be written to.
+      ValueError: a variable holds neither truth values, numbers nor texts, a name is no Unicode,
+        or the place cannot be written to.
     """
     if compression not in ("gzip", "xz", "by name", None):
         raise ValueError(
@@ -378,7 +400,8 @@ def _contents(model: Any, place: str) -> list[tuple[str, Any]]:
         action = np.asarray(sparse.action)
         names = sparse.action_names
         counts["#choice-actions"] = len(names) or int(action.max()) + 1
-        contents += _written_actions(action, names, place)
+        contents.append((f"{ACTIONS}/values.bin", _packed(action, "<u4")))
+        contents += _written_texts(names, ACTIONS, place)
     annotations, more = _annotations(sparse, initial)
     index: dict[str, Any] = {
         "format-version": 1,
@@ -389,9 +412,11 @@ def _contents(model: Any, place: str) -> list[tuple[str, Any]]:
     }
     contents += more
     if sparse.valuation:
-        described, records = write_variables(sparse.valuation, place)
-        index["valuations"] = {"states": {"unique": False, "classes": [{"variables": described}]}}
-        contents.append(("valuations/states/valuations.bin", records))
+        described, records, texts = write_variables(sparse.valuation, place)
+        states = {"unique": False, "classes": [{"variables": described}]}
+        index["valuations"] = {"states": {**states, "#strings": len(texts)} if texts else states}
+        contents.append((f"{VALUATIONS}/valuations.bin", records))
+        contents += _written_texts(texts, VALUATIONS, place)
     return [("index.json", json.dumps(index, indent=1).encode()), *contents]
 
 
@@ -400,21 +425,12 @@ def _packed(array: Any, dtype: str) -> Bytes:
     return np.ascontiguousarray(array, np.dtype(dtype)).view(np.uint8)
 
 
-def _written_actions(
-    action: NDArray[Any], names: tuple[str, ...], place: str
-) -> list[tuple[str, Any]]:
-    contents: list[tuple[str, Any]] = [("actions/choices/values.bin", _packed(action, "<u4"))]
-    if names:
-        try:
-            texts = [name.encode() for name in names]
-        except UnicodeEncodeError as error:
-            raise ValueError(f"{place}the name of an action is no Unicode: {error}.") from None
-        start = np.cumsum([0, *map(len, texts)])
-        contents += [
-            ("actions/choices/string-mapping.bin", _packed(start, "<u8")),
-            ("actions/choices/strings.bin", b"".join(texts)),
-        ]
-    return contents
+def _written_texts(texts: Sequence[str], folder: str, place: str) -> list[tuple[str, Any]]:
+    """The members for texts by their numbers; none if there are none."""
+    if not texts:
+        return []
+    start, content = write_texts(texts, f"{place}{folder}: ")
+    return [(f"{folder}/string-mapping.bin", start), (f"{folder}/strings.bin", content)]
 
 
 def _annotations(

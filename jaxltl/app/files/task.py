@@ -7,7 +7,6 @@ beside it.
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,16 +16,16 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxltl.algos.checkpoint import read_arrays
 from jaxltl.app.files import tables
 from jaxltl.app.files.tables import COUNT, NAMES, TEXT, Rule, choice, is_list, is_number, number_in
 from jaxltl.core.logic.labels import satisfying
-from jaxltl.core.models.mdp import MDP, from_dense, make_mdp
+from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, project_trajectories
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.types import Solution
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
+from jaxltl.io.npz import model_of, parse_arrays
 
 
 @dataclass(frozen=True)
@@ -266,12 +265,6 @@ def load_world(task: Task) -> World:
         return World(gridworld(text, **spec), parse_map(text), ACTIONS)
 
 
-_ARRAYS = (
-    "successor", "probability", "transition", "available", "initial", "label", "propositions",
-    "actions",
-)
-
-
 def load_model(
     path: Path, initial: str | None, more: Sequence[str] = ()
 ) -> tuple[World, dict[str, np.ndarray]]:
@@ -285,35 +278,13 @@ def load_model(
     Raises:
       ValueError: the file is no ``.npz``, or an array is unknown, missing or wrong.
     """
-    raw = tables.read_bytes(path, "the model")
-    with tables.errors_in(f"{str(path)!r} is not an .npz of plain arrays: "):
-        arrays = read_arrays(io.BytesIO(raw))
-    known = (*_ARRAYS, *more)
-    for name in arrays:
-        if name not in known:
-            raise ValueError(
-                f"{str(path)!r} holds an array {name!r}; it may hold {', '.join(known)}."
-            )
-    options: dict[str, Any] = {k: arrays[k] for k in ("available", "initial", "label")
-                               if k in arrays}
-    names = arrays.get("propositions", np.zeros(0, str))
-    options["propositions"] = [str(x) for x in names.ravel()]
-    with tables.errors_in(f"{str(path)!r}: "):
-        if "transition" in arrays:
-            mdp = from_dense(arrays["transition"], **options)
-        elif {"successor", "probability"} <= set(arrays):
-            mdp = make_mdp(arrays["successor"], arrays["probability"], **options)
-        else:
-            raise ValueError("it needs the array transition, or successor and probability.")
-        if initial is not None:
+    name = str(path)
+    arrays = parse_arrays(tables.read_bytes(path, "the model"), name, more)
+    mdp, actions = model_of(arrays, name)
+    if initial is not None:
+        with tables.errors_in(f"{name!r}: "):
             mdp = replace(mdp, initial=_where_holds(initial, mdp))
-    default = [f"action {a}" for a in range(mdp.num_actions)]
-    actions = tuple(str(a) for a in arrays.get("actions", np.array(default)).ravel())
-    if len(set(actions)) != mdp.num_actions:
-        raise ValueError(
-            f"{str(path)!r}: actions has {len(set(actions))} distinct names; the model has "
-            f"{mdp.num_actions} actions."
-        )
+    actions = actions or tuple(f"action {a}" for a in range(mdp.num_actions))
     return World(mdp, None, actions), {k: arrays[k] for k in more if k in arrays}
 
 

@@ -1,0 +1,176 @@
+"""Models from files and into files, whatever their format."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jaxltl.core.models.convert import to_sparse
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.io._files import pieces, raw_bytes, write_bytes
+from jaxltl.io.hoa_game import read_hoa_game, write_hoa_game
+from jaxltl.io.npz import read_npz, write_npz
+from jaxltl.io.pgsolver import read_pgsolver, write_pgsolver
+from jaxltl.io.prism_explicit import read_prism, write_prism
+from jaxltl.io.umb import read_umb, write_umb
+
+_BEGINNING = 4096  # bytes by which a format is known
+
+
+class Format(NamedTuple):
+    """A format: how it is called, the ends of names, and what reads and writes it."""
+
+    name: str
+    suffixes: tuple[str, ...]
+    read: Callable[[Any], SparseMDP | Game]
+    write: Callable[[Any, Any], None]
+    of: str  # what it holds: "models", "all" for games too, or "games"
+
+
+def _write_hoa(path: str | os.PathLike[str], game: Any) -> None:
+    text = write_hoa_game(game)
+    with write_bytes(path) as file:
+        file.write(text.encode())
+
+
+def _read_drn(path: str | os.PathLike[str]) -> SparseMDP:
+    from jaxltl.io.drn import read_drn
+
+    return read_drn(path)
+
+
+def _write_drn(path: str | os.PathLike[str], model: Any) -> None:
+    from jaxltl.io.drn import write_drn
+
+    write_drn(path, model)
+
+
+FORMATS = (
+    Format("UMB", (".umb",), read_umb, write_umb, "all"),
+    Format("PRISM's explicit files", (".tra", ".pexp"), read_prism, write_prism, "models"),
+    Format("DRN", (".drn",), _read_drn, _write_drn, "models"),
+    Format(
+        "PGSolver",
+        (".pg", ".gm", ".pgsolver"),
+        lambda path: read_pgsolver(path).game,
+        write_pgsolver,
+        "games",
+    ),
+    Format(
+        "extended HOA",
+        (".hoa", ".ehoa"),
+        lambda path: read_hoa_game(path).game,
+        _write_hoa,
+        "games",
+    ),
+    Format("numpy", (".npz",), read_npz, write_npz, "all"),
+)
+
+
+def read_model(path: str | os.PathLike[str]) -> SparseMDP | Game:
+    """The model of a file, by the end of its name or, where that says nothing, by how it begins.
+
+    Known are UMB (``.umb``), PRISM's explicit files (``.tra`` with what stands beside it,
+    ``.pexp``), DRN (``.drn``), parity games of PGSolver (``.pg``, ``.gm``, ``.pgsolver``) and in
+    extended HOA (``.hoa``, ``.ehoa``), and the library's own ``.npz``; all but the last may be
+    compressed, with ``.gz`` or ``.xz`` after that.
+
+    Args:
+      path: the file.
+
+    Returns:
+      A :class:`~jaxltl.core.models.sparse.SparseMDP`, or a game over one. The objective of a parity
+      game is what :func:`~jaxltl.io.pgsolver.objective_of` says of it.
+
+    Raises:
+      ValueError: the format is not known, or the file is missing or malformed. The message names
+        the file, the place in it and what was expected there.
+    """
+    return (_by_name(path) or _by_beginning(path)).read(path)
+
+
+def write_model(path: str | os.PathLike[str], model: Any) -> None:
+    """Writes a model in the format that the end of the file's name says, whole or not at all.
+
+    Args:
+      path: the file.
+      model: a model that :func:`~jaxltl.core.models.convert.to_sparse` takes, or a
+        :class:`~jaxltl.core.models.game.Game` over one.
+
+    Raises:
+      ValueError: the format is not known or cannot hold the model, naming what of it, or the place
+        cannot be written to.
+
+    Example:
+      >>> import tempfile
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> path = Path(tempfile.mkdtemp()) / "coin.umb"
+      >>> write_model(path, make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1]))
+      >>> read_model(path).successor.tolist()
+      [1, 2, 1, 2]
+    """
+    form = _by_name(path)
+    if form is None:
+        raise ValueError(
+            f"{str(path)!r}: the format is not known by the end of the name; known are {_known()}."
+        )
+    is_game = isinstance(model, Game)
+    if is_game and form.of == "models":
+        raise ValueError(
+            f"{str(path)!r}: {form.name} holds no games; write "
+            f"{_listed(x for x in FORMATS if x.of != 'models')}."
+        )
+    if not is_game and form.of == "games":
+        raise ValueError(
+            f"{str(path)!r}: {form.name} holds games only, and this is no Game; write "
+            f"{_listed(x for x in FORMATS if x.of != 'games')}."
+        )
+    form.write(path, model if is_game else to_sparse(model))
+
+
+def _by_name(path: str | os.PathLike[str]) -> Format | None:
+    suffixes = [x.lower() for x in Path(path).suffixes]
+    if suffixes and suffixes[-1] in (".gz", ".xz"):
+        del suffixes[-1]
+    return next((x for x in FORMATS if suffixes and suffixes[-1] in x.suffixes), None)
+
+
+def _by_beginning(path: str | os.PathLike[str]) -> Format:
+    """The format of a file with another name; PRISM's is not known without it."""
+    name, data = str(path), raw_bytes(path)
+    if data.startswith(b"PK"):
+        return _named("numpy")
+    start = b""
+    for piece in pieces(data, name):
+        start += piece[:_BEGINNING]
+        if len(start) >= _BEGINNING:
+            break
+    if start[257:262] == b"ustar":
+        return _named("UMB")
+    words = start.split(maxsplit=1)
+    first = words[0] if words else b""
+    if first == b"parity":
+        return _named("PGSolver")
+    if first == b"HOA:":
+        return _named("extended HOA")
+    if first.startswith(b"@") or b"\n@type:" in start:
+        return _named("DRN")
+    raise ValueError(
+        f"{name!r}: the format is known neither by the end of the name nor by how the "
+        f"file begins; known are {_known()}."
+    )
+
+
+def _named(name: str) -> Format:
+    return next(x for x in FORMATS if x.name == name)
+
+
+def _listed(formats: Any) -> str:
+    return " or ".join(f"{x.name} ({', '.join(x.suffixes)})" for x in formats)
+
+
+def _known() -> str:
+    return ", ".join(f"{x.name} ({', '.join(x.suffixes)})" for x in FORMATS)

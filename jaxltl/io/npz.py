@@ -1,0 +1,263 @@
+"""Models in the library's own ``.npz`` files: arrays by name, padded or sparse."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.algos.checkpoint import atomic_write, read_arrays
+from jaxltl.core.models.convert import to_sparse
+from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp
+from jaxltl.core.models.padded import to_padded
+from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.io._files import ALWAYS_ALLOWED, MAX_RATIO, raw_bytes
+
+Arrays = Mapping[str, NDArray[Any]]
+
+# By name: the kinds that NumPy may have of each, and what they are called.
+_NUMBERS = ("biuf", "numbers")
+_TRUTH = ("biuf", "truth values")
+_WHOLE = ("iu", "whole numbers")
+_TEXTS = ("USOiuf", "texts")
+_SHARED = {
+    "probability": _NUMBERS,
+    "successor": _WHOLE,
+    "initial": _NUMBERS,
+    "label": _TRUTH,
+    "propositions": _TEXTS,
+    "actions": _TEXTS,
+    "system": _TRUTH,
+}
+_PADDED = {"transition": _NUMBERS, "available": _TRUTH, **_SHARED}
+_SPARSE = {"row_start": _WHOLE, "entry_start": _WHOLE, "action": _WHOLE, **_SHARED}
+_VALUES = ("biufUS", "truth values, numbers and texts")
+_REWARD, _VARIABLE = "reward:", "variable:"
+_PARTS = ("state", "choice", "transition")
+
+
+def parse_arrays(raw: bytes, name: str, more: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
+    """The arrays of a model's ``.npz``, each known and of the right kind.
+
+    Args:
+      raw: the file's bytes.
+      name: the file's name, for messages.
+      more: names of arrays that it may hold beside a model's.
+
+    Raises:
+      ValueError: it is no ``.npz``, would be too large, or an array is unknown or of another kind.
+    """
+    _check_size(raw, name)
+    try:
+        arrays = read_arrays(io.BytesIO(raw))
+    except ValueError as error:
+        raise ValueError(f"{name!r} is not an .npz of plain arrays: {error}") from None
+    sparse = _is_sparse(arrays)
+    kinds = {
+        k: v
+        for k, v in (_SPARSE if sparse else _PADDED).items()
+        if k != "system" or k in more
+    }
+    for key, array in arrays.items():
+        known = kinds.get(key)
+        if sparse and key.startswith(_REWARD):
+            known = _NUMBERS
+        elif sparse and key.startswith(_VARIABLE):
+            known = _VALUES
+        elif known is None and key in more:
+            continue
+        if known is None:
+            listed = ", ".join([*kinds, *(m for m in more if m not in kinds)])
+            raise ValueError(f"{name!r} holds an array {key!r}; it may hold {listed}.")
+        if array.dtype.kind not in known[0]:
+            raise ValueError(f"{name!r}: {key} holds {array.dtype}; expected {known[1]}.")
+    return arrays
+
+
+def _check_size(raw: bytes, name: str) -> None:
+    """Raises a ValueError where an archive would grow beyond what is read."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(raw)) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+    except Exception:  # damaged; told where the arrays are read
+        return
+    if size > ALWAYS_ALLOWED + MAX_RATIO * len(raw):
+        raise ValueError(
+            f"{name!r}, {len(raw)} bytes, would grow to {size} bytes; write it with "
+            "numpy.savez, uncompressed, if that is right."
+        )
+
+
+def model_of(arrays: Arrays, name: str) -> tuple[MDP, tuple[str, ...] | None]:
+    """The padded model of a file's arrays, in JAX's default precision, and its actions' names.
+
+    Raises:
+      ValueError: an array is missing or wrong.
+    """
+    with _errors_in(name):
+        if _is_sparse(arrays):
+            return to_padded(sparse_model(arrays)), None
+        mdp, _ = _padded_model(arrays)
+        return mdp, _action_names(arrays, mdp.num_actions)
+
+
+@contextlib.contextmanager
+def _errors_in(name: str) -> Iterator[None]:
+    """Errors begin with the file's name."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{name!r}: {error}") from None
+
+
+def _is_sparse(arrays: Arrays) -> bool:
+    return "row_start" in arrays or "entry_start" in arrays
+
+
+def _padded_model(arrays: Arrays) -> tuple[MDP, SparseMDP]:
+    """The model of transition, or of successor and probability, and the same in full precision."""
+    options: dict[str, Any] = {
+        k: arrays[k] for k in ("available", "initial", "label") if k in arrays
+    }
+    names = arrays.get("propositions", np.zeros(0, str))
+    options["propositions"] = [str(x) for x in names.ravel()]
+    exact: Any
+    given: Mapping[str, Any] = arrays
+    if "transition" in arrays:
+        mdp = from_dense(given["transition"], **options)
+        exact = DenseMDP(
+            given["transition"], mdp.available, mdp.initial, mdp.label, mdp.propositions
+        )
+    elif {"successor", "probability"} <= set(arrays):
+        mdp = make_mdp(given["successor"], given["probability"], **options)
+        exact = replace(mdp, successor=given["successor"], probability=given["probability"])
+    else:
+        raise ValueError("it needs the array transition, or successor and probability.")
+    if "initial" in arrays:
+        exact = replace(exact, initial=given["initial"])
+    return mdp, to_sparse(exact)
+
+
+def _action_names(arrays: Arrays, count: int) -> tuple[str, ...] | None:
+    if "actions" not in arrays:
+        return None
+    actions = tuple(str(a) for a in arrays["actions"].ravel())
+    if len(set(actions)) != count:
+        raise ValueError(
+            f"actions has {len(set(actions))} distinct names; the model has {count} actions."
+        )
+    return actions
+
+
+def sparse_model(arrays: Arrays) -> SparseMDP:
+    """The model of the arrays row_start, entry_start, successor and probability.
+
+    Raises:
+      ValueError: an array is missing or wrong.
+    """
+    missing = {"row_start", "entry_start", "successor", "probability"} - set(arrays)
+    if missing:
+        raise ValueError(f"it needs the array {min(missing)}.")
+    rewards: dict[str, dict[str, NDArray[Any]]] = {}
+    for key, array in arrays.items():
+        if key.startswith(_REWARD):
+            reward, _, part = key.removeprefix(_REWARD).rpartition(":")
+            if part not in _PARTS:
+                raise ValueError(
+                    f"the array {key!r} is unknown; expected a reward's name and state, choice or "
+                    "transition after it."
+                )
+            rewards.setdefault(reward, {})[part] = array
+    options: dict[str, Any] = {k: arrays[k] for k in ("initial", "label", "action") if k in arrays}
+    for key, ours in (("propositions", "propositions"), ("actions", "action_names")):
+        if key in arrays:
+            options[ours] = [str(x) for x in arrays[key].ravel()]
+    model = make_sparse(
+        arrays["row_start"],
+        arrays["entry_start"],
+        arrays["successor"],
+        arrays["probability"],
+        rewards={k: Rewards(**v) for k, v in rewards.items()},
+        valuation={
+            key.removeprefix(_VARIABLE): array
+            for key, array in arrays.items()
+            if key.startswith(_VARIABLE)
+        },
+        **options,
+    )
+    if "initial" in arrays:  # what was checked may have been scaled
+        model = replace(model, initial=np.asarray(arrays["initial"], np.float64))
+    return model
+
+
+def read_npz(path: str | os.PathLike[str]) -> SparseMDP | Game:
+    """The model of an ``.npz`` file, in double precision.
+
+    A padded file has the array ``transition``, ``[S, A, S]``, or ``successor`` and ``probability``,
+    ``[S, A, K]``; a sparse one, such as :func:`write_npz` writes, the fields of
+    :class:`~jaxltl.core.models.sparse.SparseMDP`. With an array ``system`` it is a game.
+
+    Raises:
+      ValueError: naming the file and the array that is unknown, missing or wrong.
+    """
+    name = str(path)
+    try:
+        arrays = parse_arrays(raw_bytes(path), name, ("system",))
+        with _errors_in(name):
+            if _is_sparse(arrays):
+                model = sparse_model(arrays)
+            else:
+                mdp, model = _padded_model(arrays)
+                names = _action_names(arrays, mdp.num_actions)
+                model = replace(model, action_names=names or ())
+            return make_game(model, arrays["system"]) if "system" in arrays else model
+    except MemoryError:
+        raise ValueError(f"{name!r}: the model does not fit into the memory.") from None
+
+
+def write_npz(path: str | os.PathLike[str], model: Any) -> None:
+    """Writes a model as a sparse ``.npz``, whole or not at all, which :func:`read_npz` reads.
+
+    It reads back bit for bit, except that an empty reward becomes zeros on states.
+
+    Args:
+      path: the file.
+      model: a model that :func:`~jaxltl.core.models.convert.to_sparse` takes, or a game over one.
+
+    Raises:
+      ValueError: a variable holds other things, or the place cannot be written to.
+    """
+    arrays: dict[str, Any] = {}
+    if isinstance(model, Game):
+        model, arrays["system"] = model.mdp, np.asarray(model.system, bool).ravel()
+    sparse = to_sparse(model)
+    for key in ("row_start", "entry_start", "successor", "probability", "initial", "label"):
+        arrays[key] = np.asarray(getattr(sparse, key))
+    if sparse.action is not None:
+        arrays["action"] = np.asarray(sparse.action)
+    if sparse.propositions:
+        arrays["propositions"] = np.array(sparse.propositions)
+    if sparse.action_names:
+        arrays["actions"] = np.array(sparse.action_names)
+    for name, reward in sparse.rewards.items():
+        parts = {x: getattr(reward, x) for x in _PARTS if getattr(reward, x) is not None}
+        for part, values in (parts or {"state": np.zeros(sparse.num_states)}).items():
+            arrays[f"{_REWARD}{name}:{part}"] = np.asarray(values, np.float64)
+    for name, values in sparse.valuation.items():
+        values = np.asarray(values)
+        if values.dtype.kind not in _VALUES[0]:
+            raise ValueError(
+                f"{str(path)!r}: the variable {name!r} holds {values.dtype}; a file "
+                f"holds {_VALUES[1]}."
+            )
+        arrays[f"{_VARIABLE}{name}"] = values
+    with atomic_write(path) as file:
+        np.savez(file, **arrays)
