@@ -1,0 +1,213 @@
+"""What PRISM's explicit files say of a model, section by section, in lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.models.sparse import Rewards, SparseMDP
+from jaxltl.io._tokens import joined_lines
+
+_STEP = 2**17  # lines that are held at a time
+
+
+@dataclass(frozen=True)
+class Written:
+    """A section of a model's files.
+
+    Attributes:
+      kind: "tra", "lab", "sta", "srew" or "trew".
+      number: of the reward, where there are several.
+      header: the lines that introduce it where all are in one file.
+      lines: gives the lines, in pieces.
+    """
+
+    kind: str
+    number: str
+    header: list[bytes]
+    lines: Callable[[], Iterator[bytes]]
+
+
+def written_sections(model: SparseMDP, dialect: str) -> list[Written]:
+    """The sections of a model's files, in order.
+
+    Raises:
+      ValueError: the format cannot hold the model.
+    """
+    storm = dialect == "storm"
+    labels, holds = _labels(model, storm)
+    kind = b"# Transitions (%s)\n" % (b"DTMC" if model.is_chain else b"MDP")
+    action = None if storm and model.is_chain else _action_texts(model)  # Storm reads none there
+    sections = [Written("tra", "", [kind], lambda: _transitions(model, action, storm))]
+    if model.valuation and not storm:
+        values = [_value_texts(name, x) for name, x in model.valuation.items()]
+        names = _plain(model.valuation, "variable", ' "(),')
+        sections.append(Written("sta", "", [b"# States\n"], lambda: _states(names, values)))
+    sections.append(Written("lab", "", [b"# Labels\n"], lambda: _label_lines(labels, holds, storm)))
+    several = len(model.rewards) > 1
+    for i, (name, reward) in enumerate(model.rewards.items()):
+        _plain([name], "reward", '"')
+        sections += _rewards(model, name, reward, str(i + 1) if several else "", storm)
+    return sections
+
+
+def _plain(names: Any, what: str, refused: str) -> list[str]:
+    """Names, none of which breaks the format."""
+    for name in names:
+        if any(c in refused for c in name) or any(ord(c) < 32 for c in name):
+            raise ValueError(f"the {what} {name!r} cannot be written: its name must not hold "
+                             f"control characters or any of {' '.join(refused)!r}.")
+    return list(names)
+
+
+def _transitions(model: SparseMDP, action: list[str] | None, storm: bool) -> Iterator[bytes]:
+    host = model.host
+    if storm:
+        yield b"dtmc\n" if model.is_chain else b"mdp\n"
+    elif model.is_chain:
+        yield b"%d %d\n" % (host.num_states, host.num_transitions)
+    else:
+        yield b"%d %d %d\n" % (host.num_states, host.num_rows, host.num_transitions)
+    numbers = np.asarray(model.action) if model.action is not None else None
+    choice = np.arange(host.num_rows) - host.row_start[host.state]
+    for begin in range(0, host.num_transitions, _STEP):
+        part = slice(begin, begin + _STEP)
+        row = host.row[part]
+        columns: list[Any] = [host.state[row].tolist(), choice[row].tolist(),
+                              host.successor[part].tolist(), host.probability[part].tolist()]
+        form = "%d %d %d %r"
+        if model.is_chain:
+            form, columns = "%d %d %r", [columns[0], *columns[2:]]
+        if action is not None and numbers is not None:
+            form += "%s"
+            columns.append([action[i] for i in numbers[row].tolist()])
+        yield joined_lines(form + "\n", *columns)
+
+
+def _action_texts(model: SparseMDP) -> list[str] | None:
+    """What stands after a transition, by the number of its action."""
+    if model.action is None:
+        return None
+    if not model.action_names:
+        return [f" _{i}" for i in range(int(np.asarray(model.action).max()) + 1)]
+    _plain(model.action_names, "action", ' "')
+    return [f" {name}" if name else "" for name in model.action_names]
+
+
+def _labels(model: SparseMDP, storm: bool) -> tuple[list[str], list[NDArray[np.bool_]]]:
+    """The names of the labels, "init" first, and where they hold."""
+    initial = np.asarray(model.initial)
+    where = initial > 0
+    if np.ptp(initial[where]) > 1e-12:
+        raise ValueError("the initial states are not equally likely, and the format has a set of "
+                         "them; add a state whose one choice leads to them.")
+    label = np.asarray(model.label, bool)
+    names, holds = ["init"], [where]
+    for i, name in enumerate(_plain(model.propositions, "label", ' "' if storm else '"')):
+        if name != "init":
+            names.append(name)
+            holds.append(label[:, i])
+        elif not np.array_equal(label[:, i], where):
+            raise ValueError("the label 'init' is that of the initial states, and the model has "
+                             "another of this name; rename it.")
+    return names, holds
+
+
+def _label_lines(
+    names: list[str], holds: list[NDArray[np.bool_]], storm: bool
+) -> Iterator[bytes]:
+    if storm:
+        yield f"#DECLARATION\n{' '.join(names)}\n#END\n".encode()
+    else:
+        yield (" ".join(f'{i}="{name}"' for i, name in enumerate(names)) + "\n").encode()
+    texts = [f" {name}" if storm else f" {i}" for i, name in enumerate(names)]
+    for begin in range(0, holds[0].size, _STEP):
+        part = np.stack([h[begin : begin + _STEP] for h in holds], 1)
+        state, column = np.nonzero(part)
+        first = np.diff(state, prepend=-1) > 0
+        after = "" if storm else ":"
+        lines = [f"\n{s + begin}{after}{texts[c]}" if new else texts[c] for s, c, new in zip(
+            state.tolist(), column.tolist(), first.tolist(), strict=True)]
+        yield ("".join(lines)[1:] + "\n").encode() if lines else b""
+
+
+def _value_texts(name: str, value: Any) -> Callable[[slice], list[str]]:
+    value = np.asarray(value)
+    if value.dtype == bool:
+        return lambda part: np.where(value[part], "true", "false").tolist()
+    if np.issubdtype(value.dtype, np.integer) or np.issubdtype(value.dtype, np.floating):
+        if np.issubdtype(value.dtype, np.floating) and np.isnan(value).any():
+            raise ValueError(f"the variable {name!r} is NaN somewhere; leave it out.")
+        return lambda part: list(map(repr, value[part].tolist()))
+    raise ValueError(f"the variable {name!r} has values of dtype {value.dtype}; the format holds "
+                     "truth values and numbers. Leave it out, or number its values.")
+
+
+def _states(names: list[str], values: list[Callable[[slice], list[str]]]) -> Iterator[bytes]:
+    yield f"({','.join(names)})\n".encode()
+    form, begin = f"%d:({','.join(['%s'] * len(names))})\n", 0
+    while columns := [value(slice(begin, begin + _STEP)) for value in values]:
+        if not columns[0]:
+            return
+        yield joined_lines(form, range(begin, begin + len(columns[0])), *columns)
+        begin += _STEP
+
+
+def _rewards(
+    model: SparseMDP, name: str, reward: Rewards, number: str, storm: bool
+) -> Iterator[Written]:
+    title = f'# Reward structure "{name}"\n' if name else "# Reward structure\n"
+    state = None if reward.state is None else np.asarray(reward.state, np.float64)
+    earned = _on_entries(model, reward)
+    if state is not None or earned is None:
+        given = np.zeros(model.num_states) if state is None else state
+        yield Written("srew", number, [title.encode(), b"# State rewards\n"],
+                      lambda: _state_rewards(given, storm))
+    if earned is not None:
+        found = earned
+        yield Written("trew", number, [title.encode(), b"# Transition rewards\n"],
+                      lambda: _transition_rewards(model, found, storm))
+
+
+def _on_entries(model: SparseMDP, reward: Rewards) -> NDArray[np.float64] | None:
+    """Rewards of choices and transitions, ``[T]``."""
+    choice = None
+    if reward.choice is not None:
+        choice = np.asarray(reward.choice, np.float64)[model.host.row]
+    if reward.transition is None:
+        return choice
+    transition = np.asarray(reward.transition, np.float64)
+    return transition if choice is None else choice + transition
+
+
+def _state_rewards(reward: NDArray[np.float64], storm: bool) -> Iterator[bytes]:
+    state = np.flatnonzero(reward)
+    if not storm:
+        yield b"%d %d\n" % (reward.size, state.size)
+    for begin in range(0, state.size, _STEP):
+        part = state[begin : begin + _STEP]
+        yield joined_lines("%d %r\n", part.tolist(), reward[part].tolist())
+
+
+def _transition_rewards(
+    model: SparseMDP, earned: NDArray[np.float64], storm: bool
+) -> Iterator[bytes]:
+    host = model.host
+    entries = np.flatnonzero(earned)
+    sizes = [host.num_states] if host.is_chain else [host.num_states, host.num_rows]
+    if not storm:
+        yield (" ".join(map(str, [*sizes, entries.size])) + "\n").encode()
+    choice = np.arange(host.num_rows) - host.row_start[host.state]
+    for begin in range(0, entries.size, _STEP):
+        part = entries[begin : begin + _STEP]
+        row = host.row[part]
+        columns = [host.state[row].tolist(), choice[row].tolist(), host.successor[part].tolist(),
+                   earned[part].tolist()]
+        if host.is_chain:
+            yield joined_lines("%d %d %r\n", columns[0], *columns[2:])
+        else:
+            yield joined_lines("%d %d %d %r\n", *columns)

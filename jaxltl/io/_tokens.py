@@ -1,0 +1,286 @@
+"""Text files of numbers, cut into tokens by NumPy, a few megabytes at a time.
+
+A block holds whole lines. Columns are read from it as arrays, and what is no number is named with
+its line. Anything up to a blank separates tokens, and lines end with a line feed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.host.rows import spans
+
+Integers = NDArray[np.integer[Any]]
+Floats = NDArray[np.float64]
+
+_SIZE = 2**22  # bytes of a block
+_LONGEST = 10_000  # bytes of a number
+_DECIMAL = re.compile(rb"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?")
+_RATIONAL = re.compile(rb"([+-]?\d+)/(\d+)")
+_INFINITE = re.compile(rb"([+-]?)inf(?:inity)?", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Text:
+    """A part of a text file: its bytes from `begin` to `stop`, where line `line` begins."""
+
+    name: str
+    data: bytes
+    begin: int
+    stop: int
+    line: int = 1
+
+    def error(self, line: int, message: str) -> ValueError:
+        """An error of a line, to be raised."""
+        return ValueError(f"{self.name!r}, line {line}: {message}")
+
+    def first_line(self, comment: bytes) -> tuple[bytes, int, Text]:
+        """The first line with something on it, its number, and what follows."""
+        place, line = self.begin, self.line
+        while place < self.stop:
+            end = self.data.find(b"\n", place, self.stop) + 1 or self.stop
+            found = self.data[place:end].strip()
+            place, line = end, line + 1
+            if found and not found.startswith(comment):
+                return found, line - 1, Text(self.name, self.data, place, self.stop, line)
+        return b"", line, Text(self.name, self.data, self.stop, self.stop, line)
+
+    def blocks(self, comment: bytes) -> Iterator[Block]:
+        """The lines, without empty ones and those that begin with the sign of a comment."""
+        place, line = self.begin, self.line
+        while place < self.stop:
+            cut = self.stop
+            if self.stop - place > _SIZE:
+                cut = self.data.rfind(b"\n", place, place + _SIZE) + 1
+                cut = cut or self.data.find(b"\n", place + _SIZE, self.stop) + 1 or self.stop
+            block, count = _block(self, np.frombuffer(self.data, np.uint8, cut - place, place),
+                                  line, comment)
+            if block.num_lines:
+                yield block
+            place, line = cut, line + count
+
+
+@dataclass(frozen=True)
+class Block:
+    """Some lines of a text by their tokens.
+
+    Attributes:
+      text: where they are from.
+      data: ``uint8[B]``, their bytes, the last of which is blank.
+      start, end: ``int[N]``, where the tokens are.
+      first: ``int[L + 1]``; those of line i are ``first[i]`` to ``first[i + 1] - 1``.
+      line: ``int[L]``, the numbers of the lines in the file.
+    """
+
+    text: Text
+    data: NDArray[np.uint8]
+    start: Integers
+    end: Integers
+    first: Integers
+    line: Integers
+
+    @property
+    def num_lines(self) -> int:
+        return self.line.size
+
+    @property
+    def count(self) -> Integers:
+        """How many tokens a line has, ``int[L]``."""
+        return np.diff(self.first)
+
+    def error(self, token: int, expected: str) -> ValueError:
+        """The error of a token, which is not what is expected."""
+        shown = self.data[self.start[token] : self.end[token]][:60].tobytes().decode(
+            errors="replace")
+        if shown.startswith("["):
+            expected = "one number; models whose probabilities are intervals are not read"
+        line = int(np.searchsorted(self.first, token, "right")) - 1
+        return self.text.error(int(self.line[line]), f"{shown!r} stands where {expected} is "
+                               "expected.")
+
+    def whole(self, line: int) -> bytes:
+        """A line as it stands."""
+        begin, end = self.start[self.first[line]], self.end[self.first[line + 1] - 1]
+        return self.data[begin:end].tobytes()
+
+    def joined(self, token: Integers) -> NDArray[np.uint8]:
+        """The bytes of tokens, each with a blank after it."""
+        length = self.end[token] - self.start[token] + 1
+        joined = self.data[spans(self.start[token], length)]
+        joined[length.cumsum() - 1] = 32
+        return joined
+
+    def texts(self, token: Integers) -> list[bytes]:
+        """Tokens as they stand."""
+        return self.joined(token).tobytes().split(b" ")[:-1]
+
+    def integers(self, token: Integers, expected: str, below: int = 2**31 - 1) -> Integers:
+        """Tokens as integers from 0 up to a bound, ``int32[...]``.
+
+        Raises:
+          ValueError: one is none, naming its line.
+        """
+        joined = self.joined(token)
+        length = self.end[token] - self.start[token]
+        texts = joined.tobytes().split(b" ")[:-1]
+        if not _DIGIT[joined].all() or not length.all():
+            bad = next(i for i, x in enumerate(texts) if not x.isdigit())
+            raise self.error(int(token[bad]), expected)
+        large = length > 18
+        if not large.any():
+            found: Integers = np.fromiter(map(int, texts), np.int64, len(texts))
+            large = found >= below
+        if large.any():
+            raise self.error(int(token[int(large.argmax())]), f"{expected} below {below}")
+        return found.astype(np.int32)
+
+    def floats(
+        self, token: Integers, expected: str, other: Callable[[bytes], float | None] | None = None
+    ) -> Floats:
+        """Tokens as the nearest doubles: decimals, fractions such as 1/3, and infinity.
+
+        Args:
+          token: their numbers.
+          expected: what they are, for the message.
+          other: reads what is none of these, or gives None.
+
+        Raises:
+          ValueError: one is none, or too large, naming its line.
+        """
+        joined = self.joined(token)
+        longest = int((self.end[token] - self.start[token]).max(initial=0))
+        if longest <= _LONGEST and _DECIMAL_BYTE[joined].all():
+            texts = joined.tobytes().split(b" ")[:-1]
+            try:
+                found: Floats = np.fromiter(map(float, texts), np.float64, len(texts))
+                if np.isfinite(found).all():
+                    return found
+            except ValueError:
+                pass
+        found, known = np.empty(token.size), {}
+        for i, text in enumerate(self.texts(token)):
+            if text not in known:
+                number = as_double(text)
+                if number is None and other is not None:
+                    number = other(text)
+                if number is None:
+                    raise self.error(int(token[i]), expected)
+                known[text] = number
+            found[i] = known[text]
+        return found
+
+    def probabilities(
+        self, token: Integers, other: Callable[[bytes], float | None] | None = None
+    ) -> Floats:
+        """Tokens as probabilities."""
+        found = self.floats(token, "a probability", other)
+        bad = ~((found >= 0) & (found <= 1 + 1e-6))
+        if bad.any():
+            raise self.error(int(token[int(bad.argmax())]), "a probability from 0 to 1")
+        return found
+
+    def columns(self, width: int, more: int, form: str) -> Integers:
+        """The first tokens of lines that have `width` tokens, or up to `more` beyond that.
+
+        Raises:
+          ValueError: a line has another number, with the form that it should have.
+        """
+        wrong = (self.count < width) | (self.count > width + more)
+        if wrong.any():
+            raise self.malformed(int(wrong.argmax()), form)
+        return self.first[:-1]
+
+    def malformed(self, line: int, form: str) -> ValueError:
+        """The error of a line that has not the form that it should have."""
+        shown = self.whole(line)[:60].decode(errors="replace")
+        if "[" in shown and "," in shown:
+            form += "; models whose probabilities are intervals are not read"
+        return self.text.error(int(self.line[line]), f"{shown!r}; expected {form}.")
+
+
+def as_double(text: bytes) -> float | None:
+    """The double nearest to a decimal or a fraction, or infinity; None for anything else."""
+    if len(text) > _LONGEST:
+        return None
+    if _DECIMAL.fullmatch(text):
+        number = float(text)
+        return None if number in (np.inf, -np.inf) else number
+    if found := _RATIONAL.fullmatch(text):
+        try:
+            return int(found[1]) / int(found[2])  # correctly rounded, however long they are
+        except (ZeroDivisionError, OverflowError, ValueError):
+            return None
+    if found := _INFINITE.fullmatch(text):
+        return -np.inf if found[1] == b"-" else np.inf
+    return None
+
+
+def numbered(texts: list[bytes], known: dict[bytes, int]) -> Integers:
+    """The numbers of names, ``int32``; new ones are added to those that are known."""
+    found = (known.setdefault(text, len(known)) for text in texts)
+    return np.fromiter(found, np.int32, len(texts))
+
+
+def decoded(text: Text, names: dict[bytes, int]) -> list[str]:
+    """Names as text.
+
+    Raises:
+      ValueError: one is not UTF-8.
+    """
+    try:
+        return [name.decode() for name in names]
+    except UnicodeDecodeError as error:
+        line = text.data.count(b"\n", 0, max(text.data.find(error.object), 0)) + 1
+        raise text.error(line, f"the name {error.object[:60]!r} is not UTF-8.") from None
+
+
+def joined_lines(form: str, *columns: Any) -> bytes:
+    """Lines of a form with one entry of each column."""
+    return "".join(map(form.__mod__, zip(*columns, strict=True))).encode()
+
+
+def bytes_of(allowed: bytes) -> NDArray[np.bool_]:
+    """Which bytes are among some, ``bool[256]``."""
+    table = np.zeros(256, bool)
+    table[list(allowed)] = True
+    return table
+
+
+_DIGIT = bytes_of(b"0123456789 ")
+_DECIMAL_BYTE = bytes_of(b"0123456789+-.eE ")
+
+
+def _block(
+    text: Text, data: NDArray[np.uint8], line: int, comment: bytes
+) -> tuple[Block, int]:
+    """A block, and how many lines of the file it took."""
+    if data[-1] > 32:
+        data = np.append(data, np.uint8(10))
+    blank = np.ones(data.size + 1, bool)
+    np.less_equal(data, 32, out=blank[1:])
+    edge = np.flatnonzero(blank[1:] != blank[:-1])
+    start, end = edge[::2], edge[1::2]
+    is_end = data == 10
+    of = np.cumsum(is_end, dtype=np.int32)[start]
+    first = np.flatnonzero(np.diff(of, prepend=-1))
+    skipped = np.ones(first.size, bool)
+    for i, sign in enumerate(comment):
+        skipped &= data[np.minimum(start[first] + i, data.size - 1)] == sign
+    count = np.diff(first, append=start.size)
+    if skipped.any():
+        kept = np.repeat(~skipped, count)
+        start, end, count = start[kept], end[kept], count[~skipped]
+    numbers = line + of[first][~skipped].astype(np.int64)
+    starts = np.concatenate([[0], count.cumsum()])
+    return Block(text, data, start, end, starts, numbers), int(is_end.sum())
+
+
+def refuse(name: str, message: str) -> NoReturn:
+    """Refuses a file as a whole."""
+    raise ValueError(f"{name!r}: {message}")

@@ -1,0 +1,347 @@
+"""Models in the explicit files of PRISM and of Storm: transitions, labels, states and rewards."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.models.sparse import SparseMDP, make_sparse
+from jaxltl.io._files import read_bytes, write_bytes
+from jaxltl.io._prism_parts import Section, read_labels, read_rewards, read_valuation
+from jaxltl.io._prism_text import written_sections
+from jaxltl.io._tokens import Floats, Integers, Text, decoded, numbered, refuse
+
+_NAME = re.compile(r"(?P<stem>.+)\.(?P<kind>tra|pexp)(?P<packed>\.gz|\.xz)?", re.DOTALL)
+_SECTION = re.compile(rb"^#[ \t]*(Transitions|States|Observations|Labels|Reward structure)\b.*$",
+                      re.MULTILINE)
+_KIND = re.compile(rb"^#[ \t]*Transitions[ \t]*\(([^)\n]*)\)", re.MULTILINE)
+_NUMBERED = re.compile(rb"_(0|[1-9]\d{0,8})")  # how actions without names are written
+
+
+def read_prism(path: str | os.PathLike[str]) -> SparseMDP:
+    """The Markov chain or decision process in explicit files of PRISM, or of Storm's older dialect.
+
+    Beside ``name.tra`` are looked for ``name.lab`` (labels), ``name.sta`` (values of variables),
+    ``name.srew`` and ``name.trew`` (rewards), with several rewards ``name1.srew``, ``name2.srew``
+    and so on; ``name.pexp`` has all in one file. Any of them may be compressed with gzip or xz.
+    Files whose first line is ``dtmc`` or ``mdp``, and labels between ``#DECLARATION`` and
+    ``#END``, are Storm's.
+
+    The states labelled ``init`` are the initial ones, each as likely as another; without labels it
+    is state 0. A state without transitions (a deadlock) gets a loop, as in PRISM. Numbers are the
+    nearest doubles to the decimals and fractions (``1/3``) in the files. A reward of transitions
+    that is the same for all successors of every choice is one of choices. A reward without a name
+    is called "", and several ones by their numbers.
+
+    Args:
+      path: of the ``.tra`` or ``.pexp`` file.
+
+    Raises:
+      ValueError: naming file and line, and what was expected; for models whose probabilities are
+        intervals, with observations, or in continuous time.
+
+    Example:
+      >>> import tempfile
+      >>> folder = Path(tempfile.mkdtemp())
+      >>> _ = (folder / "coin.tra").write_text("3 2\\n0 1 1/2\\n0 2 1/2\\n")
+      >>> _ = (folder / "coin.lab").write_text('0="init" 1="heads"\\n0: 0\\n1: 1\\n')
+      >>> model = read_prism(folder / "coin.tra")
+      >>> model.successor.tolist(), model.probability.tolist(), model.propositions
+      ([1, 2, 1, 2], [0.5, 0.5, 1.0, 1.0], ('heads',))
+    """
+    path, found = Path(path), _NAME.fullmatch(Path(path).name)
+    if found is None:
+        refuse(str(path), "its name must end in .tra or .pexp, or that and .gz or .xz.")
+    sections = _in_one(path) if found["kind"] == "pexp" else list(_beside(path, found))
+    text = next(text for kind, _, text in sections if kind == "tra")
+    try:
+        return _model(text, sections)
+    except MemoryError:
+        refuse(text.name, "it is too large for the memory.")
+
+
+def write_prism(
+    path: str | os.PathLike[str], model: SparseMDP, *, dialect: Literal["prism", "storm"] = "prism"
+) -> None:
+    """Writes a model as explicit files, such as :func:`read_prism` reads.
+
+    Doubles are written so that the same ones are read. A reward on choices and on transitions is
+    written as their sum, on transitions. Actions with numbers and no names are called ``_0``,
+    ``_1`` and so on, and read back as numbers.
+
+    Args:
+      path: of the ``.tra`` file, beside which the others are written, or of a ``.pexp`` file, and
+        ``.gz`` or ``.xz`` to compress them.
+      model: a concrete model. Initial states must be equally likely.
+      dialect: PRISM's files, or those that Storm reads. The latter have no variables, no names of
+        rewards, and in chains no actions.
+
+    Raises:
+      ValueError: the format cannot hold the model, naming what it cannot; the place cannot be
+        written to; or files of another model stand beside, which would be read with this one.
+    """
+    path, found = Path(path), _NAME.fullmatch(Path(path).name)
+    if found is None:
+        refuse(str(path), "its name must end in .tra or .pexp, or that and .gz or .xz.")
+    if dialect not in ("prism", "storm"):
+        raise ValueError(f"dialect is {dialect!r}; give 'prism' or 'storm'.")
+    sections = written_sections(model, dialect)
+    if found["kind"] == "pexp":
+        if dialect == "storm":
+            refuse(str(path), "Storm reads no .pexp; write a .tra.")
+        with write_bytes(path) as file:
+            for section in sections:
+                file.writelines(section.header)
+                file.writelines(section.lines())
+        return
+    names = [f"{found['stem']}{s.number}.{s.kind}{found['packed'] or ''}" for s in sections]
+    others = sorted(p.name for _, _, p in _siblings(path, found) if p.name not in names)
+    if others:
+        refuse(str(path), f"beside it stand {', '.join(others)}, which would be read with it; "
+                          "delete them or choose another name.")
+    for name, section in zip(names, sections, strict=True):
+        with write_bytes(path.parent / name) as file:
+            if section.kind in ("srew", "trew") and dialect == "prism":
+                file.writelines(section.header)  # it has the name
+            file.writelines(section.lines())
+
+
+# --- which files ----------------------------------------------------------------------------
+
+
+def _siblings(path: Path, found: re.Match[str]) -> Iterator[tuple[str, str, Path]]:
+    """The files that belong to one with transitions: kind, number and path."""
+    form = re.compile(re.escape(found["stem"]) + r"\.?(\d{0,9})\.(lab|sta|srew|trew)(\.gz|\.xz)?")
+    try:
+        names = sorted(os.listdir(path.parent))
+    except (OSError, ValueError) as error:
+        refuse(str(path), f"its folder cannot be read: {error}.")
+    matches = [(name, other) for name in names if (other := form.fullmatch(name))]
+    for name, other in sorted(matches, key=lambda x: int(x[1][1] or 0)):
+        if other[1] and other[2] in ("lab", "sta"):
+            continue
+        stem = name.removesuffix(other[3] or "").removesuffix(f".{other[2]}")
+        if other[1] and {f"{stem}.tra", f"{stem}.tra.gz", f"{stem}.tra.xz"} & set(names):
+            continue  # the reward of a model that is itself called name1
+        yield other[2], other[1], path.parent / name
+
+
+def _beside(path: Path, found: re.Match[str]) -> Iterator[Section]:
+    chosen: dict[tuple[str, str], Path] = {}
+    for kind, number, other in _siblings(path, found):
+        packed = found["packed"] or ""
+        if (kind, number) not in chosen or other.name.endswith(f".{kind}{packed}"):
+            chosen[kind, number] = other
+    for (kind, number), other in [(("tra", ""), path), *chosen.items()]:
+        data = read_bytes(other)
+        yield kind, number, Text(str(other), data, 0, len(data))
+
+
+def _in_one(path: Path) -> list[Section]:
+    data, name = read_bytes(path), str(path)
+    starts = list(_SECTION.finditer(data))
+    if not starts or starts[0][1] != b"Transitions":
+        refuse(name, "it must begin with a line '# Transitions (MDP)' or '# Transitions (DTMC)'.")
+    sections: list[Section] = []
+    count = {"srew": 0, "trew": 0}
+    line, before = 1, 0
+    for start, stop in zip(starts, [*(s.start() for s in starts[1:]), len(data)], strict=True):
+        line += data.count(b"\n", before, start.start())
+        before = start.start()
+        text, number = Text(name, data, before, stop, line), ""
+        kind = {b"Transitions": "tra", b"States": "sta", b"Labels": "lab"}.get(start[1], "")
+        if start[1] == b"Observations":
+            raise text.error(line, "models with observations are not read.")
+        if not kind:
+            second = data[start.end() : stop].split(b"\n", 2)[1:2]
+            form = re.match(rb"#[ \t]*(State|Transition) rewards", second[0] if second else b"")
+            if form is None:
+                raise text.error(line + 1, "expected '# State rewards' or '# Transition rewards'.")
+            kind = {b"State": "srew", b"Transition": "trew"}[form[1]]
+            count[kind] += 1
+            number = str(count[kind])
+        elif any(kind == other for other, _, _ in sections):
+            raise text.error(line, f"a second section of {start[1].decode()}; remove one.")
+        sections.append((kind, number, text))
+    return sections
+
+
+# --- transitions ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The lines of a file of transitions, as columns.
+
+    Attributes:
+      num_states: S.
+      is_chain: whether choices have no numbers.
+      state, choice, target, action: ``int32[T]``; action -1 stands for none.
+      probability: ``float64[T]``.
+      line: ``int32[T]``, 0 where there is no line.
+      names: of the actions.
+    """
+
+    num_states: int
+    is_chain: bool
+    state: Integers
+    choice: Integers
+    target: Integers
+    probability: Floats
+    action: Integers
+    line: Integers
+    names: dict[bytes, int]
+
+
+def _sizes(text: Text) -> tuple[bool, list[int], Text]:
+    """Whether it is a chain, the sizes that the first line gives (none in Storm's), the rest."""
+    kind = _KIND.search(text.data, text.begin, min(text.stop, text.begin + 2000))
+    if kind and kind[1] not in (b"DTMC", b"MDP"):
+        raise text.error(text.line, f"a model of type {kind[1].decode(errors='replace')} is not "
+                                    "read; DTMC and MDP are.")
+    first, line, rest = text.first_line(b"#")
+    if first.lower() in (b"dtmc", b"mdp"):
+        return first.lower() == b"dtmc", [], rest
+    if first.lower() in (b"ctmc", b"ma", b"pomdp"):
+        raise text.error(line, f"a model of type {first.decode()} is not read; dtmc and mdp are.")
+    sizes = first.split()
+    if len(sizes) == 4 and all(x.isdigit() for x in sizes):
+        raise text.error(line, "four sizes are those of a model with observations, which is not "
+                               "read.")
+    if len(sizes) not in (2, 3) or not all(x.isdigit() and len(x) < 19 for x in sizes):
+        raise text.error(line, f"{first[:60].decode(errors='replace')!r}; expected 'states "
+                               "transitions' of a chain, 'states choices transitions' of an MDP, "
+                               "or Storm's 'dtmc' or 'mdp'.")
+    numbers = [int(x) for x in sizes]
+    if kind and (kind[1] == b"DTMC") != (len(sizes) == 2):
+        raise text.error(line, f"{len(sizes)} sizes; a {kind[1].decode()} has "
+                               f"{5 - len(sizes)}.")
+    if not 0 < numbers[0] < 2**31 - 1:
+        raise text.error(line, f"{numbers[0]} states; expected 1 to {2**31 - 2}.")
+    return len(sizes) == 2, numbers, rest
+
+
+def _read_rows(text: Text) -> _Rows:
+    is_chain, sizes, rest = _sizes(text)
+    width, form = (3, "'state successor probability'") if is_chain else (
+        4, "'state choice successor probability'")
+    below = sizes[0] if sizes else 2**31 - 2
+    names: dict[bytes, int] = {}
+    parts: list[list[NDArray]] = [[] for _ in range(6)]
+    for block in rest.blocks(b"#"):
+        at = block.columns(width, 1, f"{form}, and an action or none")
+        action = np.full(at.size, -1, np.int32)
+        named = block.count > width
+        action[named] = numbered(block.texts(at[named] + width), names)
+        choice = (np.zeros(at.size, np.int32) if is_chain
+                  else block.integers(at + 1, "the number of a choice"))
+        found = (block.integers(at, "a state", below), choice,
+                 block.integers(at + width - 2, "a state", below),
+                 block.probabilities(at + width - 1), action, block.line.astype(np.int32))
+        for part, column in zip(parts, found, strict=True):
+            part.append(column)
+    if not parts[0]:
+        raise text.error(rest.line, f"the file ends without a transition; expected {form}.")
+    columns = tuple(np.concatenate(x) for x in parts)
+    del parts
+    state, choice, target, probability, action, lines = columns
+    if sizes and sizes[-1] != state.size:
+        raise text.error(rest.line - 1, f"{sizes[-1]} transitions are announced and "
+                                        f"{state.size} follow; the file is cut or changed.")
+    num_states = sizes[0] if sizes else int(max(state.max(), target.max())) + 1
+    if num_states > 16 * state.size + 10_000:
+        raise text.error(rest.line - 1, f"{num_states} states are announced, which "
+                                        f"{state.size} transitions cannot reach.")
+    rows = _Rows(num_states, is_chain, state, choice, target, probability, action, lines, names)
+    new = _new_rows(text, rows, form)
+    if len(sizes) == 3 and sizes[1] != new.sum():
+        raise text.error(rest.line - 1, f"{sizes[1]} choices are announced and {new.sum()} "
+                                        "follow; the file is cut or changed.")
+    return rows
+
+
+def _new_rows(text: Text, rows: _Rows, form: str) -> NDArray[np.bool_]:
+    """Where another choice begins, ``bool[T]``; they must ascend."""
+    state, choice = rows.state, rows.choice
+    other = np.ones(state.size, bool)
+    other[1:] = state[1:] != state[:-1]
+    new = other.copy()
+    new[1:] |= choice[1:] != choice[:-1]
+    expected = np.where(other, 0, np.roll(choice, 1) + new)
+    wrong = choice != expected
+    wrong[1:] |= state[1:] < state[:-1]
+    if wrong.any():
+        i = int(wrong.argmax())
+        raise text.error(int(rows.line[i]), f"state {state[i]}, choice {choice[i]} out of order; "
+                                            f"expected {form} with states and choices ascending "
+                                            "one by one.")
+    return new
+
+
+def _with_loops(rows: _Rows) -> _Rows:
+    """States without transitions get a loop."""
+    has = np.zeros(rows.num_states, bool)
+    has[rows.state] = True
+    missing = np.flatnonzero(~has).astype(np.int32)
+    if not missing.size:
+        return rows
+    place = np.searchsorted(rows.state, missing)
+
+    def put(column: NDArray, value: NDArray | float) -> NDArray:
+        return np.insert(column, place, value)
+
+    return replace(
+        rows, state=put(rows.state, missing), choice=put(rows.choice, 0),
+        target=put(rows.target, missing), probability=put(rows.probability, 1),
+        action=put(rows.action, -1), line=put(rows.line, 0))
+
+
+def _model(text: Text, sections: list[Section]) -> SparseMDP:
+    rows = _with_loops(_read_rows(text))
+    new = np.ones(rows.state.size, bool)
+    new[1:] = (rows.state[1:] != rows.state[:-1]) | (rows.choice[1:] != rows.choice[:-1])
+    start = np.flatnonzero(new)
+    total = np.add.reduceat(rows.probability, start)
+    wrong = np.abs(total - 1) > 1e-6
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise text.error(
+            int(rows.line[start[row]]), f"the probabilities of state {rows.state[start[row]]}, "
+            f"choice {rows.choice[start[row]]} sum to {total[row]:.9g}; expected 1.")
+    count = np.bincount(rows.state[start], minlength=rows.num_states)
+    action, action_names = _actions(text, rows, start)
+    label, propositions, initial = read_labels(sections, rows.num_states)
+    model = make_sparse(
+        np.concatenate([[0], count.cumsum()]), np.append(start, rows.state.size), rows.target,
+        rows.probability, initial=initial, label=label, propositions=propositions, action=action,
+        action_names=action_names, valuation=read_valuation(sections, rows.num_states))
+    is_chain = rows.is_chain
+    del rows, new, start, total  # rewards take memory too
+    return replace(model, rewards=read_rewards(sections, model, is_chain))
+
+
+def _actions(text: Text, rows: _Rows, start: Integers) -> tuple[Integers | None, tuple[str, ...]]:
+    if not rows.names:
+        return None, ()
+    action = rows.action[start]
+    other = rows.action != np.repeat(action, np.diff(start, append=rows.action.size))
+    if other.any() and not rows.is_chain:
+        i = int(other.argmax())
+        raise text.error(int(rows.line[i]), f"state {rows.state[i]}, choice {rows.choice[i]} has "
+                                            "two actions; expected the same in all of its lines.")
+    if other.any():  # what a chain's transitions are called has no bearing on it
+        action = np.where(np.add.reduceat(other, start) > 0, -1, action)
+    texts = list(rows.names)
+    if (action >= 0).all() and all(_NUMBERED.fullmatch(x) for x in texts):
+        return np.array([int(x[1:]) for x in texts])[action], ()
+    names = decoded(text, rows.names)
+    if (action < 0).any():
+        action, names = np.where(action < 0, len(names), action), [*names, ""]
+    return action, tuple(names)

@@ -1,0 +1,70 @@
+"""Random models with all that files can hold, and when two models are the same."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from jaxltl.core.models.sparse import Rewards, SparseMDP
+from tests.sparse_models import random_sparse
+
+PARTS = ("state", "choice", "transition")
+NAMES = ("a", "goal", "some_label", "Bad2", "deadlock")
+
+
+def full_model(rng, num_states=9, *, chain=False, transition_rewards=True, names=NAMES):
+    """A random model with labels, rewards, named actions, variables and initial states."""
+    model = random_sparse(rng, num_states, chain=chain)
+    initial = rng.random(num_states) < 0.3
+    initial[rng.integers(num_states)] = True
+    label = rng.random((num_states, len(names))) < 0.3
+    label[rng.integers(num_states, size=len(names)), np.arange(len(names))] = True
+    numbers = [10.0 ** rng.integers(-300, 300), -0.1, 1 / 3, 5e-324, 2.0**60, np.inf]
+
+    def some(size):
+        found = np.where(rng.random(size) < 0.5, rng.choice(numbers, size), rng.random(size))
+        found[rng.random(size) < 0.3] = 0
+        found[0] = 0.7
+        return found
+
+    rewards = {"cost": Rewards(state=some(num_states)),
+               "time": Rewards(state=some(num_states), choice=some(model.num_rows)),
+               "r_3": Rewards(choice=some(model.num_rows))}
+    if transition_rewards:
+        rewards["steps"] = Rewards(transition=some(model.num_transitions))
+    action = rng.integers(0, 3, model.num_rows)
+    return replace(
+        model, initial=initial / initial.sum(), label=label, propositions=tuple(names),
+        rewards=rewards, action=action.astype(np.int32), action_names=("go", "", "_wait"),
+        valuation={"x": rng.integers(-5, 5, num_states), "b": rng.random(num_states) < 0.5,
+                   "y": rng.random(num_states)})
+
+
+def assert_same(found: SparseMDP, model: SparseMDP, *, valuation=True):
+    """The same bits; names may be numbered otherwise, and rewards that are zero be left out."""
+    for name in ("row_start", "entry_start", "successor", "probability", "initial"):
+        a, b = getattr(found, name), getattr(model, name)
+        assert a.dtype == b.dtype and a.tobytes() == b.tobytes(), name
+    assert set(found.propositions) == set(model.propositions)
+    for name in model.propositions:
+        np.testing.assert_array_equal(found.states_where(name), model.states_where(name))
+    assert actions(found) == actions(model)
+    assert list(found.rewards) == list(model.rewards)
+    for name, reward in model.rewards.items():
+        for part in PARTS:
+            a, b = getattr(found.rewards[name], part), getattr(reward, part)
+            if b is None or not b.any():
+                assert a is None or not a.any(), (name, part)
+            else:
+                assert a is not None and a.tobytes() == b.tobytes(), (name, part)
+    if valuation:
+        assert list(found.valuation) == list(model.valuation)
+        for name, values in model.valuation.items():
+            assert found.valuation[name].dtype == values.dtype
+            assert found.valuation[name].tobytes() == values.tobytes()
+
+
+def actions(model: SparseMDP) -> list:
+    """The name of each choice's action, or its number if it has none."""
+    if model.action is None:
+        return []
+    return [model.action_names[i] if model.action_names else int(i) for i in model.action]
