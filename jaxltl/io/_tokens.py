@@ -199,7 +199,7 @@ class Block:
     def malformed(self, line: int, form: str) -> ValueError:
         """The error of a line that has not the form that it should have."""
         shown = self.whole(line)[:60].decode(errors="replace")
-        if "[" in shown and "," in shown:
+        if "[" in shown and "," in shown and "probability" in form:
             form += "; models whose probabilities are intervals are not read"
         return self.text.error(int(self.line[line]), f"{shown!r}; expected {form}.")
 

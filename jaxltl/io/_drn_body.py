@@ -1,0 +1,385 @@
+"""The states, actions and successors of a file in the DRN format, and what stands before them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.io._tokens import Block, Integers, Text, decoded, numbered, refuse
+
+# Reads tokens of a block as numbers, or as something else that NumPy can hold.
+Values = Callable[[Block, Integers], NDArray[Any]]
+
+_MODEL = re.compile(rb"^@model[ \t\r]*$", re.MULTILINE)
+_LINE = re.compile(rb"(?:state|action)\s+\S+?\s*(?:\[([^\[\]]*)\]\s*)?((?:(?<=\s)[^\[\]].*)?)",
+                   re.DOTALL)
+_LABEL = re.compile(rb'"([^"]+)"|([^\s"]+)')
+
+
+@dataclass(frozen=True)
+class Header:
+    """What stands before ``@model``.
+
+    Attributes:
+      kind: "DTMC" or "MDP".
+      value_type: as it is given, or "".
+      parameters: their names.
+      placeholders: what stands for ``$name``.
+      rewards: the names of rewards; some may be empty.
+      num_states, num_choices: as announced; None where they are not.
+      body: what follows.
+    """
+
+    kind: str
+    value_type: str
+    parameters: tuple[str, ...]
+    placeholders: dict[bytes, bytes]
+    rewards: list[str]
+    num_states: int
+    num_choices: int | None
+    body: Text
+
+
+@dataclass
+class Body:
+    """The model as columns, gathered block by block.
+
+    Attributes:
+      state: of each action, ``int32[R]``.
+      line: of each action, ``int64[R]``.
+      row: of each successor, ``int32[T]``.
+      successor, value: of each successor, ``[T]``.
+      action: the number of each action's name, ``int32[R]``.
+      action_names, label_names: names by number.
+      labelled, label: which states have which label, a pair each.
+      rewards: how many rewards a state or action has; 0 until some have any.
+      state_reward, choice_reward: the first state or action of an array ``[n, rewards]``, and it.
+      num_states, num_rows: so far.
+      after_action: whether the last line that was no successor was an action.
+    """
+
+    state: list[Integers] = field(default_factory=list)
+    line: list[Integers] = field(default_factory=list)
+    row: list[Integers] = field(default_factory=list)
+    successor: list[Integers] = field(default_factory=list)
+    value: list[NDArray[Any]] = field(default_factory=list)
+    action: list[Integers] = field(default_factory=list)
+    action_names: dict[bytes, int] = field(default_factory=dict)
+    label_names: dict[bytes, int] = field(default_factory=dict)
+    labelled: list[Integers] = field(default_factory=list)
+    label: list[Integers] = field(default_factory=list)
+    rewards: int = 0
+    state_reward: list[tuple[int, NDArray[Any]]] = field(default_factory=list)
+    choice_reward: list[tuple[int, NDArray[Any]]] = field(default_factory=list)
+    num_states: int = 0
+    num_rows: int = 0
+    after_action: bool = False
+
+
+# --- the header -----------------------------------------------------------------------------
+
+
+def read_header(text: Text) -> Header:
+    """What stands before ``@model``.
+
+    Raises:
+      ValueError: naming the line; for models of other types, and those with intervals.
+    """
+    found = _MODEL.search(text.data)
+    if found is None:
+        refuse(text.name, "it has no line '@model'; expected a model in the DRN format.")
+    lines = text.data[: found.start()].decode(errors="replace").split("\n")[:-1]
+    given: dict[str, tuple[int, str]] = {}
+    placeholders: dict[bytes, bytes] = {}
+    i = 0
+    while i < len(lines):
+        line, number = lines[i].strip(), i + 1
+        i += 1
+        if not line or line.startswith("//"):
+            continue
+        key, colon, value = line.partition(":")
+        if key in given or (key == "@placeholders" and placeholders):
+            raise text.error(number, f"{key} is given twice.")
+        if key in ("@type", "@value_type") and colon:
+            given[key] = number, value.strip()
+        elif line in ("@parameters", "@reward_models", "@nr_states", "@nr_choices"):
+            given[line] = number + 1, lines[i].strip("\r") if i < len(lines) else ""
+            i += 1
+        elif line == "@placeholders":
+            while i < len(lines) and not lines[i].startswith("@"):
+                _placeholder(text, i + 1, lines[i].strip(), placeholders)
+                i += 1
+        else:
+            raise text.error(number, f"{line[:60]!r}; expected @type, @value_type, @parameters, "
+                                     "@placeholders, @reward_models, @nr_states or @nr_choices.")
+    at = text.data.count(b"\n", 0, found.end()) + 1
+    stop = text.data.find(b"\n", found.end()) + 1 or text.stop
+    body = Text(text.name, text.data, stop, text.stop, at + 1)
+    num_states = _count(text, given, "@nr_states")
+    if num_states is None:
+        raise text.error(at, "expected the number of states, '@nr_states', before '@model'.")
+    return Header(
+        _kind(text, given, at), _value_type(text, given),
+        tuple(given.get("@parameters", (0, ""))[1].split()), placeholders,
+        re.split("[ \t]", given["@reward_models"][1]) if "@reward_models" in given else [],
+        num_states, _count(text, given, "@nr_choices"), body)
+
+
+def _placeholder(text: Text, line: int, given: str, placeholders: dict[bytes, bytes]) -> None:
+    if not given or given.startswith("//"):
+        return
+    name, colon, value = (x.strip().encode() for x in given.partition(":"))
+    if not colon or not value or name[:1] != b"$" or name in placeholders:
+        raise text.error(line, f"{given[:60]!r}; expected '$name : value', each name once.")
+    placeholders[name] = value
+
+
+def _kind(text: Text, given: dict[str, tuple[int, str]], line: int) -> str:
+    if "@type" not in given:
+        raise text.error(line, "expected a line '@type: MDP' or '@type: DTMC' before '@model'.")
+    line, kind = given["@type"]
+    if kind.upper() not in ("DTMC", "MDP"):
+        raise text.error(line, f"a model of type {kind[:60]!r} is not read; DTMC and MDP are.")
+    return kind.upper()
+
+
+def _value_type(text: Text, given: dict[str, tuple[int, str]]) -> str:
+    line, found = given.get("@value_type", (0, ""))
+    if found in ("double-interval", "rational-interval"):
+        raise text.error(line, "models whose probabilities are intervals are not read.")
+    if found not in ("", "double", "rational", "parametric"):
+        raise text.error(line, f"the value type is {found[:60]!r}; expected double, rational or "
+                               "parametric.")
+    return found
+
+
+def _count(text: Text, given: dict[str, tuple[int, str]], key: str) -> int | None:
+    if key not in given:
+        return None
+    line, found = given[key][0], given[key][1].strip()
+    if not re.fullmatch("[0-9]{1,18}", found) or not 0 < int(found) < 2**31 - 1:
+        raise text.error(line, f"{found[:60]!r}; expected a number from 1 to {2**31 - 2}.")
+    return int(found)
+
+
+# --- the body -------------------------------------------------------------------------------
+
+
+def read_body(header: Header, probabilities: Values, numbers: Values) -> Body:
+    """The states, actions and successors.
+
+    Args:
+      header: what stands before.
+      probabilities: reads those.
+      numbers: reads rewards.
+
+    Raises:
+      ValueError: naming the line and what was expected.
+    """
+    body, text = Body(), header.body
+    for block in text.blocks(b"//"):
+        at = block.first[:-1]
+        is_state, is_action = _begins(block, at, b"state"), _begins(block, at, b"action")
+        order = _order(block, body, is_state, is_action)
+        state = body.num_states - 1 + np.cumsum(is_state)
+        row = body.num_rows - 1 + np.cumsum(is_action)
+        _read_states(header, block, body, np.flatnonzero(is_state), numbers)
+        _read_actions(block, body, np.flatnonzero(is_action), state, numbers)
+        entry = np.flatnonzero(~is_state & ~is_action)
+        if entry.size:
+            first, form = at[entry], "'successor : probability'"
+            wrong = block.count[entry] != 3
+            colon = np.minimum(first + 1, block.start.size - 1)
+            wrong |= (block.end[colon] != block.start[colon] + 1) | (
+                block.data[block.start[colon]] != ord(":"))
+            if wrong.any():
+                raise block.malformed(int(entry[int(wrong.argmax())]), form)
+            body.successor.append(block.integers(first, "a state", header.num_states))
+            body.value.append(probabilities(block, first + 2))
+            body.row.append(row[entry].astype(np.int32))
+        body.num_states, body.num_rows, body.after_action = int(state[-1]) + 1, int(row[-1]) + 1, (
+            bool(is_action[order[-1]]) if order[-1] >= 0 else body.after_action)
+    _check_counts(header, body)
+    return body
+
+
+def _begins(block: Block, at: Integers, word: bytes) -> NDArray[np.bool_]:
+    """Which tokens are a word."""
+    found = block.end[at] - block.start[at] == len(word)
+    for i, letter in enumerate(word):
+        found[found] = block.data[block.start[at[found]] + i] == letter
+    return found
+
+
+def _order(
+    block: Block, body: Body, is_state: NDArray[np.bool_], is_action: NDArray[np.bool_]
+) -> Integers:
+    """The last line up to each one that is no successor, -1 for none in the block."""
+    index = np.arange(is_state.size)
+    last = np.maximum.accumulate(np.where(is_state | is_action, index, -1))
+    within = np.where(last >= 0, is_action[last], body.after_action)
+    wrong = ~is_state & ~is_action & ~within
+    if wrong.any():
+        raise block.malformed(int(wrong.argmax()), "'state number' or 'action name' before it")
+    wrong = is_action & (body.num_states + np.cumsum(is_state) == 0)
+    if wrong.any():
+        raise block.malformed(int(wrong.argmax()), "'state 0' before it")
+    return last
+
+
+def _read_states(
+    header: Header, block: Block, body: Body, lines: Integers, numbers: Values
+) -> None:
+    if not lines.size:
+        return
+    at, form = block.first[:-1][lines], "'state number [reward, reward] label label'"
+    if (block.count[lines] < 2).any():
+        raise block.malformed(int(lines[int((block.count[lines] < 2).argmax())]), form)
+    state = block.integers(at + 1, "the number of a state", header.num_states)
+    wrong = state != body.num_states + np.arange(lines.size)
+    if wrong.any():
+        i = int(wrong.argmax())
+        raise block.error(int(at[i]) + 1, f"state {body.num_states + i}")
+    reward, label, rest = _rewards(block, body, lines, numbers, form)
+    if reward is not None:
+        body.state_reward.append((body.num_states, reward))
+    # Labels without quotation marks are tokens; the others are cut from their lines.
+    count = np.maximum(block.count[lines] - (label - at), 0)
+    for i in rest:
+        count[i] = 0
+    token = np.repeat(label - np.cumsum(count) + count, count) + np.arange(int(count.sum()))
+    names, owners = block.texts(token), [np.repeat(state, count)]
+    for i, labels in rest.items():
+        found = _LABEL.findall(labels)
+        if _LABEL.sub(b"", labels).strip():
+            raise block.malformed(int(lines[i]), form)
+        names += [quoted or plain for quoted, plain in found]
+        owners.append(np.full(len(found), state[i]))
+    body.label.append(numbered(names, body.label_names))
+    body.labelled.append(np.concatenate(owners))
+
+
+def _read_actions(
+    block: Block, body: Body, lines: Integers, state: Integers, numbers: Values
+) -> None:
+    if not lines.size:
+        return
+    at, form = block.first[:-1][lines], "'action name [reward, reward]'"
+    if (block.count[lines] < 2).any():
+        raise block.malformed(int(lines[int((block.count[lines] < 2).argmax())]), form)
+    body.action.append(numbered(block.texts(at + 1), body.action_names))
+    body.state.append(state[lines].astype(np.int32))
+    body.line.append(block.line[lines])
+    reward, after, rest = _rewards(block, body, lines, numbers, form)
+    if reward is not None:
+        body.choice_reward.append((body.num_rows, reward))
+    wrong = at + block.count[lines] > after
+    for i, more in rest.items():
+        wrong[i] = bool(more)
+    if wrong.any():
+        raise block.malformed(int(lines[int(wrong.argmax())]), form)
+
+
+def _rewards(
+    block: Block, body: Body, lines: Integers, numbers: Values, form: str
+) -> tuple[NDArray[Any] | None, Integers, dict[int, bytes]]:
+    """Rewards ``[n, rewards]`` (None without any), the token after them, and odd lines' rests.
+
+    Rewards are written as ``[1, 2]``, so that each is a token with a sign before or after it.
+    Lines that are written otherwise, or have quotation marks, are taken apart one by one.
+    """
+    at, count = block.first[:-1][lines], block.count[lines]
+    third = np.minimum(at + 2, block.start.size - 1)
+    has = (count > 2) & (block.data[block.start[third]] == ord("["))
+    quotes = np.searchsorted(block.start, np.flatnonzero(block.data == ord('"')), "right") - 1
+    odd = np.zeros(block.num_lines, bool)
+    odd[np.searchsorted(block.first, quotes, "right") - 1] = True
+    odd = odd[lines]
+    if has.any() and not body.rewards:
+        found = _LINE.fullmatch(block.whole(int(lines[int(has.argmax())])))
+        if found is None or found[1] is None:
+            raise block.malformed(int(lines[int(has.argmax())]), form)
+        body.rewards = found[1].count(b",") + 1
+    width = body.rewards
+    odd |= has & (count < 2 + width)
+    start, end = block.start.copy(), block.end.copy()
+    plain = np.flatnonzero(has & ~odd)
+    token = at[plain][:, None] + 2 + np.arange(width)
+    if plain.size:
+        sign = block.data[end[token] - 1]
+        wrong = (sign[:, :-1] != ord(",")).any(1) | (sign[:, -1] != ord("]"))
+        odd[plain[wrong]] = True
+        plain, token = plain[~wrong], token[~wrong]
+        start[token[:, 0]] += 1
+        end[token] -= 1
+    reward = None
+    if has.any():
+        values = numbers(replace(block, start=start, end=end), token.ravel())
+        reward = np.zeros((lines.size, width), values.dtype)
+        reward[plain] = values.reshape(token.shape)
+    rest = {int(i): _odd_line(block, int(lines[i]), width, numbers, form, reward, int(i))
+            for i in np.flatnonzero(odd)}
+    return reward, at + 2 + np.where(has, width, 0), rest
+
+
+def _odd_line(
+    block: Block, line: int, width: int, numbers: Values, form: str,
+    reward: NDArray[Any] | None, place: int,
+) -> bytes:
+    """Sets the rewards of a line that is taken apart as it stands; gives what follows them."""
+    found = _LINE.fullmatch(block.whole(line))
+    if found is None:
+        raise block.malformed(line, form)
+    if found[1] is not None:
+        texts = [x.strip() for x in found[1].split(b",")]
+        if len(texts) != width or not all(texts) or reward is None:
+            raise block.malformed(line, f"{form} with {width} rewards")
+        data = b" ".join(texts) + b" "
+        length = np.array([len(x) for x in texts])
+        end = np.cumsum(length + 1) - 1
+        part = Block(block.text, np.frombuffer(data, np.uint8), end - length, end,
+                     np.array([0, width]), block.line[line : line + 1])
+        reward[place] = numbers(part, np.arange(width))
+    return found[2]
+
+
+def _check_counts(header: Header, body: Body) -> None:
+    name = header.body.name
+    if body.num_states != header.num_states:
+        refuse(name, f"{header.num_states} states are announced and {body.num_states} follow; "
+                     "the file is cut or changed.")
+    if header.num_choices is not None and body.num_rows != header.num_choices:
+        refuse(name, f"{header.num_choices} choices are announced and {body.num_rows} follow; "
+                     "the file is cut or changed.")
+    state = np.concatenate(body.state) if body.state else np.zeros(0, np.int32)
+    count = np.bincount(state, minlength=body.num_states)
+    if not count.all():
+        refuse(name, f"state {int(count.argmin())} has no action; give it one, for example a loop "
+                     "to itself.")
+    lines = np.concatenate(body.line)
+    if header.kind == "DTMC" and (count > 1).any():
+        second = int(np.searchsorted(state, int((count > 1).argmax()))) + 1
+        raise header.body.error(int(lines[second]), f"a second action of state {state[second]}; "
+                                                    "a DTMC has one in each state.")
+    row = np.concatenate(body.row) if body.row else np.zeros(0, np.int32)
+    width = np.bincount(row, minlength=body.num_rows)
+    if not width.all():
+        raise header.body.error(int(lines[int(width.argmin())]), "this action leads nowhere; "
+                                                                "expected a successor after it.")
+
+
+def label_matrix(header: Header, body: Body) -> tuple[list[str], NDArray[np.bool_]]:
+    """The names of the labels and where they hold, ``bool[S, P]``."""
+    text = header.body
+    if body.num_states * len(body.label_names) > 64 * len(text.data) + 2**28:
+        refuse(text.name, f"{len(body.label_names)} labels of {body.num_states} states would take "
+                          f"{body.num_states * len(body.label_names) / 2**30:.0f} GB.")
+    holds = np.zeros((body.num_states, len(body.label_names)), bool)
+    for state, column in zip(body.labelled, body.label, strict=True):
+        holds[state, column] = True
+    return decoded(text, body.label_names), holds

@@ -1,0 +1,285 @@
+"""Markov chains and decision processes in DRN, Storm's text format."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.io._drn_body import Body, Header, label_matrix, read_body, read_header
+from jaxltl.io._files import read_bytes, write_bytes
+from jaxltl.io._tokens import (
+    Floats,
+    Integers,
+    Text,
+    as_double,
+    decoded,
+    refuse,
+)
+
+_NO_LABEL = b"__NOLABEL__"
+_NUMBER = re.compile(rb"0|[1-9]\d{0,8}")
+_STEP = 2**16  # states that are written at a time
+
+
+def read_drn(path: str | os.PathLike[str]) -> SparseMDP:
+    """The Markov chain or decision process in a DRN file, which may be compressed.
+
+    The states labelled ``init`` are the initial ones, each as likely as another. Numbers are the
+    nearest doubles to the decimals, fractions (``1/3``) and placeholders (``$name``) in the file.
+    Actions whose names are all numbers have numbers and no names, and where all are
+    ``__NOLABEL__`` there are none; where some are, their name is "". Comments, in which Storm
+    writes the values of variables, are passed over. Labels are in the order in which they occur.
+
+    Args:
+      path: the file, plain or compressed with gzip or xz.
+
+    Raises:
+      ValueError: naming file and line, and what was expected; for models with parameters, with
+        intervals or observations, or in continuous time.
+
+    Example:
+      >>> import tempfile
+      >>> path = Path(tempfile.mkdtemp()) / "coin.drn"
+      >>> _ = path.write_text('''@type: DTMC
+      ... @reward_models
+      ... tosses
+      ... @nr_states
+      ... 2
+      ... @model
+      ... state 0 [1] init
+      ...     action 0 [0]
+      ...         0 : 1/2
+      ...         1 : 1/2
+      ... state 1 [0] heads
+      ...     action 0 [0]
+      ...         1 : 1
+      ... ''')
+      >>> model = read_drn(path)
+      >>> model.probability.tolist(), model.propositions, model.rewards["tosses"].state.tolist()
+      ([0.5, 0.5, 1.0], ('heads',), [1.0, 0.0])
+    """
+    name, data = str(path), read_bytes(path)
+    header = read_header(Text(name, data, 0, len(data)))
+    if header.value_type == "parametric" or (header.parameters and not header.value_type):
+        refuse(name, f"its probabilities have parameters, {', '.join(header.parameters)}; "
+                     "jaxltl.io.drn.read_parametric reads it.")
+    known = _placeholders(header)
+    try:
+        body = read_body(
+            header, lambda block, token: block.probabilities(token, known.get),
+            lambda block, token: block.floats(token, "a reward", known.get))
+        return _model(header, body)
+    except MemoryError:
+        refuse(name, "it is too large for the memory.")
+
+
+def _placeholders(header: Header) -> dict[bytes, float]:
+    known: dict[bytes, float] = {}
+    for name, text in header.placeholders.items():
+        number = known.get(text, as_double(text))
+        if number is None:
+            refuse(header.body.name, f"the placeholder {name.decode()} stands for "
+                                     f"{text[:60].decode()!r}; expected a number.")
+        known[name] = number
+    return known
+
+
+def _model(header: Header, body: Body) -> SparseMDP:
+    text = header.body
+    state, row, line = (np.concatenate(x) for x in (body.state, body.row, body.line))
+    probability = np.concatenate(body.value)
+    start = np.concatenate([[0], np.bincount(row, minlength=body.num_rows).cumsum()])
+    total = np.add.reduceat(probability, start[:-1])
+    wrong = np.abs(total - 1) > 1e-6
+    if wrong.any():
+        bad = int(wrong.argmax())
+        raise text.error(int(line[bad]), f"the probabilities of this action of state {state[bad]} "
+                                         f"sum to {total[bad]:.9g}; expected 1.")
+    names, holds = label_matrix(header, body)
+    if "init" not in names:
+        refuse(text.name, "no state has the label 'init'; expected at least one initial state.")
+    column = names.index("init")
+    initial = holds[:, column].astype(np.float64)
+    count = np.bincount(state, minlength=body.num_states)
+    action, action_names = _actions(text, body)
+    names.pop(column)
+    return make_sparse(
+        np.concatenate([[0], count.cumsum()]), start, np.concatenate(body.successor), probability,
+        initial=initial / initial.sum(), label=np.delete(holds, column, 1), propositions=names,
+        action=action, action_names=action_names, rewards=_rewards(header, body))
+
+
+def _actions(text: Text, body: Body) -> tuple[Integers | None, tuple[str, ...]]:
+    action = np.concatenate(body.action)
+    if list(body.action_names) == [_NO_LABEL]:
+        return None, ()
+    if all(_NUMBER.fullmatch(name) for name in body.action_names):
+        return np.array([int(name) for name in body.action_names])[action], ()
+    names = decoded(text, body.action_names)
+    return action, tuple("" if name == _NO_LABEL.decode() else name for name in names)
+
+
+def _rewards(header: Header, body: Body) -> dict[str, Rewards]:
+    """Rewards by name, without parts that are zero."""
+    states = _gathered(body.state_reward, body.num_states, body.rewards)
+    choices = _gathered(body.choice_reward, body.num_rows, body.rewards)
+    found: dict[str, Rewards] = {}
+    given = header.rewards if body.rewards else [x for x in header.rewards if x]
+    for i in range(body.rewards or len(given)):
+        name = given[i] if i < len(given) else f"rew{i}"
+        if name in found:
+            refuse(header.body.name, f"two rewards are called {name!r}; rename one.")
+        found[name] = Rewards() if not body.rewards else Rewards(
+            state=states[:, i].copy() if states[:, i].any() else None,
+            choice=choices[:, i].copy() if choices[:, i].any() else None)
+    return found
+
+
+def _gathered(parts: list[tuple[int, NDArray[Any]]], size: int, width: int) -> Floats:
+    found = np.zeros((size, width))
+    for begin, part in parts:
+        found[begin : begin + len(part)] = part
+    return found
+
+
+# --- writing --------------------------------------------------------------------------------
+
+
+def write_drn(path: str | os.PathLike[str], model: SparseMDP) -> None:
+    """Writes a model as a DRN file, from which :func:`read_drn` and Storm read the same doubles.
+
+    The format has no place for the values of variables, for labels that hold nowhere and for the
+    order of labels.
+
+    Args:
+      path: the file; compressed if its name ends in ``.gz`` or ``.xz``.
+      model: a concrete model, whose initial states are equally likely.
+
+    Raises:
+      ValueError: the format cannot hold the model, naming what it cannot, such as rewards of
+        transitions; or the place cannot be written to.
+    """
+    lines = _written(model)
+    with write_bytes(path) as file:
+        file.writelines(lines)
+
+
+def _written(model: SparseMDP) -> Iterator[bytes]:
+    """The file in pieces; what cannot be written is found before the first."""
+    labels, actions = _label_texts(model), _action_texts(model)
+    rewards = []
+    for name, reward in model.rewards.items():
+        _check_name("reward", name, ' \t"')
+        if reward.transition is not None:
+            raise ValueError(
+                f"the reward {name!r} has rewards of transitions, which the format does not hold; "
+                "give their expectation on choices, Rewards(choice=row_reward(model, name)).")
+        rewards.append((reward.state, reward.choice))
+    if "" in list(model.rewards)[1:]:
+        raise ValueError("only the first reward may have the name ''; give the others names.")
+    head = ["// Written by jaxltl", f"@type: {'DTMC' if model.is_chain else 'MDP'}",
+            "@value_type: double", "@parameters", "",
+            "@reward_models", "".join(f"{name} " for name in model.rewards),
+            "@nr_states", str(model.num_states), "@nr_choices", str(model.num_rows), "@model", ""]
+    return _pieces("\n".join(head).encode(), model, labels, actions, rewards)
+
+
+def _pieces(
+    head: bytes, model: SparseMDP, labels: list[tuple[str, NDArray[np.bool_]]],
+    actions: list[str] | None, rewards: list[tuple[Any, Any]],
+) -> Iterator[bytes]:
+    yield head
+    host = model.host
+    for begin in range(0, host.num_states, _STEP):
+        end = min(begin + _STEP, host.num_states)
+        rows = slice(*host.row_start[[begin, end]].tolist())
+        entries = slice(*host.entry_start[[rows.start, rows.stop]].tolist())
+        states = slice(begin, end)
+        # The lines of states, actions and successors, each put where it belongs.
+        of_row, of_entry = host.state[rows], host.row[entries]
+        num_rows, num_entries = of_row.size, of_entry.size
+        at_entry = np.arange(num_entries) + of_entry - rows.start + host.state[of_entry] - begin + 2
+        at_row = np.arange(num_rows) + of_row - begin + 1 + (
+            host.entry_start[rows] - entries.start)
+        at_state = np.arange(end - begin) + (host.row_start[states] - rows.start) + (
+            host.entry_start[host.row_start[states]] - entries.start)
+        found = np.empty(num_entries + num_rows + end - begin, object)
+        found[at_entry] = [f"\t\t{t} : {p!r}\n" for t, p in zip(
+            host.successor[entries].tolist(), host.probability[entries].tolist(), strict=True)]
+        found[at_row] = _action_lines(model, rows, actions, rewards)
+        found[at_state] = _state_lines(states, labels, rewards)
+        yield "".join(found.tolist()).encode()
+
+
+def _state_lines(
+    states: slice, labels: list[tuple[str, NDArray[np.bool_]]], rewards: list[tuple[Any, Any]]
+) -> list[str]:
+    count = states.stop - states.start
+    after = _bracketed([state for state, _ in rewards], states, count)
+    for text, holds in labels:
+        for i in np.flatnonzero(holds[states]).tolist():
+            after[i] += text
+    return [f"state {s}{text}\n" for s, text in enumerate(after, states.start)]
+
+
+def _action_lines(
+    model: SparseMDP, rows: slice, actions: list[str] | None, rewards: list[tuple[Any, Any]]
+) -> list[str]:
+    count = rows.stop - rows.start
+    after = _bracketed([choice for _, choice in rewards], rows, count)
+    if actions is None or model.action is None:
+        return [f"\taction {_NO_LABEL.decode()}{text}\n" for text in after]
+    numbers = np.asarray(model.action)[rows].tolist()
+    return [f"\taction {actions[i]}{text}\n" for i, text in zip(numbers, after, strict=True)]
+
+
+def _bracketed(rewards: list[Any], part: slice, count: int) -> list[str]:
+    """Rewards as ``[1.0, 2.0]``, one text for each state or action."""
+    if not rewards:
+        return [""] * count
+    columns = [["0"] * count if x is None else
+               list(map(repr, np.asarray(x, np.float64)[part].tolist())) for x in rewards]
+    form = f" [{', '.join(['%s'] * len(columns))}]"
+    return [form % values for values in zip(*columns, strict=True)]
+
+
+def _label_texts(model: SparseMDP) -> list[tuple[str, NDArray[np.bool_]]]:
+    """What stands after a state that has a label, and where it does; first the initial states."""
+    initial = np.asarray(model.initial)
+    where = initial > 0
+    if np.ptp(initial[where]) > 1e-12:
+        raise ValueError("the initial states are not equally likely, and the format has a set of "
+                         "them; add a state whose one choice leads to them.")
+    found, label = [(" init", where)], np.asarray(model.label, bool)
+    for i, name in enumerate(model.propositions):
+        _check_name("label", name, '"')
+        if name == "init":
+            if not np.array_equal(label[:, i], where):
+                raise ValueError("the label 'init' is that of the initial states, and the model "
+                                 "has another of this name; rename it.")
+            continue
+        plain = re.fullmatch(r"[^\s\[\]]+", name)
+        found.append((f" {name}" if plain else f' "{name}"', label[:, i]))
+    return found
+
+
+def _action_texts(model: SparseMDP) -> list[str] | None:
+    if model.action is None:
+        return None
+    if not model.action_names:
+        return [str(i) for i in range(int(np.asarray(model.action).max()) + 1)]
+    for name in model.action_names:
+        _check_name("action", name, ' \t"')
+    return [name or _NO_LABEL.decode() for name in model.action_names]
+
+
+def _check_name(what: str, name: str, refused: str) -> None:
+    if any(c in refused or ord(c) < 32 for c in name) or (what == "label" and not name):
+        raise ValueError(f"the {what} {name!r} cannot be written: its name must not hold control "
+                         f"characters or any of {' '.join(refused)!r}, nor be empty.")
