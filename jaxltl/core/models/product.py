@@ -289,7 +289,8 @@ def expected_reads(model: Product, marked: jax.Array) -> jax.Array:
 
     Args:
       model: the product.
-      marked: ``bool[Q, L]``, transitions of the automaton.
+      marked: ``bool[Q, L]``, transitions of the automaton; or numbers on them, for what a step
+        reads of them in expectation.
 
     Returns:
       ``float[S, Q, A]``, zero at unavailable actions.

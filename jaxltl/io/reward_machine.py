@@ -1,0 +1,261 @@
+"""Reward machines: automata with a reward on transitions, from their text form.
+
+Toro Icarte, Klassen, Valenzano and McIlraith, "Using reward machines for high-level task
+specification and decomposition in reinforcement learning" (ICML 2018) and "Reward machines:
+exploiting reward function structure in reinforcement learning" (JAIR 2022), whose files these are.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxltl.core.automata.automaton import Automaton, make_automaton
+from jaxltl.core.logic.labels import satisfying
+from jaxltl.core.logic.ltl import Formula, Letter, parse_ltl, proposition_text
+from jaxltl.core.models.convert import to_sparse
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.product import Product, expected_reads
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.io._files import read_bytes
+from jaxltl.io._hoa_table import alphabet_of
+
+
+class RewardMachine(NamedTuple):
+    """An automaton, and what it pays.
+
+    Attributes:
+      automaton: with co-safe acceptance, whose final states are those in which the machine has
+        ended. Its `state_names` are the numbers in the file.
+      reward: ``float64[Q, L]``, of reading letter l in state q; zero once the machine has ended.
+    """
+
+    automaton: Automaton
+    reward: NDArray[np.float64]
+
+
+def read_reward_machine(
+    source: str | os.PathLike[str], letters: Iterable[Letter] | None = None
+) -> RewardMachine:
+    """The reward machine of a file or a text.
+
+    The first line is the initial state, the second the list of terminal states, and each other one
+    a transition ``(u, v, 'e&!n', ConstantRewardFunction(1))``; ``#`` begins a comment. A guard is a
+    proposition, ``True`` or ``False``, or made of them by ``! & |`` and brackets. Of a state's
+    transitions the first whose guard holds is taken; where none holds the machine ends, in a state
+    of its own named "ended", with reward 0. In a terminal state it has ended: nothing more is
+    earned, and transitions from there are not read.
+
+    Args:
+      source: a file, or the text itself.
+      letters: the letters that occur, each a collection of proposition names, such as
+        ``jaxltl.letters(world)``; None stands for all 2^P subsets.
+
+    Returns:
+      :class:`RewardMachine`; :func:`machine_reward` is its reward in a product with a world.
+
+    Raises:
+      ValueError: naming the file, the line and what was expected there; for rewards that are no
+        constants, and for more than 12 propositions without `letters`.
+
+    Example:
+      A robot gets coffee and then 1 for bringing it to the office; a broken plant costs 5.
+
+      >>> import jaxltl as jl
+      >>> machine = read_reward_machine('''
+      ... 0      # without coffee
+      ... [2]    # done
+      ... (0, 2, 'p', ConstantRewardFunction(-5))
+      ... (0, 1, 'c', ConstantRewardFunction(0))
+      ... (0, 0, 'True', ConstantRewardFunction(0))
+      ... (1, 2, 'o', ConstantRewardFunction(1))
+      ... (1, 1, '!o', ConstantRewardFunction(0))
+      ... ''')
+      >>> world = jl.gridworld('''
+      ...   s p o
+      ...   . . c ''', initial="s")
+      >>> prod = jl.product(world, machine.automaton)
+      >>> best = jl.optimal_value(prod, machine_reward(prod, machine.reward), discount=0.9)
+      >>> print(f"{best.value[0, 0]:.4f}")  # the office is reached by the fourth step
+      0.7290
+    """
+    is_text = isinstance(source, str) and "\n" in source
+    place = "read_reward_machine" if is_text else str(source)
+    if is_text:
+        text = str(source)
+    else:
+        try:
+            text = read_bytes(source).decode()
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{place}: this is no UTF-8 text: {error}.") from None
+    reader = _Reader(place, text)
+    initial, terminal, transitions = reader.statements()
+    names = tuple(sorted({name for x in transitions for name in x.guard.propositions}))
+    try:
+        alphabet = alphabet_of(names, letters, reader.last)
+    except ValueError as error:
+        raise ValueError(f"{place}: {str(error).removeprefix('read_hoa: ')}") from None
+    return _machine(initial, terminal, transitions, names, alphabet)
+
+
+class _Transition(NamedTuple):
+    source: int
+    target: int
+    guard: Formula
+    reward: float
+
+
+_STATE = re.compile(r"-?[0-9]{1,9}")
+_STATES = re.compile(r"\[\s*(?:-?[0-9]{1,9}\s*(?:,\s*-?[0-9]{1,9}\s*)*,?\s*)?\]")
+_NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+_TRANSITION = re.compile(
+    r"\(\s*(-?[0-9]{1,9})\s*,\s*(-?[0-9]{1,9})\s*,\s*(?:'([^']*)'|\"([^\"]*)\")\s*,"
+    r"\s*(\w+)\s*\(([^()]*)\)\s*\)"
+)
+_NAME = re.compile(r"[A-Za-z_][\w.-]*", re.ASCII)
+
+
+class _Reader:
+    """The lines of a text that say something, each with its number."""
+
+    def __init__(self, place: str, text: str) -> None:
+        self.place = place
+        lines = [line.partition("#")[0].strip() for line in text.split("\n")]
+        self.lines = [(i, line) for i, line in enumerate(lines, start=1) if line]
+        self.last = len(lines)
+        self.guards: dict[str, Formula] = {}
+
+    def error(self, line: int, message: str) -> ValueError:
+        return ValueError(f"{self.place}, line {line}: {message}")
+
+    def statements(self) -> tuple[int, set[int], list[_Transition]]:
+        head = iter(self.lines)
+        line, text = next(head, (self.last, ""))
+        if not _STATE.fullmatch(text):
+            raise self.error(
+                line, f"found {text[:40]!r}; expected the number of the initial state."
+            )
+        initial = int(text)
+        line, text = next(head, (self.last, ""))
+        if not _STATES.fullmatch(text):
+            raise self.error(
+                line, f"found {text[:40]!r}; expected the list of terminal states, such as [2]."
+            )
+        terminal = {int(x) for x in _STATE.findall(text)}
+        return initial, terminal, [self._transition(*x) for x in head]
+
+    def _transition(self, line: int, text: str) -> _Transition:
+        found = _TRANSITION.fullmatch(text)
+        if found is None:
+            raise self.error(
+                line, f"found {text[:60]!r}; expected a transition such as "
+                "(0, 1, 'e & !n', ConstantRewardFunction(1))."
+            )  # fmt: skip
+        source, target, single, double, kind, given = found.groups()
+        if kind != "ConstantRewardFunction":
+            raise self.error(
+                line, f"the reward is {kind}(...), which depends on more than the labels; expected "
+                "ConstantRewardFunction(a number)."
+            )  # fmt: skip
+        if not re.fullmatch(_NUMBER, given.strip()) or not np.isfinite(float(given)):
+            raise self.error(line, f"the reward is {given[:40]!r}; expected a finite number.")
+        guard = self._guard(line, single if double is None else double)
+        return _Transition(int(source), int(target), guard, float(given))
+
+    def _guard(self, line: int, text: str) -> Formula:
+        if text not in self.guards:
+            constants = {"True": "true", "False": "false"}
+            plain = _NAME.sub(lambda m: constants.get(m[0]) or _quoted(m[0]), text)
+            try:
+                if not re.fullmatch(r"[!&|()\s]*", _NAME.sub("", text)):
+                    raise ValueError
+                self.guards[text] = parse_ltl(plain)
+            except (ValueError, RecursionError):
+                raise self.error(
+                    line, f"the guard is {text[:60]!r}; expected propositions joined by ! & |, or "
+                    "True."
+                ) from None  # fmt: skip
+        return self.guards[text]
+
+
+def _quoted(name: str) -> str:
+    """A name that is never an operator."""
+    text = proposition_text(name)
+    return text if text.startswith('"') else f'"{text}"'
+
+
+def _machine(
+    initial: int, terminal: set[int], transitions: list[_Transition], names: tuple[str, ...],
+    alphabet: NDArray[np.bool_],
+) -> RewardMachine:  # fmt: skip
+    states = sorted({initial, *terminal, *[q for x in transitions for q in x[:2]]})
+    index = {q: i for i, q in enumerate(states)}
+    count, width = len(states), len(alphabet)
+    delta, reward = np.full((count, width), -1), np.zeros((count, width))
+    final = np.array([q in terminal for q in states])
+    delta[final] = np.flatnonzero(final)[:, None]
+    holds: dict[Formula, NDArray[np.bool_]] = {}
+    for source, target, guard, pays in transitions:
+        if guard not in holds:
+            holds[guard] = satisfying(alphabet, names, guard, "guard")
+        taken = holds[guard] & (delta[index[source]] < 0)
+        delta[index[source], taken] = index[target]
+        reward[index[source], taken] = pays
+    labels = [str(q) for q in states]
+    if (delta < 0).any():
+        delta = np.vstack([np.where(delta < 0, count, delta), np.full(width, count)])
+        reward = np.vstack([reward, np.zeros(width)])
+        final, labels = np.append(final, True), [*labels, "ended"]
+    automaton = make_automaton(
+        delta, index[initial], alphabet, names, final=final, acceptance="cosafe", state_names=labels
+    )
+    return RewardMachine(automaton, reward)
+
+
+def machine_reward(product: Any, reward: ArrayLike | jax.Array) -> Any:
+    """What a machine is expected to pay for each action in a product.
+
+    With ``label_on="entry"`` a step from (s, q) reads the label of the state that it enters,
+    ``R(s, q, a) = sum_t P(t | s, a) reward[q, L(t)]``; with ``"exit"`` that of the state that it
+    leaves, ``R(s, q, a) = reward[q, L(s)]``. An entry product has also read the label of the state
+    it starts in, and what that pays is not in the rewards of steps; a machine that does not read it
+    starts in ``(s, automaton.initial)``, which is a state of the product like others.
+
+    Args:
+      product: of a world or a game with the machine's automaton.
+      reward: ``float[Q, L]``, such as of :func:`read_reward_machine`.
+
+    Returns:
+      ``float[S, Q, A]``, as the solvers of discounted problems take it, zero at unavailable
+      actions; differentiable in the reward and in the world's transitions. Of a product over a
+      SparseMDP ``float64[R]``, a number for each choice of ``to_sparse(product)``.
+
+    Raises:
+      ValueError: the reward has another shape, or the model is no product.
+    """
+    model = product.mdp if isinstance(product, Game) else product
+    if not isinstance(model, Product):
+        raise ValueError(
+            f"{type(model).__name__} is no product; give product(world, machine.automaton)."
+        )
+    shape = np.shape(model.automaton.delta)
+    if np.shape(reward) != shape:
+        raise ValueError(f"reward has shape {np.shape(reward)}; expected {shape}, a number for "
+                         "each state and letter of the automaton.")  # fmt: skip
+    if not isinstance(model.mdp, SparseMDP):
+        return expected_reads(model, jnp.asarray(reward))
+    host = to_sparse(model).host
+    pays, letter = np.asarray(reward, np.float64), np.asarray(model.letter)
+    state, memory = np.divmod(host.state, model.num_memory)
+    if model.label_on == "exit":
+        return pays[memory, letter[state]]
+    entered = letter[host.successor // model.num_memory]
+    earned = host.probability * pays[memory[host.row], entered]
+    return np.add.reduceat(earned, host.entry_start[:-1])
