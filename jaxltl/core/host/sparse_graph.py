@@ -31,10 +31,10 @@ def reaching(mdp: HostMDP, goal: Booleans, rows: Booleans | None = None) -> Bool
         kept = rows[row]
         source = source[kept]
         start = np.concatenate([[0], kept.cumsum()])[start]
-    return _searched(start, source, goal)
+    return searched(start, source, goal)
 
 
-def _searched(start: Integers, after: Integers, first: Booleans) -> Booleans:
+def searched(start: Integers, after: Integers, first: Booleans) -> Booleans:
     """All nodes that a search from some nodes meets; node i leads to ``after[start[i] : ...]``."""
     seen = first.copy()
     frontier = np.flatnonzero(first)
@@ -113,7 +113,7 @@ class _Forced(NamedTuple):
         row = row[self.waiting[row]]
         if not row.size:
             return row
-        row = np.unique(row) if row.size < self.mdp.num_rows // 8 else self._distinct(row)
+        row = _distinct(row, self.mdp.num_rows)
         self.waiting[row] = False
         state = self.mdp.state[row]
         np.subtract.at(self.left, state, 1)
@@ -121,11 +121,6 @@ class _Forced(NamedTuple):
         self.open[state], self.region[state] = False, True
         # Rows are in order, so one state's stand together.
         return state[np.diff(state, prepend=-1) > 0]
-
-    def _distinct(self, row: Integers) -> Integers:
-        mark = np.zeros(self.mdp.num_rows, bool)
-        mark[row] = True
-        return np.flatnonzero(mark)
 
     def few(self, frontier: Integers) -> Integers:
         """The same by plain loops, while few states join at a time, as along a chain."""
@@ -150,6 +145,16 @@ class _Forced(NamedTuple):
                             new.append(state)
             todo = new
         return np.array(todo, np.int64)
+
+
+def _distinct(number: Integers, size: int) -> Integers:
+    """Numbers below a size in order, each once."""
+    if number.size < size // 8:
+        number = np.sort(number)
+        return number[np.diff(number, prepend=-1) > 0]
+    mark = np.zeros(size, bool)
+    mark[number] = True
+    return np.flatnonzero(mark)
 
 
 def surely_reaching(

@@ -1,0 +1,155 @@
+"""Systems ``(I - P) x = b`` of policies that leave, solved by sparse elimination where it pays.
+
+Unknowns are ordered by strongly connected component, so that elimination fills at most these, and
+in each by minimum degree. Where even that would fill (graphs that mix well), sweeps converge.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.host.rows import Integers
+from jaxltl.core.host.sparse import Floats
+
+_SMALL = 3000  # states of a component up to which it may be filled
+_SPREAD = 8  # how many times its mean bandwidth a larger one must have states
+_FILL = 4  # growth of the fill after which the order is sought anew
+_SWEEPS = 20_000
+
+
+class Factors(NamedTuple):
+    """The system of a policy, ready to be solved.
+
+    Attributes:
+      rows: ``float64[R, M]``, all rows, SciPy's.
+      label: ``int[M]``, components in order.
+      order: ``int[M]``, or None where it is swept.
+      matrix: ``float64[M, M]``, the policy's, in order.
+      factor: of SuperLU, or None.
+      fill: of the first factors in this order.
+    """
+
+    rows: Any
+    label: Integers
+    order: Integers | None
+    matrix: Any
+    factor: Any
+    fill: int
+
+    @property
+    def method(self) -> str:
+        """How it is solved, in words."""
+        return "policy iteration by " + ("sweeps" if self.order is None else "elimination")
+
+    def solve(self, b: Floats) -> Floats:
+        """The solution; NaN where it could not be found."""
+        if self.order is None:
+            return _swept(self.matrix, b)
+        x = np.empty(b.size)
+        x[self.order] = self.factor.solve(b[self.order], trans="T")
+        return x
+
+    def other(self, chosen: Integers) -> Factors | None:
+        """The same for another policy."""
+        if self.order is None:
+            return self._replace(matrix=self.rows[chosen])
+        found = _factored(self.rows, self.label, self.order, chosen)
+        if found is not None and found.fill > _FILL * self.fill:
+            return factors(self.rows, self.label, chosen)
+        return None if found is None else found._replace(fill=self.fill)
+
+
+def factors(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
+    """The system of a policy.
+
+    Args:
+      rows: ``float64[R, M]``, SciPy's.
+      label: ``int[M]``, numbers of components; no row leads to a greater one.
+      chosen: ``int[M]``, the row of each state.
+
+    Returns:
+      Its factors; None where it is singular.
+    """
+    matrix = rows[chosen]
+    if not _pays(matrix, label):
+        return Factors(rows, label, None, matrix, None, 0)
+    order = _order(matrix, label)
+    return None if order is None else _factored(rows, label, order, chosen)
+
+
+def _pays(matrix: Any, label: Integers) -> bool:
+    size = np.bincount(label)
+    largest = int(size.argmax())
+    if size[largest] <= _SMALL:
+        return True
+    from scipy.sparse import csgraph
+
+    node = np.flatnonzero(label == largest)
+    block = matrix[node][:, node]
+    block = (block + block.T).tocsr()
+    order = csgraph.reverse_cuthill_mckee(block, symmetric_mode=True)
+    place = np.empty(node.size, np.int64)
+    place[order] = np.arange(node.size)
+    source = np.repeat(np.arange(node.size), np.diff(block.indptr))
+    reach = place[source] - place[block.indices]
+    furthest = np.zeros(node.size, np.int64)
+    np.maximum.at(furthest, source, reach)
+    return bool(furthest.mean() * _SPREAD < node.size)
+
+
+def _order(matrix: Any, label: Integers) -> Integers | None:
+    """By component, and in each by minimum degree of what leads from it to itself."""
+    from scipy.sparse import linalg
+
+    source = np.repeat(np.arange(label.size), np.diff(matrix.indptr))
+    within = matrix.copy()
+    within.data[label[source] != label[matrix.indices]] = 0
+    within.eliminate_zeros()
+    if not within.nnz:
+        return np.argsort(label, kind="stable")
+    try:
+        factor = linalg.splu(
+            _minus(within).T, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0,
+            options={"SymmetricMode": True})
+    except (RuntimeError, MemoryError):
+        return None
+    return np.lexsort((factor.perm_c, label))
+
+
+def _factored(rows: Any, label: Integers, order: Integers, chosen: Integers) -> Factors | None:
+    from scipy.sparse import linalg
+
+    place = np.empty(order.size, np.int32)
+    place[order] = np.arange(order.size, dtype=np.int32)
+    matrix = rows[chosen[order]]
+    matrix.indices = place[matrix.indices]
+    matrix.has_sorted_indices = False
+    try:
+        factor = linalg.splu(
+            _minus(matrix).T, permc_spec="NATURAL", diag_pivot_thresh=0,
+            options={"SymmetricMode": True})
+    except (RuntimeError, MemoryError):
+        return None
+    return Factors(rows, label, order, matrix, factor, int(factor.nnz))
+
+
+def _minus(matrix: Any) -> Any:
+    from scipy import sparse
+
+    found = (sparse.eye_array(matrix.shape[0], format="csr") - matrix).tocsr()
+    found.sort_indices()
+    return found
+
+
+def _swept(matrix: Any, b: Floats) -> Floats:
+    """By sweeps, as long as what is left shrinks."""
+    x, left = np.zeros(b.size), np.array(b)
+    limit = 1e-15 * np.abs(b).max(initial=0)
+    for _ in range(_SWEEPS):
+        x += left
+        left = matrix @ left
+        if np.abs(left).max() <= limit:
+            return x
+    return np.full(b.size, np.nan)

@@ -1,0 +1,505 @@
+"""Optimal sums until some states are left: ``x = opt_r (c_r + P_r x)``, proven on both sides.
+
+States from which no circle can be entered are solved level by level, with an error that is known
+in advance; so are, at the end, those to which no circle leads. In between there is policy
+iteration by sparse elimination (Howard 1960), of the problem in which every step costs a little
+more than it does: its solution then is a bound by one application of the operator, and its
+policy attains a bound that the policy's own expected time proves.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.host.elimination import Factors, factors
+from jaxltl.core.host.levels import Edges, Levels, components_in_order, peel
+from jaxltl.core.host.rows import Booleans, Integers, spans
+from jaxltl.core.host.sparse import Floats, HostMDP
+from jaxltl.core.host.sparse_graph import searched
+
+_EPS = float(np.finfo(np.float64).eps)
+_AIM = 0.1  # of the tolerance: how much of it the extra cost of the steps may take
+_AIM_CHAIN = 1e-5  # where there is nothing to choose, so that ties do not matter
+_FIRST_SWEEPS = 40  # of value iteration, to begin with a policy that is not bad
+_SWEEPS = 12  # after each system, by which news goes on from where policies change
+_HASTY = 12  # exact rounds after which its own improvement alone goes on, which must end
+_KEPT = 0.75  # of the extra cost: who gains less stays, and the rest is what proves the bound
+_MAX_ROUNDS = 300
+
+
+class Transient(NamedTuple):
+    """A problem whose every policy that counts leaves all of its states.
+
+    Attributes:
+      mdp: the model; its rows may be unsorted and repeat successors.
+      open: ``bool[S]``, the states to solve for.
+      known: ``float64[S]``, at least 0: what is earned at the other states for ever after.
+      cost: ``float64[R]``, at least 0.
+      rows: ``bool[R]``, the rows that may be taken.
+      first: ``int[S]``, rows by which every open state is left almost surely; needed only where
+        some policies never leave.
+      depth: how many roundings may stand behind one of the numbers.
+    """
+
+    mdp: HostMDP
+    open: Booleans
+    known: Floats
+    cost: Floats
+    rows: Booleans | None = None
+    first: Integers | None = None
+    depth: int = 0
+
+
+class Optimum(NamedTuple):
+    """An enclosed optimum.
+
+    Attributes:
+      value, lower, upper: ``float64[S]``; where nothing could be proven, 0 and infinity.
+      row: ``int[S]``: rows that attain the bound on the safe side, of a maximum `lower`.
+      rounds: systems solved.
+      residual: how far the value is from satisfying its equation, as a share of it where it
+        exceeds one.
+      method: how it was found, in words.
+    """
+
+    value: Floats
+    lower: Floats
+    upper: Floats
+    row: Integers
+    rounds: int
+    residual: float
+    method: str
+
+
+class _System(NamedTuple):
+    """The open states as nodes, and a last node of value 1 through which what is known comes in.
+
+    Self-loops are eliminated. Attributes as of a HostMDP; `row` and `node` name what they were.
+    """
+
+    row_start: Integers
+    entry_start: Integers
+    target: Integers
+    weight: Floats
+    row: Integers
+    node: Integers
+
+    @property
+    def num_nodes(self) -> int:
+        return self.node.size
+
+    @property
+    def widest(self) -> int:
+        return int(np.diff(self.entry_start).max(initial=1))
+
+    @property
+    def owner(self) -> Integers:
+        """The node of each row."""
+        return np.repeat(np.arange(self.num_nodes, dtype=np.int32), np.diff(self.row_start))
+
+    def taken(self, node: Integers) -> _System:
+        """The rows of some nodes, in their order; targets stay as they are numbered."""
+        count = np.diff(self.row_start)[node]
+        row = spans(self.row_start[node], count)
+        width = np.diff(self.entry_start)[row]
+        entry = spans(self.entry_start[row], width)
+        return _System(
+            _starts(count), _starts(width), self.target[entry], self.weight[entry],
+            self.row[row], self.node[node])
+
+
+def _starts(count: Integers) -> Integers:
+    found: Any = np.zeros(count.size + 1, np.int32)
+    np.cumsum(count, out=found[1:])
+    return found
+
+
+def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: bool) -> Optimum:
+    """The optimal sums, enclosed.
+
+    Args:
+      problem: what is asked.
+      maximize: whether the largest sum is asked for, else the smallest. A maximum needs that every
+        policy leaves the open states almost surely, a minimum that those which do not cost
+        infinitely much.
+      tolerance: the width of the enclosure that is asked for.
+      relative: whether that is a share of the value.
+    """
+    system = _system(problem)
+    sign = 1 if maximize else -1
+    n = system.num_nodes
+    unit = (4 * system.widest + problem.depth + 16) * _EPS
+    bounds = np.zeros((2, n + 1))  # attained and beyond
+    bounds[:, n] = 1
+    chosen = system.row_start[:-1].copy()
+    edges = _edges(system)
+    back, among = edges.reverse(), np.ones(n, bool)
+    number = np.diff(edges.start).astype(np.int32)
+    below = peel(back, number, among)
+    _sweep(system, below, bounds, chosen, sign)
+    grown = (len(below.start) - 1) * unit
+    _widen(bounds, below.node, sign, grown)
+    rounds, method = 0, "levels"
+    if among.any():
+        above = peel(edges, _number_left(back, among), among)
+        core = np.flatnonzero(among)
+        if core.size:
+            found = _solve_core(
+                system, core, bounds, unit + grown, sign, problem, tolerance, relative)
+            rounds, method = found.rounds, found.method
+            bounds[0, core], bounds[1, core], chosen[core] = found.near, found.far, found.chosen
+        after = Levels(above.node[::-1], [above.start[-1] - x for x in above.start[::-1]])
+        _sweep(system, after, bounds, chosen, sign)
+        _widen(bounds, above.node, sign, (len(above.start) - 1) * unit)
+    return _found(problem, system, bounds[:, :n], chosen, sign, rounds, method)
+
+
+def _found(
+    problem: Transient, system: _System, bounds: Floats, chosen: Integers, sign: int, rounds: int,
+    method: str,
+) -> Optimum:
+    low, high = (bounds if sign > 0 else bounds[::-1])
+    low = np.where(np.isfinite(low), np.maximum(low, 0), 0)
+    high = np.where(np.isnan(high), np.inf, high)
+    # The policy's own value lies a third of the way: see what is subtracted from it in `_prove`.
+    near, far = bounds
+    value = np.where(np.isfinite(high), near + (far - near) / 3, low)
+
+    def everywhere(x: Floats) -> Floats:
+        full = problem.known.copy()
+        full[system.node] = x
+        return full
+
+    row = problem.mdp.row_start[:-1].astype(np.int64)
+    row[system.node] = system.row[chosen]
+    return Optimum(
+        everywhere(value), everywhere(low), everywhere(high), row, rounds,
+        _residual(system, value, sign), method)
+
+
+def _residual(system: _System, value: Floats, sign: int) -> float:
+    if not value.size or not np.isfinite(value).all():
+        return np.inf if value.size else 0.0
+    image = _backup(system, np.append(value, 1))
+    best = sign * np.maximum.reduceat(sign * image, system.row_start[:-1])
+    return float((np.abs(best - value) / np.maximum(value, 1)).max())
+
+
+def _system(problem: Transient) -> _System:
+    mdp = problem.mdp
+    kept = problem.open[mdp.state]
+    if problem.rows is not None:
+        kept &= problem.rows
+    row = np.flatnonzero(kept)
+    if row.size == mdp.num_rows:
+        target, weight, of = mdp.successor, mdp.probability, mdp.row
+    else:
+        width = np.diff(mdp.entry_start)[row]
+        entry = spans(mdp.entry_start[row], width)
+        target, weight = mdp.successor[entry], mdp.probability[entry]
+        of = np.repeat(np.arange(row.size, dtype=np.int32), width)
+    state = mdp.state[row]
+    inner = problem.open[target]
+    known = problem.cost[row]
+    if not inner.all():
+        outer = ~inner
+        known = known + np.bincount(
+            of[outer], weight[outer] * problem.known[target[outer]], row.size)
+    loops = inner & (target == state[of])
+    node = np.flatnonzero(problem.open)
+    number: Any = np.zeros(mdp.num_states, np.int32)
+    number[node] = np.arange(node.size)
+    if loops.any():
+        rest = np.bincount(of[~loops], weight[~loops], row.size)
+        looping = np.zeros(row.size, bool)
+        looping[of[loops]] = True
+        scale = np.where(looping & (rest > 0), rest, 1)
+        known, weight = known / scale, weight / scale[of]
+        inner &= ~loops
+        if (stuck := looping & (rest == 0)).any():  # rows that never get anywhere
+            inner &= ~stuck[of]
+            keep = ~stuck
+            renumber = np.cumsum(keep) - 1
+            row, state, known = row[keep], state[keep], known[keep]
+            target, weight, of, inner = (
+                x[keep[of]] for x in (target, weight, renumber[of], inner))
+    if not inner.all():
+        target, weight, of = target[inner], weight[inner], of[inner]
+    count = np.bincount(of, minlength=row.size)
+    # What is known comes first in each row, which so is never empty.
+    start = _starts(count + 1)
+    first = start[:-1]
+    place = np.arange(target.size) + of + 1
+    targets, weights = np.empty(start[-1], np.int32), np.empty(start[-1])
+    targets[first], weights[first] = node.size, known
+    targets[place], weights[place] = number[target], weight
+    row_start = _starts(np.bincount(number[state], minlength=node.size))
+    return _System(row_start, start, targets, weights, row, node)
+
+
+def _edges(system: _System) -> Edges:
+    """From node to node, without the last one."""
+    kept = system.target != system.num_nodes
+    place = np.zeros(kept.size + 1, np.int32)
+    np.cumsum(kept, out=place[1:])
+    return Edges(place[system.entry_start[system.row_start]], system.target[kept])
+
+
+def _number_left(back: Edges, among: Booleans) -> Integers:
+    """How many edges into a node come from nodes that are left."""
+    left = np.concatenate([[0], np.cumsum(among[back.target])])
+    return (left[back.start[1:]] - left[back.start[:-1]]).astype(np.int32)
+
+
+def _backup(system: _System, value: Floats) -> Floats:
+    """``c_r + P_r x`` of each row."""
+    return np.add.reduceat(system.weight * value[system.target], system.entry_start[:-1])
+
+
+def _widen(bounds: Floats, node: Integers, sign: int, share: float) -> None:
+    bounds[0, node] *= 1 - sign * share
+    bounds[1, node] *= 1 + sign * share
+
+
+def _sweep(
+    system: _System, levels: Levels, bounds: Floats, chosen: Integers, sign: int
+) -> None:
+    """Solves level by level, in place; rounding is accounted for by the caller."""
+    if not levels.node.size:
+        return
+    part = system.taken(levels.node)
+    row_at, entry_at = part.row_start.tolist(), part.entry_start
+    single = part.row.size == part.node.size
+    same = bool((bounds[0] == bounds[1]).all())
+    operation = np.maximum if sign > 0 else np.minimum
+    first_row = system.row_start[levels.node]
+    for a, b in zip(levels.start[:-1], levels.start[1:], strict=True):
+        if a == b:
+            continue
+        r0, r1 = row_at[a], row_at[b]
+        starts = entry_at[r0:r1]
+        e0, e1 = int(starts[0]), int(entry_at[r1])
+        target, weight = part.target[e0:e1], part.weight[e0:e1]
+        node = levels.node[a:b]
+        for side in (0, 1):
+            if side and same:
+                bounds[1, node] = bounds[0, node]
+                break
+            image = np.add.reduceat(weight * bounds[side][target], starts - e0)
+            if single:
+                bounds[side, node] = image
+                continue
+            begin = part.row_start[a:b] - r0
+            best = operation.reduceat(image, begin)
+            bounds[side, node] = best
+            if side == 0:
+                chosen[node] = first_row[a:b] + _first(image, best, begin)
+
+
+def _first(image: Floats, best: Floats, begin: Integers) -> Integers:
+    """The rank of the first row that attains the best of its state."""
+    count = np.diff(begin, append=image.size)
+    hit = np.flatnonzero(image == np.repeat(best, count))
+    owner = np.searchsorted(begin, hit, "right") - 1
+    found = np.empty(begin.size, np.int64)
+    found[owner[::-1]] = hit[::-1]
+    return found - begin
+
+
+# --- the states on circles, and between them ----------------------------------------------------
+
+
+class _Core(NamedTuple):
+    near: Floats
+    far: Floats
+    chosen: Integers
+    rounds: int
+    method: str
+
+
+class _Circles(NamedTuple):
+    """The core as matrices.
+
+    Attributes:
+      matrix: ``float64[R, M]``, SciPy's.
+      known: ``float64[R]``, what comes in from elsewhere.
+      owner: ``int[R]``.
+      start: ``int[M]``, the first row of each node.
+      sign: 1 to maximise.
+    """
+
+    matrix: Any
+    known: Floats
+    owner: Integers
+    start: Integers
+    sign: int
+
+    def backup(self, value: Floats) -> Floats:
+        return self.known + self.matrix @ value
+
+    def best(self, image: Floats) -> Floats:
+        if self.start.size == self.owner.size:
+            return image
+        return self.sign * np.maximum.reduceat(self.sign * image, self.start)
+
+    def argbest(self, image: Floats, best: Floats) -> Integers:
+        """The first row that attains the best of each node."""
+        hit = np.flatnonzero(image == best[self.owner])
+        found = self.start.copy()
+        found[self.owner[hit[::-1]]] = hit[::-1]
+        return found
+
+
+def _circles(system: _System, core: Integers, bounds: Floats, sign: int) -> tuple[_Circles, Any]:
+    from scipy import sparse
+
+    part = system.taken(core)
+    number: Any = np.full(system.num_nodes + 1, -1, np.int32)
+    number[core] = np.arange(core.size)
+    target = number[part.target]
+    inner = target >= 0
+    of = np.repeat(np.arange(part.row.size, dtype=np.int32), np.diff(part.entry_start))
+    middle = (bounds[0] + bounds[1]) / 2
+    outer = ~inner
+    earned = part.weight[outer] * middle[part.target[outer]]
+    known: Any = np.bincount(of[outer], earned, part.row.size)
+    start = _starts(np.bincount(of[inner], minlength=part.row.size))
+    matrix = sparse.csr_array(
+        (part.weight[inner], target[inner], start), shape=(part.row.size, core.size))
+    matrix.sum_duplicates()
+    edges = Edges(matrix.indptr[part.row_start], matrix.indices)
+    return _Circles(matrix, known, part.owner, part.row_start[:-1].astype(np.int64), sign), edges
+
+
+def _solve_core(
+    system: _System, core: Integers, bounds: Floats, unit: float, sign: int, problem: Transient,
+    tolerance: float, relative: bool,
+) -> _Core:
+    """Policy iteration of the problem whose every step costs a little more."""
+    circles, edges = _circles(system, core, bounds, sign)
+    label = components_in_order(edges)
+    first = system.row_start[core]  # the core's rows are numbered from its nodes' first ones on
+    proper = partial(_proper, circles, _leaving(circles, system, core, problem))
+    chosen = proper(_greedy(circles, 0.0, np.zeros(core.size), _FIRST_SWEEPS))
+    solver = factors(circles.matrix, label, chosen)
+    chain = circles.owner.size == circles.start.size
+    aim = (_AIM_CHAIN if chain else _AIM) * tolerance
+    extra, rounds = None, 0
+    best: _Core | None = None
+    while rounds < _MAX_ROUNDS and solver is not None:
+        rounds += 1
+        if extra is None:
+            time = solver.solve(np.ones(core.size))
+            value = solver.solve(circles.known[chosen])
+            extra = _extra(time, value, unit, aim, relative)
+        value = solver.solve(circles.known[chosen] + sign * extra)
+        if not np.isfinite(value).all():
+            break
+        image = circles.backup(value)
+        gain = sign * (circles.best(image) - value) + extra
+        better = gain > _KEPT * extra
+        if better.any():
+            if rounds <= _HASTY:
+                chosen = proper(_greedy(circles, sign * extra, value, _SWEEPS))
+            else:
+                row = circles.argbest(image, circles.best(image))
+                chosen = np.where(better, row, chosen)
+            solver = solver.other(chosen)
+            continue
+        found = _prove(circles, solver, chosen, value, extra, unit)
+        if found is not None:
+            near, far, _ = found
+            best = _Core(near, far, chosen, rounds, solver.method)
+            width = sign * (far - near)
+            size = np.maximum(sign * (near if sign > 0 else far), 0) if relative else 1
+            if (width <= tolerance * np.abs(size) / 2).all():
+                break
+        time = found[2] if found else solver.solve(np.ones(core.size))
+        smaller = _extra(time, value, unit, aim, relative)
+        if smaller >= extra / 2:
+            break
+        extra = smaller
+    if best is None:
+        low, high = np.zeros(core.size), np.full(core.size, np.inf)
+        near, far = (low, high) if sign > 0 else (high, low)
+        best = _Core(near, far, chosen, rounds, "nothing proven")
+    rank = best.chosen - circles.start
+    return best._replace(chosen=first + rank)
+
+
+def _leaving(
+    circles: _Circles, system: _System, core: Integers, problem: Transient
+) -> Integers | None:
+    """Rows by which the core is left almost surely, where some policies never leave."""
+    if problem.first is None or circles.owner.size == circles.start.size:
+        return None
+    part = system.taken(core)
+    hit = np.flatnonzero(part.row == problem.first[system.node[core]][circles.owner])
+    found = circles.start.copy()
+    found[circles.owner[hit]] = hit
+    return found
+
+
+def _proper(circles: _Circles, leaving: Integers | None, chosen: Integers) -> Integers:
+    """The policy, with other rows where it may never leave."""
+    if leaving is None:
+        return chosen
+    rows = circles.matrix[chosen]
+    leaves = rows.sum(1) < 1 - 1e-9  # what hardly leaves need not be counted
+    return np.where(_getting_out(rows, leaves), chosen, leaving)
+
+
+def _greedy(circles: _Circles, extra: float, value: Floats, sweeps: int) -> Integers:
+    """The greedy policy after some sweeps of value iteration."""
+    if circles.owner.size == circles.start.size:
+        return circles.start
+    for _ in range(sweeps):
+        image = circles.backup(value) + extra
+        value = circles.best(image)
+    return circles.argbest(image, value)
+
+
+def _getting_out(rows: Any, leaves: Booleans) -> Booleans:
+    back = Edges(rows.indptr, rows.indices).reverse()
+    return searched(back.start, back.target, leaves)
+
+
+def _extra(
+    time: Floats, value: Floats, unit: float, aim: float, relative: bool
+) -> float:
+    """What every step shall cost besides: little, but more than rounding."""
+    most = float(np.abs(value).max(initial=0))
+    if relative:
+        some = value > 0
+        share = float((value[some] / time[some]).min(initial=np.inf)) if some.any() else 1.0
+        share = share if np.isfinite(share) and share > 0 else 1.0
+    else:
+        share = 1 / max(float(time.max(initial=1)), 1)
+    return max(aim * share, 32 * unit * max(most, 1e-300))
+
+
+def _prove(
+    circles: _Circles, solver: Factors, chosen: Integers, value: Floats, extra: float, unit: float
+) -> tuple[Floats, Floats, Floats] | None:
+    """The bound that the policy attains, the one that nothing exceeds, and the policy's time.
+
+    A value that the operator does not carry away from the optimum is a bound beyond it; and one
+    that the policy's own operator does not carry towards it is attained, as the policy leaves.
+    """
+    sign = circles.sign
+    slack = unit * (circles.known + circles.matrix @ np.abs(value))
+    if not (sign * circles.backup(value) + slack <= sign * value[circles.owner]).all():
+        return None
+    time = solver.solve(np.ones(value.size))
+    rows = circles.matrix[chosen]
+    if not ((time >= 0) & (time - rows @ time >= 0.5)).all():
+        return None
+    near = value - sign * 1.5 * extra * time
+    image = circles.known[chosen] + rows @ near
+    slack = unit * (circles.known[chosen] + rows @ np.abs(near))
+    if not (sign * near <= sign * image - slack).all():
+        return None
+    return near, value, time
