@@ -1,0 +1,88 @@
+"""Models of Storm, by its Python package stormpy, which is imported only here and only when asked.
+
+Both ways go through a file of the UMB format, which holds all that either side has of a model:
+see :mod:`jaxltl.io.umb`.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.io.umb import read_umb, write_umb
+
+
+def from_stormpy(model: Any) -> SparseMDP | Game:
+    """A sparse model of Storm's as one of the library's, bit for bit.
+
+    States and choices keep their order. Kept are labels (without Storm's own ``"init"``, which is
+    the initial distribution), rewards of states, choices and transitions, labels of choices as
+    names of actions, and the values of variables, where Storm has them; exact probabilities become
+    the nearest doubles.
+
+    Args:
+      model: a sparse Markov chain, decision process or stochastic game (`SparseDtmc`, `SparseMdp`,
+        `SparseSmg`).
+
+    Returns:
+      A :class:`~jaxltl.core.models.sparse.SparseMDP`, or a Game over one.
+
+    Raises:
+      ValueError: stormpy (version 2 or later) is not installed, or the model is none of these.
+    """
+    storm = _stormpy()
+    what, options = type(model).__name__.strip("_"), storm.io.UmbExportOptions()
+    options.compression = storm.io.CompressionMode.NO_COMPRESSION
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.umb"
+        try:
+            storm.io.export_to_umb(model, str(path), options=options)
+        except Exception as error:  # of several types, none of them public
+            reason = str(error).partition("\n")[0]
+            raise ValueError(
+                f"from_stormpy: Storm does not write this {what}: {reason}. Give a sparse Markov "
+                "chain, decision process or game, without parameters."
+            ) from None
+        try:
+            return read_umb(path)
+        except ValueError as error:
+            reason = str(error).replace(str(path), what)
+            raise ValueError(f"from_stormpy: {reason}") from None
+
+
+def to_stormpy(model: Any) -> Any:
+    """A model as a sparse model of Storm's, bit for bit.
+
+    Of an initial distribution Storm has the states where it is positive.
+
+    Args:
+      model: a model that :func:`~jaxltl.core.models.convert.to_sparse` takes, or a Game over one.
+
+    Returns:
+      A `SparseDtmc` where every state has one choice, a `SparseMdp`, or a `SparseSmg`.
+
+    Raises:
+      ValueError: stormpy (version 2 or later) is not installed.
+    """
+    storm = _stormpy()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.umb"
+        write_umb(path, model, compression=None)
+        return storm.build_model_from_umb(str(path))
+
+
+def _stormpy() -> Any:
+    try:
+        import stormpy
+        import stormpy.io
+    except ImportError:
+        stormpy = None
+    if not hasattr(stormpy, "build_model_from_umb") or not hasattr(stormpy.io, "export_to_umb"):
+        raise ValueError(
+            "this takes the package stormpy, version 2 or later; install it (pip install stormpy), "
+            "or exchange files that Storm writes by read_model and write_model."
+        )
+    return stormpy
