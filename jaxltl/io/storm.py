@@ -40,10 +40,9 @@ def from_stormpy(model: Any) -> SparseMDP | Game:
         path = Path(folder) / "model.umb"
         try:
             storm.io.export_to_umb(model, str(path), options=options)
-        except Exception as error:  # of several types, none of them public
-            reason = str(error).partition("\n")[0]
+        except Exception:  # of several types, none of them public
             raise ValueError(
-                f"from_stormpy: Storm does not write this {what}: {reason}. Give a sparse Markov "
+                f"from_stormpy: Storm does not write this {what} as UMB. Give a sparse Markov "
                 "chain, decision process or game, without parameters."
             ) from None
         try:
