@@ -455,9 +455,15 @@ def run_in_chunks(
 
 def _begin(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | None) -> _Progress:
     """Before the first chunk; nothing is compiled for it."""
-    taken = step if num_lanes is None else jax.vmap(step, (0, None, 0))
-    _, shape = jax.eval_shape(taken, state, problem, hparams)
-    metrics = jax.tree.map(lambda x: jnp.asarray(np.zeros(x.shape, x.dtype)), shape)
+    lanes = () if num_lanes is None else (num_lanes,)
+
+    def one(x: Any) -> Any:
+        return jax.ShapeDtypeStruct(x.shape[len(lanes):], x.dtype)
+
+    # As a program, whose trace is kept for the next run.
+    _, shape = jax.eval_shape(
+        jax.jit(step), jax.tree.map(one, state), problem, jax.tree.map(one, hparams))
+    metrics = jax.tree.map(lambda x: jnp.asarray(np.zeros((*lanes, *x.shape), x.dtype)), shape)
     count = np.asarray(state.step, np.int32)
     return _Progress(state, metrics, jnp.asarray(count), jnp.asarray(np.zeros(count.shape, bool)))
 

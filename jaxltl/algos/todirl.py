@@ -30,6 +30,7 @@ from jaxltl.core.models.restrict import with_allowed
 from jaxltl.core.models.tables import Predecessors, predecessors
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status, status_code
+from jaxltl.core.values.satisfaction import satisfaction_probability
 from jaxltl.core.values.soft import policy_logits, soft_policy_adjoint, soft_value
 
 # --- reward networks ---------------------------------------------------------------------------
@@ -124,7 +125,9 @@ class Hparams:
       discount: in [0, 1); with a horizon 1 is allowed.
       l2: precision of the Gaussian prior on the parameters.
       learning_rate: for every optimiser but ``lbfgs``.
-      patience: steps without a better held-out likelihood after which learning stops.
+      patience: steps without a better held-out likelihood after which learning stops; with `mu`,
+        without a better sum of it and of the weighed probability of an average pair.
+      mu: weight of the probability of the task (2.6) from the worlds' starts; None leaves it out.
       tolerance: certified error asked of the soft values; None: what the dtype allows.
       optimizer: ``"adam"``, ``"sgd"``, ``"rmsprop"`` or ``"lbfgs"``, all optax's; static.
       method: of the soft solver, see :func:`~jaxltl.core.values.soft.soft_value`; static.
@@ -135,6 +138,7 @@ class Hparams:
     l2: jax.Array | float = 1e-3
     learning_rate: jax.Array | float = 3e-3
     patience: jax.Array | int = 50
+    mu: jax.Array | float | None = None
     tolerance: jax.Array | float | None = None
     optimizer: str = struct.field(pytree_node=False, default="adam")
     method: str = struct.field(pytree_node=False, default="value_iteration")
@@ -172,6 +176,7 @@ class Metrics:
       neg_log_likelihood: minus (3.3), over all pairs, weighted by world.
       per_pair: the same for the average pair.
       held_out: negative log-likelihood of the average held-out pair; NaN without any.
+      satisfaction: mean probability of the task over the worlds and their starts; NaN without mu.
       gradient_norm: Euclidean.
       error: certified error of the soft values, the largest over the worlds.
       status: of the soft solver, the worst over the worlds.
@@ -181,6 +186,7 @@ class Metrics:
     neg_log_likelihood: jax.Array
     per_pair: jax.Array
     held_out: jax.Array
+    satisfaction: jax.Array
     gradient_norm: jax.Array
     error: jax.Array
     status: jax.Array
@@ -375,6 +381,8 @@ class Objective:
     neg_log_likelihood: jax.Array
     per_pair: jax.Array
     held_out: jax.Array
+    score: jax.Array
+    satisfaction: jax.Array
     value: jax.Array
     error: jax.Array
     status: jax.Array
@@ -385,6 +393,7 @@ def objective(
 ) -> tuple[jax.Array, Objective]:
     """``-sum log pi(a | s, q) + l2 / 2 |theta|^2``: minus (3.2), over all pairs of all worlds.
 
+    With ``hparams.mu`` less mu times the probability of the task in each world, as in (2.6).
     Its gradient costs one linear solve with the transposed transition matrix of the policy
     (implicit function theorem), instead of one system (3.6) for each parameter.
 
@@ -395,8 +404,11 @@ def objective(
       The loss, and :class:`Objective`.
 
     Raises:
-      ValueError: the problem does not count pairs by time up to ``hparams.horizon``.
+      ValueError: the problem does not count pairs by time up to ``hparams.horizon``, or there is
+        a weight ``mu`` with a horizon.
     """
+    if hparams.horizon is not None and hparams.mu is not None:
+        raise ValueError("mu weighs the probability of a task at any time; leave horizon out.")
     if hparams.horizon is not None and hparams.horizon != problem.horizon:
         raise ValueError(
             f"hparams.horizon={hparams.horizon}, but the problem has horizon={problem.horizon}; "
@@ -411,7 +423,7 @@ def objective(
         find = _by_time if hparams.horizon is not None else partial(_stationary, before=before)
         return find(rewards, model, hparams, counts, held_out, initial)
 
-    seen, other, value, error, status = _each_world(
+    seen, other, done, value, error, status = _each_world(
         world, problem.model, problem.observation, counts, held_out, _initial(problem, initial),
         problem.predecessors,
     )
@@ -419,11 +431,17 @@ def objective(
     pairs, other_pairs = (weight @ jnp.sum(x, axis=(1, 2, 3)) for x in _flat(counts, held_out))
     neg = -weight @ seen
     squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(parameters))
-    return neg + hparams.l2 / 2 * squares, Objective(
-        neg_log_likelihood=neg, per_pair=neg / pairs,
-        held_out=lax.stop_gradient(-(weight @ other) / other_pairs),
-        value=value, error=jnp.max(error), status=jnp.max(status),
+    loss = neg + hparams.l2 / 2 * squares
+    score = lax.stop_gradient(-(weight @ other) / other_pairs)
+    found = Objective(
+        neg_log_likelihood=neg, per_pair=neg / pairs, held_out=score, score=score,
+        satisfaction=jnp.mean(done), value=value, error=jnp.max(error), status=jnp.max(status),
     )
+    if hparams.mu is None:
+        return loss, found
+    # Its derivative is in that of the likelihood, since one linear system serves both.
+    gain = lax.stop_gradient(hparams.mu * (weight @ done))
+    return loss - gain, replace(found, score=score - gain / pairs)
 
 
 def _stationary(rewards, model, hparams, counts, held_out, initial, *, before):
@@ -432,14 +450,24 @@ def _stationary(rewards, model, hparams, counts, held_out, initial, *, before):
     solution = lax.stop_gradient(_plan(constant, model, hparams, initial))
     log_policy = _log_policy(model, constant, hparams.discount, solution.value)
     policy = jnp.where(model.available, jnp.exp(log_policy), 0)
+    done, cotangent = jnp.full((), jnp.nan, model.dtype), counts
+    if hparams.mu is not None:
+        done, gain = jax.value_and_grad(partial(_satisfaction, model))(policy)
+        cotangent = counts + hparams.mu * policy * gain
     slope = lax.stop_gradient(
-        soft_policy_adjoint(model, policy, hparams.discount, counts, predecessors=before)
+        soft_policy_adjoint(model, policy, hparams.discount, cotangent, predecessors=before)
     )
     # The likelihood, and as its derivative the adjoint's, which differentiating the solver's
     # own equations would find by scatters, slow on a CPU.
     seen = jnp.sum(counts * log_policy) + jnp.sum(slope * (rewards - constant))
     error = jnp.max(solution.upper - solution.lower) / 2
-    return seen, jnp.sum(held_out * log_policy), solution.value, error, solution.status
+    other = jnp.sum(held_out * log_policy)
+    return seen, other, lax.stop_gradient(done), solution.value, error, solution.status
+
+
+def _satisfaction(model, policy) -> jax.Array:
+    """The mean probability of the task over the starts."""
+    return jnp.sum(model.initial * satisfaction_probability(model, policy).value)
 
 
 def _by_time(rewards, model, hparams, counts, held_out, initial):
@@ -449,7 +477,7 @@ def _by_time(rewards, model, hparams, counts, held_out, initial):
     log_policy = jax.vmap(lambda v: _log_policy(model, rewards, hparams.discount, v))(after)
     seen, other = (jnp.sum(x * log_policy) for x in (counts, held_out))
     error = lax.stop_gradient(jnp.max(solution.upper - solution.lower) / 2)
-    return seen, other, initial, error, solution.status
+    return seen, other, jnp.full((), jnp.nan, model.dtype), initial, error, solution.status
 
 
 def _log_policy(model, rewards, discount, value) -> jax.Array:
@@ -498,12 +526,12 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     )
     metrics = Metrics(
         loss=loss, neg_log_likelihood=parts.neg_log_likelihood, per_pair=parts.per_pair,
-        held_out=parts.held_out, gradient_norm=optax.tree.norm(gradient), error=parts.error,
-        status=parts.status,
+        held_out=parts.held_out, satisfaction=parts.satisfaction,
+        gradient_norm=optax.tree.norm(gradient), error=parts.error, status=parts.status,
     )
     parameters = optax.apply_updates(state.parameters, updates)
     best, stopped = learner.stop_early(
-        state, parameters, parts.held_out, jnp.any(problem.held_out > 0), hparams.patience)
+        state, parameters, parts.score, jnp.any(problem.held_out > 0), hparams.patience)
     # A solve that failed would poison the next one's start.
     value = jnp.where(parts.status != Status.NONFINITE, parts.value, 0)
     after = replace(

@@ -13,9 +13,10 @@ from jaxltl.app.files.task_todirl import Scene, Task
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.values.optimal_actions import OptimalActions
 from jaxltl.core.values.performance import Performance
 
-LENGTH = 100  # of a synthetic demonstration, at most
+LENGTH = 100  # of a demonstration of a soft-optimal expert, at most
 
 
 class Worlds(NamedTuple):
@@ -60,9 +61,13 @@ class Setup:
       worlds: those to learn in, and then those to test in.
       num_training: how many there are to learn in.
       expert: ``float[W, S, Q, A]``, the policy of an expert in the judged products.
+      soft: whether the expert is soft-optimal for a reward, not the quickest of the best policies.
       demonstrations: in each of the training worlds.
-      left_out: how many of their steps are not among the allowed actions.
-      loss: what taking those alike is certified to lose at most, in any world.
+      dropped: how many synthetic ones did not do the task.
+      asked: the guarantee; a probability of 1 is the best.
+      sure: in each world what loses nothing of the task; None without a guarantee.
+      left_out: how many demonstrated steps are not among the allowed actions.
+      trivial: what is to be said of a formula that is always true.
     """
 
     task: Task
@@ -71,9 +76,23 @@ class Setup:
     worlds: Worlds
     num_training: int
     expert: jax.Array
+    soft: bool
     demonstrations: list[Trajectories]
+    dropped: int
+    asked: str | float
+    sure: list[OptimalActions] | None = None
     left_out: int = 0
-    loss: float = 0.0
+    trivial: str | None = None
+
+    @property
+    def loss(self) -> float:
+        """What moves that lose nothing are certified to lose at most, in any world."""
+        return max((float(one.loss) for one in self.sure or ()), default=0.0)
+
+    @property
+    def is_probability(self) -> bool:
+        """Whether a probability is asked for."""
+        return not isinstance(self.asked, str)
 
     @property
     def training(self) -> Worlds:
@@ -99,6 +118,7 @@ class Learned:
       stopped: ``bool[N]``, whether learning ended by patience.
       num_steps: ``int``, made until all had ended.
       history: metrics ``[T, N]`` and ``step [T]``.
+      weight: of the task's probability, where one is asked for.
     """
 
     parameters: Any
@@ -107,6 +127,7 @@ class Learned:
     stopped: np.ndarray
     num_steps: int
     history: Mapping[str, np.ndarray]
+    weight: float | None = None
 
 
 class Judged(NamedTuple):
@@ -117,17 +138,22 @@ class Judged(NamedTuple):
       status: ``int32[W]``, of the solver that found it.
       performance: by the name of who acts: learned, expert, random; leading axis W.
       seeds: ``float[N, W]``, L_phi of each seed's policy.
+      share, attained: ``float[W]``, where a probability is asked for: of moves that lose nothing,
+        and what is certified.
     """
 
     policy: np.ndarray
     status: np.ndarray
     performance: dict[str, Performance]
     seeds: np.ndarray
+    share: np.ndarray | None = None
+    attained: np.ndarray | None = None
 
     def part(self, chosen: slice) -> Judged:
         """In some of the worlds."""
         each = part_of(self.performance, chosen)
-        return Judged(self.policy[chosen], self.status[chosen], each, self.seeds[:, chosen])
+        held = part_of((self.share, self.attained), chosen)
+        return Judged(self.policy[chosen], self.status[chosen], each, self.seeds[:, chosen], *held)
 
 
 @dataclass(frozen=True)

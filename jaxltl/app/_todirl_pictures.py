@@ -11,6 +11,7 @@ import numpy as np
 from jaxltl.app._todirl_parts import Judged, Outcome, Setup, Worlds, counted_worlds, part_of
 from jaxltl.app.drawing import Picture, drawing
 from jaxltl.app.explorer import (
+    LONGEST_RUN,
     START,
     Curves,
     Explorer,
@@ -31,6 +32,10 @@ from jaxltl.envs.gridworld import ACTIONS
 _PICTURES = 3  # worlds that are drawn, of each kind
 
 
+_END = {
+    "cosafe": "is done or has failed",
+    **dict.fromkeys(("safety", "buchi", "parity"), f"has failed, or for {LONGEST_RUN} steps"),
+}
 _FIGURES = ("per_pair", "held_out", "gradient_norm")
 
 
@@ -195,7 +200,7 @@ def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
             f"{one.stem}_runs.svg", f"Runs in {scene.name}" if one.arrows else one.title,
             drawing("temporal_gridworld", part_of(scene.colored, ...), trajectories=walks),
             f"{len(walks.length)} runs of the learned policy from random starts, each until the "
-            "task is done or has failed.", one.live,
+            f"task {_END[setup.judge.acceptance]}.", one.live,
         ))
     return found
 

@@ -227,7 +227,7 @@ def at_least(
     if first.attained >= asked:
         return first
     below, above, found = first, None, []
-    for tried in _bracket(train, first, lambda x, mu: attempt(policy_of(x), x, mu, 0.0), asked):
+    for tried in bracket(train, first, lambda x, mu: attempt(policy_of(x), x, mu, 0.0), asked):
         if tried.attained < asked:
             below = tried
         else:
@@ -246,13 +246,21 @@ def at_least(
     return min(found, key=lambda one: one.neg_log_likelihood)
 
 
-def _bracket(
-    train: Train, first: Attempt, judged: Callable[[Any, float], Attempt], asked: float
-) -> Iterator[Attempt]:
+def bracket(
+    train: Train, first: Any, judged: Callable[[Any, float], Any], asked: float,
+    halvings: int = _HALVINGS,
+) -> Iterator[Any]:
     """Attempts with more and more weight until it is enough, then between the last two.
 
     Each is learned from the one of the next lesser weight: the likelihood has other maxima, and
     those that are found from too great a weight are lesser ones.
+
+    Args:
+      train: what is learned with a weight, from what was learned before.
+      first: what was found without any weight: with `learned`, and what is `attained`.
+      judged: the same of what was learned with a weight.
+      asked: what is to be attained.
+      halvings: attempts between two weights, at most.
     """
     low, below = 0.0, first
     for high in map(float, _WEIGHTS):
@@ -264,7 +272,7 @@ def _bracket(
     else:
         return
     low = low or high * 1e-3
-    for _ in range(_HALVINGS):
+    for _ in range(halvings):
         if asked <= last.attained <= asked + _AIM or high / low < 1 + 1e-9:
             return
         middle = float(np.sqrt(low * high))

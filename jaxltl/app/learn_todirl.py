@@ -8,6 +8,7 @@ knows the task and one that moves at random.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 from jax import lax
 
 from jaxltl.algos import learner, todirl
+from jaxltl.app._todirl_guarantee import check_attainable, hold, is_weighable, likeliest
 from jaxltl.app._todirl_parts import (
     LENGTH,
     Judged,
@@ -32,6 +34,7 @@ from jaxltl.app._todirl_pictures import live as live
 from jaxltl.app._todirl_pictures import pictures as pictures
 from jaxltl.app._todirl_pictures import task_pictures as task_pictures
 from jaxltl.app.files.tables import errors_in
+from jaxltl.app.files.task import require_end, synthetic_demonstrations
 from jaxltl.app.files.task_todirl import (
     Scene,
     Task,
@@ -42,6 +45,7 @@ from jaxltl.app.files.task_todirl import (
     load_scenes,
 )
 from jaxltl.app.files.task_todirl import read_task as read_task
+from jaxltl.app.guarantee import check_formula
 from jaxltl.app.job import (
     Report,
     about,
@@ -60,8 +64,7 @@ from jaxltl.core.models.batch import lift_memory, narrow, stack_products
 from jaxltl.core.models.operators import action_mean, expectation
 from jaxltl.core.models.product import Product, allowed_steps, product
 from jaxltl.core.models.restrict import with_allowed
-from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.types import Status, status_code
+from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values.optimal_actions import optimal_actions
 from jaxltl.core.values.performance import (
     Performance,
@@ -69,6 +72,7 @@ from jaxltl.core.values.performance import (
     summarize,
     task_performances,
 )
+from jaxltl.core.values.satisfaction import optimal_satisfaction
 from jaxltl.core.values.soft import soft_value
 from jaxltl.envs import temporal_gridworld
 from jaxltl.envs.cell_kinds import COLORS
@@ -88,54 +92,79 @@ def prepare(task: Task, seed: int) -> Setup:
     """The worlds, products and demonstrations of a task; all of its files checked.
 
     Raises:
-      ValueError: something in the task or its files is wrong.
+      ValueError: something in the task or its files is wrong, or the probability that is to be
+        guaranteed is more than any policy has in some world.
     """
     judge, memory = load_automata(task)
+    require_end(task, judge)
+    with errors_in(f"{task.path}: [task] "):
+        trivial = check_formula(judge)
     scenes, others = load_scenes(task, judge)
     found = load_demonstrations(task, scenes) if "files" in task.demonstrations else []
     worlds = _stack(task, [*scenes, *others], judge, memory)
-    shown = task.demonstrations
-    discount = shown.get("discount", min(task.learner["discount"], _EXPERT_DISCOUNT))
-    models = stack_products(
-        [scene.mdp for scene in worlds.scenes], judge, label_on=task.label_on
-    )
-    expert = np.asarray(_expert(models, discount, expert_rewards(task)))
+    soft = judge.acceptance == "cosafe" and ("discount" in task.demonstrations or bool(found))
+    expert, bests = _experts(task, worlds.scenes, judge, soft=soft)
+    dropped = 0
     if not found:
         key = jax.random.fold_in(jax.random.key(seed), 0)
-        found = [
-            temporal_gridworld.demonstrations(
-                # Without padding, and whatever the learner remembers: tasks that differ only in
-                # that, or in their test worlds, have the same demonstrations.
-                jax.random.fold_in(key, w), product(scene.mdp, judge, label_on=task.label_on),
-                expert[w, : scene.mdp.num_states], shown["synthetic"],
-                shown.get("length", LENGTH),
-            )
-            for w, scene in enumerate(scenes)
-        ]
-    left_out, loss = 0, 0.0
-    if task.guarantee == "best":
-        worlds, left_out, loss = _narrowed(task, worlds, found)
+        for w, scene in enumerate(scenes):
+            # Without padding, and whatever the learner remembers: tasks that differ only in
+            # that, or in their test worlds, have the same demonstrations.
+            model = product(scene.mdp, judge, label_on=task.label_on)
+            own = jax.random.fold_in(key, w)
+            if soft:
+                found.append(temporal_gridworld.demonstrations(
+                    own, model, expert[w, : scene.mdp.num_states],
+                    task.demonstrations["synthetic"], task.demonstrations.get("length", LENGTH)))
+            else:
+                runs, lost = synthetic_demonstrations(task, model, own, bests[w])
+                found, dropped = [*found, runs], dropped + lost
     if memory is not judge:
         expert = np.tile(expert, (1, 1, len(memory.delta), 1))  # the task's state varies fastest
-    return Setup(task, judge, memory, worlds, len(scenes), jnp.asarray(expert), found, left_out,
-                 loss)
-
-
-def _narrowed(task: Task, worlds: Worlds, shown: list[Trajectories]) -> tuple[Worlds, int, float]:
-    """The worlds with the actions alone that lose nothing, how many steps took others, and what
-    those actions are certified to lose at most."""
+    setup = Setup(
+        task, judge, memory, worlds, len(scenes), jnp.asarray(expert), soft, found, dropped,
+        asked="best" if task.guarantee == 1 else task.guarantee, trivial=trivial)
+    if setup.asked == "none":
+        return setup
     lanes = [part_of(worlds.model, w) for w in range(len(worlds.scenes))]
-    found = [optimal_actions(lane) for lane in lanes]
-    allowed = [np.asarray(one.allowed) for one in found]
-    count = 0
-    for w, trajectories in enumerate(shown):
+    setup = replace(setup, sure=[optimal_actions(lane) for lane in lanes])
+    if setup.is_probability:
+        check_attainable(setup)
+        return setup
+    return _narrowed(setup)
+
+
+def _narrowed(setup: Setup) -> Setup:
+    """With the actions alone that lose nothing, and how many demonstrated steps took others."""
+    task, worlds, count = setup.task, setup.worlds, 0
+    allowed = [np.asarray(one.allowed) for one in setup.sure or ()]
+    for w, trajectories in enumerate(setup.demonstrations):
         with errors_in(f"{task.path}: demonstrations in {worlds.scenes[w].name}: "):
             size = worlds.scenes[w].mdp.num_states
-            model = product(worlds.scenes[w].mdp, lanes[w].automaton, label_on=task.label_on)
+            model = product(worlds.scenes[w].mdp, setup.judge, label_on=task.label_on)
             kept = allowed_steps(with_allowed(model, allowed[w][:size]), trajectories)
         count += int(np.asarray(trajectories.mask).sum() - kept.sum())
-    loss = max(float(one.loss) for one in found)
-    return worlds._replace(model=narrow(worlds.model, allowed)), count, loss
+    worlds = worlds._replace(model=narrow(worlds.model, allowed))
+    return replace(setup, worlds=worlds, left_out=count)
+
+
+def _experts(
+    task: Task, scenes: list[Scene], judge: Automaton, *, soft: bool
+) -> tuple[np.ndarray, list[Solution]]:
+    """Policies ``[W, S, Q, A]`` of one who knows the task, and its best probability if not soft.
+
+    Soft-optimal for a reward, or the quickest of the best.
+    """
+    if soft:
+        shown = task.demonstrations
+        discount = shown.get("discount", min(task.learner["discount"], _EXPERT_DISCOUNT))
+        models = stack_products([s.mdp for s in scenes], judge, label_on=task.label_on)
+        return np.asarray(_expert(models, discount, expert_rewards(task))), []
+    bests = [optimal_satisfaction(product(s.mdp, judge, label_on=task.label_on)) for s in scenes]
+    size = max(scene.mdp.num_states for scene in scenes)
+    # In the padding any move does.
+    chosen = [np.pad(np.asarray(x.policy), ((0, size - len(x.policy)), (0, 0))) for x in bests]
+    return np.eye(len(ACTIONS))[np.stack(chosen)], bests
 
 
 def _stack(task: Task, scenes: list[Scene], judge: Automaton, memory: Automaton) -> Worlds:
@@ -196,23 +225,71 @@ def learn(
         allowed=masks if masks is None else masks[: len(scenes), : model.mdp.num_states],
     )
     hparams = settings(todirl.Hparams, spec)
-    found, history = run_seeds(
-        todirl, (seed, num_seeds), problem, hparams, report, num_steps=spec.get("steps", STEPS),
-        until=learner.has_stopped, checkpoint=checkpoint,
-    )
-    states, best = found.state, found.state.best
-    learned = Learned(
-        parameters=best.parameters, held_out=np.asarray(best.neg_log_likelihood),
-        best_step=np.asarray(best.step), stopped=np.asarray(states.stopped),
-        num_steps=int(np.max(states.step)), history=history,
-    )
-    score = np.where(np.isfinite(learned.held_out), learned.held_out, np.inf)
-    loss = np.where(np.isfinite(history["loss"][-1]), history["loss"][-1], np.inf)
-    chosen = int(np.argmin(score if np.isfinite(score).any() else loss))
+    if setup.is_probability and is_weighable(setup):
+        hparams = replace(hparams, mu=0.0)  # it is one program for all weights
+    learned = _trained(setup, problem, hparams, (seed, num_seeds), report, checkpoint)
+    chosen = _least_loss(learned)
+    if setup.is_probability:
+        learned, chosen = _weighed(setup, problem, hparams, _lane(learned, chosen), seed), 0
     progress("checking")
     judged, count = _judge(setup, learned, network, hparams, chosen), setup.num_training
     test = judged.part(slice(count, None)) if count < len(judged.status) else None
     return learned, chosen, judged.part(slice(count)), test
+
+
+def _trained(
+    setup: Setup, problem: todirl.Problem, hparams: todirl.Hparams, seeds: tuple[int, int],
+    report: Report | None = None, checkpoint: Path | None = None,
+) -> Learned:
+    """What N seeds learn of a problem."""
+    found, history = run_seeds(
+        todirl, seeds, problem, hparams, report, num_steps=setup.task.learner.get("steps", STEPS),
+        until=learner.has_stopped, checkpoint=checkpoint,
+    )
+    states, best = found.state, found.state.best
+    score = np.asarray(best.neg_log_likelihood)
+    kept = np.minimum(np.asarray(best.step), len(history["held_out"]) - 1)
+    return Learned(
+        parameters=best.parameters,
+        held_out=score if hparams.mu is None else np.where(
+            np.isfinite(score), history["held_out"][kept, np.arange(len(kept))], score),
+        best_step=np.asarray(best.step), stopped=np.asarray(states.stopped),
+        num_steps=int(np.max(states.step)), history=history,
+    )
+
+
+def _least_loss(learned: Learned) -> int:
+    """The seed that is kept: the best on held-out demonstrations, or the least loss."""
+    score = np.where(np.isfinite(learned.held_out), learned.held_out, np.inf)
+    loss = np.where(np.isfinite(learned.history["loss"][-1]), learned.history["loss"][-1], np.inf)
+    return int(np.argmin(score if np.isfinite(score).any() else loss))
+
+
+def _lane(learned: Learned, i: int) -> Learned:
+    """One of the seeds alone."""
+    one: dict[str, Any] = {
+        k: v[i : i + 1] for k, v in vars(learned).items() if isinstance(v, np.ndarray)}
+    history = {k: v if v.ndim == 1 else v[:, i : i + 1] for k, v in learned.history.items()}
+    return replace(
+        learned, parameters=part_of(learned.parameters, slice(i, i + 1)), history=history, **one)
+
+
+def _weighed(
+    setup: Setup, problem: todirl.Problem, hparams: todirl.Hparams, free: Learned, seed: int
+) -> Learned:
+    """What is kept of what one seed learns with more and more weight of the task."""
+    def train(mu: float, _: Learned) -> Learned:
+        return _trained(setup, problem, replace(hparams, mu=mu), (seed, 1))
+
+    def plans(learned: Learned) -> tuple[np.ndarray, np.ndarray]:
+        parameters = part_of(learned.parameters, 0)
+        count = setup.num_training
+        return _plans(setup, problem.network, parameters, replace(hparams, mu=None), count)[:2]
+
+    counts = np.asarray(problem.counts + problem.held_out)
+    found, weight = likeliest(
+        setup, counts, free, None if hparams.mu is None else train, plans)
+    return replace(found, weight=weight)
 
 
 def _judge(
@@ -221,9 +298,16 @@ def _judge(
 ) -> Judged:
     worlds = setup.worlds
     performances, policies, codes = [], [], []
+    held = None
     for i in range(len(learned.held_out)):
         parameters = part_of(learned.parameters, i)
-        policy, status = _plan(network, parameters, worlds.model, worlds.observation, hparams)
+        if setup.is_probability:
+            free, inside, status = _plans(
+                setup, network, parameters, replace(hparams, mu=None), len(worlds.scenes))
+            held = hold(setup, free, inside)
+            policy = jnp.asarray(held.policy)
+        else:
+            policy, status = _plan(network, parameters, worlds.model, worlds.observation, hparams)
         lifted = policy if setup.memory is setup.judge else lift_memory(policy, setup.judge)
         performances.append(_probability(worlds.judged, lifted, hparams.horizon))
         policies.append(policy if i == chosen else None)
@@ -241,7 +325,31 @@ def _judge(
             "random": _probability(judged, blind.astype(expert.dtype), horizon),
         },
         seeds=np.stack([np.asarray(found.mean) for found in performances]),
+        **({} if held is None else {"share": held.share, "attained": held.attained}),
     )
+
+
+def _plans(
+    setup: Setup, network: Any, parameters: Any, hparams: todirl.Hparams,
+    count: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Policies of all moves and of those that lose nothing in the first worlds, and statuses.
+
+    One world after the other, so that one program serves all.
+    """
+    worlds, masks = setup.worlds, np.stack([x.allowed for x in setup.sure or ()])
+    found, codes = [], np.zeros(count, np.int32)
+    for mask in (np.asarray(jax.vmap(lambda model: model.available)(worlds.model)), masks):
+        each = []
+        for w in range(count):
+            only = slice(w, w + 1)
+            model, seen, allowed = part_of((worlds.model, worlds.observation, mask), only)
+            policy, status = _plan(
+                network, parameters, replace(model, allowed=allowed), seen, hparams)
+            each.append(np.asarray(policy)[0])
+            codes[w] = max(codes[w], int(status[0]))
+        found.append(np.stack(each))
+    return found[0], found[1], codes
 
 
 @partial(jax.jit, static_argnames=("network",))
@@ -282,11 +390,15 @@ def _within_each(judged: Product, policy: jax.Array) -> Performance:
 
 
 def _within(model: Product, policy: jax.Array) -> Performance:
-    """The probability of doing the task within the steps of a policy ``[T, S, Q, A]``."""
+    """The probability of doing the task within the steps of a policy ``[T, S, Q, A]``.
+
+    Of a safety task, of not failing it.
+    """
     done = model.final.astype(model.dtype)
+    kept = jnp.minimum if model.automaton.acceptance == "safety" else jnp.maximum
 
     def backup(value: jax.Array, policy: jax.Array) -> tuple[jax.Array, None]:
-        return jnp.maximum(done, action_mean(policy, expectation(model, value))), None
+        return kept(done, action_mean(policy, expectation(model, value))), None
 
     value, _ = lax.scan(backup, done, policy, reverse=True)
     value = jnp.take_along_axis(value, model.initial_memory[:, None], axis=1)[:, 0]
@@ -310,20 +422,27 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     """The outcome as numbers, lists and texts, for ``result.json``; NaN becomes None."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, history, count = setup.task, learned.history, setup.num_training
-    infeasible = np.asarray(jax.vmap(infeasible_starts)(setup.worlds.judged)).sum(axis=1)
+    infeasible = np.array([
+        np.asarray(infeasible_starts(part_of(setup.worlds.judged, w))).sum()
+        for w in range(len(setup.worlds.scenes))])
     result = {
         **about(task),
         "memory": task.memory,
         "label_on": task.label_on,
         "radius": task.radius,
         "horizon": task.learner.get("horizon"),
-        "guarantee": {"asked": task.guarantee, "left_out": setup.left_out,
-                      "loss": setup.loss},
+        "guarantee": {
+            "asked": setup.asked, "over": task.over, "left_out": setup.left_out,
+            "loss": setup.loss, "weight": learned.weight},
+        "trivial": setup.trivial,
+        "acceptance": setup.judge.acceptance,
+        "expert": "soft" if setup.soft else "quickest",
         "num_memory": setup.worlds.model.num_memory,
         "demonstrations": {
             "number": [len(shown.length) for shown in setup.demonstrations],
             "pairs": [int(np.sum(shown.length)) for shown in setup.demonstrations],
             "synthetic": "synthetic" in task.demonstrations,
+            "dropped": setup.dropped,
         },
         "training": _about_worlds(setup.training, outcome.training, infeasible[:count], ()),
         "test": outcome.test and setup.test and _about_worlds(
@@ -402,6 +521,8 @@ def _about_world(scene: Scene, judged: Judged, w: int, infeasible: int) -> dict[
         "random": judged.performance["random"].mean[w],
         "num_starts": int(np.sum(np.asarray(scene.mdp.initial) > 0)),
         "infeasible_starts": infeasible,
+        **({} if judged.share is None or judged.attained is None else {
+            "share": judged.share[w], "attained": judged.attained[w]}),
     }
 
 
@@ -442,5 +563,5 @@ def learned_reward(outcome: Outcome) -> LearnedReward:
         hidden=tuple(spec.get("hidden", (80, 80))), memory=outcome.setup.memory,
         label_on=task.label_on, discount=spec["discount"], horizon=spec.get("horizon"),
         radius=task.radius, formula=task.formula, kinds=tuple(kinds),
-        guarantee=str(task.guarantee),
+        guarantee=outcome.setup.asked, over=task.over,
     )

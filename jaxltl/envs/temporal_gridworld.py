@@ -23,14 +23,16 @@ import numpy as np
 from flax import struct
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.core.automata.automaton import letter_index
+from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.models import operators
+from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.product import Product, project_trajectories
+from jaxltl.core.models.product import Product, product, project_trajectories
 from jaxltl.core.models.trajectories import Trajectories, rollout
+from jaxltl.core.values.performance import infeasible_starts
 from jaxltl.core.values.soft import soft_value
 from jaxltl.envs.cell_kinds import (
     COLORS,
@@ -269,9 +271,8 @@ class _Generator(NamedTuple):
     num_objects: int  # which are the first kinds
     counts: tuple[int, ...]  # how many cells of each kind
     distance: tuple[int, ...]  # from objects, for each kind
+    automaton: Automaton
     step: NDArray[np.int32]  # [P + 1, Q], the memory after leaving a cell; the last row: of no kind
-    final: NDArray[np.bool_]
-    initial: int
 
 
 def random_worlds(
@@ -303,21 +304,21 @@ def random_worlds(
       max_tries: placements to try for each world.
 
     Raises:
-      ValueError: an unknown proposition, a task that no finite run fulfils, or no placement found
-        in which the objects have room and the task can be done from everywhere.
+      ValueError: an unknown proposition, or no placement found in which the objects have room and
+        the task can be done from everywhere.
     """
     kinds = make_kinds(objects, obstacles)
     check_margin(margin)
     _check_shape(shape)
     if num_obstacles < 0:
         raise ValueError(f"num_obstacles={num_obstacles}; give 0 or more.")
-    step, final, initial = _on_kinds(task, kinds)
+    automaton, step = _on_kinds(task, kinds)
     blank = _blank(shape, slip)
     family = _Generator(
         blank, np.asarray(blank.successor), kinds, len(objects),
         (1,) * len(objects) + (num_obstacles,) * len(obstacles),
         (min_distance,) * len(objects) + (obstacle_distance,) * len(obstacles),
-        step, final, initial,
+        automaton, step,
     )
     codes, stamps = codes_of(kinds), _stamps(kinds)
     worlds = []
@@ -349,8 +350,8 @@ def random_world(seed: int, task: Task = COMPLETE, **options: Any) -> World:
     return random_worlds([seed], task, **options)[0]
 
 
-def _on_kinds(task: Task, kinds: Kinds) -> tuple[NDArray[np.int32], NDArray[np.bool_], int]:
-    """The memory after each kind of cell ``[P + 1, Q]``, the final memory, and the first."""
+def _on_kinds(task: Task, kinds: Kinds) -> tuple[Automaton, NDArray[np.int32]]:
+    """The task's automaton, and its memory after each kind of cell ``[P + 1, Q]``."""
     names = [name for name, _ in kinds]
     if isinstance(task, str | Formula):
         formula = parse_ltl(task) if isinstance(task, str) else task
@@ -358,14 +359,8 @@ def _on_kinds(task: Task, kinds: Kinds) -> tuple[NDArray[np.int32], NDArray[np.b
         shown = [frozenset({n} & set(formula.propositions)) for n in [*names, ""]]
         task = to_automaton(formula, letters=list(dict.fromkeys(shown)))
     require_known(task.propositions, names, "the task")
-    if task.acceptance != "cosafe":
-        raise ValueError(
-            f"the task has {task.acceptance} acceptance; a task that finite runs fulfil is needed, "
-            "such as F o1."
-        )
     read = [letter_index(task, {n} & set(task.propositions)) for n in [*names, ""]]
-    delta = np.asarray(task.delta)
-    return delta[:, read].T, np.asarray(task.final), int(task.initial)
+    return task, np.asarray(task.delta)[:, read].T
 
 
 def _place(
@@ -412,10 +407,16 @@ def _adds(colors, kind, number, stamp, codes, row: int, column: int) -> bool:
 
 
 def _is_feasible(family: _Generator, kind: NDArray[np.int32]) -> bool:
-    flat = kind.ravel()
+    flat, task = kind.ravel(), family.automaton
+    if task.acceptance != "cosafe":
+        label = flat[:, None] == np.arange(len(family.kinds))
+        world = replace(
+            family.blank, label=to_jax(label), initial=to_jax(flat < 0),
+            propositions=tuple(name for name, _ in family.kinds))
+        return not np.asarray(infeasible_starts(product(world, task, label_on="exit"))).any()
     # The last row of the table is of cells of no kind, whose number is -1.
-    can = _can_finish(family.successor, family.step[flat], family.final)
-    return bool(can[flat < 0, family.initial].all())
+    can = _can_finish(family.successor, family.step[flat], np.asarray(task.final))
+    return bool(can[flat < 0, int(task.initial)].all())
 
 
 def _can_finish(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import from_dict, to_dict
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, product
-from jaxltl.core.types import Solution
+from jaxltl.core.types import Solution, worst
+from jaxltl.core.values.mixture import reaching, require_attainable
 from jaxltl.core.values.optimal_actions import optimal_actions
 
 
@@ -35,8 +37,9 @@ class LearnedReward:
       radius: how far around its cell it sees.
       formula: the task.
       kinds: names of what a cell of the observation can be, in the order of its one-hot parts.
-      guarantee: ``"best"``: plans take the actions alone that lose nothing of the memory's task; or
-        ``"none"``.
+      guarantee: ``"best"``: plans take the actions alone that lose nothing of the memory's task;
+        a probability of it, for which as many of them are mixed in as it takes; or ``"none"``.
+      over: of which initial states a probability is, their ``"mean"`` or the ``"worst"``.
     """
 
     parameters: Any
@@ -48,7 +51,8 @@ class LearnedReward:
     radius: int
     formula: str
     kinds: tuple[str, ...]
-    guarantee: str = "none"
+    guarantee: str | float = "none"
+    over: str = "mean"
 
     @property
     def network(self) -> todirl.RewardNetwork:
@@ -71,11 +75,12 @@ def plan_in(learned: LearnedReward, world: MDP, observation: Any) -> tuple[Produ
         ``temporal_gridworld.observations(world, learned.radius)``.
 
     Returns:
-      The product, and the solution with the policy ``float[S, Q, A]``.
+      The product, and the solution with the policy ``float[S, Q, A]``; its value is that of the
+      reward, before moves that lose nothing are mixed in for a probability.
 
     Raises:
-      ValueError: the world shows what the automaton does not know, or the observation does not
-        have the shape that the network reads.
+      ValueError: the world shows what the automaton does not know, the observation does not
+        have the shape that the network reads, or no policy has the probability there.
     """
     model = product(world, learned.memory, label_on=learned.label_on)
     seen = jnp.asarray(observation, model.dtype)
@@ -86,17 +91,27 @@ def plan_in(learned: LearnedReward, world: MDP, observation: Any) -> tuple[Produ
             f"observation has shape {seen.shape}; the network reads {width} numbers in each of the "
             f"world's states: {(world.num_states, width)}."
         )
-    allowed = optimal_actions(model).allowed if learned.guarantee == "best" else None
-    return model, todirl.plan(
-        learned.network, learned.parameters, model, seen, learned.hparams, allowed=allowed
-    )
+    plan = partial(
+        todirl.plan, learned.network, learned.parameters, model, seen, learned.hparams)
+    asked = learned.guarantee
+    if asked == "none":
+        return model, plan()
+    sure = optimal_actions(model)
+    inside = plan(allowed=sure.allowed)
+    if isinstance(asked, str):
+        return model, inside
+    require_attainable(model, sure.best, asked, learned.over, "state {}".format)
+    found = plan()
+    mixed = reaching(model, found.policy, inside.policy, sure.best, asked, over=learned.over)
+    policy = jnp.asarray(mixed.policy, model.dtype)
+    return model, replace(found, policy=policy, status=worst(found.status, inside.status))
 
 
 # --- files ----------------------------------------------------------------------------------
 
 
 _ABOUT = ("hidden", "label_on", "discount", "horizon", "radius", "formula", "kinds",
-          "guarantee")
+          "guarantee", "over")
 
 
 def save_reward(path: str | Path, learned: LearnedReward) -> None:

@@ -15,6 +15,7 @@ from jaxltl.algos import todirl
 from jaxltl.core.models.operators import expectation, pushforward
 from jaxltl.core.models.tables import predecessors, successors
 from tests import reference
+from tests.algos.test_guaranteed import evaluate as probability
 from tests.support import random_representation, stack
 
 TASK = jl.to_automaton(jl.parse_ltl("!r U (c & (!r U g))"), letters=[set(), {"c"}, {"g"}, {"r"}])
@@ -82,11 +83,15 @@ def parameters(problem, seed=0):
                  marks=pytest.mark.exhaustive),
     pytest.param({"slip": 0.0, "label_on": "entry"}, id="entry", marks=pytest.mark.exhaustive),
     pytest.param({"horizon": 6}, id="horizon"),
+    pytest.param({"mu": 3.0, "slip": 0.3}, id="mu"),
+    pytest.param({"mu": 3.0, "worlds": (0, 1), "weight": [1.0, 0.5], "label_on": "entry"},
+                 id="mu-two-worlds", marks=pytest.mark.exhaustive),
 ])
 def test_the_gradient_is_that_of_central_differences(setting):
-    problem = small(**setting)
+    mu = setting.get("mu")
+    problem = small(**{k: v for k, v in setting.items() if k != "mu"})
     hparams = todirl.Hparams(
-        discount=0.9, l2=0.1, tolerance=1e-12, horizon=setting.get("horizon"))
+        discount=0.9, l2=0.1, tolerance=1e-12, horizon=setting.get("horizon"), mu=mu)
     flat, unravel = ravel_pytree(parameters(problem))
 
     def losses(rows):
@@ -100,6 +105,39 @@ def test_the_gradient_is_that_of_central_differences(setting):
         (flat + steps * directions).reshape(-1, flat.size)).reshape(4, -1)
     central = (low2 - 8 * low + 8 * high - high2) / (12 * 1e-4)  # of fourth order
     np.testing.assert_allclose(directions @ found, central, rtol=1e-8, atol=1e-8)
+
+
+def check_weighed(worlds, weight):
+    """Less mu times the probability of the task of the policy: the loss, what is told, the score.
+    """
+    problem = small(worlds, slip=0.3, weight=weight, held_out=0.5)
+    start = parameters(problem)
+    plain = todirl.Hparams(discount=0.9, tolerance=1e-12)
+    weighed = plain.replace(mu=2.5)
+    (loss, parts), (less, found) = (slope(start, problem, x)[0] for x in (plain, weighed))
+    policy = np.asarray(todirl.solve(start, problem, plain).policy)
+    done = []
+    for i in worlds:
+        value, _ = probability(lazy(i, 0.3), policy[worlds.index(i)])
+        done.append(float(np.sum(np.asarray(lazy(i, 0.3).initial) * value)))
+    assert 0.01 < min(done) <= max(done) < 0.99
+    assert float(found.satisfaction) == pytest.approx(np.mean(done), rel=1e-9)
+    assert np.isnan(parts.satisfaction) and parts.score == parts.held_out == found.held_out
+    gain = 2.5 * np.dot([1.0] * len(worlds) if weight is None else weight, done)
+    assert float(loss - less) == pytest.approx(gain, rel=1e-9)
+    pairs = found.neg_log_likelihood / found.per_pair
+    assert float(found.score) == pytest.approx(float(found.held_out) - gain / float(pairs))
+
+
+def test_a_weight_is_of_the_probability_of_the_task():
+    check_weighed((0,), None)
+    with pytest.raises(ValueError, match="leave horizon out"):
+        todirl.objective(None, None, todirl.Hparams(discount=0.9, mu=1.0, horizon=5))
+
+
+@pytest.mark.exhaustive
+def test_a_weight_is_of_the_probability_of_the_task_in_each_world():
+    check_weighed((0, 1), [1.0, 0.5])
 
 
 def test_the_gradient_is_that_of_the_dense_sensitivity():

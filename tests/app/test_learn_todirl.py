@@ -171,7 +171,8 @@ def test_what_is_seen_on_a_text_map():
     (("[world]", '[world]\nwall = "#"'), r"\[world\] wall belongs to maps with a legend"),
     ((KINDS, "objects = { o1 = 5 }"), r"a table of kinds and their colours"),
     (("synthetic = 40", ""), r"either files = \[\.\.\.\] or synthetic = N"),
-    (("discount = 0.9\nlength", "length"), r"\[demonstrations\] lacks discount"),
+    (("discount = 0.9\nlength", "progress = 5\nlength"),
+     r"\[demonstrations\] progress belongs to a demonstrator who maximises a reward; give its"),
     (("synthetic = 40\ndiscount = 0.9\nlength = 30", 'files = ["a", "b", "c"]'),
      r"names 3 files for 2 worlds"),
     (("hidden = [12]", "hidden = [0]"), r"widths of the hidden layers"),
@@ -193,7 +194,9 @@ def test_mistakes_in_the_task_file(write, replacement, message):
      r"\[world\] map 1: map row 2, column 2: 'x' is no colour"),
     (("patience = 15", "radius = 2"), r"world\.txt: the learner sees 2 cells .* margin of 1"),
     (("!ob U o2", "!ob U o7"), r"\[task\] formula: .*'o7'"),
-    (("(!o2 & !ob) U (o1 & (!ob U o2))", "G !ob"), r"formula has safety acceptance"),
+    (("(!o2 & !ob) U (o1 & (!ob U o2))", "G F o1\"\nguarantee = \"none"),
+     r"\[demonstrations\] discount is that of the reward of doing a task that ends"),
+    (("(!o2 & !ob) U (o1 & (!ob U o2))", "F (o1 & ob)"), r"\[task\] formula: nothing satisfies"),
     (("patience = 15", 'memory = "F o9"'), r"\[learner\] memory: .*'o9'"),
     (("shape = [6, 6]", "shape = [2, 2]"), r"\[test\] generate: seed 0: in 1000 placements"),
     (("obstacles = 1", 'leave_out = ["seed 7"]'),
@@ -208,7 +211,7 @@ def test_mistakes_in_the_worlds(write, tmp_path, replacement, message):
     (tmp_path / "another.txt").write_text("o1: 9 white\nwwww\nwbbw\nwwww\n")
     task = read_task(write(replacement))
     with pytest.raises(ValueError, match=message):
-        load_scenes(task, load_automata(task)[0])
+        learn_todirl.prepare(task, 0)
 
 
 def test_mistakes_come_as_one_line(write):

@@ -17,7 +17,9 @@ import jax
 import numpy as np
 
 from jaxltl.app.files import tables
+from jaxltl.app.files.models import read_padded
 from jaxltl.app.files.tables import COUNT, NAMES, TEXT, Rule, choice, is_list, is_number, number_in
+from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, project_trajectories
@@ -25,7 +27,6 @@ from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.types import Solution
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
-from jaxltl.io.npz import model_of, parse_arrays
 
 
 @dataclass(frozen=True)
@@ -95,9 +96,6 @@ def _guarantee(path: Path, data: Mapping[str, Any]) -> str | float:
         (bool(blind) and asked != "none",
          f"guarantee = {asked!r} needs a learner that sees the task and has the time for it: leave "
          f"out {''.join(blind[:1])}"),
-        (number and learner.get("method") == "todirl",
-         f'guarantee = {asked!r} is a probability, which takes method = "mlirl"; for "todirl" '
-         'choose "best" or "none"'),
         ("over" in task and not number, "over belongs to a guarantee that is a probability"),
         (number and "mu" in learner,
          f"guarantee = {asked} finds the weight mu that reaches it: leave mu out of [learner]"),
@@ -268,24 +266,26 @@ def load_world(task: Task) -> World:
 def load_model(
     path: Path, initial: str | None, more: Sequence[str] = ()
 ) -> tuple[World, dict[str, np.ndarray]]:
-    """A model from an ``.npz`` of arrays, and those of `more` arrays that it holds.
+    """A model from a file of any format that is read, and those of `more` arrays that it holds.
 
     Args:
-      path: the file.
+      path: the file; see :func:`~jaxltl.app.files.models.read_padded`.
       initial: a Boolean formula, uniformly where it holds; default the file's own.
       more: names of arrays that it may hold beside a model's.
 
     Raises:
-      ValueError: the file is no ``.npz``, or an array is unknown, missing or wrong.
+      ValueError: the file is malformed, of no known format, or too large when padded.
     """
-    name = str(path)
-    arrays = parse_arrays(tables.read_bytes(path, "the model"), name, more)
-    mdp, actions = model_of(arrays, name)
-    if initial is not None:
-        with tables.errors_in(f"{name!r}: "):
-            mdp = replace(mdp, initial=_where_holds(initial, mdp))
-    actions = actions or tuple(f"action {a}" for a in range(mdp.num_actions))
-    return World(mdp, None, actions), {k: arrays[k] for k in more if k in arrays}
+    found = read_padded(path, more)
+    return World(initial_where(found.mdp, initial, path), None, found.actions), found.more
+
+
+def initial_where(mdp: MDP, formula: str | None, path: Path) -> MDP:
+    """The model of a file, starting uniformly where a Boolean formula holds; None leaves it."""
+    if formula is None:
+        return mdp
+    with tables.errors_in(f"{str(path)!r}: "):
+        return replace(mdp, initial=_where_holds(formula, mdp))
 
 
 def _where_holds(formula: str, mdp: MDP) -> jax.Array:
@@ -469,13 +469,18 @@ def _demonstrator(task: Task, model: Product, best: Solution) -> jax.Array:
     discount = task.demonstrations.get("discount")
     if discount is None:
         return best.policy
-    if model.automaton.acceptance != "cosafe":
-        raise ValueError(
-            f"{task.path}: [demonstrations] discount is that of the reward of doing a task that "
-            "ends, which takes a co-safe formula; leave it out for runs of the quickest policy.")
+    require_end(task, model.automaton)
     from jaxltl.core.models.operators import expectation
     from jaxltl.core.values.discounted import optimal_value
 
     arriving = expectation(model, model.final.astype(model.dtype))
     reward = jax.numpy.where(model.final[..., None], 0, arriving)
     return optimal_value(model, reward, discount).policy
+
+
+def require_end(task: Task, automaton: Automaton) -> None:
+    """Refuses a demonstrator's discount for a task without end."""
+    if "discount" in task.demonstrations and automaton.acceptance != "cosafe":
+        raise ValueError(
+            f"{task.path}: [demonstrations] discount is that of the reward of doing a task that "
+            "ends, which takes a co-safe formula; leave it out for runs of the quickest policy.")

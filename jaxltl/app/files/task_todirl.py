@@ -134,10 +134,12 @@ def read_task(path: str | Path) -> Task:
         tables.refuse(path, "world", world, of_text, "maps with a legend")
     of_synthetic = ("discount", "length", *_REWARDS)
     tables.check_demonstrations(path, shown, "files", "files = [...]", of_synthetic)
+    rewards = [key for key in _REWARDS if key in shown]
     tables.reject(path, "demonstrations", [
-        ("synthetic" in shown and "discount" not in shown,
-         "lacks discount, that of the reward which the synthetic demonstrator maximises; for "
-         "example 0.95"),
+        (bool(rewards) and "discount" not in shown,
+         f"{''.join(rewards[:1])} belongs to a demonstrator who maximises a reward; give its "
+         "discount too, for example 0.95, or leave it out for runs of the quickest of the best "
+         "policies"),
     ])
     files, number = shown.get("files", world["maps"]), len(world["maps"])
     tables.reject(path, "demonstrations", [
@@ -357,14 +359,15 @@ def load_automata(task: Task) -> tuple[Automaton, Automaton]:
     the same in every world.
 
     Raises:
-      ValueError: a malformed formula, an unknown proposition, or a task that no finite run does.
+      ValueError: a malformed formula, an unknown proposition, or a horizon for a task without end.
     """
     alphabet = _alphabet(task)
     judge = _translate(task, "[task] formula", task.formula, alphabet)
-    if judge.acceptance != "cosafe":
+    if "horizon" in task.learner and judge.acceptance not in ("cosafe", "safety"):
         raise ValueError(
-            f'{task.path}: [task] formula has {judge.acceptance} acceptance; method = "todirl" '
-            "learns tasks that are done by a finite run, such as F o1."
+            f"{task.path}: [learner] horizon = {task.learner['horizon']} ends a run after so many "
+            f"steps, by which no task without end is done (the formula has {judge.acceptance} "
+            "acceptance); leave it out, with a discount below 1."
         )
     if task.memory == task.formula:
         return judge, judge

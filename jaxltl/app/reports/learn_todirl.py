@@ -22,6 +22,11 @@ from jaxltl.app.reports.page import (
 _WHO = {
     "learned": "learned reward", "expert": "expert, who knows the task", "random": "random moves",
 }
+_EXPERT = {
+    "soft": "The expert knows the task and is soft-optimal for it.",
+    "quickest": "The expert knows the task: no policy does it with a greater probability, and of "
+                "those that do it as well it is the quickest.",
+}
 _ROWS = 20  # worlds in a table
 
 
@@ -54,9 +59,34 @@ def remarks(result: Mapping[str, Any]) -> list[Remark]:
             "By construction: in every world, new ones too, the policy takes moves that lose "
             "nothing of the task, and no others; what was learned decides how. Taken alike, they "
             f"are certified to lose at most {number(result['guarantee']['loss'])} here.")))
+    elif result["guarantee"]["asked"] != "none":
+        found.append(("good", _asked(result)))
+    if result["trivial"]:
+        found.append(("note", result["trivial"]))
     if lost := result["guarantee"]["left_out"]:
         found.append(("note", f"{lost} demonstrated steps lose something and were left out."))
     return found
+
+
+def _asked(result: Mapping[str, Any]) -> str:
+    """How a probability that was asked for was reached."""
+    asked = result["guarantee"]
+    over = "on average over its starts" if asked["over"] == "mean" else "from its worst start"
+    worlds = [
+        world for key in ("training", "test") if result[key] for world in result[key]["worlds"]
+        if world["name"] not in result[key]["left_out"]]
+    least = min(world["attained"] for world in worlds)
+    how = ("the likeliest reward is taken as it is" if not asked["weight"] else
+           f"the task is weighed by mu = {asked['weight']:.3g} in learning")
+    mixed = [world["share"] for world in worlds if world["share"]]
+    more = ""
+    if mixed:
+        shares = number(mixed[0]) if len(mixed) == 1 else f"{min(mixed):.3g} to {max(mixed):.3g}"
+        more = (f", and in {len(mixed)} of {len(worlds)} worlds a share of {shares} of moves that "
+                "lose nothing is mixed in")
+    return (
+        f"Asked for {probability(asked['asked'])} in every world, new ones too, {over}; certified "
+        f"at least {probability(least)} here: {how}{more}.")
 
 
 def table(result: Mapping[str, Any]) -> str:
@@ -150,7 +180,8 @@ def warnings(result: Mapping[str, Any]) -> list[str]:
 
 
 def _within(result: Mapping[str, Any]) -> str:
-    return f" within {result['horizon']} steps" if result["horizon"] else ""
+    how = "for" if result["acceptance"] == "safety" else "within"
+    return f" {how} {result['horizon']} steps" if result["horizon"] else ""
 
 
 def _s(count: int) -> str:
@@ -165,11 +196,12 @@ def _number_of_worlds(about: Mapping[str, Any]) -> str:
 def _plain_sentence(result: Mapping[str, Any]) -> str:
     shown = result["demonstrations"]
     kind = "synthetic demonstrations" if shown["synthetic"] else "demonstrations"
+    dropped = f", {shown['dropped']} unfinished dropped" if shown["dropped"] else ""
     worlds, tests = result["training"]["num_worlds"], result["test"]
     also = f", tested in {tests['num_worlds']}" if tests else ""
     return (
         f"todirl in {worlds} world{_s(worlds)}{also}, {result['num_memory']} memory states, "
-        f"{sum(shown['number'])} {kind} ({sum(shown['pairs'])} pairs)"
+        f"{sum(shown['number'])} {kind} ({sum(shown['pairs'])} pairs{dropped})"
     )
 
 
@@ -231,8 +263,8 @@ def _evidence_table(result: Mapping[str, Any]) -> str:
     header = ("who", "mean", "certified", "deviation", "worst world", "worst start")
     return rows(header, lines) + (
         "<p class=muted>The true mean over worlds and starts is certified to be that close. The "
-        "deviation is over worlds; the worst start is over all starts of all worlds. The expert "
-        "knows the task and is soft-optimal for it.</p>"
+        "deviation is over worlds; the worst start is over all starts of all worlds. "
+        f"{_EXPERT[result['expert']]}</p>"
     )
 
 

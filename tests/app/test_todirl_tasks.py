@@ -1,0 +1,324 @@
+"""`jaxltl learn` for a reward that carries over, with tasks without end and with probabilities."""
+
+import json
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxltl as jl
+from jaxltl.app import learn_todirl as job
+from jaxltl.app._todirl_parts import part_of
+from jaxltl.app.files.task_todirl import read_task
+from jaxltl.app.reports.learn_todirl import remarks
+from jaxltl.core.models.batch import stack_products
+from jaxltl.core.models.mdp import from_dense
+from jaxltl.core.values.mixture import WINDOW, at_starts
+from jaxltl.core.values.performance import infeasible_starts
+from jaxltl.io.learned_reward import load_reward, plan_in, save_reward
+from tests.algos.test_guaranteed import evaluate
+from tests.test_cli import run
+
+TASK = '''
+[world]
+maps = ["""
+. a .
+. c .
+. . b
+"""]
+legend = { "." = [], a = ["a"], b = ["b"], c = ["c"] }
+initial = "!c"
+
+[task]
+formula = "G F a & G F b & G !c"
+
+[demonstrations]
+synthetic = 10
+length = 12
+
+[learner]
+method = "todirl"
+discount = 0.9
+hidden = []
+steps = 40
+learning_rate = 0.1
+
+[test]
+maps = ["""
+b # c
+. # .
+. . a
+""", """
+. b .
+# # #
+. a .
+"""]
+'''
+FORMULA = 'formula = "G F a & G F b & G !c"'
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Writes a task, after replacing parts of it."""
+
+    def write(*replacements, text=TASK):
+        for old, new in replacements:
+            assert old in text
+            text = text.replace(old, new)
+        (tmp_path / "task.toml").write_text(text)
+        return tmp_path / "task.toml"
+
+    return write
+
+
+def prepared(path, seed=0):
+    return job.prepare(read_task(path), seed)
+
+
+def own(setup, w):
+    """The product of a world without padding."""
+    return jl.product(
+        setup.worlds.scenes[w].mdp, setup.judge, label_on=setup.task.label_on)
+
+
+# --- tasks without end -------------------------------------------------------------------------
+
+
+def test_a_task_without_end_is_learned_and_done_in_worlds_never_seen(write, tmp_path):
+    path = write()
+    result = run("learn", path, "--out", tmp_path / "out", "--json")
+    assert result.exit_code == 0, result.output
+    assert "warning: No policy can do the task from 6 of 6 starts of the test world map 2" in (
+        result.stdout)
+    found = json.loads(result.stdout.splitlines()[-1])
+    assert (found["acceptance"], found["expert"]) == ("buchi", "quickest")
+    assert found["demonstrations"]["number"] == [10] and found["demonstrations"]["dropped"] == 0
+    assert found["test"]["infeasible"] == ["map 2"]
+    worlds = found["training"]["worlds"] + found["test"]["worlds"]
+    for world, possible in zip(worlds, (1, 1, 0), strict=True):
+        assert world["minimum"]["lower"] == world["minimum"]["upper"] == possible
+        assert world["expert"] == possible and world["random"] == 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "and of those that do it as well it is the quickest" in page
+    runs = json.loads(re.search(r'id="data">(.*?)</script>', page)[1])[0]["runs"]
+    assert max(len(played["steps"]) for played in runs) > 100  # on and on
+    assert {"automaton.svg", "training_1.svg", "test_2.svg", "learning.svg"} <= {
+        file.name for file in (tmp_path / "out").iterdir()}
+    # What is in the file plans the same in a world that is given to it.
+    learned, setup = load_reward(tmp_path / "out" / "network.npz"), prepared(path)
+    for w in (0, 1):
+        scene = setup.worlds.scenes[w]
+        model, solution = plan_in(learned, scene.mdp, scene.observation)
+        _, sure = evaluate(model, solution.policy)
+        starts = np.flatnonzero(np.asarray(scene.mdp.initial) > 0)
+        assert sure[starts, np.asarray(model.initial_memory)[starts]].all()
+
+
+@pytest.mark.parametrize(("formula", "kind"), [
+    ("G F a & G F b & G !c", "buchi"), ("F G !a | G F b", "parity"), ("G !c & !b", "safety"),
+    ("!c U (a & (!c U b))", "cosafe")])
+def test_the_expert_is_the_quickest_of_the_best_and_demonstrates(write, formula, kind):
+    setup = prepared(write((FORMULA, f'formula = "{formula}"')), seed=3)
+    assert setup.judge.acceptance == kind and not setup.soft
+    found = np.asarray(job._probability(setup.worlds.judged, setup.expert, None).value)
+    for w, scene in enumerate(setup.worlds.scenes):
+        model, size = own(setup, w), scene.mdp.num_states
+        best = jl.optimal_satisfaction(model)
+        np.testing.assert_array_equal(
+            setup.expert[w, :size], np.eye(4)[np.asarray(best.policy)])
+        value, _ = evaluate(model, setup.expert[w, :size])
+        memory = np.asarray(model.initial_memory)
+        np.testing.assert_allclose(found[w, :size], value[np.arange(size), memory], atol=1e-12)
+        starts = np.asarray(scene.mdp.initial) > 0
+        never = np.asarray(infeasible_starts(part_of(setup.worlds.judged, w)))
+        np.testing.assert_array_equal(
+            never[:size][starts], value[np.arange(size), memory][starts] == 0)
+    (shown,) = setup.demonstrations
+    model = own(setup, 0)
+    best = np.asarray(jl.optimal_satisfaction(model).policy)
+    for states, actions, length in zip(*map(
+            np.asarray, (shown.state, shown.action, shown.length)), strict=True):
+        q = int(model.initial_memory[states[0]])
+        for s, a in zip(states[:length], actions[:length], strict=True):
+            assert a == best[s, q]
+            q = int(model.next_memory[s, q])
+        assert length == 12 or kind == "cosafe"
+
+
+def test_the_learner_is_given_what_the_task_is_not(write):
+    """Judged by a task without end, whatever the learner remembers."""
+    path = write(("[task]", '[task]\nguarantee = "none"'),
+                 ("discount = 0.9", 'discount = 0.9\nmemory = "F a"'))
+    setup = prepared(path)
+    policy = np.full((3, 9, len(setup.memory.delta), 4), 0.25)
+    policy[:] = np.random.default_rng(0).dirichlet(np.ones(4), policy.shape[:-1])
+    lifted = job.lift_memory(jnp.asarray(policy), setup.judge)
+    found = job._probability(setup.worlds.judged, lifted, None)
+    same = job._probability(setup.worlds.judged, setup.expert, None)
+    np.testing.assert_array_equal(same.mean, [1, 1, 0])
+    for w in range(3):
+        model = part_of(setup.worlds.judged, w)
+        value, _ = evaluate(model, lifted[w])
+        np.testing.assert_allclose(
+            found.value[w], value[np.arange(9), np.asarray(model.initial_memory)], atol=1e-12)
+
+
+def test_a_horizon_is_for_tasks_that_are_decided_within_it(write):
+    within = ("discount = 0.9", "discount = 0.9\nhorizon = 15")
+    with pytest.raises(ValueError, match=r"\[learner\] horizon = 15 ends a run .* has buchi"):
+        prepared(write(within))
+    assert prepared(write(within, (FORMULA, 'formula = "G !c"'))).judge.acceptance == "safety"
+
+
+def test_the_probability_of_not_failing_within_a_horizon():
+    rng = np.random.default_rng(0)
+    matrix = rng.dirichlet(np.ones(3), (3, 2))
+    mdp = from_dense(matrix, label=[[0], [1], [0]], propositions=["a"], initial=[0.5, 0, 0.5])
+    policy = rng.dirichlet([1, 1], (1, 4, 3, 2))
+    found = job._within_each(stack_products([mdp], "G !a"), jnp.asarray(policy))
+    value = np.array([1, 1, 1.0])  # of not being at 1 before, on the way out of it
+    for actions in policy[0, ::-1, :, 0]:
+        value = np.where([False, True, False], 0, np.einsum("sa,sat,t->s", actions, matrix, value))
+    np.testing.assert_allclose(found.value[0], value, atol=1e-14)
+
+
+# --- a probability -----------------------------------------------------------------------------
+
+RISKY = '''
+[world]
+maps = ["""
+. . a . .
+. r r r .
+. . . . .
+s . r . b
+"""]
+legend = { "." = [], a = ["a"], b = ["b"], r = ["r"], s = ["s"] }
+initial = "s"
+slip = 0.1
+absorbing = ["b"]
+
+[task]
+formula = "!r U b"
+guarantee = 0.85
+
+[demonstrations]
+files = ["shown.json"]
+
+[learner]
+method = "todirl"
+discount = 0.9
+hidden = []
+held_out = 0.0
+steps = 60
+learning_rate = 0.3
+
+[test]
+maps = ["""
+s . . . .
+. r . r .
+. . . . b
+. r . . .
+""", """
+s . . .
+. . . b
+""", """
+s r b
+"""]
+leave_out = ["map 3"]
+'''
+CARELESS = {"demonstrations": [
+    {"cells": [[4, 1], [3, 1], [3, 2], [3, 3], [3, 4], [3, 5]],
+     "actions": ["up", "right", "right", "right", "right", "down"]},
+    {"cells": [[4, 1], [4, 2], [3, 2], [3, 3], [3, 4], [4, 4]],
+     "actions": ["right", "up", "right", "right", "down", "right"]},
+]}
+
+
+def learned(path, seed=0):
+    """The outcome of a task file, and its summary."""
+    setup = prepared(path, seed)
+    outcome = job.Outcome(setup, *job.learn(setup, seed, 1), seed=seed, seconds=0.0)
+    return outcome, json.loads(json.dumps(job.summary(outcome)))
+
+
+def check_reached(outcome, asked, over):
+    """In every world that counts it has what was asked, and no more than the share gives it."""
+    setup, mixed = outcome.setup, 0
+    judged = [(outcome.training, w, w) for w in range(setup.num_training)]
+    judged += [(outcome.test, i, setup.num_training + i) for i in range(2)]
+    for judgement, i, w in judged:
+        model = own(setup, w)
+        policy = judgement.policy[i][: model.mdp.num_states]
+        np.testing.assert_allclose(policy.sum(-1), 1)
+        value, _ = evaluate(model, policy)
+        reached, _ = at_starts(model, value, over)
+        assert judgement.attained[i] == pytest.approx(reached, abs=1e-9)
+        assert reached >= asked - 1e-12
+        share = judgement.share[i]
+        assert share == 0 or asked <= judgement.attained[i] <= asked + WINDOW
+        mixed += share > 0
+    return mixed
+
+
+def test_a_probability_is_reached_in_every_world(write, tmp_path):
+    (tmp_path / "shown.json").write_text(json.dumps(CARELESS))
+    outcome, result = learned(write(text=RISKY))
+    assert check_reached(outcome, 0.85, "mean") > 0
+    assert outcome.learned.weight > 0 and result["guarantee"]["weight"] == outcome.learned.weight
+    counted = result["training"]["worlds"] + result["test"]["worlds"][:2]
+    (text,) = (text for kind, text in remarks(result) if kind == "good")
+    least = min(world["attained"] for world in counted)
+    assert text.startswith(
+        "Asked for 0.8500 in every world, new ones too, on average over its starts; certified at "
+        f"least {least:.4f} here: the task is weighed by mu = ")
+    assert result["test"]["worlds"][2]["share"] == 1  # where it cannot be had
+    # What is written plans the same in worlds that it is given.
+    save_reward(tmp_path / "network.npz", job.learned_reward(outcome))
+    reward = load_reward(tmp_path / "network.npz")
+    assert (reward.guarantee, reward.over) == (0.85, "mean")
+    scene = outcome.setup.worlds.scenes[1]
+    _, solution = plan_in(reward, scene.mdp, scene.observation)
+    np.testing.assert_allclose(
+        solution.policy, outcome.test.policy[0][: scene.mdp.num_states], atol=1e-6)
+    scene = outcome.setup.worlds.scenes[3]
+    with pytest.raises(ValueError, match=r"guarantee = 0.85: the best .* is 0 .*least from state"):
+        plan_in(reward, scene.mdp, scene.observation)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("asked", [0.5, 0.8, 0.86])
+@pytest.mark.parametrize("over", ["mean", "worst"])
+def test_probabilities_are_reached_from_the_worst_start_too(write, tmp_path, asked, over):
+    (tmp_path / "shown.json").write_text(json.dumps(CARELESS))
+    worst = '\nover = "worst"' if over == "worst" else ""
+    outcome, _ = learned(write(
+        ("guarantee = 0.85", f"guarantee = {asked}{worst}"), text=RISKY))
+    mixed = check_reached(outcome, asked, over)
+    assert asked > 0.5 or (mixed, outcome.learned.weight) == (0, 0)
+    # Nothing that was learned with another weight makes the demonstrations likelier.
+    setup = outcome.setup
+    assert setup.asked == asked
+
+
+def test_a_task_without_end_has_its_probability_by_moves_that_lose_nothing(write):
+    """Any share of others would fail it in the end, and no weight changes that."""
+    outcome, result = learned(write(("[task]", "[task]\nguarantee = 0.7"),
+                                    ("\n[test]", '\n[test]\nleave_out = ["map 2"]')))
+    assert outcome.learned.weight == 0
+    for world in result["training"]["worlds"] + result["test"]["worlds"][:1]:
+        assert (world["share"], world["attained"]) == (1, 1)
+
+
+def test_what_no_policy_has_in_a_world_is_refused_with_what_is_possible(write, tmp_path):
+    (tmp_path / "shown.json").write_text(json.dumps(CARELESS))
+    best = jl.optimal_satisfaction(own(prepared(write(text=RISKY)), 2))
+    assert float(jnp.sum(best.value[0])) > 0
+    with pytest.raises(ValueError, match=(
+            r"\[task\] in the test world map 3: guarantee = 0.85: the best that can be achieved is "
+            r"0 on average .*least from row 1, column 1.*Or name it in \[test\] leave_out")):
+        prepared(write(('leave_out = ["map 3"]', ""), text=RISKY))
+    narrow = (". . a . .", ". r a . .")
+    with pytest.raises(ValueError, match=r"in the training world map 1: guarantee = 0.999: the be"):
+        prepared(write(narrow, ("guarantee = 0.85", "guarantee = 0.999"), text=RISKY))
+    assert prepared(write(("guarantee = 0.85", "guarantee = 1.0"), text=RISKY)).asked == "best"
