@@ -73,49 +73,37 @@ def factors(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
       Its factors; None where it is singular.
     """
     matrix = rows[chosen]
-    if not _pays(matrix, label):
-        return Factors(rows, label, None, matrix, None, 0)
     order = _order(matrix, label)
-    return None if order is None else _factored(rows, label, order, chosen)
-
-
-def _pays(matrix: Any, label: Integers) -> bool:
-    size = np.bincount(label)
-    largest = int(size.argmax())
-    if size[largest] <= _SMALL:
-        return True
-    from scipy.sparse import csgraph
-
-    node = np.flatnonzero(label == largest)
-    block = matrix[node][:, node]
-    block = (block + block.T).tocsr()
-    order = csgraph.reverse_cuthill_mckee(block, symmetric_mode=True)
-    place = np.empty(node.size, np.int64)
-    place[order] = np.arange(node.size)
-    source = np.repeat(np.arange(node.size), np.diff(block.indptr))
-    reach = place[source] - place[block.indices]
-    furthest = np.zeros(node.size, np.int64)
-    np.maximum.at(furthest, source, reach)
-    return bool(furthest.mean() * _SPREAD < node.size)
+    if order is None:
+        return Factors(rows, label, None, matrix, None, 0)
+    return _factored(rows, label, order, chosen)
 
 
 def _order(matrix: Any, label: Integers) -> Integers | None:
-    """By component, and in each by minimum degree of what leads from it to itself."""
-    from scipy.sparse import linalg
+    """By component, and in each one after its neighbours; None where that would not help."""
+    from scipy.sparse import csgraph
 
+    size = np.bincount(label)
+    if size.max(initial=0) <= 1:
+        return np.argsort(label, kind="stable")
     source = np.repeat(np.arange(label.size), np.diff(matrix.indptr))
     within = matrix.copy()
     within.data[label[source] != label[matrix.indices]] = 0
     within.eliminate_zeros()
-    if not within.nnz:
-        return np.argsort(label, kind="stable")
-    try:
-        factor = linalg.splu(
-            _minus(within).T, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0,
-            options={"SymmetricMode": True})
-    except (RuntimeError, MemoryError):
-        return None
-    return np.lexsort((factor.perm_c, label))
+    both = (within + within.T).tocsr()
+    order = csgraph.reverse_cuthill_mckee(both, symmetric_mode=True)
+    order = order[np.argsort(label[order], kind="stable")]
+    large = size[label] > _SMALL
+    if large.any():
+        place = np.empty(label.size, np.int64)
+        place[order] = np.arange(label.size)
+        source = np.repeat(np.arange(label.size), np.diff(both.indptr))
+        furthest = np.zeros(label.size, np.int64)
+        np.maximum.at(furthest, source, place[source] - place[both.indices])
+        largest = label == size.argmax()
+        if furthest[largest].mean() * _SPREAD > np.count_nonzero(largest):
+            return None
+    return order
 
 
 def _factored(rows: Any, label: Integers, order: Integers, chosen: Integers) -> Factors | None:

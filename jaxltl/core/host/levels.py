@@ -9,8 +9,8 @@ import numpy as np
 
 from jaxltl.core.host.rows import Booleans, Integers, spans
 
-_WIDE = 32  # states a level below which a round for each level is slower than elimination
-_ROUNDS = 40  # levels after which that is asked
+_ROUNDS = 40  # levels, and
+_NODES = 32  # so many nodes for a further one, until elimination is faster
 
 
 class Edges(NamedTuple):
@@ -64,7 +64,8 @@ def peel(back: Edges, number: Integers, among: Booleans) -> Levels:
     found: list[Integers] = []
     start = [0]
     frontier: Integers = np.flatnonzero(among & (number == 0))
-    while frontier.size and not (len(found) > _ROUNDS and start[-1] < _WIDE * len(found)):
+    most = _ROUNDS + number.size // _NODES
+    while frontier.size and len(found) < most:
         found.append(frontier)
         start.append(start[-1] + frontier.size)
         among[frontier] = False

@@ -240,9 +240,12 @@ def _most(
     mdp: HostMDP, cost: Floats, goal: Booleans, depth: int, tolerance: float
 ) -> Enclosed:
     never = ~forced(mdp, goal)
-    infinite = reaching(mdp, never, _rows_of(mdp, ~goal))
+    before = _rows_of(mdp, ~goal)
+    infinite = reaching(mdp, never, before)
     goal = _nothing(mdp, cost, goal, infinite)
-    row = mdp.first_choice(mdp.support.lead_to(infinite))[1].astype(np.int64)
+    # Where it is infinite: rows to where the target can be avoided, and there rows that avoid it.
+    avoids = ~mdp.support.lead_to(~never) & never[mdp.state]
+    row = np.where(never, mdp.first_choice(avoids)[1], _nearer(mdp, never, before))
     return _finite(mdp, cost, goal, infinite, row, depth, tolerance, maximize=True)
 
 

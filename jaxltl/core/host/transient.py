@@ -23,7 +23,7 @@ from jaxltl.core.host.sparse_graph import searched
 _EPS = float(np.finfo(np.float64).eps)
 _AIM = 0.1  # of the tolerance: how much of it the extra cost of the steps may take
 _AIM_CHAIN = 1e-5  # where there is nothing to choose, so that ties do not matter
-_FIRST_SWEEPS = 40  # of value iteration, to begin with a policy that is not bad
+_FIRST_SWEEPS = 60  # of value iteration, to begin with a policy that is not bad
 _SWEEPS = 12  # after each system, by which news goes on from where policies change
 _HASTY = 12  # exact rounds after which its own improvement alone goes on, which must end
 _KEPT = 0.75  # of the extra cost: who gains less stays, and the rest is what proves the bound
@@ -134,7 +134,7 @@ def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: b
     unit = (4 * system.widest + problem.depth + 16) * _EPS
     bounds = np.zeros((2, n + 1))  # attained and beyond
     bounds[:, n] = 1
-    chosen = system.row_start[:-1].copy()
+    chosen: Any = system.row_start[:-1].copy()
     edges = _edges(system)
     back, among = edges.reverse(), np.ones(n, bool)
     number = np.diff(edges.start).astype(np.int32)
@@ -150,6 +150,7 @@ def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: b
             found = _solve_core(
                 system, core, bounds, unit + grown, sign, problem, tolerance, relative)
             rounds, method = found.rounds, found.method
+            core = found.node
             bounds[0, core], bounds[1, core], chosen[core] = found.near, found.far, found.chosen
         after = Levels(above.node[::-1], [above.start[-1] - x for x in above.start[::-1]])
         _sweep(system, after, bounds, chosen, sign)
@@ -313,6 +314,7 @@ def _first(image: Floats, best: Floats, begin: Integers) -> Integers:
 
 
 class _Core(NamedTuple):
+    node: Integers
     near: Floats
     far: Floats
     chosen: Integers
@@ -321,57 +323,90 @@ class _Core(NamedTuple):
 
 
 class _Circles(NamedTuple):
-    """The core as matrices.
+    """The core as matrices. Its nodes stand by their number of rows, those with most first.
+
+    Rows stand by rank: the first ones of all nodes, in order, then the second ones of the nodes
+    that have a second, and so on. So an optimum over rows is one over slices.
 
     Attributes:
       matrix: ``float64[R, M]``, SciPy's.
       known: ``float64[R]``, what comes in from elsewhere.
-      owner: ``int[R]``.
-      start: ``int[M]``, the first row of each node.
+      owner: ``int[R]``, the node of a row.
+      row: ``int[R]``, the row of the system that it is.
+      starts: where the rows of each rank start, and R.
       sign: 1 to maximise.
     """
 
     matrix: Any
     known: Floats
     owner: Integers
-    start: Integers
+    row: Integers
+    starts: list[int]
     sign: int
+
+    @property
+    def num_nodes(self) -> int:
+        return self.starts[1]
+
+    @property
+    def is_chain(self) -> bool:
+        return len(self.starts) == 2
 
     def backup(self, value: Floats) -> Floats:
         return self.known + self.matrix @ value
 
     def best(self, image: Floats) -> Floats:
-        if self.start.size == self.owner.size:
-            return image
-        return self.sign * np.maximum.reduceat(self.sign * image, self.start)
+        """The optimum over the rows of each node."""
+        found = image[: self.starts[1]].copy()
+        better = np.maximum if self.sign > 0 else np.minimum
+        for a, b in zip(self.starts[1:-1], self.starts[2:], strict=True):
+            better(found[: b - a], image[a:b], out=found[: b - a])
+        return found
 
     def argbest(self, image: Floats, best: Floats) -> Integers:
         """The first row that attains the best of each node."""
-        hit = np.flatnonzero(image == best[self.owner])
-        found = self.start.copy()
-        found[self.owner[hit[::-1]]] = hit[::-1]
+        found = np.arange(self.num_nodes)
+        for a, b in reversed(list(zip(self.starts[:-1], self.starts[1:], strict=True))):
+            hit = image[a:b] == best[: b - a]
+            found[: b - a] = np.where(hit, np.arange(a, b), found[: b - a])
         return found
 
 
-def _circles(system: _System, core: Integers, bounds: Floats, sign: int) -> tuple[_Circles, Any]:
+def _circles(
+    system: _System, core: Integers, bounds: Floats, sign: int
+) -> tuple[_Circles, Integers, Edges]:
+    """The matrices, the nodes in their order, and the edges among them."""
     from scipy import sparse
 
-    part = system.taken(core)
+    count = np.diff(system.row_start)[core]
+    order = np.argsort(-count, kind="stable")
+    core, count = core[order], count[order]
+    rank = np.arange(int(count.sum())) - np.repeat(count.cumsum() - count, count)
+    owner = np.repeat(np.arange(core.size, dtype=np.int32), count)
+    place = np.argsort(rank, kind="stable")
+    owner = owner[place]
+    row = system.row_start[core][owner] + rank[place]
+    starts = [0, *np.bincount(rank).cumsum().tolist()]
+    width = np.diff(system.entry_start)[row]
+    entry = spans(system.entry_start[row], width)
     number: Any = np.full(system.num_nodes + 1, -1, np.int32)
     number[core] = np.arange(core.size)
-    target = number[part.target]
+    target, weight = number[system.target[entry]], system.weight[entry]
     inner = target >= 0
-    of = np.repeat(np.arange(part.row.size, dtype=np.int32), np.diff(part.entry_start))
+    of = np.repeat(np.arange(row.size, dtype=np.int32), width)
     middle = (bounds[0] + bounds[1]) / 2
     outer = ~inner
-    earned = part.weight[outer] * middle[part.target[outer]]
-    known: Any = np.bincount(of[outer], earned, part.row.size)
-    start = _starts(np.bincount(of[inner], minlength=part.row.size))
-    matrix = sparse.csr_array(
-        (part.weight[inner], target[inner], start), shape=(part.row.size, core.size))
+    earned = weight[outer] * middle[system.target[entry[outer]]]
+    known: Any = np.bincount(of[outer], earned, row.size)
+    start = _starts(np.bincount(of[inner], minlength=row.size))
+    shape = (row.size, core.size)
+    matrix = sparse.csr_array((weight[inner], target[inner], start), shape=shape)
     matrix.sum_duplicates()
-    edges = Edges(matrix.indptr[part.row_start], matrix.indices)
-    return _Circles(matrix, known, part.owner, part.row_start[:-1].astype(np.int64), sign), edges
+    source = np.repeat(owner, np.diff(matrix.indptr))
+    edges = sparse.coo_array((np.ones(source.size, bool), (source, matrix.indices)),
+                             shape=(core.size, core.size)).tocsr()
+    circles = _Circles(matrix, known, owner, row, starts, sign)
+    return circles, core, Edges(edges.indptr, edges.indices)
 
 
 def _solve_core(
@@ -379,14 +414,12 @@ def _solve_core(
     tolerance: float, relative: bool,
 ) -> _Core:
     """Policy iteration of the problem whose every step costs a little more."""
-    circles, edges = _circles(system, core, bounds, sign)
+    circles, core, edges = _circles(system, core, bounds, sign)
     label = components_in_order(edges)
-    first = system.row_start[core]  # the core's rows are numbered from its nodes' first ones on
     proper = partial(_proper, circles, _leaving(circles, system, core, problem))
     chosen = proper(_greedy(circles, 0.0, np.zeros(core.size), _FIRST_SWEEPS))
     solver = factors(circles.matrix, label, chosen)
-    chain = circles.owner.size == circles.start.size
-    aim = (_AIM_CHAIN if chain else _AIM) * tolerance
+    aim = (_AIM_CHAIN if circles.is_chain else _AIM) * tolerance
     extra, rounds = None, 0
     best: _Core | None = None
     while rounds < _MAX_ROUNDS and solver is not None:
@@ -412,7 +445,7 @@ def _solve_core(
         found = _prove(circles, solver, chosen, value, extra, unit)
         if found is not None:
             near, far, _ = found
-            best = _Core(near, far, chosen, rounds, solver.method)
+            best = _Core(core, near, far, chosen, rounds, solver.method)
             width = sign * (far - near)
             size = np.maximum(sign * (near if sign > 0 else far), 0) if relative else 1
             if (width <= tolerance * np.abs(size) / 2).all():
@@ -425,20 +458,19 @@ def _solve_core(
     if best is None:
         low, high = np.zeros(core.size), np.full(core.size, np.inf)
         near, far = (low, high) if sign > 0 else (high, low)
-        best = _Core(near, far, chosen, rounds, "nothing proven")
-    rank = best.chosen - circles.start
-    return best._replace(chosen=first + rank)
+        best = _Core(core, near, far, chosen, rounds, "nothing proven")
+    return best._replace(chosen=circles.row[best.chosen])
 
 
 def _leaving(
     circles: _Circles, system: _System, core: Integers, problem: Transient
 ) -> Integers | None:
     """Rows by which the core is left almost surely, where some policies never leave."""
-    if problem.first is None or circles.owner.size == circles.start.size:
+    if problem.first is None or circles.is_chain:
         return None
-    part = system.taken(core)
-    hit = np.flatnonzero(part.row == problem.first[system.node[core]][circles.owner])
-    found = circles.start.copy()
+    given = problem.first[system.node[core]]
+    hit = np.flatnonzero(system.row[circles.row] == given[circles.owner])
+    found = np.arange(core.size)
     found[circles.owner[hit]] = hit
     return found
 
@@ -454,8 +486,8 @@ def _proper(circles: _Circles, leaving: Integers | None, chosen: Integers) -> In
 
 def _greedy(circles: _Circles, extra: float, value: Floats, sweeps: int) -> Integers:
     """The greedy policy after some sweeps of value iteration."""
-    if circles.owner.size == circles.start.size:
-        return circles.start
+    if circles.is_chain:
+        return np.arange(circles.num_nodes)
     for _ in range(sweeps):
         image = circles.backup(value) + extra
         value = circles.best(image)

@@ -1,0 +1,208 @@
+"""Certified optima on sparse rows against all memoryless policies, by exact fractions."""
+
+import itertools
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from jaxltl.core.host import contract, elimination, levels
+from jaxltl.core.host.optimal import reachability, total_reward, worst_width
+from jaxltl.core.host.sparse import HostMDP
+from jaxltl.core.models.sparse import make_sparse
+
+
+def random_model(rng, num_states, most_choices=3):
+    """Probabilities that are eighths, so that fractions are exact; chains, loops and components."""
+    row_start, entry_start, successor, probability = [0], [0], [], []
+    sink = num_states - 1 if rng.random() < 0.7 else -1
+    for s in range(num_states):
+        for _ in range(int(rng.integers(1, most_choices + 1)) if s != sink else 1):
+            width = int(rng.integers(1, 4)) if rng.random() < 0.6 else 1
+            near = rng.random() < 0.7
+            pool = range(max(0, s - 2), min(num_states, s + 3)) if near else range(num_states)
+            pool, width = ([s], 1) if s == sink else (pool, width)
+            targets = rng.choice(list(pool), size=min(width, len(list(pool))), replace=False)
+            weights = {1: [8], 2: [3, 5], 3: [1, 2, 5]}[len(targets)]
+            successor += targets.tolist()
+            probability += [w / 8 for w in weights]
+            entry_start.append(len(successor))
+        row_start.append(len(entry_start) - 1)
+    return make_sparse(row_start, entry_start, successor, probability)
+
+
+def solved(host: HostMDP, row, fixed, known, cost):
+    """``x = c + P x`` of a policy by exact elimination; infinite where it may never get out."""
+    size = host.num_states
+    edges = [set() for _ in range(size)]
+    for s in range(size):
+        if not fixed[s]:
+            r = row[s]
+            edges[s] = set(host.successor[host.entry_start[r] : host.entry_start[r + 1]].tolist())
+    gets_out = set(np.flatnonzero(fixed).tolist())
+    while True:
+        more = {s for s in range(size) if s not in gets_out and edges[s] & gets_out}
+        if not more:
+            break
+        gets_out |= more
+    stuck = {s for s in range(size) if s not in gets_out}
+    while True:  # who may get stuck
+        more = {s for s in range(size) if s not in stuck and not fixed[s] and edges[s] & stuck}
+        if not more:
+            break
+        stuck |= more
+    open_ = [s for s in range(size) if not fixed[s] and s not in stuck]
+    place = {s: i for i, s in enumerate(open_)}
+    rows = []
+    for s in open_:
+        line = [Fraction(0)] * (len(open_) + 1)
+        line[place[s]] += 1
+        line[-1] += Fraction(float(cost[row[s]]))
+        for e in range(host.entry_start[row[s]], host.entry_start[row[s] + 1]):
+            t, p = int(host.successor[e]), Fraction(float(host.probability[e]))
+            if fixed[t]:
+                line[-1] += p * Fraction(float(known[t]))
+            else:
+                line[place[t]] -= p
+        rows.append(line)
+    for i in range(len(rows)):
+        j = next(j for j in range(i, len(rows)) if rows[j][i])
+        rows[i], rows[j] = rows[j], rows[i]
+        rows[i] = [x / rows[i][i] for x in rows[i]]
+        for k in range(len(rows)):
+            if k != i and rows[k][i]:
+                rows[k] = [a - rows[k][i] * b for a, b in zip(rows[k], rows[i], strict=True)]
+    value = [Fraction(float(known[s])) if fixed[s] else None for s in range(size)]
+    for s in open_:
+        value[s] = rows[place[s]][-1]
+    return value
+
+
+def policies(host):
+    spans = [range(host.row_start[s], host.row_start[s + 1]) for s in range(host.num_states)]
+    return itertools.product(*spans)
+
+
+def probability_of(host, row, target, stay):
+    """Of reaching the target: states that cannot get there are taken out first."""
+    size = host.num_states
+    fixed = target | ~stay
+    can = target.copy()
+    for _ in range(size):
+        for s in range(size):
+            r = row[s]
+            after = host.successor[host.entry_start[r] : host.entry_start[r + 1]]
+            can[s] |= not fixed[s] and can[after].any()
+    return solved(host, row, fixed | ~can, target.astype(float), np.zeros(host.num_rows))
+
+
+def encloses(found, best, *, maximize):
+    for s, exact in enumerate(best):
+        if exact is None:
+            assert found.lower[s] == found.upper[s] == np.inf
+            continue
+        assert Fraction(float(found.lower[s])) <= exact <= Fraction(float(found.upper[s]))
+        if exact in (0, 1) and not (found.upper > 1).any():
+            assert found.lower[s] == found.upper[s] == exact
+
+
+def best_of(values, *, maximize):
+    """State by state; None is infinite."""
+    columns = zip(*values, strict=True)
+    if maximize:
+        return [None if any(x is None for x in c) else max(c) for c in columns]
+    return [min((x for x in c if x is not None), default=None) for c in columns]
+
+
+WAYS = ["as it is", "in the core", "by sweeps", "contracted"]
+
+
+@pytest.fixture(params=WAYS)
+def way(request, monkeypatch):
+    """Each way through the solver, which size and shape choose."""
+    if request.param != "as it is":
+        monkeypatch.setattr(contract, "_WORTH", 10**6)
+    if request.param in ("in the core", "by sweeps"):
+        monkeypatch.setattr(levels, "_ROUNDS", 0)
+        monkeypatch.setattr(levels, "_NODES", 10**9)
+    if request.param == "by sweeps":
+        monkeypatch.setattr(elimination, "_SMALL", 0)
+        monkeypatch.setattr(elimination, "_SPREAD", 10**9)
+
+
+def cases(count, seed=0):
+    rng = np.random.default_rng(seed)
+    made = 0
+    while made < count:
+        model = random_model(rng, int(rng.integers(3, 8)))
+        host = model.host
+        if np.diff(host.row_start).prod() > 60:
+            continue
+        made += 1
+        target = np.zeros(host.num_states, bool)
+        target[rng.integers(host.num_states)] = True
+        stay = rng.random(host.num_states) < 0.9
+        yield rng, host, target, stay
+
+
+def probabilities(host, target, stay):
+    return [probability_of(host, row, target, stay) for row in policies(host)]
+
+
+def rewards(host, target, cost):
+    nothing = np.zeros(host.num_states)
+    return [solved(host, row, target, nothing, cost) for row in policies(host)]
+
+
+def attained(found, values, *, maximize):
+    """The policy's own value is no worse than the bound on the safe side."""
+    for s, exact in enumerate(values):
+        if maximize:
+            assert exact is None or exact >= Fraction(float(found.lower[s]))
+        elif np.isfinite(found.upper[s]):
+            assert exact is not None and exact <= Fraction(float(found.upper[s]))
+
+
+@pytest.mark.usefixtures("way")
+@pytest.mark.parametrize("maximize", [True, False])
+def test_probabilities(maximize):
+    hard = 0
+    for _, host, target, stay in cases(60):
+        found = reachability(host, target, maximize=maximize, stay=stay)
+        best = best_of(probabilities(host, target, stay), maximize=maximize)
+        encloses(found, best, maximize=maximize)
+        assert worst_width(found, relative=False) <= 1e-6
+        attained(found, probability_of(host, found.row, target, stay), maximize=maximize)
+        hard += any(0 < x < 1 for x in best)
+    assert hard > 10
+
+
+@pytest.mark.usefixtures("way")
+@pytest.mark.parametrize("maximize", [True, False])
+def test_total_rewards(maximize):
+    hard = 0
+    for rng, host, target, _ in cases(60, seed=1):
+        target[-1] = True  # so that more of it is finite
+        cost = rng.integers(0, 4, host.num_rows) * (rng.random(host.num_rows) < 0.7) / 4
+        found = total_reward(host, cost, target, maximize=maximize)
+        best = best_of(rewards(host, target, cost), maximize=maximize)
+        encloses(found, best, maximize=maximize)
+        assert worst_width(found, relative=True) <= 1e-6
+        nothing = np.zeros(host.num_states)
+        attained(found, solved(host, found.row, target, nothing, cost), maximize=maximize)
+        hard += any(x is not None and x > 0 for x in best)
+    assert hard > 10
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("seed", range(20))
+def test_many(seed):
+    for rng, host, target, stay in cases(100, seed=100 + seed):
+        cost = rng.integers(0, 4, host.num_rows) * (rng.random(host.num_rows) < 0.7) / 4
+        probability, reward = probabilities(host, target, stay), rewards(host, target, cost)
+        for maximize in (True, False):
+            found = reachability(host, target, maximize=maximize, stay=stay)
+            encloses(found, best_of(probability, maximize=maximize), maximize=maximize)
+            attained(found, probability_of(host, found.row, target, stay), maximize=maximize)
+            found = total_reward(host, cost, target, maximize=maximize)
+            encloses(found, best_of(reward, maximize=maximize), maximize=maximize)
