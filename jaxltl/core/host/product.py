@@ -99,6 +99,14 @@ def host_product(
     return _written(world, code, lambda x: np.searchsorted(code, x).astype(np.int32), start)
 
 
+def without_memory(host: HostMDP, state: Integers) -> HostProduct:
+    """The world itself as its product with an automaton of one state, reached or not."""
+    number = np.arange(host.num_states, dtype=np.int32)
+    return HostProduct(
+        host, number, np.zeros_like(number), np.arange(host.num_rows, dtype=np.int32),
+        np.asarray(state, np.int64), np.zeros(host.num_states, bool))
+
+
 class _World(NamedTuple):
     host: HostMDP
     step: NDArray[np.int64]
