@@ -35,7 +35,7 @@ class Steps(NamedTuple):
 
 def backup_unit(mdp: HostMDP) -> float:
     """The relative rounding of one backup, and by how much its row may miss one."""
-    width = int(np.diff(mdp.entry_start).max())
+    width = int(np.diff(mdp.entry_start).max(initial=1))
     return (2 * width + 6) * float(np.finfo(np.float64).eps)
 
 

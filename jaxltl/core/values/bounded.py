@@ -294,9 +294,9 @@ def _entry_reward(model: SparseMDP, given: Rewards) -> np.ndarray:
 
 def enclosed(
     value: np.ndarray, error: Any, policy: Any, num_steps: int, *, highest: float = math.inf,
-    tolerance: float = TOLERANCE, relative: bool = True,
+    tolerance: float = TOLERANCE, least: float = 1.0, residual: float = 0.0,
 ) -> Solution:
-    """A host solver's :class:`Solution`; probabilities are narrow absolutely, rewards relatively.
+    """A host solver's :class:`Solution`.
 
     Args:
       value: ``float64[S]``.
@@ -304,21 +304,21 @@ def enclosed(
       policy: rows.
       num_steps: what was spent.
       highest: 1 for probabilities.
-      tolerance: half the width that is asked for.
-      relative: whether that is times what values above one are.
+      tolerance: the error up to which it has converged, as a share of the value.
+      least: or of this, where that is more.
+      residual: what the solution says.
     """
     error = np.broadcast_to(np.asarray(error, np.float64), value.shape)
     out = error > 0
-    with np.errstate(invalid="ignore"):
-        lower = np.where(out, np.nextafter(value - error, -np.inf), value)
-        upper = np.where(out, np.nextafter(value + error, np.inf), value)
+    lower = np.where(out, np.nextafter(value - error, -np.inf), value)
+    upper = np.where(out, np.nextafter(value + error, np.inf), value)
     if highest == 1:
         lower, upper, value = (np.clip(x, 0, 1) for x in (lower, upper, value))
-    size = np.maximum(np.abs(value), 1) if relative else 1.0
     finite = bool(np.isfinite(value).all())
-    narrow = finite and bool((error <= tolerance * size).all())
+    narrow = bool((error <= tolerance * np.maximum(np.abs(value), least)).all())
     status = Status.CONVERGED if narrow else Status.PRECISION if finite else Status.NONFINITE
     found: Any = {
         "value": value, "policy": policy, "lower": lower, "upper": upper,
-        "residual": np.float64(0), "num_steps": np.int32(num_steps), "status": np.int32(status)}
+        "residual": np.float64(residual), "num_steps": np.int32(num_steps),
+        "status": np.int32(status)}
     return Solution(**found)

@@ -1,0 +1,59 @@
+"""Long-run average rewards of Markov chains and decision processes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.host.average import average
+from jaxltl.core.models.convert import to_sparse
+from jaxltl.core.types import Solution
+from jaxltl.core.values.bounded import enclosed, finite_reward, optimum_of
+
+
+def average_reward(
+    model: Any, reward: Any, *, objective: str = "max", tolerance: float = 1e-6,
+    max_steps: int = 1_000_000,
+) -> Solution:
+    """Largest or smallest expected long-run average of a reward, a step.
+
+    ``lim 1/n E[r_1 + ... + r_n]`` from every state, of multichain models too (Puterman 1994,
+    chapter 9). It is the best expected gain of the end component in which a run ends: in each of
+    these the optimal gain is enclosed by the span of ``T v - v``, by value iteration, then policy
+    iteration with sparse elimination; and they are the terminal rewards of an optimal stopping
+    problem, whose every policy ends. Solved on the host, in double precision; every bound
+    includes its rounding. Games have :func:`~jaxltl.core.values.mean_payoff.mean_payoff`.
+
+    Args:
+      model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
+      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`; finite.
+      objective: ``"max"`` or ``"min"``; of chains either.
+      tolerance: the width of the enclosure asked for, as a share of the value (of the largest
+        value, where one is smaller than a millionth of the largest reward).
+      max_steps: sweeps of value iteration at most.
+
+    Returns:
+      :class:`Solution`; `value` is ``float64[S]``, `policy` rows ``int32[S]``: it attains the bound
+      on the safe side (`lower` of a maximum). `residual` is half the width of the gain's widest
+      enclosure.
+
+    Raises:
+      ValueError: the reward or the objective.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> model = make_sparse([0, 2, 3, 4], [0, 2, 3, 4, 5], [1, 2, 0, 1, 2],
+      ...                     [0.25, 0.75, 1, 1, 1])
+      >>> found = average_reward(model, [3.0, 8.0, 4.0])
+      >>> found.value.round(9).tolist(), found.policy.tolist()
+      ([5.0, 8.0, 4.0], [0, 2, 3])
+    """
+    model = to_sparse(model)
+    sign = 1 if optimum_of(objective) is np.maximum else -1
+    earned, magnitude = finite_reward(model, reward)
+    found = average(model.host, sign * earned, magnitude, tolerance=tolerance, max_steps=max_steps)
+    bounds = sorted((sign * found.lower, sign * found.upper), key=lambda x: float(x[0]))
+    error = np.maximum(bounds[1] - sign * found.value, sign * found.value - bounds[0])
+    return enclosed(sign * found.value, error, found.row.astype(np.int32), found.rounds,
+                    tolerance=tolerance, least=1e-6 * magnitude.max(), residual=found.residual)
