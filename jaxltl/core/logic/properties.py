@@ -459,7 +459,10 @@ class _Parser:
         relation = self.accept("<=", "<")
         if relation is None:
             raise self.error("<= or <; only upper bounds on rewards are solved for")
+        start = self.token
         limit = self.number()
+        if relation == "<" and not limit:
+            raise self.error("a bound that some reward meets", start)
         if self.token.text == ",":
             raise self.error("a formula; one bound on a reward is solved for, not several")
         return Bounded("U", TRUE, TRUE, reward=reward, limit=limit, strict=relation == "<")

@@ -182,6 +182,7 @@ WRONG = {
     'P=? [ F "a" ]]': ("'\\]'", "a property"),
     'P=? [ F{"x"}>=5 "a" ]': ("'>='", "upper bounds"),
     'P=? [ F{"x"}<=5,{"y"}<=2 "a" ]': ("','", "one bound"),
+    'P=? [ F{"x"}<0 "a" ]': ("'0'", "some reward"),
     'R{x}=? [ C ]': ("'x'", "double quotes"),
     'R=? [ G "a" ]': ("'G'", "F and a state formula"),
     'R=? [ F G "a" ]': ("'F'", "F and a state formula"),
