@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,9 +15,11 @@ from jaxltl.io._tokens import Block, Integers, Text, decoded, numbered, refuse
 # Reads tokens of a block as numbers, or as something else that NumPy can hold.
 Values = Callable[[Block, Integers], NDArray[Any]]
 
+NO_LABEL = b"__NOLABEL__"  # the name of actions that have none
 _MODEL = re.compile(rb"^@model[ \t\r]*$", re.MULTILINE)
 _LINE = re.compile(rb"(?:state|action)\s+\S+?\s*(?:\[([^\[\]]*)\]\s*)?((?:(?<=\s)[^\[\]].*)?)",
                    re.DOTALL)
+_NUMBER = re.compile(rb"0|[1-9]\d{0,8}")
 _LABEL = re.compile(rb'"([^"]+)"|([^\s"]+)')
 
 
@@ -305,6 +307,9 @@ def _rewards(
         if found is None or found[1] is None:
             raise block.malformed(int(lines[int(has.argmax())]), form)
         body.rewards = found[1].count(b",") + 1
+    if body.rewards * lines.size > 8 * len(block.text.data) + 2**24:
+        raise block.text.error(int(block.line[lines[0]]), f"{body.rewards} rewards are announced "
+                                                          "before, more than this holds.")
     width = body.rewards
     odd |= has & (count < 2 + width)
     start, end = block.start.copy(), block.end.copy()
@@ -337,14 +342,15 @@ def _odd_line(
         raise block.malformed(line, form)
     if found[1] is not None:
         texts = [x.strip() for x in found[1].split(b",")]
-        if len(texts) != width or not all(texts) or reward is None:
+        if len(texts) != width or not all(texts) or any(b" " in x for x in texts):
             raise block.malformed(line, f"{form} with {width} rewards")
         data = b" ".join(texts) + b" "
         length = np.array([len(x) for x in texts])
         end = np.cumsum(length + 1) - 1
         part = Block(block.text, np.frombuffer(data, np.uint8), end - length, end,
                      np.array([0, width]), block.line[line : line + 1])
-        reward[place] = numbers(part, np.arange(width))
+        if reward is not None:
+            reward[place] = numbers(part, np.arange(width))
     return found[2]
 
 
@@ -373,13 +379,59 @@ def _check_counts(header: Header, body: Body) -> None:
                                                                 "expected a successor after it.")
 
 
-def label_matrix(header: Header, body: Body) -> tuple[list[str], NDArray[np.bool_]]:
-    """The names of the labels and where they hold, ``bool[S, P]``."""
-    text = header.body
-    if body.num_states * len(body.label_names) > 64 * len(text.data) + 2**28:
-        refuse(text.name, f"{len(body.label_names)} labels of {body.num_states} states would take "
-                          f"{body.num_states * len(body.label_names) / 2**30:.0f} GB.")
-    holds = np.zeros((body.num_states, len(body.label_names)), bool)
+# --- what the columns say -------------------------------------------------------------------
+
+
+def names_of(header: Header, body: Body) -> dict[str, Any]:
+    """Labels, initial states and actions, as :func:`~jaxltl.core.models.sparse.make_sparse` has."""
+    text, num_labels = header.body, len(body.label_names)
+    if body.num_states * num_labels > 64 * len(text.data) + 2**28:
+        refuse(text.name, f"{num_labels} labels of {body.num_states} states would take "
+                          f"{body.num_states * num_labels / 2**30:.0f} GB.")
+    holds = np.zeros((body.num_states, num_labels), bool)
     for state, column in zip(body.labelled, body.label, strict=True):
         holds[state, column] = True
-    return decoded(text, body.label_names), holds
+    names = decoded(text, body.label_names)
+    if "init" not in names:
+        refuse(text.name, "no state has the label 'init'; expected at least one initial state.")
+    init = names.index("init")
+    names.pop(init)
+    initial = holds[:, init].astype(np.float64)
+    action, action_names = _actions(text, body)
+    return {"initial": initial / initial.sum(), "label": np.delete(holds, init, 1),
+            "propositions": tuple(names), "action": action, "action_names": action_names}
+
+
+def _actions(text: Text, body: Body) -> tuple[Integers | None, tuple[str, ...]]:
+    action = np.concatenate(body.action)
+    if list(body.action_names) == [NO_LABEL]:
+        return None, ()
+    if all(_NUMBER.fullmatch(name) for name in body.action_names):
+        return np.array([int(name) for name in body.action_names])[action], ()
+    names = decoded(text, body.action_names)
+    return action, tuple("" if name == NO_LABEL.decode() else name for name in names)
+
+
+def rewards_of(
+    header: Header, body: Body
+) -> Iterator[tuple[str, NDArray[Any], NDArray[Any]]]:
+    """Each reward: its name, and its values on states ``[S]`` and on choices ``[R]``, or none."""
+    text, width = header.body, body.rewards
+    if width * (body.num_states + body.num_rows) > 8 * len(text.data) + 2**24:
+        refuse(text.name, f"{width} rewards of {body.num_states} states are more than it writes.")
+    given = header.rewards if width else [x for x in header.rewards if x]
+    names = [given[i] if i < len(given) else f"rew{i}" for i in range(width or len(given))]
+    seen: set[str] = set()
+    for i, name in enumerate(names):
+        if name in seen:
+            refuse(text.name, f"two rewards are called {name!r}; rename one.")
+        seen.add(name)
+        yield (name, _gathered(body.state_reward, body.num_states, i),
+               _gathered(body.choice_reward, body.num_rows, i))
+
+
+def _gathered(parts: list[tuple[int, NDArray[Any]]], size: int, column: int) -> NDArray[Any]:
+    found = np.zeros(size if parts else 0, parts[0][1].dtype if parts else None)
+    for begin, part in parts:
+        found[begin : begin + len(part)] = part[:, column]
+    return found

@@ -38,9 +38,6 @@ def read_labels(
         holds, names = _storm_labels(text, num_states)
     else:
         holds, names = _prism_labels(text, num_states)
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise text.error(text.line, f"the label {twice!r} is declared twice.")
     if "init" not in names:
         return holds, names, np.eye(1, num_states)[0]
     column = names.index("init")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any, NoReturn
 
 import numpy as np
@@ -219,6 +220,18 @@ def as_double(text: bytes) -> float | None:
     if found := _INFINITE.fullmatch(text):
         return -np.inf if found[1] == b"-" else np.inf
     return None
+
+
+def as_fraction(text: bytes) -> Fraction | None:
+    """A decimal exactly; None for anything else, and for powers of ten that no double has."""
+    found = _DECIMAL.fullmatch(text) if len(text) <= _LONGEST else None
+    exponent = re.search(rb"[eE]([+-]?\d+)", text)
+    if found is None or (exponent and (len(exponent[1]) > 4 or abs(int(exponent[1])) > 400)):
+        return None
+    try:
+        return Fraction(text.decode())
+    except ValueError:  # more digits than Python reads
+        return None
 
 
 def numbered(texts: list[bytes], known: dict[bytes, int]) -> Integers:

@@ -11,19 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
-from jaxltl.io._drn_body import Body, Header, label_matrix, read_body, read_header
+from jaxltl.io._drn_body import NO_LABEL, Body, Header, names_of, read_body, read_header, rewards_of
 from jaxltl.io._files import read_bytes, write_bytes
 from jaxltl.io._tokens import (
-    Floats,
-    Integers,
     Text,
     as_double,
-    decoded,
     refuse,
 )
 
-_NO_LABEL = b"__NOLABEL__"
-_NUMBER = re.compile(rb"0|[1-9]\d{0,8}")
 _STEP = 2**16  # states that are written at a time
 
 
@@ -44,8 +39,8 @@ def read_drn(path: str | os.PathLike[str]) -> SparseMDP:
         intervals or observations, or in continuous time.
 
     Example:
-      >>> import tempfile
-      >>> path = Path(tempfile.mkdtemp()) / "coin.drn"
+      >>> import pathlib, tempfile
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
       >>> _ = path.write_text('''@type: DTMC
       ... @reward_models
       ... tosses
@@ -68,7 +63,7 @@ def read_drn(path: str | os.PathLike[str]) -> SparseMDP:
     header = read_header(Text(name, data, 0, len(data)))
     if header.value_type == "parametric" or (header.parameters and not header.value_type):
         refuse(name, f"its probabilities have parameters, {', '.join(header.parameters)}; "
-                     "jaxltl.io.drn.read_parametric reads it.")
+                     "jaxltl.io.parametric.read_parametric reads it.")
     known = _placeholders(header)
     try:
         body = read_body(
@@ -101,50 +96,18 @@ def _model(header: Header, body: Body) -> SparseMDP:
         bad = int(wrong.argmax())
         raise text.error(int(line[bad]), f"the probabilities of this action of state {state[bad]} "
                                          f"sum to {total[bad]:.9g}; expected 1.")
-    names, holds = label_matrix(header, body)
-    if "init" not in names:
-        refuse(text.name, "no state has the label 'init'; expected at least one initial state.")
-    column = names.index("init")
-    initial = holds[:, column].astype(np.float64)
     count = np.bincount(state, minlength=body.num_states)
-    action, action_names = _actions(text, body)
-    names.pop(column)
     return make_sparse(
         np.concatenate([[0], count.cumsum()]), start, np.concatenate(body.successor), probability,
-        initial=initial / initial.sum(), label=np.delete(holds, column, 1), propositions=names,
-        action=action, action_names=action_names, rewards=_rewards(header, body))
-
-
-def _actions(text: Text, body: Body) -> tuple[Integers | None, tuple[str, ...]]:
-    action = np.concatenate(body.action)
-    if list(body.action_names) == [_NO_LABEL]:
-        return None, ()
-    if all(_NUMBER.fullmatch(name) for name in body.action_names):
-        return np.array([int(name) for name in body.action_names])[action], ()
-    names = decoded(text, body.action_names)
-    return action, tuple("" if name == _NO_LABEL.decode() else name for name in names)
+        rewards=_rewards(header, body), **names_of(header, body))
 
 
 def _rewards(header: Header, body: Body) -> dict[str, Rewards]:
     """Rewards by name, without parts that are zero."""
-    states = _gathered(body.state_reward, body.num_states, body.rewards)
-    choices = _gathered(body.choice_reward, body.num_rows, body.rewards)
-    found: dict[str, Rewards] = {}
-    given = header.rewards if body.rewards else [x for x in header.rewards if x]
-    for i in range(body.rewards or len(given)):
-        name = given[i] if i < len(given) else f"rew{i}"
-        if name in found:
-            refuse(header.body.name, f"two rewards are called {name!r}; rename one.")
-        found[name] = Rewards() if not body.rewards else Rewards(
-            state=states[:, i].copy() if states[:, i].any() else None,
-            choice=choices[:, i].copy() if choices[:, i].any() else None)
-    return found
-
-
-def _gathered(parts: list[tuple[int, NDArray[Any]]], size: int, width: int) -> Floats:
-    found = np.zeros((size, width))
-    for begin, part in parts:
-        found[begin : begin + len(part)] = part
+    found = {}
+    for name, state, choice in rewards_of(header, body):
+        found[name] = Rewards(state=state if state.any() else None,
+                              choice=choice if choice.any() else None)
     return found
 
 
@@ -234,7 +197,7 @@ def _action_lines(
     count = rows.stop - rows.start
     after = _bracketed([choice for _, choice in rewards], rows, count)
     if actions is None or model.action is None:
-        return [f"\taction {_NO_LABEL.decode()}{text}\n" for text in after]
+        return [f"\taction {NO_LABEL.decode()}{text}\n" for text in after]
     numbers = np.asarray(model.action)[rows].tolist()
     return [f"\taction {actions[i]}{text}\n" for i, text in zip(numbers, after, strict=True)]
 
@@ -276,7 +239,7 @@ def _action_texts(model: SparseMDP) -> list[str] | None:
         return [str(i) for i in range(int(np.asarray(model.action).max()) + 1)]
     for name in model.action_names:
         _check_name("action", name, ' \t"')
-    return [name or _NO_LABEL.decode() for name in model.action_names]
+    return [name or NO_LABEL.decode() for name in model.action_names]
 
 
 def _check_name(what: str, name: str, refused: str) -> None:

@@ -18,7 +18,8 @@ from jaxltl.io._prism_parts import Section, read_labels, read_rewards, read_valu
 from jaxltl.io._prism_text import written_sections
 from jaxltl.io._tokens import Floats, Integers, Text, decoded, numbered, refuse
 
-_NAME = re.compile(r"(?P<stem>.+)\.(?P<kind>tra|pexp)(?P<packed>\.gz|\.xz)?", re.DOTALL)
+_NAME = re.compile(r"(?P<stem>.+)\.(?P<kind>tra|pexp)(?P<packed>\.gz|\.xz)?",
+                   re.DOTALL | re.IGNORECASE)
 _SECTION = re.compile(rb"^#[ \t]*(Transitions|States|Observations|Labels|Reward structure)\b.*$",
                       re.MULTILINE)
 _KIND = re.compile(rb"^#[ \t]*Transitions[ \t]*\(([^)\n]*)\)", re.MULTILINE)
@@ -59,7 +60,7 @@ def read_prism(path: str | os.PathLike[str]) -> SparseMDP:
     path, found = Path(path), _NAME.fullmatch(Path(path).name)
     if found is None:
         refuse(str(path), "its name must end in .tra or .pexp, or that and .gz or .xz.")
-    sections = _in_one(path) if found["kind"] == "pexp" else list(_beside(path, found))
+    sections = _in_one(path) if found["kind"].lower() == "pexp" else list(_beside(path, found))
     text = next(text for kind, _, text in sections if kind == "tra")
     try:
         return _model(text, sections)
@@ -93,7 +94,7 @@ def write_prism(
     if dialect not in ("prism", "storm"):
         raise ValueError(f"dialect is {dialect!r}; give 'prism' or 'storm'.")
     sections = written_sections(model, dialect)
-    if found["kind"] == "pexp":
+    if found["kind"].lower() == "pexp":
         if dialect == "storm":
             refuse(str(path), "Storm reads no .pexp; write a .tra.")
         with write_bytes(path) as file:

@@ -125,6 +125,7 @@ WRONG = [
     ("state 1 [0,2,0]", "state 1 [0,2,0", "line 27: .*; expected 'state number"),
     ("[1, 0, 0.5]", "[1, 0, x]", "line 18: 'x' stands where a reward"),
     ("[1, 0, 0.5]", "[1, , 0.5]", "line 18: .*reward"),
+    ("[0,2,0]", "[0,2 1,0]", "line 27: .* with 3 rewards"),
     ("[0,2,0]", "[0,x,0]", "line 27: 'x' stands where a reward"),
     ("state 2\n", "state\n", "line 30: 'state'; expected 'state number"),
     ("action stay", "action", "line 23: 'action'; expected 'action name"),

@@ -1,0 +1,330 @@
+"""Models whose probabilities and rewards are functions of parameters, from DRN files."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.io._drn_body import names_of, read_body, read_header, rewards_of
+from jaxltl.io._files import read_bytes
+from jaxltl.io._tokens import Block, Integers, Text, as_fraction, numbered, refuse
+
+_TOKEN = re.compile(r"\s*(?:(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
+                    r"|([A-Za-z_][\w.\[\]]*)|(\*\*|[-+*/^()]))")
+# More than any model has, and little enough that a short text cannot fill the memory.
+_MOST_TERMS, _MOST_DEPTH, _MOST_POWER, _MOST_BITS = 10_000, 50, 1_000, 20_000
+
+# The coefficient of each monomial, which is the power of each parameter: 3 p q^2 is {(1, 2): 3}.
+Polynomial = dict[tuple[int, ...], Fraction]
+
+
+@dataclass(frozen=True)
+class RationalFunction:
+    """The quotient of two polynomials in the parameters of a model."""
+
+    numerator: Polynomial
+    denominator: Polynomial
+
+    def at(self, point: tuple[Fraction, ...]) -> Fraction:
+        """Its exact value; ZeroDivisionError at a pole."""
+        return _value(self.numerator, point) / _value(self.denominator, point)
+
+
+@dataclass(frozen=True)
+class ParametricModel:
+    """A Markov chain or decision process whose numbers are functions of parameters.
+
+    Rows, entries, labels and actions are as in :class:`~jaxltl.core.models.sparse.SparseMDP`, but
+    for the successors of a row, which are in the order of the file.
+
+    Attributes:
+      parameters: the names of the parameters.
+      functions: the distinct functions, the first of which is zero.
+      row_start, entry_start, successor: the transitions.
+      probability: ``int32[T]``, the number of each entry's function.
+      rewards: for each name the numbers of the functions on states, ``int32[S]``, and on choices,
+        ``int32[R]``.
+      names: labels, initial states and actions, as ``make_sparse`` takes them.
+    """
+
+    parameters: tuple[str, ...]
+    functions: tuple[RationalFunction, ...]
+    row_start: Integers
+    entry_start: Integers
+    successor: Integers
+    probability: Integers
+    rewards: dict[str, tuple[Integers, Integers]]
+    names: dict[str, Any]
+
+    def at(self, values: Mapping[str, float | Fraction]) -> SparseMDP:
+        """The model at a point, its functions evaluated exactly and then rounded.
+
+        Args:
+          values: a finite number for each parameter.
+
+        Raises:
+          ValueError: a parameter is missing or unknown, a function has a pole there, or the
+            probabilities of a row are none.
+        """
+        if set(values) != set(self.parameters):
+            raise ValueError(f"values are given for {', '.join(sorted(values)) or 'nothing'}; the "
+                             f"parameters are {', '.join(self.parameters) or 'none'}.")
+        if not all(np.isfinite(float(x)) for x in values.values()):
+            raise ValueError(f"values {dict(values)} must be finite.")
+        point = tuple(Fraction(values[name]) for name in self.parameters)
+        try:
+            value = np.array([float(f.at(point)) for f in self.functions])
+        except (ZeroDivisionError, OverflowError):
+            raise ValueError(f"a function has a pole at {dict(values)}, or is too large.") from None
+        rewards = {name: Rewards(state=value[state] if state.any() else None,
+                                 choice=value[choice] if choice.any() else None)
+                   for name, (state, choice) in self.rewards.items()}
+        return make_sparse(self.row_start, self.entry_start, self.successor,
+                           value[self.probability], rewards=rewards, **self.names)
+
+
+def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
+    """The Markov chain or decision process in a DRN file whose numbers may have parameters.
+
+    Functions are sums, products, quotients and whole powers of numbers, which are exact, and of
+    parameters, such as ``(-1)*p+1`` or ``p^2/(p+q)``, without blanks between.
+
+    Args:
+      path: the file, plain or compressed with gzip or xz.
+
+    Raises:
+      ValueError: naming file and line, and what was expected; as for
+        :func:`~jaxltl.io.drn.read_drn`.
+
+    Example:
+      >>> import tempfile, pathlib
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
+      >>> _ = path.write_text('''@type: DTMC
+      ... @parameters
+      ... p
+      ... @nr_states
+      ... 2
+      ... @model
+      ... state 0 init
+      ...     action 0
+      ...         0 : 1-p
+      ...         1 : p
+      ... state 1
+      ...     action 0
+      ...         1 : 1
+      ... ''')
+      >>> read_parametric(path).at({"p": 0.25}).probability.tolist()
+      [0.75, 0.25, 1.0]
+    """
+    name, data = str(path), read_bytes(path)
+    header = read_header(Text(name, data, 0, len(data)))
+    if len(set(header.parameters)) < len(header.parameters):
+        refuse(name, "a parameter is named twice.")
+    known = {b"0": 0}
+    functions = [RationalFunction({}, _constant(header.parameters, 1))]
+    placeholders: dict[str, RationalFunction] = {}
+    for place, text in header.placeholders.items():
+        try:
+            placeholders[place.decode()] = _parsed(text, header.parameters, placeholders)
+        except _Malformed as error:
+            refuse(name, f"the placeholder {place.decode()} stands for {text[:60].decode()!r}, "
+                         f"which is {error}.")
+
+    def values(block: Block, token: Integers) -> Integers:
+        texts = block.texts(token)
+        found = numbered(texts, known)
+        for text in list(known)[len(functions) :]:
+            try:
+                functions.append(_parsed(text, header.parameters, placeholders))
+            except _Malformed as error:
+                expected = f"a function of {', '.join(header.parameters) or 'no parameter'}"
+                raise block.error(int(token[texts.index(text)]),
+                                  f"{expected} (it is {error})") from None
+        return found
+
+    try:
+        body = read_body(header, values, values)
+        state, row = np.concatenate(body.state), np.concatenate(body.row)
+        return ParametricModel(
+            header.parameters, tuple(functions),
+            _starts(state, body.num_states), _starts(row, body.num_rows),
+            np.concatenate(body.successor), np.concatenate(body.value),
+            {key: (of_state, of_choice) for key, of_state, of_choice in rewards_of(header, body)},
+            names_of(header, body))
+    except MemoryError:
+        refuse(name, "it is too large for the memory.")
+
+
+def _starts(owner: Integers, size: int) -> Integers:
+    return np.concatenate([[0], np.bincount(owner, minlength=size).cumsum()])
+
+
+# --- functions ------------------------------------------------------------------------------
+
+
+class _Malformed(ValueError):
+    """What is wrong with a text that should be a function."""
+
+
+def _constant(parameters: tuple[str, ...], value: Fraction | int) -> Polynomial:
+    return {(0,) * len(parameters): Fraction(value)} if value else {}
+
+
+def _value(polynomial: Polynomial, point: tuple[Fraction, ...]) -> Fraction:
+    total = Fraction(0)
+    for powers, coefficient in polynomial.items():
+        for x, power in zip(point, powers, strict=True):
+            coefficient *= x**power
+        total += coefficient
+    return total
+
+
+def _checked(polynomial: Polynomial) -> Polynomial:
+    found = {powers: c for powers, c in polynomial.items() if c}
+    if len(found) > _MOST_TERMS or any(max(powers, default=0) > _MOST_POWER for powers in found):
+        raise _Malformed("too large")
+    if any(max(c.numerator.bit_length(), c.denominator.bit_length()) > _MOST_BITS
+           for c in found.values()):
+        raise _Malformed("too large")
+    return found
+
+
+def _sum(a: Polynomial, b: Polynomial) -> Polynomial:
+    found = dict(a)
+    for powers, c in b.items():
+        found[powers] = found.get(powers, Fraction(0)) + c
+    return _checked(found)
+
+
+def _times(a: Polynomial, b: Polynomial) -> Polynomial:
+    if len(a) * len(b) > _MOST_TERMS:
+        raise _Malformed("too large")
+    found: Polynomial = {}
+    for p, c in a.items():
+        for q, d in b.items():
+            powers = tuple(i + j for i, j in zip(p, q, strict=True))
+            found[powers] = found.get(powers, Fraction(0)) + c * d
+    return _checked(found)
+
+
+def _add(a: RationalFunction, b: RationalFunction) -> RationalFunction:
+    if a.denominator == b.denominator:
+        return RationalFunction(_sum(a.numerator, b.numerator), a.denominator)
+    return RationalFunction(
+        _sum(_times(a.numerator, b.denominator), _times(b.numerator, a.denominator)),
+        _times(a.denominator, b.denominator))
+
+
+def _multiply(a: RationalFunction, b: RationalFunction) -> RationalFunction:
+    return RationalFunction(
+        _times(a.numerator, b.numerator), _times(a.denominator, b.denominator))
+
+
+def _divide(a: RationalFunction, b: RationalFunction) -> RationalFunction:
+    if not b.numerator:
+        raise _Malformed("divided by zero")
+    if len(b.numerator) == 1 and not any(next(iter(b.numerator))):  # by a number
+        (powers, number), = b.numerator.items()
+        b = RationalFunction({powers: Fraction(1)}, {
+            q: c / number for q, c in b.denominator.items()})
+    return _multiply(a, RationalFunction(b.denominator, b.numerator))
+
+
+def _parsed(
+    text: bytes, parameters: tuple[str, ...], placeholders: Mapping[str, RationalFunction]
+) -> RationalFunction:
+    """A function from its text."""
+    try:
+        shown = text.decode()
+    except UnicodeDecodeError:
+        raise _Malformed("not UTF-8") from None
+    if shown.startswith("$"):
+        if shown not in placeholders:
+            raise _Malformed("no placeholder that is defined before")
+        return placeholders[shown]
+    tokens, place = [], 0
+    while place < len(shown):
+        found = _TOKEN.match(shown, place)
+        if found is None:
+            raise _Malformed(f"malformed at {shown[place : place + 20]!r}")
+        tokens.append(found[0].strip())
+        place = found.end()
+    reader = _Reader(tokens, parameters)
+    result = reader.sum(0)
+    if reader.place < len(tokens):
+        raise _Malformed(f"malformed at {tokens[reader.place][:20]!r}")
+    return result
+
+
+@dataclass
+class _Reader:
+    """Reads a function from tokens, by precedence."""
+
+    tokens: list[str]
+    parameters: tuple[str, ...]
+    place: int = 0
+
+    def next(self) -> str:
+        return self.tokens[self.place] if self.place < len(self.tokens) else ""
+
+    def take(self) -> str:
+        self.place += 1
+        return self.tokens[self.place - 1] if self.place <= len(self.tokens) else ""
+
+    def number(self, value: Fraction | int) -> RationalFunction:
+        return RationalFunction(_constant(self.parameters, value), _constant(self.parameters, 1))
+
+    def sum(self, depth: int) -> RationalFunction:
+        if depth > _MOST_DEPTH:
+            raise _Malformed("nested too deeply")
+        found = self.product(depth)
+        while self.next() in ("+", "-"):
+            sign = self.take()
+            other = self.product(depth)
+            found = _add(found, other if sign == "+" else _multiply(self.number(-1), other))
+        return found
+
+    def product(self, depth: int) -> RationalFunction:
+        found = self.power(depth)
+        while self.next() in ("*", "/"):
+            combine: Callable[..., RationalFunction] = (
+                _multiply if self.take() == "*" else _divide)
+            found = combine(found, self.power(depth))
+        return found
+
+    def power(self, depth: int) -> RationalFunction:
+        sign = 1
+        while self.next() in ("+", "-"):
+            sign = -sign if self.take() == "-" else sign
+        found = self.atom(depth)
+        if self.next() in ("^", "**"):
+            self.take()
+            exponent = self.take()
+            if not re.fullmatch(r"[0-9]{1,4}", exponent) or int(exponent) > _MOST_POWER:
+                raise _Malformed("no whole power up to 1000")
+            base, found = found, self.number(1)
+            for _ in range(int(exponent)):
+                found = _multiply(found, base)
+        return found if sign == 1 else _multiply(self.number(-1), found)
+
+    def atom(self, depth: int) -> RationalFunction:
+        token = self.take()
+        if token == "(":
+            found = self.sum(depth + 1)
+            if self.take() != ")":
+                raise _Malformed("without a closing bracket")
+            return found
+        if token in self.parameters:
+            powers = tuple(int(name == token) for name in self.parameters)
+            return RationalFunction({powers: Fraction(1)}, _constant(self.parameters, 1))
+        number = as_fraction(token.encode())
+        if number is None:
+            raise _Malformed(f"malformed at {token[:20]!r}" if token else "cut")
+        return self.number(number)
