@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from jaxltl.app.files import tables
+from jaxltl.app.files.models import read_padded
 from jaxltl.app.files.tables import COUNT, TEXT, TRUTH, Rule, choice, is_list, number_in
-from jaxltl.app.files.task import load_model
+from jaxltl.app.files.task import initial_where
 from jaxltl.core.games.objective import GR1, Parity, gr1, safety
 from jaxltl.core.games.permissive import METHODS
 from jaxltl.core.games.winning import task_game
@@ -55,6 +56,7 @@ class World:
       text: the map; None for a game from arrays.
       wall: the kind of cell that is not a place.
       places: ``int[C, 2]``, row and column of each place from 0; None without a map.
+      objective: what the game's own file asks for, a parity condition; None if it does not.
     """
 
     game: Game
@@ -62,6 +64,7 @@ class World:
     text: str | None = None
     wall: str = "#"
     places: np.ndarray | None = None
+    objective: Parity | None = None
 
     def where(self, state: int) -> dict[str, Any]:
         """A state for people: both robots' rows and columns from 1, else its number from 0."""
@@ -111,6 +114,7 @@ _KEYS: dict[str, dict[str, Rule]] = {
         "assumptions": _FORMULAS,
         "guarantees": _FORMULAS,
         "safe": TEXT,
+        "parity": choice("model"),
         "chance": choice("random", "adversarial"),
     },
     "strategy": {"method": choice(*METHODS), "bound": COUNT},
@@ -144,9 +148,13 @@ def _check_task(path: Path, task: Mapping[str, Any]) -> None:
         ("formula" in task and bool(lists),
          f"has both formula and {''.join(lists[:1])}; give either a formula, or guarantees with "
          "assumptions and safe where needed"),
-        ("formula" not in task and not {"guarantees", "safe"} & set(lists),
+        ("parity" in task and ("formula" in task or bool(lists)),
+         'has parity = "model", the condition in the file of a parity game, and another one; keep '
+         "one of them"),
+        (not {"formula", "guarantees", "safe", "parity"} & set(task),
          'lacks what the system is to achieve: formula = "...", or guarantees = ["..."], each to '
-         'be met again and again, or safe = "...", to hold for ever'),
+         'be met again and again, or safe = "...", to hold for ever, or parity = "model", of a '
+         "parity game from a file"),
         ("assumptions" in task and "guarantees" not in task,
          "has assumptions but no guarantees, so that they assume in vain; add guarantees or leave "
          "them out"),
@@ -173,14 +181,16 @@ def load_game(file: GameFile) -> World:
 
 
 def _from_arrays(path: Path, initial: str | None) -> World:
-    world, more = load_model(path, initial, ("system",))
-    if "system" not in more:
+    found = read_padded(path, ("system",))
+    if "system" not in found.more:
         raise ValueError(
-            f"{str(path)!r} lacks the array system: for each state True where the system moves "
-            "and False where the environment does."
+            f"{str(path)!r} is no game: it lacks the array system: for each state True where the "
+            "system moves and False where the environment does."
         )
+    mdp = initial_where(found.mdp, initial, path)
     with tables.errors_in(f"{str(path)!r}: "):
-        return World(make_game(world.mdp, more["system"]), world.actions)
+        game = make_game(mdp, found.more["system"])
+    return World(game, found.actions, objective=found.objective)
 
 
 def _cell(given: list[int], key: str, cells: np.ndarray, wall: str) -> tuple[int, int]:
@@ -206,6 +216,11 @@ def load_objective(file: GameFile, world: World) -> tuple[Game, Parity | GR1]:
     with tables.errors_in(f"{file.path}: [task] "):
         if "formula" in task:
             return task_game(game, task["formula"])
+        if "parity" in task:
+            if world.objective is None:
+                raise ValueError('parity = "model" takes the file of a parity game (PGSolver, '
+                                 "extended HOA); this game has no condition of its own.")
+            return game, world.objective
         safe = task.get("safe", "true")
         if "guarantees" not in task:
             return game, safety(game, safe)
@@ -221,6 +236,8 @@ def task_text(task: Mapping[str, Any]) -> str:
     """
     if "formula" in task:
         return str(task["formula"])
+    if "parity" in task:
+        return "the parity condition of the model's file"
 
     def all_of(sets: list[str]) -> str:
         return " & ".join(f"G F ({x})" for x in sets)

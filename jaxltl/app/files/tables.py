@@ -172,7 +172,7 @@ def reject(path: Path, table: str, faults: Iterable[tuple[bool, str]]) -> None:
 
 def check_source(path: Path, table: str, data: Mapping[str, Any], of_map: Iterable[str]) -> None:
     """Raises a ValueError unless there is a map or a model; keys of a map do not fit a model."""
-    require_one(path, table, data, ("map", "model"), "a map or a model (an .npz file)")
+    require_one(path, table, data, ("map", "model"), "a map or a model (a file)")
     if "model" in data:
         refuse(path, table, data, of_map, "a map; a model has it in its arrays")
 

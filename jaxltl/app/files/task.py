@@ -258,26 +258,11 @@ def load_world(task: Task) -> World:
     with tables.errors_in(f"{task.path}: [world] "):
         if "model" in spec:
             path = task.path.parent / spec["model"]
-            return load_model(path, spec.get("initial"))[0]
+            found = read_padded(path)
+            mdp = initial_where(found.mdp, spec.get("initial"), path)
+            return World(mdp, None, found.actions)
         text = tables.read_map(task.path, spec.pop("map"))
         return World(gridworld(text, **spec), parse_map(text), ACTIONS)
-
-
-def load_model(
-    path: Path, initial: str | None, more: Sequence[str] = ()
-) -> tuple[World, dict[str, np.ndarray]]:
-    """A model from a file of any format that is read, and those of `more` arrays that it holds.
-
-    Args:
-      path: the file; see :func:`~jaxltl.app.files.models.read_padded`.
-      initial: a Boolean formula, uniformly where it holds; default the file's own.
-      more: names of arrays that it may hold beside a model's.
-
-    Raises:
-      ValueError: the file is malformed, of no known format, or too large when padded.
-    """
-    found = read_padded(path, more)
-    return World(initial_where(found.mdp, initial, path), None, found.actions), found.more
 
 
 def initial_where(mdp: MDP, formula: str | None, path: Path) -> MDP:

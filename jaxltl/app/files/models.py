@@ -1,0 +1,102 @@
+"""Models that task and game files name, whatever their format, padded for learners and games."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.app.files import tables
+from jaxltl.core.games.objective import Parity
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.padded import to_padded
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.io.model_files import read_model
+from jaxltl.io.npz import model_of, parse_arrays
+from jaxltl.io.pgsolver import objective_of
+
+_MOST_NAMES = 100  # a padded model has a column for each
+
+
+class ReadModel(NamedTuple):
+    """A model with padded successor lists, and what else its file says.
+
+    Attributes:
+      mdp: the model.
+      actions: A names.
+      more: arrays that were asked for; ``"system"`` of a game.
+      objective: the parity objective of a parity game's file, or None.
+    """
+
+    mdp: MDP
+    actions: tuple[str, ...]
+    more: dict[str, np.ndarray]
+    objective: Parity | None = None
+
+
+def read_padded(path: Path, more: Sequence[str] = ()) -> ReadModel:
+    """The model of a file, of a format of ``read_model`` or an ``.npz`` of padded arrays.
+
+    An action is a name where the choices of each state have different ones, of at most 100;
+    else the rank of a choice in its state.
+
+    Args:
+      path: the file.
+      more: names of arrays that an ``.npz`` may hold beside a model's; a game is refused if
+        ``"system"`` is not among them.
+
+    Raises:
+      ValueError: the file is malformed, holds a game where none is asked for, or is too large
+        when padded, with the size.
+    """
+    name = str(path)
+    raw = tables.read_bytes(path, "the model")
+    if path.suffix.lower() == ".npz" or raw.startswith(b"PK"):
+        arrays = parse_arrays(raw, name, more)
+        if "entry_start" not in arrays:
+            mdp, names = model_of(arrays, name)
+            return ReadModel(
+                mdp,
+                names or _numbered("action", mdp.num_actions),
+                {k: arrays[k] for k in more if k in arrays},
+            )
+    del raw
+    model: Any = read_model(path)
+    found: dict[str, np.ndarray] = {}
+    objective = None
+    if isinstance(model, Game):
+        if "system" not in more:
+            raise ValueError(
+                f"{name!r} holds a game of two players, expected a model of one; games are for "
+                "jaxltl synthesize."
+            )
+        found["system"] = np.asarray(model.system)
+        if "priority" in model.mdp.valuation:
+            objective = objective_of(model)
+        model = model.mdp
+    with tables.errors_in(f"{name!r}: "):
+        mdp, names = _padded(model)
+    return ReadModel(mdp, names, found, objective)
+
+
+def _padded(model: SparseMDP) -> tuple[MDP, tuple[str, ...]]:
+    names = tuple(x or "(no name)" for x in model.action_names)
+    if model.action is not None and names:
+        state, action = model.host.state, np.asarray(model.action)
+        used = np.unique(action)
+        pairs = np.unique(state.astype(np.int64) * len(names) + action)
+        listed = tuple(names[a] for a in used)
+        if pairs.size == action.size and len(set(listed)) == used.size <= _MOST_NAMES:
+            column = np.searchsorted(used, action).astype(np.int32)
+            return to_padded(replace(model, action=column, action_names=())), listed
+        model = replace(model, action=None)
+    mdp = to_padded(model)
+    return mdp, _numbered("choice" if model.action is None else "action", mdp.num_actions)
+
+
+def _numbered(what: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{what} {i}" for i in range(count))
