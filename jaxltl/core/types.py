@@ -46,6 +46,29 @@ class NotConverged(RuntimeError):
     """A solver's answer was asked for and its status says that there is none."""
 
 
+class Method:
+    """How an answer was found, in words. All are equal, so that solutions are of one kind.
+
+    >>> str(Method("the graph")), Method("levels") == Method("")
+    ('the graph', True)
+    """
+
+    def __init__(self, text: str = "") -> None:
+        self.text = text
+
+    def __str__(self) -> str:
+        return self.text
+
+    def __repr__(self) -> str:
+        return repr(self.text)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Method)
+
+    def __hash__(self) -> int:
+        return 0
+
+
 @struct.dataclass
 class Solution:
     """A solver's answer with its evidence.
@@ -60,6 +83,7 @@ class Solution:
       residual: how far the value is from satisfying its equation (sup norm).
       num_steps: applications of the operator that were spent.
       status: an array of :class:`Status` codes.
+      method: how it was found, where there were several ways; static.
     """
 
     value: jax.Array
@@ -69,6 +93,7 @@ class Solution:
     residual: jax.Array
     num_steps: jax.Array
     status: jax.Array
+    method: Method = struct.field(pytree_node=False, default=Method())
 
 
 def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:

@@ -309,6 +309,64 @@ def _least(
         row=np.where(nothing, row, towards))
 
 
+def reward_forever(
+    mdp: HostMDP, reward: Floats, *, maximize: bool, tolerance: float = 1e-6
+) -> Enclosed:
+    """The largest or smallest expected reward in all.
+
+    The largest is infinite where an end component that earns can be reached; other end components
+    earn nothing and are left at most once. The smallest is what is earned until nothing more need
+    be, and infinite where that is not so almost surely.
+
+    Args:
+      mdp: the model.
+      reward: ``float[R]``, at least 0.
+      maximize: which of the two.
+      tolerance: the width of the enclosure asked for, as a share of the value.
+    """
+    if not maximize or mdp.is_chain:
+        earning = reward > 0
+        never = ~_kept_away(mdp, earning)
+        found = total_reward(mdp, reward, never, maximize=False, tolerance=tolerance)
+        quiet = never[mdp.state] & ~earning & ~mdp.support.lead_to(~never)
+        return found._replace(row=np.where(never, mdp.first_choice(quiet)[1], found.row))
+    components = end_components(mdp)
+    earns = np.zeros(mdp.num_states, bool)
+    earns[components.component[mdp.state[components.inside & (reward > 0)]]] = True
+    rich = earns[components.component]
+    infinite = reaching(mdp, rich)
+    part = merged(mdp, components.component, components.inside, reward)
+    small = part.mdp
+    left = np.zeros(small.num_states, bool)  # nodes that some row leaves
+    left[small.state[~components.inside[part.row]]] = True
+    infinite_ = np.zeros(small.num_states, bool)
+    infinite_[part.node[infinite]] = True
+    row = small.row_start[:-1].astype(np.int64)
+    found = _finite(small, part.cost, ~left, infinite_, row, 0, tolerance, maximize=True)
+    towards = _towards(mdp, components, part.row[found.row][part.node])
+    endless = _earning(mdp, components, rich, reward)
+    return found._replace(
+        value=found.value[part.node], lower=found.lower[part.node], upper=found.upper[part.node],
+        row=np.where(infinite, endless, towards))
+
+
+def _kept_away(mdp: HostMDP, rows: Booleans) -> Booleans:
+    """The states from which no policy surely avoids some rows for ever: ``bool[S]``."""
+    nothing = np.zeros(mdp.num_states, bool)
+    return forced(mdp, nothing, ~rows)
+
+
+def _earning(
+    mdp: HostMDP, components: Components, rich: Booleans, reward: Floats
+) -> Integers:
+    """A policy that gets to components that earn, and earns there for ever."""
+    paid = components.inside & (reward > 0)
+    some, first = mdp.first_choice(paid)
+    inner = _nearer(mdp, some, components.inside)
+    outer = _nearer(mdp, rich, np.ones(mdp.num_rows, bool))
+    return np.where(some, first, np.where(rich, inner, outer))
+
+
 def worst_width(found: Enclosed, *, relative: bool) -> float:
     """The widest enclosure, as a share of the value where that is asked for."""
     low, high = found.lower, found.upper

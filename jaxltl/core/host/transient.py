@@ -132,7 +132,7 @@ def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: b
     sign = 1 if maximize else -1
     n = system.num_nodes
     unit = (4 * system.widest + problem.depth + 16) * _EPS
-    bounds = np.zeros((2, n + 1))  # attained and beyond
+    bounds: Any = np.zeros((2, n + 1))  # attained and beyond
     bounds[:, n] = 1
     chosen: Any = system.row_start[:-1].copy()
     edges = _edges(system)
@@ -150,8 +150,8 @@ def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: b
             found = _solve_core(
                 system, core, bounds, unit + grown, sign, problem, tolerance, relative)
             rounds, method = found.rounds, found.method
-            core = found.node
-            bounds[0, core], bounds[1, core], chosen[core] = found.near, found.far, found.chosen
+            node = found.node
+            bounds[0, node], bounds[1, node], chosen[node] = found.near, found.far, found.chosen
         after = Levels(above.node[::-1], [above.start[-1] - x for x in above.start[::-1]])
         _sweep(system, after, bounds, chosen, sign)
         _widen(bounds, above.node, sign, (len(above.start) - 1) * unit)

@@ -37,6 +37,7 @@ from jaxltl.core.models.operators import (
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.tables import action_columns, table
 from jaxltl.core.types import Solution, Status, require_shape, status_code
+from jaxltl.core.values.enclosed import is_sparse, reachability
 from jaxltl.core.values.evidence import m_matrix_error, refuse, rounding_unit
 from jaxltl.core.values.fixed_point import implicit
 from jaxltl.core.values.iterate import in_turn, iterate
@@ -62,6 +63,7 @@ def reachability_probability(
     model: Any,
     target: jax.Array,
     *,
+    stay: jax.Array | None = None,
     policy: jax.Array | None = None,
     objective: str = "max",
     method: str = "auto",
@@ -75,18 +77,21 @@ def reachability_probability(
     (Baier and Katoen 2008, section 10.6). Small concrete models are solved on the host by
     elimination and policy iteration, and nothing is compiled. Other optima: interval iteration
     (Haddad and Monmege 2018) with maximal end components collapsed and each bound rounded
-    outwards.
+    outwards. Sparse models are solved by :mod:`jaxltl.core.host.optimal`.
 
     Args:
       model: the model.
       target: ``bool[S]``.
-      policy: ``float[S, A]`` or ``int32[S]``: evaluate this policy. Default: optimise.
+      stay: ``bool[S]``, the states that may be passed before (until); default all. Concrete.
+      policy: ``float[S, A]`` or ``int32[S]``: evaluate this policy. Default: optimise. Of a sparse
+        model ``float[R]``, or rows ``int32[S]``.
       objective: ``"max"`` or ``"min"``; ignored when a policy is given.
       method: for a given policy: ``"direct"`` (elimination, however slowly the policy
         makes progress), ``"iterative"`` (Krylov), or ``"auto"``, direct for small models.
       tolerance: half the width of the enclosure asked for. Default: the square root of the
         dtype's precision must be met, and an optimum is then enclosed as closely as the dtype
-        allows, until a round of sweeps gains less than rounding takes.
+        allows, until a round of sweeps gains less than rounding takes. Of a sparse model, or with
+        `stay`: the whole width, 1e-6 by default (1e-3 in single precision).
       max_steps: sweeps at most.
 
     Returns:
@@ -112,6 +117,9 @@ def reachability_probability(
     if objective not in ("max", "min"):
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
     require_shape("target", target, model.state_shape)
+    if is_sparse(model) or stay is not None:
+        return reachability(
+            model, target, stay=stay, policy=policy, objective=objective, tolerance=tolerance)
     traced = is_traced((model, target, policy, tolerance, max_steps))
     readable = not traced and is_table(model)
     small = readable and math.prod(model.state_shape) <= _HOST_LIMIT

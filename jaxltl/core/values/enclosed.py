@@ -1,0 +1,176 @@
+"""Certified answers of the host engine as solutions, for sparse and for padded models."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.host import optimal
+from jaxltl.core.host.optimal import Enclosed
+from jaxltl.core.host.sparse import HostMDP
+from jaxltl.core.models.concrete import is_traced, to_jax
+from jaxltl.core.models.convert import to_sparse
+from jaxltl.core.models.operators import is_deterministic
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.types import (
+    Method,
+    Solution,
+    Status,
+    describe_row,
+    require_shape,
+    row_tolerance,
+)
+
+
+def is_sparse(model: Any) -> bool:
+    """Whether a model's choices are rows: a SparseMDP, or a product of one."""
+    return isinstance(model.mdp if isinstance(model, Product) else model, SparseMDP)
+
+
+def solution_of(
+    model: Any, sparse: SparseMDP, found: Enclosed, tolerance: float, *, relative: bool
+) -> Solution:
+    """A solution with the model's shapes; bounds in its precision, rounded outwards.
+
+    Args:
+      model: the model that was asked about.
+      sparse: the same as sparse rows.
+      found: the enclosure.
+      tolerance: the width that was asked for.
+      relative: whether that is a share of the value.
+    """
+    low, high = found.lower, found.upper
+    finite = np.isfinite(high)
+    width = np.where(finite, high, 0) - np.where(finite, low, 0)
+    scale = np.where(finite, high, 1) if relative else 1
+    narrow = (width <= tolerance * scale) & (finite | (low == high))
+    status = Status.CONVERGED if narrow.all() else Status.PRECISION
+    policy = found.row
+    shape = model.state_shape
+    if not is_sparse(model):
+        policy = np.asarray(sparse.action)[found.row]
+    policy = policy.astype(np.int32).reshape(shape)
+    numbers: tuple[Any, ...] = (np.int32(found.rounds), np.int32(status))
+    method = Method(found.method)
+    value, residual = found.value, found.residual
+    if is_sparse(model):
+        arrays = (value.reshape(shape), policy, low.reshape(shape), high.reshape(shape),
+                  np.float64(residual), *numbers)
+        return Solution(*arrays, method=method)
+    dtype = np.dtype(model.dtype)
+    exact = low == high
+    low, high = (
+        np.where(exact, x, np.nextafter(x.astype(dtype), end)).astype(dtype)
+        for x, end in ((low, dtype.type(-np.inf)), (high, dtype.type(np.inf))))
+    low = np.maximum(low, 0)
+    if not relative:
+        high = np.minimum(high, 1)
+    value = np.clip(value.astype(dtype), low, high)
+    return Solution(
+        *to_jax((value.reshape(shape), policy, low.reshape(shape), high.reshape(shape),
+                 np.asarray(residual, dtype), *numbers)), method=method)
+
+
+def chain_of(model: Any, sparse: SparseMDP, policy: Any) -> tuple[HostMDP, np.ndarray]:
+    """The Markov chain of a policy, and how much of each row it takes, ``float64[R]``.
+
+    Args:
+      model: the model that the policy is for.
+      sparse: the same as sparse rows.
+      policy: rows ``int32[S]`` or their weights ``float[R]``; for a padded model actions
+        ``int32[S]`` or ``float[S, A]``.
+
+    Raises:
+      ValueError: a shape is wrong, or a state's row is no distribution over its choices.
+    """
+    host = sparse.host
+    weight = _weights(model, sparse, np.asarray(policy))
+    total = host.over_choices(np.add, weight)
+    off = (np.abs(total - 1) > row_tolerance(np.float64)) | (
+        host.over_choices(np.minimum, weight) < 0)
+    if off.any():
+        s = int(np.flatnonzero(off)[0])
+        row = weight[host.row_start[s] : host.row_start[s + 1]]
+        raise ValueError(f"{describe_row(row, (s,))}.")
+    from scipy.sparse import csr_array
+
+    taken = np.flatnonzero(weight > 0)
+    count = np.bincount(host.state[taken], minlength=host.num_states)
+    starts = np.concatenate([[0], count.cumsum()])
+    share = (weight / total[host.state])[taken]
+    mix = csr_array((share, taken, starts), shape=(host.num_states, host.num_rows))
+    chain = (mix @ host.matrix).tocsr()
+    chain.sort_indices()
+    states = np.arange(host.num_states + 1)
+    return HostMDP(states, chain.indptr, chain.indices, chain.data), weight
+
+
+def _weights(model: Any, sparse: SparseMDP, policy: np.ndarray) -> np.ndarray:
+    host = sparse.host
+    if not is_sparse(model):
+        actions = (*model.state_shape, model.num_actions)
+        if is_deterministic(policy) and policy.shape == actions[:-1]:
+            policy = np.eye(model.num_actions)[policy]
+        if policy.shape != actions:
+            raise ValueError(f"policy has shape {policy.shape}; expected {actions[:-1]} of actions "
+                             f"or {actions} of their probabilities.")
+        flat = policy.reshape(host.num_states, -1)
+        return flat[host.state, np.asarray(sparse.action)].astype(np.float64)
+    if is_deterministic(policy):
+        if policy.shape != (host.num_states,):
+            raise ValueError(f"policy has shape {policy.shape}; expected ({host.num_states},), a "
+                             f"row for each state, or ({host.num_rows},) weights of rows.")
+        wrong = (policy < host.row_start[:-1]) | (policy >= host.row_start[1:])
+        if wrong.any():
+            s = int(np.flatnonzero(wrong)[0])
+            raise ValueError(
+                f"the policy takes row {policy[s]} in state {s}, whose rows are "
+                f"{host.row_start[s]} to {host.row_start[s + 1] - 1}.")
+        weight = np.zeros(host.num_rows)
+        weight[policy] = 1
+        return weight
+    if policy.shape != (host.num_rows,):
+        raise ValueError(f"policy has shape {policy.shape}; expected ({host.num_rows},), a weight "
+                         "for each choice.")
+    return policy.astype(np.float64)
+
+
+
+def given_policy(solution: Solution, policy: Any) -> Solution:
+    """A solution with the policy that it is of, where one was given."""
+    if policy is None:
+        return solution
+    table = np.asarray(policy)
+    kind: Any = np.int32 if is_deterministic(table) else table.dtype
+    return replace(solution, policy=table.astype(kind))
+
+
+def reachability(
+    model: Any, target: Any, *, stay: Any, policy: Any, objective: str, tolerance: float | None
+) -> Solution:
+    """Probabilities of reaching a target through some states, by the host engine.
+
+    Arguments as of :func:`~jaxltl.core.values.reachability.reachability_probability`.
+    """
+    if is_traced((model, target, stay, policy)):
+        raise ValueError(
+            "a sparse model, or what may be passed (stay), is read on the host: give concrete "
+            "arrays; inside jit use prepare(model, target), or the formula's product.")
+    sparse = to_sparse(model)
+    target = np.asarray(target, bool).ravel()
+    if stay is not None:
+        require_shape("stay", stay, model.state_shape)
+        stay = np.asarray(stay, bool).ravel()
+    asked = default_tolerance(model) if tolerance is None else float(tolerance)
+    host = sparse.host if policy is None else chain_of(model, sparse, policy)[0]
+    found = optimal.reachability(
+        host, target, maximize=objective == "max", stay=stay, tolerance=asked)
+    return given_policy(solution_of(model, sparse, found, asked, relative=False), policy)
+
+
+def default_tolerance(model: Any) -> float:
+    """The width that is asked for where nothing is said."""
+    return 1e-6 if np.dtype(model.dtype) == np.float64 else 1e-3
