@@ -132,7 +132,7 @@ def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: b
     sign = 1 if maximize else -1
     n = system.num_nodes
     unit = (4 * system.widest + problem.depth + 16) * _EPS
-    bounds: Any = np.zeros((2, n + 1))  # attained and beyond
+    bounds: Any = np.zeros((3, n + 1))  # attained, beyond, and the value of the policy
     bounds[:, n] = 1
     chosen: Any = system.row_start[:-1].copy()
     edges = _edges(system)
@@ -151,7 +151,7 @@ def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: b
                 system, core, bounds, unit + grown, sign, problem, tolerance, relative)
             rounds, method = found.rounds, found.method
             node = found.node
-            bounds[0, node], bounds[1, node], chosen[node] = found.near, found.far, found.chosen
+            bounds[:, node], chosen[node] = (found.near, found.far, found.value), found.chosen
         after = Levels(above.node[::-1], [above.start[-1] - x for x in above.start[::-1]])
         _sweep(system, after, bounds, chosen, sign)
         _widen(bounds, above.node, sign, (len(above.start) - 1) * unit)
@@ -162,12 +162,11 @@ def _found(
     problem: Transient, system: _System, bounds: Floats, chosen: Integers, sign: int, rounds: int,
     method: str,
 ) -> Optimum:
-    low, high = (bounds if sign > 0 else bounds[::-1])
+    near, far, value = bounds
+    low, high = (near, far) if sign > 0 else (far, near)
     low = np.where(np.isfinite(low), np.maximum(low, 0), 0)
     high = np.where(np.isnan(high), np.inf, high)
-    # The policy's own value lies a third of the way: see what is subtracted from it in `_prove`.
-    near, far = bounds
-    value = np.where(np.isfinite(high), near + (far - near) / 3, low)
+    value = np.clip(value, low, high)
 
     def everywhere(x: Floats) -> Floats:
         full = problem.known.copy()
@@ -275,6 +274,7 @@ def _sweep(
     row_at, entry_at = part.row_start.tolist(), part.entry_start
     single = part.row.size == part.node.size
     same = bool((bounds[0] == bounds[1]).all())
+    sides = (2,) if same else (0, 1, 2)
     operation = np.maximum if sign > 0 else np.minimum
     first_row = system.row_start[levels.node]
     for a, b in zip(levels.start[:-1], levels.start[1:], strict=True):
@@ -285,19 +285,15 @@ def _sweep(
         e0, e1 = int(starts[0]), int(entry_at[r1])
         target, weight = part.target[e0:e1], part.weight[e0:e1]
         node = levels.node[a:b]
-        for side in (0, 1):
-            if side and same:
-                bounds[1, node] = bounds[0, node]
-                break
+        begin = part.row_start[a:b] - r0
+        for side in sides:
             image = np.add.reduceat(weight * bounds[side][target], starts - e0)
-            if single:
-                bounds[side, node] = image
-                continue
-            begin = part.row_start[a:b] - r0
-            best = operation.reduceat(image, begin)
+            best = image if single else operation.reduceat(image, begin)
             bounds[side, node] = best
-            if side == 0:
+            if side == sides[0] and not single:
                 chosen[node] = first_row[a:b] + _first(image, best, begin)
+        if same:
+            bounds[:2, node] = bounds[2, node]
 
 
 def _first(image: Floats, best: Floats, begin: Integers) -> Integers:
@@ -317,6 +313,7 @@ class _Core(NamedTuple):
     node: Integers
     near: Floats
     far: Floats
+    value: Floats
     chosen: Integers
     rounds: int
     method: str
@@ -394,7 +391,7 @@ def _circles(
     target, weight = number[system.target[entry]], system.weight[entry]
     inner = target >= 0
     of = np.repeat(np.arange(row.size, dtype=np.int32), width)
-    middle = (bounds[0] + bounds[1]) / 2
+    middle = bounds[2]
     outer = ~inner
     earned = weight[outer] * middle[system.target[entry[outer]]]
     known: Any = np.bincount(of[outer], earned, row.size)
@@ -444,13 +441,15 @@ def _solve_core(
             continue
         found = _prove(circles, solver, chosen, value, extra, unit)
         if found is not None:
-            near, far, _ = found
-            best = _Core(core, near, far, chosen, rounds, solver.method)
+            near, far, time = found
+            own = value - sign * extra * time
+            best = _Core(core, near, far, own, chosen, rounds, solver.method)
             width = sign * (far - near)
-            size = np.maximum(sign * (near if sign > 0 else far), 0) if relative else 1
+            size = np.abs(near if sign > 0 else far) if relative else 1
             if (width <= tolerance * np.abs(size) / 2).all():
                 break
-        time = found[2] if found else solver.solve(np.ones(core.size))
+        else:
+            time = solver.solve(np.ones(core.size))
         smaller = _extra(time, value, unit, aim, relative)
         if smaller >= extra / 2:
             break
@@ -458,7 +457,7 @@ def _solve_core(
     if best is None:
         low, high = np.zeros(core.size), np.full(core.size, np.inf)
         near, far = (low, high) if sign > 0 else (high, low)
-        best = _Core(core, near, far, chosen, rounds, "nothing proven")
+        best = _Core(core, near, far, low, chosen, rounds, "nothing proven")
     return best._replace(chosen=circles.row[best.chosen])
 
 

@@ -53,13 +53,13 @@ def solution_of(
     if not is_sparse(model):
         policy = np.asarray(sparse.action)[found.row]
     policy = policy.astype(np.int32).reshape(shape)
-    numbers: tuple[Any, ...] = (np.int32(found.rounds), np.int32(status))
+    parts: dict[str, Any] = {
+        "value": found.value.reshape(shape), "policy": policy, "lower": low.reshape(shape),
+        "upper": high.reshape(shape), "residual": np.float64(found.residual),
+        "num_steps": np.int32(found.rounds), "status": np.int32(status)}
     method = Method(found.method)
-    value, residual = found.value, found.residual
     if is_sparse(model):
-        arrays = (value.reshape(shape), policy, low.reshape(shape), high.reshape(shape),
-                  np.float64(residual), *numbers)
-        return Solution(*arrays, method=method)
+        return Solution(**parts, method=method)
     dtype = np.dtype(model.dtype)
     exact = low == high
     low, high = (
@@ -68,10 +68,11 @@ def solution_of(
     low = np.maximum(low, 0)
     if not relative:
         high = np.minimum(high, 1)
-    value = np.clip(value.astype(dtype), low, high)
-    return Solution(
-        *to_jax((value.reshape(shape), policy, low.reshape(shape), high.reshape(shape),
-                 np.asarray(residual, dtype), *numbers)), method=method)
+    low, high = low.reshape(shape), high.reshape(shape)
+    parts |= {
+        "value": np.clip(parts["value"].astype(dtype), low, high), "lower": low, "upper": high,
+        "residual": np.asarray(found.residual, dtype)}
+    return Solution(**to_jax(parts), method=method)
 
 
 def chain_of(model: Any, sparse: SparseMDP, policy: Any) -> tuple[HostMDP, np.ndarray]:
@@ -145,11 +146,12 @@ def given_policy(solution: Solution, policy: Any) -> Solution:
         return solution
     table = np.asarray(policy)
     kind: Any = np.int32 if is_deterministic(table) else table.dtype
-    return replace(solution, policy=table.astype(kind))
+    given: Any = table.astype(kind)
+    return replace(solution, policy=given)
 
 
 def reachability(
-    model: Any, target: Any, *, stay: Any, policy: Any, objective: str, tolerance: float | None
+    model: Any, target: Any, *, stay: Any, policy: Any, objective: str, tolerance: Any
 ) -> Solution:
     """Probabilities of reaching a target through some states, by the host engine.
 
