@@ -20,13 +20,14 @@ from jaxltl.algos.play import (
 )
 from jaxltl.core.models.operators import sample_successor
 
+_BEST, _KNOWN = 1, 2
+
 
 class Rules(NamedTuple):
-    """What the moves of one step need."""
+    """What the moves of one step need; `marks` of :func:`marks`."""
 
     problem: Any
-    best: jax.Array
-    known_at: jax.Array
+    marks: jax.Array
     key: jax.Array
     stream: tuple[jax.Array, jax.Array]
     explore: jax.Array
@@ -65,6 +66,14 @@ class Walk(NamedTuple):
     fault: jax.Array
 
 
+def marks(best: jax.Array, known_at: jax.Array) -> jax.Array:
+    """Which pairs are preferred and which are known, in one byte: ``uint8[S, A]``.
+
+    A move looks at both, of another lane each time, and waits for memory twice if they lie apart.
+    """
+    return best * jnp.uint8(_BEST) + (known_at >= 0) * jnp.uint8(_KNOWN)
+
+
 def walk_from(state: Any, moves: jax.Array) -> Walk:
     """A walk that starts where the learner stands."""
     zero, false = jnp.int32(0), jnp.bool_(False)
@@ -84,7 +93,7 @@ def move(walk: Walk, rules: Rules) -> Walk:
     s = jnp.where(anew, draw(rules.problem.start_table, words[1]), walk.position)
     mine = jnp.where(
         splitmix.uniform(words[2], dtype) < rules.explore,
-        take(rules.problem.allowed, s), take(rules.best, s),
+        take(rules.problem.allowed, s), (take(rules.marks, s) & _BEST) > 0,
     )
     weight = jnp.where(take(game.system, s), mine, take(rules.problem.environment, s))
     action = _draw_action(weight, splitmix.uniform(words[3], dtype))
@@ -106,28 +115,32 @@ def _draw_action(weight: jax.Array, uniform: jax.Array) -> jax.Array:
 def record(walk: Walk, seen: Seen, rules: Rules, active: jax.Array) -> Walk:
     """What a transition adds to the counts and rewards, and whether the model changes."""
     game = rules.problem.game
-    width, pair = game.num_successors, seen.state * game.num_actions + seen.action
-    slot = successor_slot(game, seen.state, seen.action, seen.successor)
+    pair = seen.state * game.num_actions + seen.action
     # Not flat: arrays that are reshaped in a loop are copied in every pass.
     place = (seen.state, seen.action)
-    entry = (*place, slot)
-    # Written before it is read: the other way round whole arrays would be copied. Without
-    # chance a pair is known after one move, the last of a walk, which is noted after it.
-    counts = walk.counts if width == 1 else _counted(walk.counts, entry, active)
-    row = take(counts, place)
-    was_known, first = take(rules.known_at, place) >= 0, row[slot] == 1
-    alone = jnp.sum(take(game.mdp.probability, place) > 0) == 1
-    enough = alone | (jnp.sum(row).astype(game.dtype) >= rules.enough)
-    known = active & ~was_known & enough
-    fresh = active & was_known & first & rules.every & (width > 1)
+    was_known = take(rules.marks, place) >= _KNOWN
+    if game.num_successors == 1:
+        # Without chance a pair is known after one move, the last of a walk, noted after it.
+        counts, reward = walk.counts, walk.reward
+        known, fresh = active & ~was_known, jnp.bool_(False)
+    else:
+        entry = (*place, successor_slot(game, seen.state, seen.action, seen.successor))
+        # Written before it is read: the other way round whole arrays would be copied.
+        counts = _counted(walk.counts, entry, active)
+        row = take(counts, place)
+        first = row[entry[-1]] == 1
+        alone = jnp.sum(take(game.mdp.probability, place) > 0) == 1
+        enough = alone | (jnp.sum(row).astype(game.dtype) >= rules.enough)
+        known, fresh = active & ~was_known & enough, active & was_known & first & rules.every
+        noted = active & jnp.where(rules.every, first, known)
+        reward = _rewarded(walk.reward, entry, seen.reward, noted)
     wrong = active & ~((seen.reward >= 0) & (seen.reward <= rules.bound))
-    noted = active & jnp.where(rules.every, first, known)
     return Walk(
         moves=walk.moves + active,
         left=jnp.where(active, jnp.where(known | fresh, 0, walk.left - 1), walk.left),
         position=jnp.where(active, seen.successor, walk.position),
         counts=counts,
-        reward=walk.reward if width == 1 else _rewarded(walk.reward, entry, seen.reward, noted),
+        reward=reward,
         pair=jnp.where(active, pair, walk.pair),
         seen=jnp.where(active, seen.reward, walk.seen),
         known=known | (~active & walk.known), fresh=fresh | (~active & walk.fresh),

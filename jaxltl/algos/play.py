@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from jaxltl.core.models.game import Game
 from jaxltl.core.types import require_shape
@@ -69,9 +70,23 @@ def cumulative(distribution: np.ndarray) -> np.ndarray:
 
 
 def draw(table: jax.Array, words: jax.Array) -> jax.Array:
-    """States drawn from a table of :func:`cumulative` weights by 32 random bits each."""
-    found = jnp.searchsorted(table, words >> 1, side="right")
-    return found.astype(jnp.int32)
+    """States drawn from a table of :func:`cumulative` weights by 32 random bits each.
+
+    The first entry above half of the word, by halving: ``searchsorted`` to the right, which the
+    last entry, ``2 ** 31``, is never passed by. Two halvings a pass: a pass costs more than they
+    do, and more of them would be computed anew by whatever reads the state.
+    """
+    point, size = words >> 1, len(table)
+
+    def halve_twice(i: jax.Array, first: jax.Array) -> jax.Array:
+        for step in (2 * i, 2 * i + 1):
+            half = ((size - 1 >> step) + 1) // 2  # of those that it may be, from the first
+            beyond = take(table, first + jnp.maximum(half, 1) - 1) <= point
+            first = jnp.where(beyond, first + half, first)
+        return first
+
+    passes = -(-(size - 1).bit_length() // 2)
+    return lax.fori_loop(0, passes, halve_twice, jnp.zeros(point.shape, jnp.int32))
 
 
 def observed_reward(

@@ -34,7 +34,16 @@ from jaxltl.algos._joint_game import (
     require_start,
     shaped_reward,
 )
-from jaxltl.algos._walk import Rules, Seen, Walk, move, note_last, record, walk_from
+from jaxltl.algos._walk import (
+    Rules,
+    Seen,
+    Walk,
+    marks,
+    move,
+    note_last,
+    record,
+    walk_from,
+)
 from jaxltl.algos.play import (
     check_distributions,
     cumulative,
@@ -459,7 +468,7 @@ def wins_almost_surely(problem: Problem, play: jax.Array) -> jax.Array:
 def _rules(state: State, problem: Problem, hparams: Hparams) -> Rules:
     dtype, key = problem.game.dtype, learner.step_key(state)
     return Rules(
-        problem, state.best, state.known_at, jax.random.fold_in(key, 1),
+        problem, marks(state.best, state.known_at), jax.random.fold_in(key, 1),
         splitmix.streams(jax.random.fold_in(key, 0)),
         _exploration(problem, hparams), _enough(problem, hparams),
         jnp.asarray(hparams.reward_bound, dtype), jnp.asarray(hparams.restart, dtype),
@@ -505,24 +514,33 @@ def _updated(state: State, walk: Walk, problem: Problem, hparams: Hparams) -> St
 
 def _solved(state: State, problem: Problem, hparams: Hparams, news: jax.Array) -> State:
     """The optimistic model's value and near-optimal moves; the same state without news."""
-    dtype = problem.game.dtype
-    asked = pac.action_tolerance(hparams.epsilon, hparams.discount)
-    discount = jnp.asarray(hparams.discount, dtype)
-    value, error, quantity = span_iteration(
-        problem.game, problem.allowed, state.gain, state.probability, state.value, discount,
-        enough=_solver_tolerance(problem, hparams), active=news,
-    )
-    # What is within eps_1 by these values less twice their error is within eps_1 by the true.
-    strict = jnp.maximum(asked - 2 * error, 0).astype(dtype)
-    mine = problem.allowed & problem.game.system[:, None]
-    best = pac.near_optimal(quantity, mine, strict)
+    given = (state.gain, state.probability, problem, hparams)
+    # A loop of one pass, which is left out where no lane has news.
+    value, error, best, _ = learner.while_active(
+        lambda now, _: now[-1], _solve, (state.value, state.error, state.best, news), given)
     # Every allowed move then has a positive probability, unless that is too small a number.
     least = _exploration(problem, hparams) / problem.game.num_actions
     return replace(
-        state, value=value, error=jnp.where(news, error, state.error),
-        best=jnp.where(news, best, state.best),
+        state, value=value, error=error, best=best,
         always_almost_sure=state.always_almost_sure & (least > 0),
     )
+
+
+def _solve(now: Any, given: Any) -> Any:
+    value, error, best, news = now
+    gain, probability, problem, hparams = given
+    dtype = problem.game.dtype
+    discount = jnp.asarray(hparams.discount, dtype)
+    value, width, quantity = span_iteration(
+        problem.game, problem.allowed, gain, probability, value, discount,
+        enough=_solver_tolerance(problem, hparams), active=news,
+    )
+    # What is within eps_1 by these values less twice their error is within eps_1 by the true.
+    asked = pac.action_tolerance(hparams.epsilon, hparams.discount)
+    strict = jnp.maximum(asked - 2 * width, 0).astype(dtype)
+    mine = problem.allowed & problem.game.system[:, None]
+    near = pac.near_optimal(quantity, mine, strict)
+    return value, jnp.where(news, width, error), jnp.where(news, near, best), jnp.zeros_like(news)
 
 
 # --- constants ------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from jax import lax
 from jaxltl.core.models.game import Game
 
 _MOST_SWEEPS = 100_000
+_FEWEST = 16  # lanes that are worth a loop of their own
 _WRITTEN_OUT = 16  # successors up to which a sum over them is written out
 
 
@@ -81,55 +82,99 @@ def span_iteration(
     return _iterate(graph, models)
 
 
+class _Sweeps(NamedTuple):
+    """What a loop over sweeps carries; `change` is ``T v - v``, written out once for all uses."""
+
+    value: jax.Array
+    change: jax.Array
+    error: jax.Array
+    number: jax.Array
+
+
 def _plain(graph: _Graph, models: _Models) -> tuple[jax.Array, jax.Array, jax.Array]:
-    shape = (1,) * (models.value.ndim - 1)
+    start = _Sweeps(
+        models.value, _change(graph, models, models.value),
+        jnp.full_like(models.enough, jnp.inf), jnp.int32(0),
+    )
+    lanes = models.active.shape
+    few = lanes[0] // 4 if lanes and lanes[0] >= 4 * _FEWEST else 0
+    found = _swept(graph, models, start, few)
+    if few:
+        found = _last_lanes(graph, models, found, few)
+    return found.value, found.error, jnp.stack(_quantities(graph, models, found.value), axis=1)
 
-    def beside(x: jax.Array) -> jax.Array:
-        """One entry for all lanes."""
-        return x.reshape(x.shape + shape)
 
-    allowed, sign = beside(graph.allowed), beside(graph.sign)
-    live = beside(graph.allowed.any(-1))
+def _unfinished(models: _Models, now: _Sweeps) -> jax.Array:
+    return models.active & (now.error > models.enough) & (now.number < _MOST_SWEEPS)
+
+
+def _swept(graph: _Graph, models: _Models, start: _Sweeps, few: int = 0) -> _Sweeps:
+    """Sweeps until at most a few lanes are left that are not done."""
+    live = _beside(models, graph.allowed.any(-1))
     ahead = models.discount / (1 - models.discount)
 
-    def reached(value: jax.Array, *where: Any) -> jax.Array:
+    def sweep(now: _Sweeps) -> _Sweeps:
+        top = jnp.where(live, now.change, -jnp.inf).max(axis=0)
+        bottom = jnp.where(live, now.change, jnp.inf).min(axis=0)
+        going = models.active & (now.error > models.enough)
+        moved = now.value + now.change + ahead * (top + bottom) / 2
+        value = jnp.where(live & going, moved, now.value)
+        error = jnp.where(going, ahead * (top - bottom) / 2, now.error)
+        return _Sweeps(value, _change(graph, models, value), error, now.number + 1)
+
+    def left(now: _Sweeps) -> jax.Array:
+        going = _unfinished(models, now)
+        return jnp.sum(going) > few if few else jnp.any(going)
+
+    return lax.while_loop(left, sweep, start)
+
+
+def _last_lanes(graph: _Graph, models: _Models, found: _Sweeps, few: int) -> _Sweeps:
+    """The lanes that are not done go on by themselves: most models need a few sweeps, some many."""
+    going = _unfinished(models, found)
+    place = jnp.cumsum(going) - 1
+    who = jnp.nonzero(going, size=few, fill_value=0)[0]
+    narrow, rest = jax.tree.map(lambda x: x[..., who] if x.ndim else x, (models, found))
+    narrow = narrow._replace(active=jnp.arange(few) <= place[-1])
+    last = _swept(graph, narrow, rest)
+    place = jnp.maximum(place, 0)
+    return jax.tree.map(
+        lambda x, y: jnp.where(going, x[..., place], y) if y.ndim else x, last, found)
+
+
+def _beside(models: _Models, x: jax.Array) -> jax.Array:
+    """One entry for all lanes."""
+    return x.reshape(x.shape + (1,) * models.active.ndim)
+
+
+def _change(graph: _Graph, models: _Models, value: jax.Array) -> jax.Array:
+    """``T v - v``; zero where there is no move."""
+    allowed, sign = _beside(models, graph.allowed), _beside(models, graph.sign)
+    best = jnp.full_like(value, -jnp.inf)
+    for a, column in enumerate(_quantities(graph, models, value)):
+        best = jnp.maximum(best, jnp.where(allowed[:, a], sign * column, -jnp.inf))
+    return jnp.where(_beside(models, graph.allowed.any(-1)), sign * best - value, 0)
+
+
+def _quantities(graph: _Graph, models: _Models, value: jax.Array) -> list[jax.Array]:
+    """``gain + discount * P v``, a column for each action: so it is read in the order of memory."""
+    num_actions, width = graph.successor.shape[1:]
+
+    def reached(*where: Any) -> jax.Array:
         return value.at[graph.successor[:, *where]].get(
             mode="promise_in_bounds", wrap_negative_indices=False)
 
-    def quantities(value: jax.Array) -> list[jax.Array]:
-        """One column for each action: written out, it is read in the order of memory."""
-        num_actions, width = graph.successor.shape[1:]
-        columns = []
-        for a in range(num_actions):
-            if width == 1:  # what is certain need not be weighed
-                mean = reached(value, a, 0)
-            elif width > _WRITTEN_OUT:
-                mean = jnp.sum(models.probability[:, a] * reached(value, a), axis=1)
-            else:
-                terms = [models.probability[:, a, k] * reached(value, a, k) for k in range(width)]
-                mean = sum(terms[1:], start=terms[0])
-            columns.append(models.gain[:, a] + models.discount * mean)
-        return columns
-
-    def sweep(carry):
-        value, error, n = carry
-        best = jnp.full_like(value, -jnp.inf)
-        for a, column in enumerate(quantities(value)):
-            best = jnp.maximum(best, jnp.where(allowed[:, a], sign * column, -jnp.inf))
-        change = jnp.where(live, sign * best - value, 0)
-        top = jnp.where(live, change, -jnp.inf).max(axis=0)
-        bottom = jnp.where(live, change, jnp.inf).min(axis=0)
-        going = models.active & (error > models.enough)
-        moved = jnp.where(live & going, value + change + ahead * (top + bottom) / 2, value)
-        return moved, jnp.where(going, ahead * (top - bottom) / 2, error), n + 1
-
-    def unfinished(carry):
-        _, error, n = carry
-        return jnp.any(models.active & (error > models.enough)) & (n < _MOST_SWEEPS)
-
-    start = (models.value, jnp.full_like(models.enough, jnp.inf), jnp.int32(0))
-    value, error, _ = lax.while_loop(unfinished, sweep, start)
-    return value, error, jnp.stack(quantities(value), axis=1)
+    columns = []
+    for a in range(num_actions):
+        if width == 1:  # what is certain need not be weighed
+            mean = reached(a, 0)
+        elif width > _WRITTEN_OUT:
+            mean = jnp.sum(models.probability[:, a] * reached(a), axis=1)
+        else:
+            terms = [models.probability[:, a, k] * reached(a, k) for k in range(width)]
+            mean = sum(terms[1:], start=terms[0])
+        columns.append(models.gain[:, a] + models.discount * mean)
+    return columns
 
 
 _iterate = jax.custom_batching.custom_vmap(_plain)

@@ -79,6 +79,30 @@ def test_lanes_are_as_if_alone_however_they_are_nested():
     assert flat[1][2] == np.inf
 
 
+def test_the_last_of_many_lanes_end_as_they_do_among_few():
+    """Most begin with their value and end at once, which leaves few that go on by themselves."""
+    game, allowed, probability, gain, guess = models(3, 64)
+    enough = jnp.full(64, 1e-9)
+
+    def solve(p, g, v, e, a):
+        return span_iteration(game, allowed, g, p, v, 0.8, enough=e, active=a)
+
+    few = jax.jit(jax.vmap(solve))
+
+    def by_eights(value, active):
+        groups = [few(*(x[i : i + 8] for x in (probability, gain, value, enough, active)))
+                  for i in range(0, 64, 8)]
+        return jax.tree.map(lambda *x: jnp.concatenate(x), *groups)
+
+    near = by_eights(guess, jnp.ones(64, bool))[0]
+    late = np.random.default_rng(0).permutation(64)[:12]
+    near, active = near.at[late].set(guess[late]), jnp.ones(64, bool).at[late[0]].set(False)
+    for value in (near, guess):
+        together = jax.jit(jax.vmap(solve))(probability, gain, value, enough, active)
+        for x, y in zip(together, by_eights(value, active), strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-12)
+
+
 def test_a_good_guess_and_a_constant_beside_it_end_at_once():
     game, allowed, probability, gain, _ = models(2, 1)
     solve = partial(span_iteration, game, allowed, gain[0], probability[0], discount=0.9)
