@@ -24,6 +24,7 @@ PARTS = {"states": "state", "choices": "choice", "branches": "transition"}  # as
 # Groups of ours. Labels that others take for their own have their place among all as their id.
 OTHER_LABELS = "other-aps"
 INITIAL = "initial"  # an initial distribution that is not uniform
+TEXTS = "texts"  # the parameter of ours that names variables that are numbers of texts
 ACTIONS, VALUATIONS = "actions/choices", "valuations/states"  # folders
 _MOST_STATES = 2**31 - 2  # states and choices are numbered with 32 bits
 _MOST_STRING = 2**10  # bytes of a text, on the average
@@ -55,13 +56,22 @@ class Annotation:
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable of a state, at a place in bits in its record; `presence` is before it or None."""
+    """A variable of a state.
+
+    Attributes:
+      name, type: as in the file.
+      offset: what is added to its code.
+      start: where its code starts in the record, in bits.
+      presence: the bit that says whether it is there; None if it always is.
+      is_text: whether it is the number of a text.
+    """
 
     name: str
     type: Type
     offset: int
     start: int
     presence: int | None
+    is_text: bool = False
 
 
 @dataclass(frozen=True)
@@ -166,7 +176,7 @@ def parse_index(content: bytes, place: str) -> Index:
         counts["choice-actions"],
         probability,
         annotations,
-        *_records(data.get("valuations", {}), place),
+        *_records(data.get("valuations", {}), _texts_of_ours(data), place),
         tuple(names),
     )
 
@@ -258,7 +268,14 @@ def _annotation(group: str, key: str, value: Any, place: str) -> Annotation:
     return Annotation(group, key, name, tuple(applies), kind)
 
 
-def _records(data: Any, place: str) -> tuple[tuple[Record, ...], int]:
+def _texts_of_ours(data: Mapping[str, Any]) -> list[Any]:
+    """The whole numbers that are those of texts; other tools refuse files with the type string."""
+    for key in ("file-data", "parameters", TEXTS):
+        data = data.get(key, {}) if isinstance(data, dict) else {}
+    return data if isinstance(data, list) else []
+
+
+def _records(data: Any, texts_of_ours: list[Any], place: str) -> tuple[tuple[Record, ...], int]:
     """The classes of states, and how many texts their variables have."""
     states = _table(data, "valuations", place).get("states")
     if states is None:
@@ -271,10 +288,10 @@ def _records(data: Any, place: str) -> tuple[tuple[Record, ...], int]:
         raise ValueError(
             f"{place}{VALUATIONS}: #strings is {texts}; at most {_MOST_STATES} are read."
         )
-    return tuple(_record(one, f"{place}{VALUATIONS}: ") for one in classes), texts
+    return tuple(_record(one, texts_of_ours, f"{place}{VALUATIONS}: ") for one in classes), texts
 
 
-def _record(data: Any, place: str) -> Record:
+def _record(data: Any, texts_of_ours: list[Any], place: str) -> Record:
     variables = _get(_table(data, "a class", place), "variables", place)
     if not isinstance(variables, list):
         raise ValueError(f"{place}variables is {_shown(variables)}; expected a list.")
@@ -302,7 +319,8 @@ def _record(data: Any, place: str) -> Record:
                     f"{place}is-optional of {name!r} is {_shown(optional)}; expected true or false."
                 )
             presence, start = (start, start + 1) if optional else (None, start)
-            found.append(Variable(name, kind, offset, start, presence))
+            is_text = kind.name == "uint" and name in texts_of_ours
+            found.append(Variable(name, kind, offset, start, presence, is_text))
             start += kind.size
         if start > 8 * _MOST_RECORD:
             raise ValueError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,8 +118,8 @@ def read_variables(
     """The variables of states, ``[S]`` each, by name.
 
     Whole numbers are int32 or, where the type is larger, int64 (or uint64); what is absent in
-    some state is a double, NaN there, or an empty text. Whole numbers of more than 64 bits, and
-    texts that would take more than 1 GB, are left out.
+    some state is a double, NaN there, or an empty text. Texts that would take more than 1 GB are
+    objects. Whole numbers of more than 64 bits are left out.
 
     Args:
       content: the records of the states, one after the other.
@@ -187,7 +187,8 @@ def _read_variable(
     if kind.name == "string":
         return _texts(np.ascontiguousarray(field).view("<u8")[:, 0], texts, what)
     if kind.name != "rational":
-        return _whole_numbers(field, variable, what)
+        values = _whole_numbers(field, variable, what)
+        return _texts(values, texts, what) if variable.is_text else values
     if kind.size % 16:
         raise ValueError(f"{what}is a rational of {kind.size} bits; expected whole bytes.")
     values = np.full(len(raw), np.nan)
@@ -198,12 +199,15 @@ def _read_variable(
     return values
 
 
-def _texts(number: NDArray[np.uint64], texts: Sequence[str], what: str) -> NDArray[Any] | None:
-    if number.max() >= len(texts):
-        raise ValueError(f"{what}has the text {number.max()}; there are {len(texts)}.")
-    if 4 * max(number.size, len(texts)) * max(map(len, texts)) > _MOST_TEXT:
-        return None
-    return np.array(texts)[number.astype(np.int64)]
+def _texts(number: NDArray[Any], texts: Sequence[str], what: str) -> NDArray[Any]:
+    """The texts of some numbers."""
+    used, which = np.unique(number, return_inverse=True)
+    if used[0] < 0 or used[-1] >= len(texts):
+        raise ValueError(f"{what}has the text {used[-1]}; there are {len(texts)}.")
+    chosen = [texts[i] for i in used.tolist()]
+    # NumPy gives every text the room of the longest one.
+    dtype = object if 4 * number.size * max(map(len, chosen)) > _MOST_TEXT else str
+    return np.array(chosen, dtype)[which.ravel()]
 
 
 def _field(raw: Bytes, start: int, size: int) -> Bytes:
@@ -252,22 +256,36 @@ def _joined(parts: Sequence[_Part], count: int, what: str) -> NDArray[Any]:
     """A variable's values from all classes of states."""
     if len(parts) == 1 and parts[0][0].size == count:
         return parts[0][1]
-    kinds = {values.dtype.kind for _, values in parts}
-    if "U" in kinds and len(kinds) > 1:
+    texts = {values.dtype.kind in "UO" for _, values in parts}
+    if len(texts) > 1:
         raise ValueError(f"{what}is a text in some states only; expected one type.")
     dtype = np.result_type(*(values.dtype for _, values in parts))
-    found: NDArray[Any] = np.zeros(count, dtype)
-    if sum(states.size for states, _ in parts) < count and "U" not in kinds:
+    found: NDArray[Any] = np.full(count, "" if True in texts else 0, dtype)
+    if sum(states.size for states, _ in parts) < count and True not in texts:
         found = np.full(count, np.nan)
     for states, values in parts:
         found[states] = values
     return found
 
 
-def write_variables(valuation: Mapping[str, Any], place: str) -> tuple[list[Any], Bytes, list[str]]:
-    """Variables described, the records of all states, and texts that they have by their numbers.
+class Written(NamedTuple):
+    """Variables as they are written.
 
-    Each variable begins at a whole byte.
+    Attributes:
+      variables: what the index says of them.
+      records: those of all states, one after the other.
+      texts: those that variables have by their numbers.
+      named: the variables that are texts.
+    """
+
+    variables: list[Any]
+    records: Bytes
+    texts: list[str]
+    named: list[str]
+
+
+def write_variables(valuation: Mapping[str, Any], place: str) -> Written:
+    """The variables of all states; each begins at a whole byte of its record.
 
     Raises:
       ValueError: a variable holds neither truth values, nor numbers, nor texts.
@@ -275,11 +293,14 @@ def write_variables(valuation: Mapping[str, Any], place: str) -> tuple[list[Any]
     described: list[Any] = []
     fields: list[NDArray[Any]] = []
     texts: list[str] = []
+    named: list[str] = []
     for name, values in valuation.items():
         values = np.asarray(values)
         kind = {"b": "bool", "i": "int", "u": "uint", "f": "double", "U": "string"}.get(
             values.dtype.kind
         )
+        if values.dtype.kind == "O" and all(isinstance(x, str) for x in values):
+            kind = "string"
         if kind is None or (kind != "string" and values.dtype.itemsize > 8):
             raise ValueError(
                 f"{place}the variable {name!r} holds {values.dtype}; UMB files hold "
@@ -291,6 +312,8 @@ def write_variables(valuation: Mapping[str, Any], place: str) -> tuple[list[Any]
             different, number = np.unique(values, return_inverse=True)
             values = number.ravel().astype(np.uint64) + np.uint64(len(texts))
             texts += map(str, different)
+            named.append(name)
+            kind = "uint"  # as Storm refuses files that have the type string
         size = 1 if kind == "bool" else 8 * values.dtype.itemsize
         described.append({"name": name, "type": {"type": kind, "size": size}})
         if kind == "bool":
@@ -300,7 +323,7 @@ def write_variables(valuation: Mapping[str, Any], place: str) -> tuple[list[Any]
     records = np.zeros(fields[0].size, layout)
     for i, field in enumerate(fields):
         records[f"v{i}"] = field
-    return described, records.view(np.uint8), texts
+    return Written(described, records.view(np.uint8), texts, named)
 
 
 def write_texts(texts: Sequence[str], place: str) -> tuple[Bytes, bytes]:

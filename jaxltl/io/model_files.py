@@ -11,6 +11,7 @@ from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.io._files import pieces, raw_bytes, write_bytes
+from jaxltl.io.drn import read_drn, write_drn
 from jaxltl.io.hoa_game import read_hoa_game, write_hoa_game
 from jaxltl.io.npz import read_npz, write_npz
 from jaxltl.io.pgsolver import read_pgsolver, write_pgsolver
@@ -36,22 +37,10 @@ def _write_hoa(path: str | os.PathLike[str], game: Any) -> None:
         file.write(text.encode())
 
 
-def _read_drn(path: str | os.PathLike[str]) -> SparseMDP:
-    from jaxltl.io.drn import read_drn
-
-    return read_drn(path)
-
-
-def _write_drn(path: str | os.PathLike[str], model: Any) -> None:
-    from jaxltl.io.drn import write_drn
-
-    write_drn(path, model)
-
-
 FORMATS = (
     Format("UMB", (".umb",), read_umb, write_umb, "all"),
     Format("PRISM's explicit files", (".tra", ".pexp"), read_prism, write_prism, "models"),
-    Format("DRN", (".drn",), _read_drn, _write_drn, "models"),
+    Format("DRN", (".drn",), read_drn, write_drn, "models"),
     Format(
         "PGSolver",
         (".pg", ".gm", ".pgsolver"),

@@ -62,9 +62,7 @@ def parse_arrays(raw: bytes, name: str, more: Sequence[str] = ()) -> dict[str, N
         raise ValueError(f"{name!r} is not an .npz of plain arrays: {error}") from None
     sparse = _is_sparse(arrays)
     kinds = {
-        k: v
-        for k, v in (_SPARSE if sparse else _PADDED).items()
-        if k != "system" or k in more
+        k: v for k, v in (_SPARSE if sparse else _PADDED).items() if k != "system" or k in more
     }
     for key, array in arrays.items():
         known = kinds.get(key)
@@ -253,6 +251,8 @@ def write_npz(path: str | os.PathLike[str], model: Any) -> None:
             arrays[f"{_REWARD}{name}:{part}"] = np.asarray(values, np.float64)
     for name, values in sparse.valuation.items():
         values = np.asarray(values)
+        if values.dtype.kind == "O" and all(isinstance(x, str) for x in values):
+            values = values.astype(str)
         if values.dtype.kind not in _VALUES[0]:
             raise ValueError(
                 f"{str(path)!r}: the variable {name!r} holds {values.dtype}; a file "

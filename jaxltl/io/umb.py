@@ -25,6 +25,7 @@ from jaxltl.io._umb_index import (
     INITIAL,
     OTHER_LABELS,
     PARTS,
+    TEXTS,
     VALUATIONS,
     Index,
     ids_for,
@@ -58,8 +59,8 @@ def read_umb(path: str | os.PathLike[str]) -> SparseMDP | Game:
 
     Left out, as nothing follows from them: who made the file, the players' names, actions of
     branches, annotations other than labels and rewards, variables of choices and branches, and
-    variables that are whole numbers of more than 64 bits or texts of more than 1 GB. A variable
-    that some state lacks is a double, NaN there, or an empty text.
+    whole numbers of more than 64 bits. A variable that some state lacks is a double, NaN there, or
+    an empty text.
 
     Args:
       path: the file.
@@ -412,11 +413,14 @@ def _contents(model: Any, place: str) -> list[tuple[str, Any]]:
     }
     contents += more
     if sparse.valuation:
-        described, records, texts = write_variables(sparse.valuation, place)
-        states = {"unique": False, "classes": [{"variables": described}]}
-        index["valuations"] = {"states": {**states, "#strings": len(texts)} if texts else states}
-        contents.append((f"{VALUATIONS}/valuations.bin", records))
-        contents += _written_texts(texts, VALUATIONS, place)
+        written = write_variables(sparse.valuation, place)
+        states: dict[str, Any] = {"unique": False, "classes": [{"variables": written.variables}]}
+        if written.named:
+            states["#strings"] = len(written.texts)
+            index["file-data"]["parameters"] = {TEXTS: written.named}
+        index["valuations"] = {"states": states}
+        contents.append((f"{VALUATIONS}/valuations.bin", written.records))
+        contents += _written_texts(written.texts, VALUATIONS, place)
     return [("index.json", json.dumps(index, indent=1).encode()), *contents]
 
 
