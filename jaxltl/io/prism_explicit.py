@@ -161,7 +161,7 @@ def _in_one(path: Path) -> list[Section]:
         if start[1] == b"Observations":
             raise text.error(line, "models with observations are not read.")
         if not kind:
-            second = data[start.end() : stop].split(b"\n", 2)[1:2]
+            second = data[start.end() : min(stop, start.end() + 200)].split(b"\n", 2)[1:2]
             form = re.match(rb"#[ \t]*(State|Transition) rewards", second[0] if second else b"")
             if form is None:
                 raise text.error(line + 1, "expected '# State rewards' or '# Transition rewards'.")
