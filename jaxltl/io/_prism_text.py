@@ -190,7 +190,7 @@ def _state_rewards(reward: NDArray[np.float64], storm: bool) -> Iterator[bytes]:
         yield b"%d %d\n" % (reward.size, state.size)
     for begin in range(0, state.size, _STEP):
         part = state[begin : begin + _STEP]
-        yield joined_lines("%d %r\n", part.tolist(), reward[part].tolist())
+        yield _infinity(joined_lines("%d %r\n", part.tolist(), reward[part].tolist()), storm)
 
 
 def _transition_rewards(
@@ -208,6 +208,12 @@ def _transition_rewards(
         columns = [host.state[row].tolist(), choice[row].tolist(), host.successor[part].tolist(),
                    earned[part].tolist()]
         if host.is_chain:
-            yield joined_lines("%d %d %r\n", columns[0], *columns[2:])
+            lines = joined_lines("%d %d %r\n", columns[0], *columns[2:])
         else:
-            yield joined_lines("%d %d %d %r\n", *columns)
+            lines = joined_lines("%d %d %d %r\n", *columns)
+        yield _infinity(lines, storm)
+
+
+def _infinity(lines: bytes, storm: bool) -> bytes:
+    """Numbers with infinity as PRISM reads it."""
+    return lines if storm else lines.replace(b"inf", b"Infinity")

@@ -115,6 +115,51 @@ def test_actions_with_numbers_keep_them(tmp_path):
     assert_same(read_prism(tmp_path / "m.tra"), model)
 
 
+def test_sections_as_prism_writes_them(tmp_path):
+    (tmp_path / "m.pexp").write_text("""\
+# Transitions (DTMC)
+2 3
+0 0 0.5
+0 1 0.5
+1 1 1
+
+# States
+(s)
+0:(3)
+1:(4)
+
+# Labels
+0="init" 1="deadlock"
+0: 0
+
+# Reward structure "r"
+# State rewards
+2 1
+0 Infinity
+
+# Reward structure "r"
+# Transition rewards
+2 0
+
+# Reward structure
+# State rewards
+2 0
+
+# Reward structure
+# Transition rewards
+2 1
+0 1 1
+""")
+    model = read_prism(tmp_path / "m.pexp")
+    assert model.valuation["s"].tolist() == [3, 4] and model.propositions == ("deadlock",)
+    r, other = model.rewards["r"], model.rewards[""]
+    assert r.state.tolist() == [np.inf, 0] and r.choice is r.transition is other.state is None
+    assert other.transition.tolist() == [0, 1, 0]
+    write_prism(tmp_path / "n.pexp", model)
+    assert "\n0 Infinity\n" in (tmp_path / "n.pexp").read_text()
+    assert_same(read_prism(tmp_path / "n.pexp"), model)
+
+
 def test_compressed_files_may_stand_beside_others(tmp_path):
     path = put(tmp_path, FILES)
     model = read_prism(path)
