@@ -20,9 +20,11 @@ import numpy as np
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.io.drn import read_drn, write_drn
+from jaxltl.io.hoa_game import read_hoa_game
 from jaxltl.io.npz import read_npz, write_npz
 from jaxltl.io.pgsolver import read_pgsolver
 from jaxltl.io.prism_explicit import read_prism, write_prism
+from jaxltl.io.reward_machine import read_reward_machine
 from jaxltl.io.umb import read_umb, write_umb
 from tests.io.archives import classes_example, example, members_of, tar, umb
 from tests.io.mutate import mutated
@@ -294,6 +296,7 @@ def damaged_arrays(rng: np.random.Generator, data: bytes) -> bytes:
         names = list(arrays) or ["label"]
         name, other = (names[i] for i in rng.integers(len(names), size=2))
         array = np.array(arrays.get(name, [True]))
+        array = array.real if array.dtype.kind == "c" else array
         kind = rng.integers(8)
         if kind == 0:
             arrays.pop(name, None)
@@ -360,10 +363,26 @@ _PARITY = (
     b"0 1 0 1;\n1 0 1 0,1;\n",
 )
 
+_ARBITER = b"""HOA: v1 States: 2 Start: 0 AP: 3 "r" "g" "s" controllable-AP: 1
+acc-name: parity max even 3 Acceptance: 3 Inf(2) | (Fin(1) & Inf(0))
+--BODY-- State: 0 [!0] 0 {2} [0 & 1] 0 {2} [0 & !1] 1 {1}
+State: 1 [1 & !2] 0 {2} [!1 | 2] 1 {1} --END--
+"""
+
+_MACHINE = b"""0 # where it starts
+[2]
+(0,0,'!f&!n',ConstantRewardFunction(0))
+(0,2,'n',ConstantRewardFunction(-0.5))
+(0,1,'f&!n',ConstantRewardFunction(2.5e-1))
+(1,2,"!(g | False)",ConstantRewardFunction(1))
+"""
+
 READERS = {
     "umb": Reader(read_umb, ".umb", umb_samples, damaged_archive),
     "npz": Reader(read_npz, ".npz", npz_samples, damaged_arrays),
     "drn": Reader(read_drn, ".drn", _written(write_drn, "sample.drn")),
     "pexp": Reader(read_prism, ".pexp", _written(write_prism, "sample.pexp")),
+    "hoa_game": Reader(read_hoa_game, ".hoa", lambda folder: [_ARBITER]),
+    "reward_machine": Reader(read_reward_machine, ".txt", lambda folder: [_MACHINE]),
     "pgsolver": Reader(read_pgsolver, ".pg", lambda folder: list(_PARITY)),
 }
