@@ -460,6 +460,57 @@ def _render(result: Automaton, form: str, formula: str) -> str:
     return plot.to_bytes(plot.automaton(result), "svg").decode()
 
 
+@main.command()
+@click.argument("model_file", metavar="MODEL", type=click.Path(path_type=Path))
+@click.argument("properties", metavar="PROPERTY...", nargs=-1, required=True)
+@click.option("--strategy", type=click.Path(path_type=Path), metavar="FILE",
+              help="Write the strategies that attain the values to this file, as JSON.")
+@click.option("--tolerance", default=1e-6, show_default=True,
+              type=click.FloatRange(0, 1, min_open=True),
+              help="The width of the bounds: absolute of probabilities, else relative.")
+@click.option("--json", "as_json", is_flag=True, help="End with the results as one JSON line.")
+@_plain_errors
+def solve(
+    model_file: Path, properties: tuple[str, ...], strategy: Path | None, tolerance: float,
+    as_json: bool,
+) -> None:
+    """Solve properties of a Markov chain or decision process, with certified bounds.
+
+    A PROPERTY is written as for PRISM and Storm, such as 'Pmax=? [ F "goal" ]',
+    'R{"time"}min=? [ C<=10 ]', 'P>=0.9 [ G !"crash" ]', or any formula of linear temporal logic in
+    P; or it is a file of properties that ends in .props, .prop or .pctl. See docs/solve.md.
+
+    Values are those of the initial states. The exit status is 0 where all were solved, 1 where
+    some value did not converge or threshold was not decided, 2 for mistakes in what was asked.
+    """
+    _begin(f"solving {model_file}")
+    from jaxltl.app import solve as solving
+
+    asked = solving.asked_for(properties)
+    if all(one.parsed is None for one in asked):
+        raise ValueError("\n".join(str(one.error) for one in asked))
+    from jaxltl.algos.checkpoint import atomic_write
+
+    # A place that cannot be written to must be known before the work, not after.
+    place = contextlib.nullcontext() if strategy is None else atomic_write(strategy)
+    with place as file:
+        begin = time.perf_counter()
+        model = solving.load(model_file)
+        entry = solving.model_entry(model, time.perf_counter() - begin)
+        click.echo("{kind} of {states} states, {choices} choices, {transitions} transitions, read "
+                   "in {seconds:.3f} s".format(**entry))
+        results = []
+        for result in solving.solve(model, asked, tolerance):
+            results.append(result)
+            click.echo(f"\n{solving.text(result)}")
+        if file is not None:
+            file.write(solving.strategies(model, results, model_file))
+    if as_json:
+        _print_json({"model": entry, "results": [solving.result_entry(r) for r in results]})
+    if status := max(result.exit_status for result in results):
+        raise SystemExit(status)
+
+
 _EXPERIMENTS = {
     "mlirl": "section 2.5, inverse reinforcement learning with a temporal-logic task",
     "todirl": "section 3.5, reward networks that plan in worlds never seen",

@@ -1,0 +1,269 @@
+"""Solving properties of a model file: what `jaxltl solve` does, without compiling anything."""
+
+from __future__ import annotations
+
+import json
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.logic.properties import Property, parse_properties
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.types import NotConverged, Status
+from jaxltl.core.values.answer import Answer, Strategy, answer
+
+PROPERTY_FILES = (".props", ".prop", ".pctl")
+SHOWN = 10  # initial states whose values are printed
+MAX_FILE = 2**24  # bytes of a file of properties
+
+SOLVED, NOT_CONVERGED, MISTAKEN = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One property as it was asked for.
+
+    Attributes:
+      text: as it stands in the command or file.
+      parsed: what it says; None where it is no property.
+      error: why, or None.
+    """
+
+    text: str
+    parsed: Property | None = None
+    error: str | None = None
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of one property.
+
+    Attributes:
+      asked: the property.
+      answer: its answer, or None.
+      seconds: how long it took.
+      error: why there is no answer, or None.
+      fault: whose: NOT_CONVERGED the solver's, MISTAKEN the question's.
+      extra: further entries of its JSON object.
+    """
+
+    asked: Asked
+    answer: Answer | None
+    seconds: float
+    error: str | None = None
+    fault: int = SOLVED
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def exit_status(self) -> int:
+        if self.answer is None:
+            return self.fault
+        return SOLVED if self.answer.status == Status.CONVERGED else NOT_CONVERGED
+
+
+def asked_for(arguments: Sequence[str]) -> list[Asked]:
+    """The properties of some arguments, each properties or the name of a file of them.
+
+    A mistake in one does not hide the others.
+
+    Raises:
+      ValueError: a file cannot be read.
+    """
+    found = []
+    for argument in arguments:
+        place, text = "", argument
+        if argument.lower().endswith(PROPERTY_FILES):
+            place, text = f"{argument}: ", _text_of(Path(argument))
+        try:
+            found += [Asked(p.text, p) for p in parse_properties(text)]
+        except ValueError as error:
+            found.append(Asked(argument, error=f"{place}{error}"))
+    return found
+
+
+def _text_of(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_FILE + 1)
+        if len(data) > MAX_FILE:
+            raise ValueError(f"cannot read {str(path)!r}: it has more than {MAX_FILE} bytes.")
+        return data.decode()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"cannot read {str(path)!r}: byte {error.start} is not UTF-8.") from None
+    except OSError as error:
+        raise ValueError(f"cannot read {str(path)!r}: {error.strerror}.") from None
+
+
+def load(path: Path) -> SparseMDP:
+    """A chain or decision process from a model file.
+
+    Raises:
+      ValueError: it is none.
+    """
+    from jaxltl.io.model_files import read_model
+
+    model = read_model(path)
+    if isinstance(model, Game):
+        raise ValueError(f"{str(path)!r} is a game; properties of chains and decision processes "
+                         "are solved, games by `jaxltl synthesize`.")
+    if not isinstance(model, SparseMDP):
+        raise ValueError(f"{str(path)!r} holds a {type(model).__name__}; properties of chains and "
+                         "decision processes are solved.")
+    return model
+
+
+def solve(model: SparseMDP, asked: Sequence[Asked], tolerance: float) -> Iterator[Result]:
+    """The result of each property, as soon as it is there."""
+    from scipy.sparse import csgraph, linalg  # noqa: F401 - their time is no property's
+
+    for one in asked:
+        begin = time.perf_counter()
+        found, error = None, one.error
+        fault, extra = MISTAKEN, {}  # type: int, dict[str, Any]
+        if one.parsed is not None:
+            try:
+                if one.parsed.operator == "multi":
+                    extra, status = _several(model, one.parsed, tolerance)
+                    fault = status
+                else:
+                    found = answer(model, one.parsed, tolerance=tolerance)
+            except ValueError as mistake:
+                error = str(mistake)
+            except NotConverged as failure:
+                error, fault = str(failure), NOT_CONVERGED
+            except Exception as failure:  # a mistake of ours must not lose the other answers
+                traceback.print_exc()
+                error, fault = f"{type(failure).__name__}: {failure}", NOT_CONVERGED
+        yield Result(one, found, time.perf_counter() - begin, error, fault, extra)
+
+
+def _several(model: SparseMDP, prop: Property, tolerance: float) -> tuple[dict[str, Any], Any]:
+    raise ValueError("multi")
+
+
+# --- what is shown ----------------------------------------------------------------------------
+
+
+def model_entry(model: SparseMDP, seconds: float) -> dict[str, Any]:
+    """The model's part of the JSON object."""
+    return {"kind": "chain" if model.is_chain else "mdp", "states": model.num_states,
+            "choices": model.num_rows, "transitions": model.num_transitions, "seconds": seconds}
+
+
+def result_entry(result: Result) -> dict[str, Any]:
+    """A result as its JSON object."""
+    found = result.answer
+    entry: dict[str, Any] = {"property": result.asked.text, "value": None, "lower": None,
+                             "upper": None, "status": "INVALID"}
+    if result.asked.parsed is not None and result.asked.parsed.name is not None:
+        entry["name"] = result.asked.parsed.name
+    if found is not None:
+        entry |= {
+            "value": _over_states(found.value.tolist() if found.holds is None else found.holds),
+            "lower": _over_states(found.lower.tolist()),
+            "upper": _over_states(found.upper.tolist()),
+            "status": found.status.name, "method": found.method}
+        if found.states.size > 1:
+            entry["states"] = found.states.tolist()
+    elif result.fault == NOT_CONVERGED:
+        entry["status"] = "MAX_STEPS"
+    if result.error is not None:
+        entry["error"] = result.error
+    return entry | result.extra | {"seconds": result.seconds}
+
+
+def _over_states(values: list[Any]) -> Any:
+    """The value of the one state, or the list over several; JSON knows no infinity."""
+    plain = [_number(x) for x in values]
+    return plain[0] if len(plain) == 1 else plain
+
+
+def _number(x: Any) -> Any:
+    if isinstance(x, float) and not np.isfinite(x):
+        return None if np.isnan(x) else "inf" if x > 0 else "-inf"
+    return x
+
+
+def text(result: Result) -> str:
+    """A result for people."""
+    lines = [result.asked.text]
+    parsed, found = result.asked.parsed, result.answer
+    if parsed is not None and parsed.name is not None:
+        lines[0] = f'"{parsed.name}": {lines[0]}'
+    if result.error is not None:
+        lines.append("  " + result.error.replace("\n", "\n  "))
+    if found is None:
+        return "\n".join(lines)
+    shown = found.states[:SHOWN].tolist()
+    for i, state in enumerate(shown):
+        where = f"state {state}: " if found.states.size > 1 else ""
+        lines.append(f"  {where}{_value_text(found, i)}")
+    if found.states.size > SHOWN:
+        lines.append(f"  and {found.states.size - SHOWN} more initial states")
+    status = "" if found.status == Status.CONVERGED else f", {found.status.name}"
+    how = f", {found.method}" if found.method else ""
+    lines.append(f"  {result.seconds:.3f} s{how}{status}")
+    return "\n".join(lines)
+
+
+def _value_text(found: Answer, i: int) -> str:
+    lower, upper = (float(x[i]) for x in (found.lower, found.upper))
+    within = f"exactly {lower!r}" if lower == upper else f"in [{lower!r}, {upper!r}]"
+    if found.holds is None:
+        value = float(found.value[i])
+        return f"{value!r}, {within}" if lower != upper else f"{value!r}, exactly"
+    verdict = {True: "true", False: "false", None: "not decided"}[found.holds[i]]
+    return f"{verdict}: the value is {within}"
+
+
+# --- strategies -------------------------------------------------------------------------------
+
+
+def strategies(model: SparseMDP, results: Sequence[Result], source: Path) -> bytes:
+    """A file of the strategies that attain the answers, as JSON; see docs/solve.md."""
+    found = [
+        {"property": r.asked.text, **_strategy(model, r.answer.strategy)}
+        for r in results if r.answer is not None and r.answer.strategy is not None
+        and not model.is_chain]
+    table = {"model": source.name, "states": model.num_states, "strategies": found}
+    return (json.dumps(table, allow_nan=False) + "\n").encode()
+
+
+def _strategy(model: SparseMDP, strategy: Strategy) -> dict[str, Any]:
+    host = model.host
+    row = np.asarray(strategy.row)
+    choice = (row - host.row_start[host.state[row]]).tolist()
+    names = _names(model)
+    entry: dict[str, Any] = {"kind": "memoryless", "choice": choice}
+    if strategy.by:
+        entry["kind"] = f"first choice, then by the {strategy.by} left"
+    if names is not None:
+        entry["action"] = names(row)
+    if strategy.memory is None:
+        return entry
+    found = strategy.memory
+    start = found.product.start
+    return {
+        "kind": "memory",
+        "initial": np.stack([found.product.base_state[start], found.product.memory[start]],
+                            1).tolist(),
+        "letters": [sorted(p for p, holds in zip(found.automaton.propositions, letter, strict=True)
+                           if holds) for letter in found.automaton.letters],
+        "letter": found.letter.tolist(),
+        "update": found.automaton.delta.tolist(),
+        "state": found.product.base_state.tolist(), "memory": found.product.memory.tolist(),
+        **{k: v for k, v in entry.items() if k != "kind"},
+    }
+
+
+def _names(model: SparseMDP) -> Callable[[np.ndarray], list[str]] | None:
+    if model.action is None or not model.action_names:
+        return None
+    action, names = np.asarray(model.action), np.array(model.action_names, dtype=object)
+    return lambda row: names[action[row]].tolist()

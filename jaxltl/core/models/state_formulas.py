@@ -1,0 +1,79 @@
+"""Where labels and Boolean formulas of them hold in a sparse model."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+
+from jaxltl.core.logic.labels import distinct_rows, require_known, satisfying
+from jaxltl.core.logic.ltl import Formula, as_formula
+from jaxltl.core.models.sparse import SparseMDP
+
+BUILT_IN = ("init", "deadlock")  # what every model of PRISM and Storm has
+
+
+def label_columns(model: SparseMDP, names: Collection[str], place: str) -> np.ndarray:
+    """Where some labels hold, ``bool[S, len(names)]``.
+
+    A model without the label ``init`` has it in its initial states, and one without ``deadlock``
+    where the only choice is a loop to itself with probability 1, as which readers keep a state
+    without choices.
+
+    Raises:
+      ValueError: there is no such label, with those that there are.
+    """
+    known = (*model.propositions, *(x for x in BUILT_IN if x not in model.propositions))
+    require_known(names, known, place)
+    found = np.zeros((model.num_states, len(names)), bool)
+    for i, name in enumerate(names):
+        if name in model.propositions:
+            found[:, i] = np.asarray(model.label)[:, model.propositions.index(name)]
+        elif name == "init":
+            found[:, i] = np.asarray(model.initial) > 0
+        else:
+            found[:, i] = _standing_still(model)
+    return found
+
+
+def _standing_still(model: SparseMDP) -> np.ndarray:
+    host = model.host
+    row = host.row_start[:-1]
+    entry = host.entry_start[row]
+    alone = (np.diff(host.row_start) == 1) & (host.entry_start[row + 1] - entry == 1)
+    return alone & (host.successor[entry] == np.arange(host.num_states))
+
+
+def states_satisfying(
+    model: SparseMDP, condition: Formula | str, place: str = "the condition"
+) -> np.ndarray:
+    """Where a Boolean formula of labels holds, ``bool[S]``.
+
+    Raises:
+      ValueError: an unknown label or a temporal operator.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> model = make_sparse(None, [0, 1, 2], [1, 1], [1.0, 1.0], initial=[1, 0],
+      ...                     label=[[1], [0]], propositions=["a"])
+      >>> states_satisfying(model, "!a | init").tolist()
+      [True, True]
+      >>> states_satisfying(model, "deadlock").tolist()
+      [False, True]
+    """
+    condition = as_formula(condition)
+    names = condition.propositions
+    return satisfying(label_columns(model, names, place), names, condition, place)
+
+
+def letters_of(
+    model: SparseMDP, names: Collection[str], place: str = "the formula"
+) -> tuple[list[frozenset[str]], np.ndarray]:
+    """The sets of labels that occur, of those named, and the number of each state's: ``int[S]``.
+
+    Raises:
+      ValueError: there is no such label.
+    """
+    rows, number = distinct_rows(label_columns(model, names, place))
+    return [frozenset(n for n, holds in zip(names, row, strict=True) if holds)
+            for row in rows], number

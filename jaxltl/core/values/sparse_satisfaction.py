@@ -1,0 +1,169 @@
+"""The best probability of a formula of linear temporal logic on a sparse model, on the host."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.automata.automaton import Automaton, letter_index
+from jaxltl.core.automata.runs import live_states, universal_states
+from jaxltl.core.automata.translate import Task, to_automaton
+from jaxltl.core.host.accepting import accepting_region
+from jaxltl.core.host.product import HostProduct, host_product, without_memory
+from jaxltl.core.logic.ltl import as_formula
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.models.state_formulas import letters_of
+from jaxltl.core.types import Solution
+from jaxltl.core.values.reachability import reachability_probability
+
+
+class Satisfaction(NamedTuple):
+    """The best probability of a task, with a policy that has a memory.
+
+    Attributes:
+      solution: value, lower and upper are ``float64[I]``, one for each state that was asked for.
+      automaton: the task, over the letters that occur.
+      letter: ``int[S]``, the letter that each state shows.
+      product: what is reached of the model beside the automaton, N states.
+      row: ``int32[N]``, the row of the model that the policy takes in each of them.
+    """
+
+    solution: Solution
+    automaton: Automaton
+    letter: np.ndarray
+    product: HostProduct
+    row: np.ndarray
+
+
+def sparse_satisfaction(
+    model: SparseMDP,
+    task: Task,
+    *,
+    objective: str = "max",
+    states: Any = None,
+    label_on: str = "entry",
+    tolerance: float | None = None,
+) -> Satisfaction:
+    """Largest or smallest probability of satisfying a formula, from some states.
+
+    Only what is reached of the product of the model and the formula's automaton is written out (an
+    automaton of one state has the model itself for a product), and that only until the verdict is
+    known. In it the task is to reach states whose verdict is yes, among them, for Buchi and parity
+    acceptance, the accepting end components (Baier and Katoen 2008, section 10.6.4); for a safety
+    formula, not to reach those whose verdict is no. The least probability of Buchi and parity is
+    one minus the largest of the negation.
+
+    Args:
+      model: the model.
+      task: a formula, its text, or an automaton over the letters that occur in the model.
+      objective: ``"max"`` or ``"min"``.
+      states: ``int[I]``, where runs start; default the initial states.
+      label_on: ``"entry"``: the label of the first state is read at once; ``"exit"``: as it is
+        left. The probabilities are the same, for the run shows the same word.
+      tolerance: of :func:`~jaxltl.core.values.reachability.reachability_probability`.
+
+    Raises:
+      ValueError: an unknown label, objective or reading, or a product beyond 2^31 states.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                    initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["a"])
+      >>> sparse_satisfaction(coin, "F G a").solution.value.tolist()
+      [0.5]
+    """
+    if objective not in ("max", "min"):
+        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    if label_on not in ("entry", "exit"):
+        raise ValueError(f'label_on={label_on!r}; it must be "entry" or "exit".')
+    automaton, letter = automaton_of(model, task)
+    states = np.flatnonzero(np.asarray(model.initial) > 0) if states is None else states
+    states = np.asarray(states, np.int64)
+    yes, no = universal_states(automaton), ~live_states(automaton)
+    on_entry = label_on == "entry"
+    product = _product(model, automaton, letter, states, on_entry, yes | no)
+    opposite = automaton.acceptance == "safety" or (
+        automaton.acceptance in ("buchi", "parity") and objective == "min")
+    goal: Any = (no if opposite else yes)[product.memory]
+    visiting = None
+    if automaton.acceptance in ("buchi", "parity"):
+        entry_letter = product.entry_letter(letter, on_entry)
+        priority = automaton.priority[product.memory[product.host.state[product.host.row]],
+                                      entry_letter] + opposite
+        # What stands still has its verdict, and no end component of its own.
+        priority[product.still[product.host.state[product.host.row]]] = 1
+        visiting = accepting_region(product.host, priority)
+        goal = goal | visiting.region
+        aim = "max"
+    else:
+        aim = objective if not opposite else {"max": "min", "min": "max"}[objective]
+    found = reachability_probability(
+        as_sparse(product), goal, objective=aim, tolerance=tolerance)
+    row = np.asarray(found.policy)
+    if visiting is not None:
+        row = np.where(visiting.region, visiting.row, row)
+    return Satisfaction(
+        at_states(opposite_event(found) if opposite else found, product.start), automaton, letter,
+        product, product.base_row[row])
+
+
+def _product(
+    model: SparseMDP, automaton: Automaton, letter: np.ndarray, states: np.ndarray, on_entry: bool,
+    still: np.ndarray,
+) -> HostProduct:
+    if still.size == 1 and not still.any():
+        return without_memory(model.host, states)
+    initial = np.broadcast_to(automaton.initial, states.shape)
+    memory = automaton.delta[initial, letter[states]] if on_entry else initial
+    return host_product(
+        model.host, automaton.delta, letter, states, memory, on_entry=on_entry, still=still)
+
+
+def automaton_of(model: SparseMDP, task: Task) -> tuple[Automaton, np.ndarray]:
+    """The automaton of a task over the letters of a model, and the letter of each state."""
+    if not isinstance(task, Automaton):
+        task = as_formula(task)
+        shown, number = letters_of(model, task.propositions)
+        task = to_automaton(task, letters=shown)
+    else:
+        shown, number = letters_of(model, task.propositions)
+    index = np.array([letter_index(task, letter) for letter in shown], np.int64)
+    automaton = replace(
+        task, delta=np.asarray(task.delta), priority=np.asarray(task.priority),
+        letters=np.asarray(task.letters))
+    return automaton, index[number]
+
+
+def as_sparse(product: HostProduct) -> SparseMDP:
+    """A product as a model without labels, that starts where its runs do."""
+    host = product.host
+    initial = np.zeros(host.num_states)
+    initial[product.start] = 1
+    return SparseMDP(
+        host.row_start, host.entry_start, host.successor, host.probability,
+        initial / initial.sum(), np.zeros((host.num_states, 0), bool))
+
+
+def at_states(solution: Solution, states: np.ndarray) -> Solution:
+    """A solution's value and bounds at some states."""
+    taken: dict[str, Any] = {
+        name: np.asarray(getattr(solution, name), np.float64)[states]
+        for name in ("value", "lower", "upper")}
+    return replace(solution, **taken)
+
+
+def opposite_event(solution: Solution) -> Solution:
+    """Of the opposite event, in double precision, with bounds rounded outwards."""
+    value, lower, upper = (
+        np.asarray(x, np.float64) for x in (solution.value, solution.lower, solution.upper))
+    turned: dict[str, Any] = {
+        "value": 1 - value, "lower": _one_minus(upper, 0.0), "upper": _one_minus(lower, 1.0)}
+    return replace(solution, **turned)
+
+
+def _one_minus(bound: np.ndarray, end: float) -> np.ndarray:
+    found = 1 - bound
+    exact = (bound == 0) | (bound == 1)
+    return np.where(exact, found, np.clip(np.nextafter(found, 3 * end - 1), 0, 1))
