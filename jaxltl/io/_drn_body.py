@@ -17,8 +17,9 @@ Values = Callable[[Block, Integers], NDArray[Any]]
 
 NO_LABEL = b"__NOLABEL__"  # the name of actions that have none
 _MODEL = re.compile(rb"^@model[ \t\r]*$", re.MULTILINE)
-_LINE = re.compile(rb"(?:state|action)\s+\S+?\s*(?:\[([^\[\]]*)\]\s*)?((?:(?<=\s)[^\[\]].*)?)",
-                   re.DOTALL)
+_LINE = re.compile(
+    rb"(?:state|action)\s+\S+?\s*(?:\[([^\[\]]*)\]\s*)?((?:(?<=\s)[^\[\]].*)?)", re.DOTALL
+)
 _NUMBER = re.compile(rb"0|[1-9]\d{0,8}")
 _LABEL = re.compile(rb'"([^"]+)"|([^\s"]+)')
 
@@ -117,8 +118,11 @@ def read_header(text: Text) -> Header:
                 _placeholder(text, i + 1, lines[i].strip(), placeholders)
                 i += 1
         else:
-            raise text.error(number, f"{line[:60]!r}; expected @type, @value_type, @parameters, "
-                                     "@placeholders, @reward_models, @nr_states or @nr_choices.")
+            raise text.error(
+                number,
+                f"{line[:60]!r}; expected @type, @value_type, @parameters, "
+                "@placeholders, @reward_models, @nr_states or @nr_choices.",
+            )
     at = text.data.count(b"\n", 0, found.end()) + 1
     stop = text.data.find(b"\n", found.end()) + 1 or text.stop
     body = Text(text.name, text.data, stop, text.stop, at + 1)
@@ -126,10 +130,15 @@ def read_header(text: Text) -> Header:
     if num_states is None:
         raise text.error(at, "expected the number of states, '@nr_states', before '@model'.")
     return Header(
-        _kind(text, given, at), _value_type(text, given),
-        tuple(given.get("@parameters", (0, ""))[1].split()), placeholders,
+        _kind(text, given, at),
+        _value_type(text, given),
+        tuple(given.get("@parameters", (0, ""))[1].split()),
+        placeholders,
         re.split("[ \t]", given["@reward_models"][1]) if "@reward_models" in given else [],
-        num_states, _count(text, given, "@nr_choices"), body)
+        num_states,
+        _count(text, given, "@nr_choices"),
+        body,
+    )
 
 
 def _placeholder(text: Text, line: int, given: str, placeholders: dict[bytes, bytes]) -> None:
@@ -155,8 +164,9 @@ def _value_type(text: Text, given: dict[str, tuple[int, str]]) -> str:
     if found in ("double-interval", "rational-interval"):
         raise text.error(line, "models whose probabilities are intervals are not read.")
     if found not in ("", "double", "rational", "parametric"):
-        raise text.error(line, f"the value type is {found[:60]!r}; expected double, rational or "
-                               "parametric.")
+        raise text.error(
+            line, f"the value type is {found[:60]!r}; expected double, rational or parametric."
+        )
     return found
 
 
@@ -198,14 +208,18 @@ def read_body(header: Header, probabilities: Values, numbers: Values) -> Body:
             wrong = block.count[entry] != 3
             colon = np.minimum(first + 1, block.start.size - 1)
             wrong |= (block.end[colon] != block.start[colon] + 1) | (
-                block.data[block.start[colon]] != ord(":"))
+                block.data[block.start[colon]] != ord(":")
+            )
             if wrong.any():
                 raise block.malformed(int(entry[int(wrong.argmax())]), form)
             body.successor.append(block.integers(first, "a state", header.num_states))
             body.value.append(probabilities(block, first + 2))
             body.row.append(row[entry].astype(np.int32))
-        body.num_states, body.num_rows, body.after_action = int(state[-1]) + 1, int(row[-1]) + 1, (
-            bool(is_action[order[-1]]) if order[-1] >= 0 else body.after_action)
+        body.num_states, body.num_rows, body.after_action = (
+            int(state[-1]) + 1,
+            int(row[-1]) + 1,
+            (bool(is_action[order[-1]]) if order[-1] >= 0 else body.after_action),
+        )
     _check_counts(header, body)
     return body
 
@@ -308,8 +322,10 @@ def _rewards(
             raise block.malformed(int(lines[int(has.argmax())]), form)
         body.rewards = found[1].count(b",") + 1
     if body.rewards * lines.size > 8 * len(block.text.data) + 2**24:
-        raise block.text.error(int(block.line[lines[0]]), f"{body.rewards} rewards are announced "
-                                                          "before, more than this holds.")
+        raise block.text.error(
+            int(block.line[lines[0]]),
+            f"{body.rewards} rewards are announced before, more than this holds.",
+        )
     width = body.rewards
     odd |= has & (count < 2 + width)
     start, end = block.start.copy(), block.end.copy()
@@ -327,14 +343,21 @@ def _rewards(
         values = numbers(replace(block, start=start, end=end), token.ravel())
         reward = np.zeros((lines.size, width), values.dtype)
         reward[plain] = values.reshape(token.shape)
-    rest = {int(i): _odd_line(block, int(lines[i]), width, numbers, form, reward, int(i))
-            for i in np.flatnonzero(odd)}
+    rest = {
+        int(i): _odd_line(block, int(lines[i]), width, numbers, form, reward, int(i))
+        for i in np.flatnonzero(odd)
+    }
     return reward, at + 2 + np.where(has, width, 0), rest
 
 
 def _odd_line(
-    block: Block, line: int, width: int, numbers: Values, form: str,
-    reward: NDArray[Any] | None, place: int,
+    block: Block,
+    line: int,
+    width: int,
+    numbers: Values,
+    form: str,
+    reward: NDArray[Any] | None,
+    place: int,
 ) -> bytes:
     """Sets the rewards of a line that is taken apart as it stands; gives what follows them."""
     found = _LINE.fullmatch(block.whole(line))
@@ -347,8 +370,14 @@ def _odd_line(
         data = b" ".join(texts) + b" "
         length = np.array([len(x) for x in texts])
         end = np.cumsum(length + 1) - 1
-        part = Block(block.text, np.frombuffer(data, np.uint8), end - length, end,
-                     np.array([0, width]), block.line[line : line + 1])
+        part = Block(
+            block.text,
+            np.frombuffer(data, np.uint8),
+            end - length,
+            end,
+            np.array([0, width]),
+            block.line[line : line + 1],
+        )
         if reward is not None:
             reward[place] = numbers(part, np.arange(width))
     return found[2]
@@ -357,26 +386,39 @@ def _odd_line(
 def _check_counts(header: Header, body: Body) -> None:
     name = header.body.name
     if body.num_states != header.num_states:
-        refuse(name, f"{header.num_states} states are announced and {body.num_states} follow; "
-                     "the file is cut or changed.")
+        refuse(
+            name,
+            f"{header.num_states} states are announced and {body.num_states} follow; "
+            "the file is cut or changed.",
+        )
     if header.num_choices is not None and body.num_rows != header.num_choices:
-        refuse(name, f"{header.num_choices} choices are announced and {body.num_rows} follow; "
-                     "the file is cut or changed.")
+        refuse(
+            name,
+            f"{header.num_choices} choices are announced and {body.num_rows} follow; "
+            "the file is cut or changed.",
+        )
     state = np.concatenate(body.state) if body.state else np.zeros(0, np.int32)
     count = np.bincount(state, minlength=body.num_states)
     if not count.all():
-        refuse(name, f"state {int(count.argmin())} has no action; give it one, for example a loop "
-                     "to itself.")
+        refuse(
+            name,
+            f"state {int(count.argmin())} has no action; give it one, for example a loop "
+            "to itself.",
+        )
     lines = np.concatenate(body.line)
     if header.kind == "DTMC" and (count > 1).any():
         second = int(np.searchsorted(state, int((count > 1).argmax()))) + 1
-        raise header.body.error(int(lines[second]), f"a second action of state {state[second]}; "
-                                                    "a DTMC has one in each state.")
+        raise header.body.error(
+            int(lines[second]),
+            f"a second action of state {state[second]}; a DTMC has one in each state.",
+        )
     row = np.concatenate(body.row) if body.row else np.zeros(0, np.int32)
     width = np.bincount(row, minlength=body.num_rows)
     if not width.all():
-        raise header.body.error(int(lines[int(width.argmin())]), "this action leads nowhere; "
-                                                                "expected a successor after it.")
+        raise header.body.error(
+            int(lines[int(width.argmin())]),
+            "this action leads nowhere; expected a successor after it.",
+        )
 
 
 # --- what the columns say -------------------------------------------------------------------
@@ -386,8 +428,11 @@ def names_of(header: Header, body: Body) -> dict[str, Any]:
     """Labels, initial states and actions, as :func:`~jaxltl.core.models.sparse.make_sparse` has."""
     text, num_labels = header.body, len(body.label_names)
     if body.num_states * num_labels > 64 * len(text.data) + 2**28:
-        refuse(text.name, f"{num_labels} labels of {body.num_states} states would take "
-                          f"{body.num_states * num_labels / 2**30:.0f} GB.")
+        refuse(
+            text.name,
+            f"{num_labels} labels of {body.num_states} states would take "
+            f"{body.num_states * num_labels / 2**30:.0f} GB.",
+        )
     holds = np.zeros((body.num_states, num_labels), bool)
     for state, column in zip(body.labelled, body.label, strict=True):
         holds[state, column] = True
@@ -398,8 +443,13 @@ def names_of(header: Header, body: Body) -> dict[str, Any]:
     names.pop(init)
     initial = holds[:, init].astype(np.float64)
     action, action_names = _actions(text, body)
-    return {"initial": initial / initial.sum(), "label": np.delete(holds, init, 1),
-            "propositions": tuple(names), "action": action, "action_names": action_names}
+    return {
+        "initial": initial / initial.sum(),
+        "label": np.delete(holds, init, 1),
+        "propositions": tuple(names),
+        "action": action,
+        "action_names": action_names,
+    }
 
 
 def _actions(text: Text, body: Body) -> tuple[Integers | None, tuple[str, ...]]:
@@ -412,9 +462,7 @@ def _actions(text: Text, body: Body) -> tuple[Integers | None, tuple[str, ...]]:
     return action, tuple("" if name == NO_LABEL.decode() else name for name in names)
 
 
-def rewards_of(
-    header: Header, body: Body
-) -> Iterator[tuple[str, NDArray[Any], NDArray[Any]]]:
+def rewards_of(header: Header, body: Body) -> Iterator[tuple[str, NDArray[Any], NDArray[Any]]]:
     """Each reward: its name, and its values on states ``[S]`` and on choices ``[R]``, or none."""
     text, width = header.body, body.rewards
     if width * (body.num_states + body.num_rows) > 8 * len(text.data) + 2**24:
@@ -426,8 +474,11 @@ def rewards_of(
         if name in seen:
             refuse(text.name, f"two rewards are called {name!r}; rename one.")
         seen.add(name)
-        yield (name, _gathered(body.state_reward, body.num_states, i),
-               _gathered(body.choice_reward, body.num_rows, i))
+        yield (
+            name,
+            _gathered(body.state_reward, body.num_states, i),
+            _gathered(body.choice_reward, body.num_rows, i),
+        )
 
 
 def _gathered(parts: list[tuple[int, NDArray[Any]]], size: int, column: int) -> NDArray[Any]:

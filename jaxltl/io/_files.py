@@ -74,8 +74,9 @@ def pieces(data: bytes, name: str, limit: int = MAX_BYTES) -> Iterator[bytes]:
     try:
         yield from _decompressed(data, kind, allowed, name)
     except (zlib.error, lzma.LZMAError, EOFError, MemoryError) as error:
-        raise ValueError(f"{name!r} begins as {kind} does and is damaged: "
-                         f"{error or 'out of memory'}.") from None
+        raise ValueError(
+            f"{name!r} begins as {kind} does and is damaged: {error or 'out of memory'}."
+        ) from None
 
 
 def compression_of(data: bytes) -> Compression | None:
@@ -101,7 +102,8 @@ def _decompressed(data: bytes, kind: Compression, allowed: int, name: str) -> It
             if size > allowed:
                 raise ValueError(
                     f"{name!r}, {len(data)} bytes of {kind}, holds more than {allowed} bytes; if "
-                    "that is right, decompress it and read what comes out.")
+                    "that is right, decompress it and read what comes out."
+                )
             yield part
 
 

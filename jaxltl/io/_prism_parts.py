@@ -50,14 +50,17 @@ def read_labels(
 
 def _matrix(text: Text, num_states: int, num_labels: int) -> NDArray[np.bool_]:
     if num_states * num_labels > 64 * (text.stop - text.begin) + 2**28:
-        refuse(text.name, f"{num_labels} labels of {num_states} states would take "
-                          f"{num_states * num_labels / 2**30:.0f} GB.")
+        refuse(
+            text.name,
+            f"{num_labels} labels of {num_states} states would take "
+            f"{num_states * num_labels / 2**30:.0f} GB.",
+        )
     return np.zeros((num_states, num_labels), bool)
 
 
 def _prism_labels(text: Text, num_states: int) -> tuple[NDArray[np.bool_], list[str]]:
     first, line, rest = text.first_line(b"#")
-    form = "'0=\"init\" 1=\"name\"', the labels numbered from 0"
+    form = '\'0="init" 1="name"\', the labels numbered from 0'
     names: dict[bytes, int] = {}
     place = 0
     while place < len(first.rstrip()):
@@ -119,8 +122,11 @@ def read_valuation(sections: list[Section], num_states: int) -> dict[str, NDArra
     first, line, rest = text.first_line(b"#")
     given = [name.strip() for name in first[1:-1].split(b",")]
     if first[:1] != b"(" or first[-1:] != b")" or not all(given) or len(set(given)) < len(given):
-        raise text.error(line, f"{first[:60].decode(errors='replace')!r}; expected the names of "
-                               "variables, '(x,y)', each once.")
+        raise text.error(
+            line,
+            f"{first[:60].decode(errors='replace')!r}; expected the names of "
+            "variables, '(x,y)', each once.",
+        )
     names = decoded(text, dict.fromkeys(given, 0))
     found: list[list[NDArray]] = [[] for _ in names]
     count = 0
@@ -153,8 +159,11 @@ def _fields(block: Block, width: int) -> list[list[bytes]]:
         fits = bool((np.diff(by_line)[:, [0, -1]] == 1).all())
     fields = joined.tobytes().translate(_TO_BLANKS).split()
     states = fields[:: width + 1]
-    if not fits or len(fields) != block.num_lines * (width + 1) or not all(
-            x.isdigit() and len(x) < 19 for x in states):
+    if (
+        not fits
+        or len(fields) != block.num_lines * (width + 1)
+        or not all(x.isdigit() and len(x) < 19 for x in states)
+    ):
         good = re.compile(rb"\d{1,18}:\([^,():]+" + rb",[^,():]+" * (width - 1) + rb"\)")
         bad = next(i for i in range(block.num_lines) if not good.fullmatch(block.whole(i)))
         raise block.malformed(bad, form)
@@ -174,7 +183,8 @@ def _values(block: Block, name: str, texts: list[bytes]) -> NDArray:
     if None in found:
         bad = found.index(None)
         raise block.malformed(
-            bad, f"a value of {name!r}: true, false or a number, in all states alike")
+            bad, f"a value of {name!r}: true, false or a number, in all states alike"
+        )
     return np.array(found, np.float64)
 
 
@@ -198,19 +208,34 @@ def read_rewards(sections: list[Section], model: SparseMDP, is_chain: bool) -> d
     for kind, number, text in found:
         name = _reward_name(text)
         key = name or (number if unnamed > 1 else "")
-        part = (_state_reward(text, model.num_states) if kind == "srew"
-                else _transition_reward(text, model, is_chain))
+        part = (
+            _state_reward(text, model.num_states)
+            if kind == "srew"
+            else _transition_reward(text, model, is_chain)
+        )
         before = parts.get(key)
         if before is None:
             parts[key] = kind, text, part
         elif before[0] == kind:
-            raise text.error(text.line, f"a second reward {name!r} of this kind, beside that of "
-                                        f"{before[1].name!r}.")
+            raise text.error(
+                text.line,
+                f"a second reward {name!r} of this kind, beside that of {before[1].name!r}.",
+            )
         else:
-            parts[key] = "both", text, Rewards(
-                *(b if a is None else a for a, b in zip(
-                    (part.state, part.choice, part.transition),
-                    (before[2].state, before[2].choice, before[2].transition), strict=True)))
+            parts[key] = (
+                "both",
+                text,
+                Rewards(
+                    *(
+                        b if a is None else a
+                        for a, b in zip(
+                            (part.state, part.choice, part.transition),
+                            (before[2].state, before[2].choice, before[2].transition),
+                            strict=True,
+                        )
+                    )
+                ),
+            )
     return {key: part for key, (_, _, part) in parts.items()}
 
 
@@ -226,13 +251,18 @@ def _reward_lines(text: Text, num_states: int, form: str) -> tuple[int | None, T
     if not first:
         return 0, rest
     if not sizes[0].isdigit() or len(sizes[0]) > 18 or int(sizes[0]) > num_states:
-        raise text.error(line, f"{first[:60].decode(errors='replace')!r}; expected a number of "
-                               f"states, here {num_states}, and of rewards, or {form}.")
+        raise text.error(
+            line,
+            f"{first[:60].decode(errors='replace')!r}; expected a number of "
+            f"states, here {num_states}, and of rewards, or {form}.",
+        )
     if int(sizes[0]) < num_states:
         return None, text
     if not sizes[-1].isdigit() or len(sizes[-1]) > 18 or len(sizes) not in (2, 3):
-        raise text.error(line, f"{first[:60].decode(errors='replace')!r}; expected a number of "
-                               "states and of rewards.")
+        raise text.error(
+            line,
+            f"{first[:60].decode(errors='replace')!r}; expected a number of states and of rewards.",
+        )
     return int(sizes[-1]), rest
 
 
@@ -250,13 +280,17 @@ def _state_reward(text: Text, num_states: int) -> Rewards:
 
 def _check_announced(text: Text, announced: int | None, count: int) -> None:
     if announced is not None and announced != count:
-        refuse(text.name, f"from line {text.line} on {announced} rewards are announced and "
-                          f"{count} follow; the file is cut or changed.")
+        refuse(
+            text.name,
+            f"from line {text.line} on {announced} rewards are announced and "
+            f"{count} follow; the file is cut or changed.",
+        )
 
 
 def _transition_reward(text: Text, model: SparseMDP, is_chain: bool) -> Rewards:
-    width, form = (3, "'state successor reward'") if is_chain else (
-        4, "'state choice successor reward'")
+    width, form = (
+        (3, "'state successor reward'") if is_chain else (4, "'state choice successor reward'")
+    )
     announced, rest = _reward_lines(text, model.num_states, form)
     host = model.host
     place = host.row.astype(np.int64) * host.num_states + host.successor

@@ -59,8 +59,10 @@ def _plain(names: Any, what: str, refused: str) -> list[str]:
     """Names, none of which breaks the format."""
     for name in names:
         if any(c in refused for c in name) or any(ord(c) < 32 for c in name):
-            raise ValueError(f"the {what} {name!r} cannot be written: its name must not hold "
-                             f"control characters or any of {' '.join(refused)!r}.")
+            raise ValueError(
+                f"the {what} {name!r} cannot be written: its name must not hold "
+                f"control characters or any of {' '.join(refused)!r}."
+            )
     return list(names)
 
 
@@ -77,8 +79,12 @@ def _transitions(model: SparseMDP, action: list[str] | None, storm: bool) -> Ite
     for begin in range(0, host.num_transitions, _STEP):
         part = slice(begin, begin + _STEP)
         row = host.row[part]
-        columns: list[Any] = [host.state[row].tolist(), choice[row].tolist(),
-                              host.successor[part].tolist(), host.probability[part].tolist()]
+        columns: list[Any] = [
+            host.state[row].tolist(),
+            choice[row].tolist(),
+            host.successor[part].tolist(),
+            host.probability[part].tolist(),
+        ]
         form = "%d %d %d %r"
         if model.is_chain:
             form, columns = "%d %d %r", [columns[0], *columns[2:]]
@@ -103,8 +109,10 @@ def _labels(model: SparseMDP, storm: bool) -> tuple[list[str], list[NDArray[np.b
     initial = np.asarray(model.initial)
     where = initial > 0
     if np.ptp(initial[where]) > 1e-12:
-        raise ValueError("the initial states are not equally likely, and the format has a set of "
-                         "them; add a state whose one choice leads to them.")
+        raise ValueError(
+            "the initial states are not equally likely, and the format has a set of "
+            "them; add a state whose one choice leads to them."
+        )
     label = np.asarray(model.label, bool)
     names, holds = ["init"], [where]
     for i, name in enumerate(_plain(model.propositions, "label", ' "' if storm else '"')):
@@ -112,14 +120,14 @@ def _labels(model: SparseMDP, storm: bool) -> tuple[list[str], list[NDArray[np.b
             names.append(name)
             holds.append(label[:, i])
         elif not np.array_equal(label[:, i], where):
-            raise ValueError("the label 'init' is that of the initial states, and the model has "
-                             "another of this name; rename it.")
+            raise ValueError(
+                "the label 'init' is that of the initial states, and the model has "
+                "another of this name; rename it."
+            )
     return names, holds
 
 
-def _label_lines(
-    names: list[str], holds: list[NDArray[np.bool_]], storm: bool
-) -> Iterator[bytes]:
+def _label_lines(names: list[str], holds: list[NDArray[np.bool_]], storm: bool) -> Iterator[bytes]:
     if storm:
         yield f"#DECLARATION\n{' '.join(names)}\n#END\n".encode()
     else:
@@ -130,8 +138,10 @@ def _label_lines(
         state, column = np.nonzero(part)
         first = np.diff(state, prepend=-1) > 0
         after = "" if storm else ":"
-        lines = [f"\n{s + begin}{after}{texts[c]}" if new else texts[c] for s, c, new in zip(
-            state.tolist(), column.tolist(), first.tolist(), strict=True)]
+        lines = [
+            f"\n{s + begin}{after}{texts[c]}" if new else texts[c]
+            for s, c, new in zip(state.tolist(), column.tolist(), first.tolist(), strict=True)
+        ]
         yield ("".join(lines)[1:] + "\n").encode() if lines else b""
 
 
@@ -143,8 +153,10 @@ def _value_texts(name: str, value: Any) -> Callable[[slice], list[str]]:
         if np.issubdtype(value.dtype, np.floating) and np.isnan(value).any():
             raise ValueError(f"the variable {name!r} is NaN somewhere; leave it out.")
         return lambda part: list(map(repr, value[part].tolist()))
-    raise ValueError(f"the variable {name!r} has values of dtype {value.dtype}; the format holds "
-                     "truth values and numbers. Leave it out, or number its values.")
+    raise ValueError(
+        f"the variable {name!r} has values of dtype {value.dtype}; the format holds "
+        "truth values and numbers. Leave it out, or number its values."
+    )
 
 
 def _states(names: list[str], values: list[Callable[[slice], list[str]]]) -> Iterator[bytes]:
@@ -165,12 +177,20 @@ def _rewards(
     earned = _on_entries(model, reward)
     if state is not None or earned is None:
         given = np.zeros(model.num_states) if state is None else state
-        yield Written("srew", number, [title.encode(), b"# State rewards\n"],
-                      lambda: _state_rewards(given, storm))
+        yield Written(
+            "srew",
+            number,
+            [title.encode(), b"# State rewards\n"],
+            lambda: _state_rewards(given, storm),
+        )
     if earned is not None:
         found = earned
-        yield Written("trew", number, [title.encode(), b"# Transition rewards\n"],
-                      lambda: _transition_rewards(model, found, storm))
+        yield Written(
+            "trew",
+            number,
+            [title.encode(), b"# Transition rewards\n"],
+            lambda: _transition_rewards(model, found, storm),
+        )
 
 
 def _on_entries(model: SparseMDP, reward: Rewards) -> NDArray[np.float64] | None:
@@ -205,8 +225,12 @@ def _transition_rewards(
     for begin in range(0, entries.size, _STEP):
         part = entries[begin : begin + _STEP]
         row = host.row[part]
-        columns = [host.state[row].tolist(), choice[row].tolist(), host.successor[part].tolist(),
-                   earned[part].tolist()]
+        columns = [
+            host.state[row].tolist(),
+            choice[row].tolist(),
+            host.successor[part].tolist(),
+            earned[part].tolist(),
+        ]
         if host.is_chain:
             lines = joined_lines("%d %d %r\n", columns[0], *columns[2:])
         else:

@@ -60,8 +60,9 @@ class Text:
             if self.stop - place > _SIZE:
                 cut = self.data.rfind(b"\n", place, place + _SIZE) + 1
                 cut = cut or self.data.find(b"\n", place + _SIZE, self.stop) + 1 or self.stop
-            block, count = _block(self, np.frombuffer(self.data, np.uint8, cut - place, place),
-                                  line, comment)
+            block, count = _block(
+                self, np.frombuffer(self.data, np.uint8, cut - place, place), line, comment
+            )
             if block.num_lines:
                 yield block
             place, line = cut, line + count
@@ -97,13 +98,15 @@ class Block:
 
     def error(self, token: int, expected: str) -> ValueError:
         """The error of a token, which is not what is expected."""
-        shown = self.data[self.start[token] : self.end[token]][:60].tobytes().decode(
-            errors="replace")
+        shown = (
+            self.data[self.start[token] : self.end[token]][:60].tobytes().decode(errors="replace")
+        )
         if shown.startswith("["):
             expected = "one number; models whose probabilities are intervals are not read"
         line = int(np.searchsorted(self.first, token, "right")) - 1
-        return self.text.error(int(self.line[line]), f"{shown!r} stands where {expected} is "
-                               "expected.")
+        return self.text.error(
+            int(self.line[line]), f"{shown!r} stands where {expected} is expected."
+        )
 
     def whole(self, line: int) -> bytes:
         """A line as it stands."""
@@ -269,9 +272,7 @@ _DIGIT = bytes_of(b"0123456789 ")
 _DECIMAL_BYTE = bytes_of(b"0123456789+-.eE ")
 
 
-def _block(
-    text: Text, data: NDArray[np.uint8], line: int, comment: bytes
-) -> tuple[Block, int]:
+def _block(text: Text, data: NDArray[np.uint8], line: int, comment: bytes) -> tuple[Block, int]:
     """A block, and how many lines of the file it took."""
     if data[-1] > 32:
         data = np.append(data, np.uint8(10))

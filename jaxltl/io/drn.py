@@ -62,13 +62,18 @@ def read_drn(path: str | os.PathLike[str]) -> SparseMDP:
     name, data = str(path), read_bytes(path)
     header = read_header(Text(name, data, 0, len(data)))
     if header.value_type == "parametric" or (header.parameters and not header.value_type):
-        refuse(name, f"its probabilities have parameters, {', '.join(header.parameters)}; "
-                     "jaxltl.io.parametric.read_parametric reads it.")
+        refuse(
+            name,
+            f"its probabilities have parameters, {', '.join(header.parameters)}; "
+            "jaxltl.io.parametric.read_parametric reads it.",
+        )
     known = _placeholders(header)
     try:
         body = read_body(
-            header, lambda block, token: block.probabilities(token, known.get),
-            lambda block, token: block.floats(token, "a reward", known.get))
+            header,
+            lambda block, token: block.probabilities(token, known.get),
+            lambda block, token: block.floats(token, "a reward", known.get),
+        )
         return _model(header, body)
     except MemoryError:
         refuse(name, "it is too large for the memory.")
@@ -79,8 +84,11 @@ def _placeholders(header: Header) -> dict[bytes, float]:
     for name, text in header.placeholders.items():
         number = known.get(text, as_double(text))
         if number is None:
-            refuse(header.body.name, f"the placeholder {name.decode()} stands for "
-                                     f"{text[:60].decode()!r}; expected a number.")
+            refuse(
+                header.body.name,
+                f"the placeholder {name.decode()} stands for "
+                f"{text[:60].decode()!r}; expected a number.",
+            )
         known[name] = number
     return known
 
@@ -94,20 +102,29 @@ def _model(header: Header, body: Body) -> SparseMDP:
     wrong = np.abs(total - 1) > 1e-6
     if wrong.any():
         bad = int(wrong.argmax())
-        raise text.error(int(line[bad]), f"the probabilities of this action of state {state[bad]} "
-                                         f"sum to {total[bad]:.9g}; expected 1.")
+        raise text.error(
+            int(line[bad]),
+            f"the probabilities of this action of state {state[bad]} "
+            f"sum to {total[bad]:.9g}; expected 1.",
+        )
     count = np.bincount(state, minlength=body.num_states)
     return make_sparse(
-        np.concatenate([[0], count.cumsum()]), start, np.concatenate(body.successor), probability,
-        rewards=_rewards(header, body), **names_of(header, body))
+        np.concatenate([[0], count.cumsum()]),
+        start,
+        np.concatenate(body.successor),
+        probability,
+        rewards=_rewards(header, body),
+        **names_of(header, body),
+    )
 
 
 def _rewards(header: Header, body: Body) -> dict[str, Rewards]:
     """Rewards by name, without parts that are zero."""
     found = {}
     for name, state, choice in rewards_of(header, body):
-        found[name] = Rewards(state=state if state.any() else None,
-                              choice=choice if choice.any() else None)
+        found[name] = Rewards(
+            state=state if state.any() else None, choice=choice if choice.any() else None
+        )
     return found
 
 
@@ -142,20 +159,35 @@ def _written(model: SparseMDP) -> Iterator[bytes]:
         if reward.transition is not None:
             raise ValueError(
                 f"the reward {name!r} has rewards of transitions, which the format does not hold; "
-                "give their expectation on choices, Rewards(choice=row_reward(model, name)).")
+                "give their expectation on choices, Rewards(choice=row_reward(model, name))."
+            )
         rewards.append((reward.state, reward.choice))
     if "" in list(model.rewards)[1:]:
         raise ValueError("only the first reward may have the name ''; give the others names.")
-    head = ["// Written by jaxltl", f"@type: {'DTMC' if model.is_chain else 'MDP'}",
-            "@value_type: double", "@parameters", "",
-            "@reward_models", "".join(f"{name} " for name in model.rewards),
-            "@nr_states", str(model.num_states), "@nr_choices", str(model.num_rows), "@model", ""]
+    head = [
+        "// Written by jaxltl",
+        f"@type: {'DTMC' if model.is_chain else 'MDP'}",
+        "@value_type: double",
+        "@parameters",
+        "",
+        "@reward_models",
+        "".join(f"{name} " for name in model.rewards),
+        "@nr_states",
+        str(model.num_states),
+        "@nr_choices",
+        str(model.num_rows),
+        "@model",
+        "",
+    ]
     return _pieces("\n".join(head).encode(), model, labels, actions, rewards)
 
 
 def _pieces(
-    head: bytes, model: SparseMDP, labels: list[tuple[str, NDArray[np.bool_]]],
-    actions: list[str] | None, rewards: list[tuple[Any, Any]],
+    head: bytes,
+    model: SparseMDP,
+    labels: list[tuple[str, NDArray[np.bool_]]],
+    actions: list[str] | None,
+    rewards: list[tuple[Any, Any]],
 ) -> Iterator[bytes]:
     yield head
     host = model.host
@@ -168,13 +200,19 @@ def _pieces(
         of_row, of_entry = host.state[rows], host.row[entries]
         num_rows, num_entries = of_row.size, of_entry.size
         at_entry = np.arange(num_entries) + of_entry - rows.start + host.state[of_entry] - begin + 2
-        at_row = np.arange(num_rows) + of_row - begin + 1 + (
-            host.entry_start[rows] - entries.start)
-        at_state = np.arange(end - begin) + (host.row_start[states] - rows.start) + (
-            host.entry_start[host.row_start[states]] - entries.start)
+        at_row = np.arange(num_rows) + of_row - begin + 1 + (host.entry_start[rows] - entries.start)
+        at_state = (
+            np.arange(end - begin)
+            + (host.row_start[states] - rows.start)
+            + (host.entry_start[host.row_start[states]] - entries.start)
+        )
         found = np.empty(num_entries + num_rows + end - begin, object)
-        found[at_entry] = [f"\t\t{t} : {p!r}\n" for t, p in zip(
-            host.successor[entries].tolist(), host.probability[entries].tolist(), strict=True)]
+        found[at_entry] = [
+            f"\t\t{t} : {p!r}\n"
+            for t, p in zip(
+                host.successor[entries].tolist(), host.probability[entries].tolist(), strict=True
+            )
+        ]
         found[at_row] = _action_lines(model, rows, actions, rewards)
         found[at_state] = _state_lines(states, labels, rewards)
         yield "".join(found.tolist()).encode()
@@ -206,8 +244,10 @@ def _bracketed(rewards: list[Any], part: slice, count: int) -> list[str]:
     """Rewards as ``[1.0, 2.0]``, one text for each state or action."""
     if not rewards:
         return [""] * count
-    columns = [["0"] * count if x is None else
-               list(map(repr, np.asarray(x, np.float64)[part].tolist())) for x in rewards]
+    columns = [
+        ["0"] * count if x is None else list(map(repr, np.asarray(x, np.float64)[part].tolist()))
+        for x in rewards
+    ]
     form = f" [{', '.join(['%s'] * len(columns))}]"
     return [form % values for values in zip(*columns, strict=True)]
 
@@ -217,15 +257,19 @@ def _label_texts(model: SparseMDP) -> list[tuple[str, NDArray[np.bool_]]]:
     initial = np.asarray(model.initial)
     where = initial > 0
     if np.ptp(initial[where]) > 1e-12:
-        raise ValueError("the initial states are not equally likely, and the format has a set of "
-                         "them; add a state whose one choice leads to them.")
+        raise ValueError(
+            "the initial states are not equally likely, and the format has a set of "
+            "them; add a state whose one choice leads to them."
+        )
     found, label = [(" init", where)], np.asarray(model.label, bool)
     for i, name in enumerate(model.propositions):
         _check_name("label", name, '"')
         if name == "init":
             if not np.array_equal(label[:, i], where):
-                raise ValueError("the label 'init' is that of the initial states, and the model "
-                                 "has another of this name; rename it.")
+                raise ValueError(
+                    "the label 'init' is that of the initial states, and the model "
+                    "has another of this name; rename it."
+                )
             continue
         plain = re.fullmatch(r"[^\s\[\]]+", name)
         found.append((f" {name}" if plain else f' "{name}"', label[:, i]))
@@ -244,5 +288,7 @@ def _action_texts(model: SparseMDP) -> list[str] | None:
 
 def _check_name(what: str, name: str, refused: str) -> None:
     if any(c in refused or ord(c) < 32 for c in name) or (what == "label" and not name):
-        raise ValueError(f"the {what} {name!r} cannot be written: its name must not hold control "
-                         f"characters or any of {' '.join(refused)!r}, nor be empty.")
+        raise ValueError(
+            f"the {what} {name!r} cannot be written: its name must not hold control "
+            f"characters or any of {' '.join(refused)!r}, nor be empty."
+        )

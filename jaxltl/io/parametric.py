@@ -16,8 +16,10 @@ from jaxltl.io._drn_body import names_of, read_body, read_header, rewards_of
 from jaxltl.io._files import read_bytes
 from jaxltl.io._tokens import Block, Integers, Text, as_fraction, numbered, refuse
 
-_TOKEN = re.compile(r"\s*(?:(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
-                    r"|([A-Za-z_][\w.\[\]]*)|(\*\*|[-+*/^()]))")
+_TOKEN = re.compile(
+    r"\s*(?:(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
+    r"|([A-Za-z_][\w.\[\]]*)|(\*\*|[-+*/^()]))"
+)
 # More than any model has, and little enough that a short text cannot fill the memory.
 _MOST_TERMS, _MOST_DEPTH, _MOST_POWER, _MOST_BITS = 10_000, 50, 1_000, 20_000
 
@@ -74,8 +76,10 @@ class ParametricModel:
             probabilities of a row are none.
         """
         if set(values) != set(self.parameters):
-            raise ValueError(f"values are given for {', '.join(sorted(values)) or 'nothing'}; the "
-                             f"parameters are {', '.join(self.parameters) or 'none'}.")
+            raise ValueError(
+                f"values are given for {', '.join(sorted(values)) or 'nothing'}; the "
+                f"parameters are {', '.join(self.parameters) or 'none'}."
+            )
         if not all(np.isfinite(float(x)) for x in values.values()):
             raise ValueError(f"values {dict(values)} must be finite.")
         point = tuple(Fraction(values[name]) for name in self.parameters)
@@ -83,11 +87,21 @@ class ParametricModel:
             value = np.array([float(f.at(point)) for f in self.functions])
         except (ZeroDivisionError, OverflowError):
             raise ValueError(f"a function has a pole at {dict(values)}, or is too large.") from None
-        rewards = {name: Rewards(state=value[state] if state.any() else None,
-                                 choice=value[choice] if choice.any() else None)
-                   for name, (state, choice) in self.rewards.items()}
-        return make_sparse(self.row_start, self.entry_start, self.successor,
-                           value[self.probability], rewards=rewards, **self.names)
+        rewards = {
+            name: Rewards(
+                state=value[state] if state.any() else None,
+                choice=value[choice] if choice.any() else None,
+            )
+            for name, (state, choice) in self.rewards.items()
+        }
+        return make_sparse(
+            self.row_start,
+            self.entry_start,
+            self.successor,
+            value[self.probability],
+            rewards=rewards,
+            **self.names,
+        )
 
 
 def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
@@ -134,8 +148,11 @@ def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
         try:
             placeholders[place.decode()] = _parsed(text, header.parameters, placeholders)
         except _Malformed as error:
-            refuse(name, f"the placeholder {place.decode()} stands for {text[:60].decode()!r}, "
-                         f"which is {error}.")
+            refuse(
+                name,
+                f"the placeholder {place.decode()} stands for {text[:60].decode()!r}, "
+                f"which is {error}.",
+            )
 
     def values(block: Block, token: Integers) -> Integers:
         texts = block.texts(token)
@@ -145,19 +162,24 @@ def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
                 functions.append(_parsed(text, header.parameters, placeholders))
             except _Malformed as error:
                 expected = f"a function of {', '.join(header.parameters) or 'no parameter'}"
-                raise block.error(int(token[texts.index(text)]),
-                                  f"{expected} (it is {error})") from None
+                raise block.error(
+                    int(token[texts.index(text)]), f"{expected} (it is {error})"
+                ) from None
         return found
 
     try:
         body = read_body(header, values, values)
         state, row = np.concatenate(body.state), np.concatenate(body.row)
         return ParametricModel(
-            header.parameters, tuple(functions),
-            _starts(state, body.num_states), _starts(row, body.num_rows),
-            np.concatenate(body.successor), np.concatenate(body.value),
+            header.parameters,
+            tuple(functions),
+            _starts(state, body.num_states),
+            _starts(row, body.num_rows),
+            np.concatenate(body.successor),
+            np.concatenate(body.value),
             {key: (of_state, of_choice) for key, of_state, of_choice in rewards_of(header, body)},
-            names_of(header, body))
+            names_of(header, body),
+        )
     except MemoryError:
         refuse(name, "it is too large for the memory.")
 
@@ -190,8 +212,10 @@ def _checked(polynomial: Polynomial) -> Polynomial:
     found = {powers: c for powers, c in polynomial.items() if c}
     if len(found) > _MOST_TERMS or any(max(powers, default=0) > _MOST_POWER for powers in found):
         raise _Malformed("too large")
-    if any(max(c.numerator.bit_length(), c.denominator.bit_length()) > _MOST_BITS
-           for c in found.values()):
+    if any(
+        max(c.numerator.bit_length(), c.denominator.bit_length()) > _MOST_BITS
+        for c in found.values()
+    ):
         raise _Malformed("too large")
     return found
 
@@ -219,21 +243,22 @@ def _add(a: RationalFunction, b: RationalFunction) -> RationalFunction:
         return RationalFunction(_sum(a.numerator, b.numerator), a.denominator)
     return RationalFunction(
         _sum(_times(a.numerator, b.denominator), _times(b.numerator, a.denominator)),
-        _times(a.denominator, b.denominator))
+        _times(a.denominator, b.denominator),
+    )
 
 
 def _multiply(a: RationalFunction, b: RationalFunction) -> RationalFunction:
-    return RationalFunction(
-        _times(a.numerator, b.numerator), _times(a.denominator, b.denominator))
+    return RationalFunction(_times(a.numerator, b.numerator), _times(a.denominator, b.denominator))
 
 
 def _divide(a: RationalFunction, b: RationalFunction) -> RationalFunction:
     if not b.numerator:
         raise _Malformed("divided by zero")
     if len(b.numerator) == 1 and not any(next(iter(b.numerator))):  # by a number
-        (powers, number), = b.numerator.items()
-        b = RationalFunction({powers: Fraction(1)}, {
-            q: c / number for q, c in b.denominator.items()})
+        ((powers, number),) = b.numerator.items()
+        b = RationalFunction(
+            {powers: Fraction(1)}, {q: c / number for q, c in b.denominator.items()}
+        )
     return _multiply(a, RationalFunction(b.denominator, b.numerator))
 
 
@@ -294,8 +319,7 @@ class _Reader:
     def product(self, depth: int) -> RationalFunction:
         found = self.power(depth)
         while self.next() in ("*", "/"):
-            combine: Callable[..., RationalFunction] = (
-                _multiply if self.take() == "*" else _divide)
+            combine: Callable[..., RationalFunction] = _multiply if self.take() == "*" else _divide
             found = combine(found, self.power(depth))
         return found
 

@@ -18,10 +18,12 @@ from jaxltl.io._prism_parts import Section, read_labels, read_rewards, read_valu
 from jaxltl.io._prism_text import written_sections
 from jaxltl.io._tokens import Floats, Integers, Text, decoded, numbered, refuse
 
-_NAME = re.compile(r"(?P<stem>.+)\.(?P<kind>tra|pexp)(?P<packed>\.gz|\.xz)?",
-                   re.DOTALL | re.IGNORECASE)
-_SECTION = re.compile(rb"^#[ \t]*(Transitions|States|Observations|Labels|Reward structure)\b.*$",
-                      re.MULTILINE)
+_NAME = re.compile(
+    r"(?P<stem>.+)\.(?P<kind>tra|pexp)(?P<packed>\.gz|\.xz)?", re.DOTALL | re.IGNORECASE
+)
+_SECTION = re.compile(
+    rb"^#[ \t]*(Transitions|States|Observations|Labels|Reward structure)\b.*$", re.MULTILINE
+)
 _KIND = re.compile(rb"^#[ \t]*Transitions[ \t]*\(([^)\n]*)\)", re.MULTILINE)
 _NUMBERED = re.compile(rb"_(0|[1-9]\d{0,8})")  # how actions without names are written
 
@@ -105,8 +107,11 @@ def write_prism(
     names = [f"{found['stem']}{s.number}.{s.kind}{found['packed'] or ''}" for s in sections]
     others = sorted(p.name for _, _, p in _siblings(path, found) if p.name not in names)
     if others:
-        refuse(str(path), f"beside it stand {', '.join(others)}, which would be read with it; "
-                          "delete them or choose another name.")
+        refuse(
+            str(path),
+            f"beside it stand {', '.join(others)}, which would be read with it; "
+            "delete them or choose another name.",
+        )
     for name, section in zip(names, sections, strict=True):
         with write_bytes(path.parent / name) as file:
             if section.kind in ("srew", "trew") and dialect == "prism":
@@ -205,8 +210,10 @@ def _sizes(text: Text) -> tuple[bool, list[int], Text]:
     """Whether it is a chain, the sizes that the first line gives (none in Storm's), the rest."""
     kind = _KIND.search(text.data, text.begin, min(text.stop, text.begin + 2000))
     if kind and kind[1] not in (b"DTMC", b"MDP"):
-        raise text.error(text.line, f"a model of type {kind[1].decode(errors='replace')} is not "
-                                    "read; DTMC and MDP are.")
+        raise text.error(
+            text.line,
+            f"a model of type {kind[1].decode(errors='replace')} is not read; DTMC and MDP are.",
+        )
     first, line, rest = text.first_line(b"#")
     if first.lower() in (b"dtmc", b"mdp"):
         return first.lower() == b"dtmc", [], rest
@@ -214,16 +221,19 @@ def _sizes(text: Text) -> tuple[bool, list[int], Text]:
         raise text.error(line, f"a model of type {first.decode()} is not read; dtmc and mdp are.")
     sizes = first.split()
     if len(sizes) == 4 and all(x.isdigit() for x in sizes):
-        raise text.error(line, "four sizes are those of a model with observations, which is not "
-                               "read.")
+        raise text.error(
+            line, "four sizes are those of a model with observations, which is not read."
+        )
     if len(sizes) not in (2, 3) or not all(x.isdigit() and len(x) < 19 for x in sizes):
-        raise text.error(line, f"{first[:60].decode(errors='replace')!r}; expected 'states "
-                               "transitions' of a chain, 'states choices transitions' of an MDP, "
-                               "or Storm's 'dtmc' or 'mdp'.")
+        raise text.error(
+            line,
+            f"{first[:60].decode(errors='replace')!r}; expected 'states "
+            "transitions' of a chain, 'states choices transitions' of an MDP, "
+            "or Storm's 'dtmc' or 'mdp'.",
+        )
     numbers = [int(x) for x in sizes]
     if kind and (kind[1] == b"DTMC") != (len(sizes) == 2):
-        raise text.error(line, f"{len(sizes)} sizes; a {kind[1].decode()} has "
-                               f"{5 - len(sizes)}.")
+        raise text.error(line, f"{len(sizes)} sizes; a {kind[1].decode()} has {5 - len(sizes)}.")
     if not 0 < numbers[0] < 2**31 - 1:
         raise text.error(line, f"{numbers[0]} states; expected 1 to {2**31 - 2}.")
     return len(sizes) == 2, numbers, rest
@@ -231,8 +241,11 @@ def _sizes(text: Text) -> tuple[bool, list[int], Text]:
 
 def _read_rows(text: Text) -> _Rows:
     is_chain, sizes, rest = _sizes(text)
-    width, form = (3, "'state successor probability'") if is_chain else (
-        4, "'state choice successor probability'")
+    width, form = (
+        (3, "'state successor probability'")
+        if is_chain
+        else (4, "'state choice successor probability'")
+    )
     below = sizes[0] if sizes else 2**31 - 2
     names: dict[bytes, int] = {}
     parts: list[list[NDArray]] = [[] for _ in range(6)]
@@ -241,11 +254,19 @@ def _read_rows(text: Text) -> _Rows:
         action = np.full(at.size, -1, np.int32)
         named = block.count > width
         action[named] = numbered(block.texts(at[named] + width), names)
-        choice = (np.zeros(at.size, np.int32) if is_chain
-                  else block.integers(at + 1, "the number of a choice"))
-        found = (block.integers(at, "a state", below), choice,
-                 block.integers(at + width - 2, "a state", below),
-                 block.probabilities(at + width - 1), action, block.line.astype(np.int32))
+        choice = (
+            np.zeros(at.size, np.int32)
+            if is_chain
+            else block.integers(at + 1, "the number of a choice")
+        )
+        found = (
+            block.integers(at, "a state", below),
+            choice,
+            block.integers(at + width - 2, "a state", below),
+            block.probabilities(at + width - 1),
+            action,
+            block.line.astype(np.int32),
+        )
         for part, column in zip(parts, found, strict=True):
             part.append(column)
     if not parts[0]:
@@ -254,17 +275,24 @@ def _read_rows(text: Text) -> _Rows:
     del parts
     state, choice, target, probability, action, lines = columns
     if sizes and sizes[-1] != state.size:
-        raise text.error(rest.line - 1, f"{sizes[-1]} transitions are announced and "
-                                        f"{state.size} follow; the file is cut or changed.")
+        raise text.error(
+            rest.line - 1,
+            f"{sizes[-1]} transitions are announced and "
+            f"{state.size} follow; the file is cut or changed.",
+        )
     num_states = sizes[0] if sizes else int(max(state.max(), target.max())) + 1
     if num_states > 16 * state.size + 10_000:
-        raise text.error(rest.line - 1, f"{num_states} states are announced, which "
-                                        f"{state.size} transitions cannot reach.")
+        raise text.error(
+            rest.line - 1,
+            f"{num_states} states are announced, which {state.size} transitions cannot reach.",
+        )
     rows = _Rows(num_states, is_chain, state, choice, target, probability, action, lines, names)
     new = _new_rows(text, rows, form)
     if len(sizes) == 3 and sizes[1] != new.sum():
-        raise text.error(rest.line - 1, f"{sizes[1]} choices are announced and {new.sum()} "
-                                        "follow; the file is cut or changed.")
+        raise text.error(
+            rest.line - 1,
+            f"{sizes[1]} choices are announced and {new.sum()} follow; the file is cut or changed.",
+        )
     return rows
 
 
@@ -280,9 +308,12 @@ def _new_rows(text: Text, rows: _Rows, form: str) -> NDArray[np.bool_]:
     wrong[1:] |= state[1:] < state[:-1]
     if wrong.any():
         i = int(wrong.argmax())
-        raise text.error(int(rows.line[i]), f"state {state[i]}, choice {choice[i]} out of order; "
-                                            f"expected {form} with states and choices ascending "
-                                            "one by one.")
+        raise text.error(
+            int(rows.line[i]),
+            f"state {state[i]}, choice {choice[i]} out of order; "
+            f"expected {form} with states and choices ascending "
+            "one by one.",
+        )
     return new
 
 
@@ -299,9 +330,14 @@ def _with_loops(rows: _Rows) -> _Rows:
         return np.insert(column, place, value)
 
     return replace(
-        rows, state=put(rows.state, missing), choice=put(rows.choice, 0),
-        target=put(rows.target, missing), probability=put(rows.probability, 1),
-        action=put(rows.action, -1), line=put(rows.line, 0))
+        rows,
+        state=put(rows.state, missing),
+        choice=put(rows.choice, 0),
+        target=put(rows.target, missing),
+        probability=put(rows.probability, 1),
+        action=put(rows.action, -1),
+        line=put(rows.line, 0),
+    )
 
 
 def _model(text: Text, sections: list[Section]) -> SparseMDP:
@@ -314,15 +350,25 @@ def _model(text: Text, sections: list[Section]) -> SparseMDP:
     if wrong.any():
         row = int(wrong.argmax())
         raise text.error(
-            int(rows.line[start[row]]), f"the probabilities of state {rows.state[start[row]]}, "
-            f"choice {rows.choice[start[row]]} sum to {total[row]:.9g}; expected 1.")
+            int(rows.line[start[row]]),
+            f"the probabilities of state {rows.state[start[row]]}, "
+            f"choice {rows.choice[start[row]]} sum to {total[row]:.9g}; expected 1.",
+        )
     count = np.bincount(rows.state[start], minlength=rows.num_states)
     action, action_names = _actions(text, rows, start)
     label, propositions, initial = read_labels(sections, rows.num_states)
     model = make_sparse(
-        np.concatenate([[0], count.cumsum()]), np.append(start, rows.state.size), rows.target,
-        rows.probability, initial=initial, label=label, propositions=propositions, action=action,
-        action_names=action_names, valuation=read_valuation(sections, rows.num_states))
+        np.concatenate([[0], count.cumsum()]),
+        np.append(start, rows.state.size),
+        rows.target,
+        rows.probability,
+        initial=initial,
+        label=label,
+        propositions=propositions,
+        action=action,
+        action_names=action_names,
+        valuation=read_valuation(sections, rows.num_states),
+    )
     is_chain = rows.is_chain
     del rows, new, start, total  # rewards take memory too
     return replace(model, rewards=read_rewards(sections, model, is_chain))
@@ -335,8 +381,11 @@ def _actions(text: Text, rows: _Rows, start: Integers) -> tuple[Integers | None,
     other = rows.action != np.repeat(action, np.diff(start, append=rows.action.size))
     if other.any() and not rows.is_chain:
         i = int(other.argmax())
-        raise text.error(int(rows.line[i]), f"state {rows.state[i]}, choice {rows.choice[i]} has "
-                                            "two actions; expected the same in all of its lines.")
+        raise text.error(
+            int(rows.line[i]),
+            f"state {rows.state[i]}, choice {rows.choice[i]} has "
+            "two actions; expected the same in all of its lines.",
+        )
     if other.any():  # what a chain's transitions are called has no bearing on it
         action = np.where(np.add.reduceat(other, start) > 0, -1, action)
     texts = list(rows.names)

@@ -2,9 +2,38 @@
 
 import numpy as np
 
-WORDS = [b"0", b"-1", b"1e999", b"nan", b"inf", b"99999999999999999999", b"1/0", b"[0,1]", b"\n",
-         b" ", b"\t", b"\xff", b"\0", b'"', b":", b"#", b"//", b"$", b"@", b"state", b"action",
-         b"init", b"(", b")", b",", b"4294967296", b"2147483647", b"mdp", b"\r\n", b""]
+WORDS = [
+    b"0",
+    b"-1",
+    b"1e999",
+    b"nan",
+    b"inf",
+    b"99999999999999999999",
+    b"1/0",
+    b"[0,1]",
+    b"\n",
+    b" ",
+    b"\t",
+    b"\xff",
+    b"\0",
+    b'"',
+    b":",
+    b"#",
+    b"//",
+    b"$",
+    b"@",
+    b"state",
+    b"action",
+    b"init",
+    b"(",
+    b")",
+    b",",
+    b"4294967296",
+    b"2147483647",
+    b"mdp",
+    b"\r\n",
+    b"",
+]
 
 
 def mutated(rng: np.random.Generator, data: bytes) -> bytes:

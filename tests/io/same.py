@@ -26,17 +26,28 @@ def full_model(rng, num_states=9, *, chain=False, transition_rewards=True, names
         found[0] = 0.7
         return found
 
-    rewards = {"cost": Rewards(state=some(num_states)),
-               "time": Rewards(state=some(num_states), choice=some(model.num_rows)),
-               "r_3": Rewards(choice=some(model.num_rows))}
+    rewards = {
+        "cost": Rewards(state=some(num_states)),
+        "time": Rewards(state=some(num_states), choice=some(model.num_rows)),
+        "r_3": Rewards(choice=some(model.num_rows)),
+    }
     if transition_rewards:
         rewards["steps"] = Rewards(transition=some(model.num_transitions))
     action = rng.integers(0, 3, model.num_rows)
     return replace(
-        model, initial=initial / initial.sum(), label=label, propositions=tuple(names),
-        rewards=rewards, action=action.astype(np.int32), action_names=("go", "", "_wait"),
-        valuation={"x": rng.integers(-5, 5, num_states), "b": rng.random(num_states) < 0.5,
-                   "y": rng.random(num_states)})
+        model,
+        initial=initial / initial.sum(),
+        label=label,
+        propositions=tuple(names),
+        rewards=rewards,
+        action=action.astype(np.int32),
+        action_names=("go", "", "_wait"),
+        valuation={
+            "x": rng.integers(-5, 5, num_states),
+            "b": rng.random(num_states) < 0.5,
+            "y": rng.random(num_states),
+        },
+    )
 
 
 def assert_same(found: SparseMDP, model: SparseMDP, *, valuation=True):

@@ -76,8 +76,9 @@ def test_a_model_of_storm(tmp_path):
 @pytest.mark.parametrize("name", ["m.drn", "m.drn.gz", "m.xz"])
 def test_what_is_written_is_read(tmp_path, seed, name):
     names = ("a", "two words", "x]", "[y", "//", "state")
-    model = full_model(np.random.default_rng(seed), chain=seed % 2 == 1, transition_rewards=False,
-                       names=names)
+    model = full_model(
+        np.random.default_rng(seed), chain=seed % 2 == 1, transition_rewards=False, names=names
+    )
     write_drn(tmp_path / name, model)
     assert_same(read_drn(tmp_path / name), model, valuation=False)
 
@@ -166,12 +167,17 @@ def test_a_chain_has_one_action_in_each_state(tmp_path):
 def test_what_cannot_be_written_is_named(tmp_path):
     model = full_model(np.random.default_rng(0))
     for wrong, message in {
-        "initial": "not equally likely", "action_names": "the action 'a b' cannot",
-        "propositions": "the label 'a\"b' cannot", "rewards": "has rewards of transitions",
+        "initial": "not equally likely",
+        "action_names": "the action 'a b' cannot",
+        "propositions": "the label 'a\"b' cannot",
+        "rewards": "has rewards of transitions",
     }.items():
-        value = {"initial": np.r_[0.25, 0.75, np.zeros(7)], "action_names": ("a b", "b", "c"),
-                 "propositions": ('a"b', *model.propositions[1:]),
-                 "rewards": {"r": Rewards(transition=np.ones(model.num_transitions))}}[wrong]
+        value = {
+            "initial": np.r_[0.25, 0.75, np.zeros(7)],
+            "action_names": ("a b", "b", "c"),
+            "propositions": ('a"b', *model.propositions[1:]),
+            "rewards": {"r": Rewards(transition=np.ones(model.num_transitions))},
+        }[wrong]
         whole = replace(model, rewards={}) if wrong != "rewards" else model
         with pytest.raises(ValueError, match=message):
             write_drn(tmp_path / "m.drn", replace(whole, **{wrong: value}))
@@ -183,11 +189,22 @@ def test_storm_reads_what_is_written_and_writes_what_is_read(tmp_path, chain):
     stormpy = pytest.importorskip("stormpy")
     from stormpy import io
 
-    model = full_model(np.random.default_rng(5), 12, chain=chain, transition_rewards=False,
-                       names=("goal", "two words"))
-    finite = {name: Rewards(*(None if x is None else np.clip(np.nan_to_num(x), -9, 9)
-                              for x in (r.state, r.choice, None)))
-              for name, r in model.rewards.items()}
+    model = full_model(
+        np.random.default_rng(5),
+        12,
+        chain=chain,
+        transition_rewards=False,
+        names=("goal", "two words"),
+    )
+    finite = {
+        name: Rewards(
+            *(
+                None if x is None else np.clip(np.nan_to_num(x), -9, 9)
+                for x in (r.state, r.choice, None)
+            )
+        )
+        for name, r in model.rewards.items()
+    }
     model = replace(model, rewards=finite)
     write_drn(tmp_path / "m.drn", model)
     named = io.DirectEncodingParserOptions()

@@ -34,7 +34,7 @@ FILES = {
 }
 STORM = {
     "m.tra": "mdp\n0 0 1 0.5 go\n0 0 2 0.5 go\n0 1 3 1.0 stay\n1 0 1 1\n2 0 2 0.25\n2 0 3 0.75\n"
-             "3 0 3 1",
+    "3 0 3 1",
     "m.lab": "#DECLARATION\ninit goal\nunused\n#END\n0 init\n3 goal\n",
     "m.srew": "0 1.5\n2 3\n",
     "m.trew": "0 0 1 4\n2 0 3 5",
@@ -78,8 +78,16 @@ def test_a_model_of_storm(tmp_path):
 
 
 def test_chains_and_files_that_are_not_there(tmp_path):
-    chain = read_prism(put(tmp_path, {"m.tra": "3 3\r\n0 2 0.5 a\r\n0 1 0.5 b\r\n2 0 1\r\n",
-                                      "m10.tra": "", "m10.srew": "3 1\n0 1\n"}))
+    chain = read_prism(
+        put(
+            tmp_path,
+            {
+                "m.tra": "3 3\r\n0 2 0.5 a\r\n0 1 0.5 b\r\n2 0 1\r\n",
+                "m10.tra": "",
+                "m10.srew": "3 1\n0 1\n",
+            },
+        )
+    )
     assert chain.is_chain and chain.successor.tolist() == [1, 2, 1, 0]
     assert chain.initial.tolist() == [1, 0, 0] and not chain.propositions and not chain.rewards
     assert actions(chain) == ["", "", ""]
@@ -208,7 +216,7 @@ WRONG = [
     (TRA, "0 0 2 0.5 go", "0 1 2 0.5 go", "line 5: state 0, choice 1|sum to 0.5"),
     (TRA, "3 1.0\n", "3 1.0 \udcff\n", "line 5: the name b'.*' is not UTF-8"),
     (LAB, '0="init"', '1="init"', "m.lab', line 1: '1=\"init\" .*; expected '0="),
-    (LAB, '1="deadlock"', '1="init"', "line 1: '1=\"init\""),
+    (LAB, '1="deadlock"', '1="init"', 'line 1: \'1="init"'),
     (LAB, "3: 1 2", "3: 1 3", "line 4: '3' stands where the number of a label below 3"),
     (LAB, "3: 1 2", "4: 1 2", "line 4: '4' stands where a state below 4"),
     (LAB, "3: 1 2", "3 1 2", "line 4: '3 1 2'; expected 'state: label label'"),
@@ -236,11 +244,14 @@ def test_what_is_wrong_is_named(tmp_path, name, old, new, message):
         read_prism(path)
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ("#END", "", "the labels after '#DECLARATION' do not end"),
-    ("3 goal", "3 gaol", "line 6: 'gaol' stands where a label that is declared"),
-    ("goal\nunused", "goal\ngoal", "declared twice"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("#END", "", "the labels after '#DECLARATION' do not end"),
+        ("3 goal", "3 gaol", "line 6: 'gaol' stands where a label that is declared"),
+        ("goal\nunused", "goal\ngoal", "declared twice"),
+    ],
+)
 def test_what_is_wrong_with_storm_is_named(tmp_path, old, new, message):
     path = put(tmp_path, STORM | {"m.lab": STORM["m.lab"].replace(old, new, 1)})
     with pytest.raises(ValueError, match=message):
@@ -268,13 +279,19 @@ def test_sections_that_are_wrong_are_named(tmp_path):
 def test_what_cannot_be_written_is_named(tmp_path):
     model = full_model(np.random.default_rng(0))
     for wrong, message in {
-        "initial": "not equally likely", "action_names": "the action 'a b' cannot",
-        "propositions": "the label 'a\"b' cannot", "rewards": "the reward 'a\"b' cannot",
+        "initial": "not equally likely",
+        "action_names": "the action 'a b' cannot",
+        "propositions": "the label 'a\"b' cannot",
+        "rewards": "the reward 'a\"b' cannot",
         "valuation": "the variable 'x' has values of dtype",
     }.items():
-        value = {"initial": np.r_[0.25, 0.75, np.zeros(7)], "action_names": ("a b", "b", "c"),
-                 "propositions": ('a"b', *model.propositions[1:]), "rewards": {'a"b': Rewards()},
-                 "valuation": {"x": np.array(["u"] * 9)}}[wrong]
+        value = {
+            "initial": np.r_[0.25, 0.75, np.zeros(7)],
+            "action_names": ("a b", "b", "c"),
+            "propositions": ('a"b', *model.propositions[1:]),
+            "rewards": {'a"b': Rewards()},
+            "valuation": {"x": np.array(["u"] * 9)},
+        }[wrong]
         with pytest.raises(ValueError, match=message):
             write_prism(tmp_path / "m.tra", replace(model, **{wrong: value}))
     assert not list(tmp_path.iterdir())
@@ -295,8 +312,11 @@ def test_storm_reads_what_is_written_for_it(tmp_path, chain):
     path = tmp_path / "m.tra"
     write_prism(path, model, dialect="storm")
     storm = stormpy.build_model_from_explicit(
-        path, tmp_path / "m.lab", state_rewards=tmp_path / "m.srew",
-        transition_rewards=tmp_path / "m.trew")
+        path,
+        tmp_path / "m.lab",
+        state_rewards=tmp_path / "m.srew",
+        transition_rewards=tmp_path / "m.trew",
+    )
     matrix = storm.transition_matrix
     entries = [(e.column, e.value) for r in range(model.num_rows) for e in matrix.get_row(r)]
     assert entries == list(zip(model.successor.tolist(), model.probability.tolist(), strict=True))
@@ -305,7 +325,7 @@ def test_storm_reads_what_is_written_for_it(tmp_path, chain):
         assert [label in storm.labeling.get_labels_of_state(s) for s in range(12)] == where.tolist()
     direction = "" if chain else "max"
     mine = read_prism(path)
-    values = storm_values(storm, f'R{direction}=? [ C<=5 ]')
+    values = storm_values(storm, f"R{direction}=? [ C<=5 ]")
     expected = bounded_reward(mine, 5)
     np.testing.assert_allclose(values, expected, rtol=1e-9)
 
