@@ -7,9 +7,11 @@ see :mod:`jaxltl.io.umb`.
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.io.umb import read_umb, write_umb
@@ -67,10 +69,18 @@ def to_stormpy(model: Any) -> Any:
       ValueError: stormpy (version 2 or later) is not installed.
     """
     storm = _stormpy()
+    sparse = to_sparse(model.mdp if isinstance(model, Game) else model)
+    options = storm.io.UmbImportOptions()
+    options.build_state_valuations = bool(sparse.valuation)  # else Storm warns that there are none
+    options.build_choice_labeling = sparse.action is not None
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.umb"
-        write_umb(path, model, compression=None)
-        return storm.build_model_from_umb(str(path))
+        write_umb(
+            path,
+            replace(model, mdp=sparse) if isinstance(model, Game) else sparse,
+            compression=None,
+        )
+        return storm.build_model_from_umb(str(path), options=options)
 
 
 def _stormpy() -> Any:
