@@ -188,6 +188,15 @@ def test_padded_arrays_are_read_in_full_precision(tmp_path):
             {"row_start": [0, 1], "entry_start": [0, 1], "successor": [0], "probability": [0.9]},
             r"m\.npz': state 0, choice 0: the probabilities sum to 0\.9",
         ),
+        (
+            {
+                "row_start": np.array([0, 2**62, 1], np.uint64),
+                "entry_start": [0, 1],
+                "successor": [0],
+                "probability": [1.0],
+            },
+            r"m\.npz': row_start falls from 4611686018427387904 to 1 at 2",
+        ),
     ],
 )
 def test_arrays_that_are_no_model(tmp_path, arrays, message):

@@ -10,6 +10,7 @@ import chex
 import numpy as np
 from flax import struct
 
+from jaxltl.core.host.rows import LARGE
 from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.models.mdp import checked_initial, checked_label
 
@@ -250,8 +251,9 @@ def _starts(name: str, start: Any, total: int, of: str) -> np.ndarray:
     if start[0] != 0 or start[-1] != total:
         raise ValueError(f"{name} goes from {start[0]} to {start[-1]}; it must go from 0 to the "
                          f"number of {of}, {total}.")
-    if (np.diff(start) < 0).any():
-        i = int(np.flatnonzero(np.diff(start) < 0)[0])
+    falls = start[1:] < start[:-1]  # differences of unsigned numbers are never negative
+    if falls.any():
+        i = int(np.flatnonzero(falls)[0])
         raise ValueError(f"{name} falls from {start[i]} to {start[i + 1]} at {i + 1}; it must "
                          "ascend.")
     return start
@@ -328,9 +330,9 @@ def _canonical(
     ascends = successor[1:] > successor[:-1]
     if (ascends | first[1:-1]).all() and probability.min(initial=1) > 0:
         return (entry_start.astype(index), successor.astype(np.int32), probability, rewards)
-    row = np.repeat(np.arange(entry_start.size - 1), np.diff(entry_start))
-    used = np.flatnonzero(probability > 0)
-    order = used[np.lexsort((successor[used], row[used]))]
+    row = np.repeat(np.arange(entry_start.size - 1, dtype=np.int32), np.diff(entry_start))
+    order = _sorted(entry_start, successor, row)
+    order = order[probability[order] > 0]
     row, target, weight = row[order], successor[order], probability[order]
     new = np.ones(order.size, bool)
     new[1:] = (row[1:] != row[:-1]) | (target[1:] != target[:-1])
@@ -351,6 +353,19 @@ def _canonical(
         raise ValueError(f"{place}: the probabilities sum to 0, not 1; correct the row.")
     starts = np.concatenate([[0], count.cumsum()]).astype(index)
     return starts, target[start].astype(np.int32), merged, found
+
+
+def _sorted(entry_start: np.ndarray, successor: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """The entries in an order in which successors ascend in each row."""
+    if successor.size <= LARGE:
+        return np.lexsort((successor, row))
+    from scipy.sparse import csr_array
+
+    place = np.arange(successor.size)
+    shape = (entry_start.size - 1, int(successor.max()) + 1)
+    within = csr_array((place, successor.copy(), entry_start), shape=shape)
+    within.sort_indices()
+    return within.data
 
 
 def _scaled(row_start: np.ndarray, entry_start: np.ndarray, probability: np.ndarray) -> np.ndarray:
