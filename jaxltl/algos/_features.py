@@ -40,10 +40,14 @@ def pair_counts(
 
 
 class Features(NamedTuple):
-    """Named features: `values` is ``float[S, A, F]`` (``[S, Q, A, F]``)."""
+    """Named features: `values` is ``float[S, A, F]`` (``[S, Q, A, F]``).
+
+    And what is to be said of one that had to be left out.
+    """
 
     values: jax.Array
     names: tuple[str, ...]
+    remark: str | None = None
 
 
 def task_features(
@@ -63,8 +67,14 @@ def task_features(
     priority; ``avoid``: minus the probability that the next cell shows a proposition of `avoid`
     (left out if there is none); ``time`` (co-safe): -1; ``nearer`` (with `best`, unless the task
     is a safety one): by how many steps an action shortens the best policy's expected way to where
-    the task is done, or to an accepting component and there to the next accepting visit. All are
-    zero where the task is done.
+    the task is done, or to an accepting component and there to the next accepting visit; left out,
+    with a remark, where that takes longer than double precision can tell. All are zero where the
+    task is done.
+
+    There is none of by how much an action changes the best probability: inside the actions that
+    lose nothing that is zero. Where a probability is asked for, ``Hparams.mu`` weighs that of whole
+    runs (2.6), of which it is the part of a single step; and without a guarantee the dissertation's
+    learners see Table 1's features alone.
 
     Args:
       model: the product.
@@ -89,29 +99,38 @@ def task_features(
                 f"progress: automaton state {q} does not exist; there are {model.num_memory}."
             )
     _require_known(model.mdp, avoid, "avoid")
-    nearer = None if best is None or kind == "safety" else _nearer(model, best)
+    wanted = best is not None and kind != "safety"
+    nearer = _nearer(model, best) if wanted else None
     values = _task_values(model, demonstrations, nearer, avoid=tuple(avoid), progress=chosen)
     main = {"cosafe": ("goal", "progress"), "safety": ()}.get(kind, ("accepting",))
     names = ("demonstrated", *main, *(("avoid",) if avoid else ()))
     names += (("time",) if kind == "cosafe" else ()) + (("nearer",) if nearer is not None else ())
-    return Features(values, names)
+    return Features(values, names, _TOO_LONG if wanted and nearer is None else None)
 
 
-def _nearer(model: Product, best: Solution) -> np.ndarray:
+_TOO_LONG = (
+    "The feature nearer is left out: the best policy's way takes more steps on average than double "
+    "precision can tell, so that nothing is known of which action shortens it.")
+
+
+def _nearer(model: Product, best: Solution) -> np.ndarray | None:
     """By how much an action shortens the way ahead, ``float[S, Q, A]``; what is lost is farthest.
 
     The way leads to where the task is done, or to an accepting component and there to its next
-    accepting visit.
+    accepting visit. None if it is too long to be told.
     """
     problem, lost = as_reachability(model, "max"), np.asarray(best.upper).ravel() <= 0
     reached = np.asarray(problem.target).ravel()
     rows = action_matrices(model)
     ahead = _steps(rows, best.policy, reached | lost)
     if problem.accepting is None:
-        inside, visits = np.zeros_like(ahead), rows
+        inside, visits = np.zeros(reached.size), rows
     else:
         visits = until_read(rows, *visiting(problem))
-        inside = np.where(reached, _steps(visits, best.policy, ~reached), 0)
+        inside = _steps(visits, best.policy, ~reached)
+    if ahead is None or inside is None:
+        return None
+    inside = np.where(reached, inside, 0)
     # Whoever leaves the component has all of a way before him.
     ahead = np.where(reached, 0, np.where(lost, ahead.max(initial=0), ahead)) + inside.max(
         initial=0)
@@ -125,11 +144,10 @@ def _nearer(model: Product, best: Solution) -> np.ndarray:
     return np.where(available, found.reshape(available.shape), 0).astype(model.dtype)
 
 
-def _steps(rows: list[Any], policy: Any, ended: np.ndarray) -> np.ndarray:
-    """Expected steps until a set is entered or a transition that is left out is made."""
+def _steps(rows: list[Any], policy: Any, ended: np.ndarray) -> np.ndarray | None:
+    """Expected steps until a set is entered or a transition that is left out is made, if known."""
     chosen = np.asarray(policy).reshape(-1, 1) == np.arange(len(rows))
-    found = steps_until(policy_row(rows, chosen.astype(float)), ~ended)
-    return np.zeros(ended.size) if found is None else found
+    return steps_until(policy_row(rows, chosen.astype(float)), ~ended)
 
 
 @partial(jax.jit, static_argnames=("avoid", "progress"))

@@ -103,20 +103,23 @@ class Learned:
     history: Mapping[str, np.ndarray]
 
 
-def _problem(setup: Setup, allowed: np.ndarray | None) -> tuple[tuple[str, ...], mlirl.Problem]:
-    """What inverse RL learns from, in the world or in the product (chapter 2): names of features.
-    """
+def _features(setup: Setup) -> mlirl.Features:
+    """What inverse RL learns by, in the world or in the product (chapter 2)."""
     spec, model, shown = setup.task.learner, setup.model, setup.demonstrations
-    in_world = spec.get("in", "product") == "world"
     avoid, progress = spec.get("avoid", ()), spec.get("progress")
-    if in_world:
-        features = mlirl.world_features(
+    if spec.get("in", "product") == "world":
+        return mlirl.world_features(
             model.mdp, shown, goal=spec["goal"], progress=progress or (), avoid=avoid
         )
-    else:
-        # The dissertation's learners, without a guarantee, have Table 1's alone.
-        best = None if setup.guarantee.asked == "none" else setup.guarantee.best
-        features = mlirl.task_features(model, shown, avoid=avoid, progress=progress, best=best)
+    # The dissertation's learners, without a guarantee, have Table 1's alone.
+    best = None if setup.guarantee.asked == "none" else setup.guarantee.best
+    return mlirl.task_features(model, shown, avoid=avoid, progress=progress, best=best)
+
+
+def _problem(setup: Setup, allowed: np.ndarray | None) -> tuple[tuple[str, ...], mlirl.Problem]:
+    """What inverse RL learns from, with the names of its features."""
+    spec, model, features = setup.task.learner, setup.model, setup.features
+    in_world = spec.get("in", "product") == "world"
     start = spec.get("start")
     if start is not None and len(start) != len(features.names):
         raise ValueError(
@@ -124,7 +127,7 @@ def _problem(setup: Setup, allowed: np.ndarray | None) -> tuple[tuple[str, ...],
             f"features: {', '.join(features.names)}."
         )
     problem = mlirl.make_problem(
-        model.mdp if in_world else model, features.values, shown,
+        model.mdp if in_world else model, features.values, setup.demonstrations,
         start=start, satisfaction_over=spec.get("satisfaction_over", "initial"),
         allowed=None if allowed is None else jnp.asarray(allowed),
     )
@@ -264,6 +267,11 @@ class Setup:
     trivial: str | None = None  # what is to be said of a formula that is always true
 
     @functools.cached_property
+    def features(self) -> mlirl.Features:
+        """Of the learned reward."""
+        return _features(self)
+
+    @functools.cached_property
     def learning(self) -> tuple[tuple[str, ...], mlirl.Problem]:
         """The features' names, and what is learned from under the guarantee."""
         return _problem(self, self.guarantee.allowed)
@@ -382,6 +390,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "guarantee": kept(
             setup.guarantee, outcome.attempt, model, world, setup.demonstrations, outcome.solution),
         "trivial": setup.trivial,
+        "remark": setup.features.remark,
         "expected_steps": outcome.expected_steps,
         "satisfaction": _evidence(outcome.solution, model, world, starts),
         "best_achievable": _evidence(best, model, world, starts),

@@ -312,6 +312,22 @@ def test_nearer_is_the_step_that_the_quickest_way_is_shorter_by():
     np.testing.assert_allclose(found.values[0, q, :, -1], [0, -1, 0, 1], atol=1e-9)
 
 
+@pytest.mark.parametrize("task", ["F g", "G F g"])
+def test_what_takes_longer_than_can_be_told_is_said_to_be_left_out(task):
+    """By a chance of 1e-20 in each step, which is surely taken some time."""
+    world = jl.from_dense(
+        [[[1.0, 1e-20]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
+    lazy = jl.product(world, task)
+    runs = jl.make_trajectories(world, [[(0, 0)]])
+    best = jl.optimal_satisfaction(lazy)
+    assert float(best.lower[0, int(lazy.initial_memory[0])]) == 1
+    found = mlirl.task_features(lazy, runs, best=best)
+    assert "nearer" not in found.names and found.values.shape[-1] == len(found.names)
+    assert found.remark.startswith("The feature nearer is left out: the best policy's way takes")
+    plain = mlirl.task_features(lazy, runs)
+    assert (plain.names, plain.remark) == (found.names, None)
+
+
 # --- fewer actions -----------------------------------------------------------------------------
 
 

@@ -6,9 +6,10 @@ import jax
 import numpy as np
 import pytest
 
-from jaxltl.algos import learner, mlirl
+from jaxltl.algos import _features, learner, mlirl
 from jaxltl.app import learn
 from jaxltl.app.files.task import read_task
+from jaxltl.app.reports.learn import remarks
 from tests.app.test_task import write  # noqa: F401
 
 
@@ -30,3 +31,12 @@ def test_the_policy_is_that_of_the_weights(write, optimizer):  # noqa: F811
         np.testing.assert_allclose(loss, by_hand, rtol=1e-9)
         assert status == expected.status
         state, _ = learner.run(mlirl.step, state, problem, hparams, num_steps=3)
+
+
+def test_a_feature_that_is_left_out_is_named(write, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(_features, "steps_until", lambda *_: None)
+    setup = learn.prepare(read_task(write()), 0)
+    assert "nearer" not in setup.learning[0]
+    outcome = learn.Outcome(setup, *learn.learn(setup, 0, 1), seed=0, seconds=0.0)
+    notes = [text for kind, text in remarks(learn.summary(outcome)) if kind == "note"]
+    assert [text for text in notes if text.startswith("The feature nearer is left out")]

@@ -65,8 +65,7 @@ def _notes(result: Mapping[str, Any]) -> list[Remark]:
         found.append(("good", _asked(result["guarantee"])))
     if (lost := result["guarantee"].get("left_out")) is not None:
         found.append(("note", _left_out(lost)))
-    if result.get("trivial"):
-        found.append(("note", result["trivial"]))
+    found += [("note", result[key]) for key in ("remark", "trivial") if result.get(key)]
     return found
 
 
