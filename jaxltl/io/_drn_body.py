@@ -20,7 +20,7 @@ _MODEL = re.compile(rb"^@model[ \t\r]*$", re.MULTILINE)
 _LINE = re.compile(
     rb"(?:state|action)\s+\S+?\s*(?:\[([^\[\]]*)\]\s*)?((?:(?<=\s)[^\[\]].*)?)", re.DOTALL
 )
-_NUMBER = re.compile(rb"0|[1-9]\d{0,8}")
+_NUMBER = re.compile(rb"0|[1-9]\d{0,8}|1\d{9}")
 _LABEL = re.compile(rb'"([^"]+)"|([^\s"]+)')
 
 

@@ -66,7 +66,9 @@ def _plain(names: Any, what: str, refused: str) -> list[str]:
     return list(names)
 
 
-def _transitions(model: SparseMDP, action: list[str] | None, storm: bool) -> Iterator[bytes]:
+def _transitions(
+    model: SparseMDP, action: Callable[[int], str] | None, storm: bool
+) -> Iterator[bytes]:
     host = model.host
     if storm:
         yield b"dtmc\n" if model.is_chain else b"mdp\n"
@@ -90,18 +92,18 @@ def _transitions(model: SparseMDP, action: list[str] | None, storm: bool) -> Ite
             form, columns = "%d %d %r", [columns[0], *columns[2:]]
         if action is not None and numbers is not None:
             form += "%s"
-            columns.append([action[i] for i in numbers[row].tolist()])
+            columns.append(list(map(action, numbers[row].tolist())))
         yield joined_lines(form + "\n", *columns)
 
 
-def _action_texts(model: SparseMDP) -> list[str] | None:
+def _action_texts(model: SparseMDP) -> Callable[[int], str] | None:
     """What stands after a transition, by the number of its action."""
     if model.action is None:
         return None
     if not model.action_names:
-        return [f" _{i}" for i in range(int(np.asarray(model.action).max()) + 1)]
+        return " _{}".format
     _plain(model.action_names, "action", ' "')
-    return [f" {name}" if name else "" for name in model.action_names]
+    return [f" {name}" if name else "" for name in model.action_names].__getitem__
 
 
 def _labels(model: SparseMDP, storm: bool) -> tuple[list[str], list[NDArray[np.bool_]]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -186,7 +186,7 @@ def _pieces(
     head: bytes,
     model: SparseMDP,
     labels: list[tuple[str, NDArray[np.bool_]]],
-    actions: list[str] | None,
+    actions: Callable[[int], str] | None,
     rewards: list[tuple[Any, Any]],
 ) -> Iterator[bytes]:
     yield head
@@ -230,14 +230,17 @@ def _state_lines(
 
 
 def _action_lines(
-    model: SparseMDP, rows: slice, actions: list[str] | None, rewards: list[tuple[Any, Any]]
+    model: SparseMDP,
+    rows: slice,
+    actions: Callable[[int], str] | None,
+    rewards: list[tuple[Any, Any]],
 ) -> list[str]:
     count = rows.stop - rows.start
     after = _bracketed([choice for _, choice in rewards], rows, count)
     if actions is None or model.action is None:
         return [f"\taction {NO_LABEL.decode()}{text}\n" for text in after]
     numbers = np.asarray(model.action)[rows].tolist()
-    return [f"\taction {actions[i]}{text}\n" for i, text in zip(numbers, after, strict=True)]
+    return [f"\taction {actions(i)}{text}\n" for i, text in zip(numbers, after, strict=True)]
 
 
 def _bracketed(rewards: list[Any], part: slice, count: int) -> list[str]:
@@ -276,14 +279,15 @@ def _label_texts(model: SparseMDP) -> list[tuple[str, NDArray[np.bool_]]]:
     return found
 
 
-def _action_texts(model: SparseMDP) -> list[str] | None:
+def _action_texts(model: SparseMDP) -> Callable[[int], str] | None:
+    """What an action is called, by its number."""
     if model.action is None:
         return None
     if not model.action_names:
-        return [str(i) for i in range(int(np.asarray(model.action).max()) + 1)]
+        return str
     for name in model.action_names:
         _check_name("action", name, ' \t"')
-    return [name or NO_LABEL.decode() for name in model.action_names]
+    return [name or NO_LABEL.decode() for name in model.action_names].__getitem__
 
 
 def _check_name(what: str, name: str, refused: str) -> None:

@@ -25,7 +25,7 @@ _SECTION = re.compile(
     rb"^#[ \t]*(Transitions|States|Observations|Labels|Reward structure)\b.*$", re.MULTILINE
 )
 _KIND = re.compile(rb"^#[ \t]*Transitions[ \t]*\(([^)\n]*)\)", re.MULTILINE)
-_NUMBERED = re.compile(rb"_(0|[1-9]\d{0,8})")  # how actions without names are written
+_NUMBERED = re.compile(rb"_(0|[1-9]\d{0,8}|1\d{9})")  # how actions without names are written
 
 
 def read_prism(path: str | os.PathLike[str]) -> SparseMDP:

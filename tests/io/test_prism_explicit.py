@@ -117,9 +117,9 @@ def test_what_is_written_for_storm_is_read(tmp_path, seed):
 
 
 def test_actions_with_numbers_keep_them(tmp_path):
-    model = make_sparse([0, 2, 3], [0, 1, 2, 3], [0, 1, 1], [1.0, 1, 1], action=[4, 0, 12])
+    model = make_sparse([0, 2, 3], [0, 1, 2, 3], [0, 1, 1], [1.0, 1, 1], action=[4, 0, 1999999999])
     write_prism(tmp_path / "m.tra", model)
-    assert " _12\n" in (tmp_path / "m.tra").read_text()
+    assert " _1999999999\n" in (tmp_path / "m.tra").read_text()
     assert_same(read_prism(tmp_path / "m.tra"), model)
 
 
