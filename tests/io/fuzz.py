@@ -204,9 +204,9 @@ def _edited(rng: np.random.Generator, content: bytes) -> bytes:
     """JSON with a value changed somewhere; at times its text."""
     try:
         data = json.loads(content)
-    except ValueError:
+    except (ValueError, RecursionError):
         return content
-    if rng.integers(8) == 0:
+    if rng.integers(8) == 0 or not isinstance(data, dict | list):
         return mutated(rng, content)
     places = list(_places(data))
     if not places:
