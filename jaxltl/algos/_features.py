@@ -99,13 +99,15 @@ def task_features(
                 f"progress: automaton state {q} does not exist; there are {model.num_memory}."
             )
     _require_known(model.mdp, avoid, "avoid")
-    wanted = best is not None and kind != "safety"
-    nearer = _nearer(model, best) if wanted else None
+    nearer, remark = None, None
+    if best is not None and kind != "safety":
+        nearer = _nearer(model, best)
+        remark = _TOO_LONG if nearer is None else None
     values = _task_values(model, demonstrations, nearer, avoid=tuple(avoid), progress=chosen)
     main = {"cosafe": ("goal", "progress"), "safety": ()}.get(kind, ("accepting",))
     names = ("demonstrated", *main, *(("avoid",) if avoid else ()))
     names += (("time",) if kind == "cosafe" else ()) + (("nearer",) if nearer is not None else ())
-    return Features(values, names, _TOO_LONG if wanted and nearer is None else None)
+    return Features(values, names, remark)
 
 
 _TOO_LONG = (
@@ -123,14 +125,15 @@ def _nearer(model: Product, best: Solution) -> np.ndarray | None:
     reached = np.asarray(problem.target).ravel()
     rows = action_matrices(model)
     ahead = _steps(rows, best.policy, reached | lost)
+    far: np.ndarray | None
     if problem.accepting is None:
-        inside, visits = np.zeros(reached.size), rows
+        far, visits = np.zeros(reached.size), rows
     else:
         visits = until_read(rows, *visiting(problem))
-        inside = _steps(visits, best.policy, ~reached)
-    if ahead is None or inside is None:
+        far = _steps(visits, best.policy, ~reached)
+    if ahead is None or far is None:
         return None
-    inside = np.where(reached, inside, 0)
+    inside = np.where(reached, far, 0)
     # Whoever leaves the component has all of a way before him.
     ahead = np.where(reached, 0, np.where(lost, ahead.max(initial=0), ahead)) + inside.max(
         initial=0)

@@ -456,13 +456,11 @@ def run_in_chunks(
 def _begin(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | None) -> _Progress:
     """Before the first chunk; nothing is compiled for it."""
     lanes = () if num_lanes is None else (num_lanes,)
-
-    def one(x: Any) -> Any:
-        return jax.ShapeDtypeStruct(x.shape[len(lanes):], x.dtype)
-
+    one = (state, hparams)
+    if lanes:
+        one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), one)
     # As a program, whose trace is kept for the next run.
-    _, shape = jax.eval_shape(
-        jax.jit(step), jax.tree.map(one, state), problem, jax.tree.map(one, hparams))
+    _, shape = jax.eval_shape(jax.jit(step), one[0], problem, one[1])
     metrics = jax.tree.map(lambda x: jnp.asarray(np.zeros((*lanes, *x.shape), x.dtype)), shape)
     count = np.asarray(state.step, np.int32)
     return _Progress(state, metrics, jnp.asarray(count), jnp.asarray(np.zeros(count.shape, bool)))
