@@ -204,6 +204,7 @@ WRONG = [
     (TRA, "1 0 1 1\n", "1 0 1\n", "line 7: '1 0 1'; expected 'state choice successor prob"),
     (TRA, "1 0 1 1\n", "1 0 1 1 a b\n", "line 7: '1 0 1 1 a b'; expected 'state choice succ"),
     (TRA, "1 0 1 1\n", "1 1 1 1\n", "line 7: state 1, choice 1 out of order"),
+    (TRA, "1 0 1 1\n", "3 0 1 1\n", "line 9: state 2, choice 0 out of order"),
     (TRA, "1 0 1 1\n", "-1 0 1 1\n", "line 7: '-1' stands where a state is expected"),
     (TRA, "1 0 1 1\n", "1 0 1 1.2\n", "line 7: '1.2' stands where a probability from 0 to 1"),
     (TRA, "1 0 1 1\n", "1 0 1 nan\n", "line 7: 'nan' stands where a probability is expected"),
