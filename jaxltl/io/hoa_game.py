@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 MAX_MOVES = 2**22
 _MAX_NODES = 2**20  # of the diagrams of all guards
+_LONGEST, _LONGEST_ALL = 1000, 10**6  # paths in the diagrams of guards that are written out
 
 
 class HoaGame(NamedTuple):
@@ -68,7 +69,8 @@ def read_hoa_game(source: str | os.PathLike[str]) -> HoaGame:
     actions are the conditions on inputs and outputs; the model's `valuation` holds in ``"state"``
     the automaton's state (-1 for the lost state that missing edges lead to) and in ``"priority"``
     max-even priorities. Guards are kept as decision diagrams, so that many propositions are no
-    matter where few classes are made of them. States that no run comes to are left out.
+    matter where few classes are made of them. States that no run comes to are left out, and a
+    condition that takes hundreds of terms to write is named ``condition`` and a number.
 
     Args:
       source: a file, plain or compressed, or the text itself, which begins with ``HOA:``.
@@ -156,11 +158,18 @@ class _Guards(Diagrams):
     def __init__(self, variable: list[int]) -> None:
         super().__init__()
         self.variable = variable  # of each proposition
+        self.paths = [0, 1]
 
     def node(self, variable: int, low: int, high: int) -> int:
-        if len(self.nodes) > _MAX_NODES:
+        if len(self.nodes) > _MAX_NODES or len(self._choices) > 4 * _MAX_NODES:
             raise _TooMany
         return super().node(variable, low, high)
+
+    def num_paths(self, guard: int) -> int:
+        """The number of paths to true, which bounds the length of a guard's text."""
+        for _, low, high in self.nodes[len(self.paths) :]:  # what a node leads to is older
+            self.paths.append(min(self.paths[low] + self.paths[high], 2**40))
+        return self.paths[guard]
 
     def constant(self, value: bool) -> int:
         return TRUE if value else FALSE
@@ -197,7 +206,7 @@ class _Split:
         low, high = zip(*[self.guards.cofactors(part, top) for part in parts], strict=True)
         sides = self.of(low), self.of(high)
         self.work += sum(map(len, sides)) * len(parts)
-        if self.work > 16 * MAX_MOVES:
+        if self.work > 4 * MAX_MOVES:
             raise _TooMany
         found = {
             rest: self.guards.node(top, sides[0].get(rest, FALSE), sides[1].get(rest, FALSE))
@@ -222,6 +231,7 @@ class _Reader:
         self.names = self.inputs + self.outputs
         self.guards = _Guards([order.index(p) for p in range(len(order))])
         self.texts: dict[int, str] = {}
+        self.length = 0  # of all texts, in paths through their diagrams
         found = decisive_sets(condition_given(header.condition, -1, True))
         if found is None:
             raise error_at(
@@ -316,8 +326,14 @@ class _Reader:
         return HoaGame(game, objective_of(game), self.inputs, self.outputs)
 
     def _text(self, guard: int) -> str:
-        """A condition as a formula."""
-        if guard not in self.texts:
+        """A condition as a formula; one that would be long gets a name alone."""
+        if guard in self.texts:
+            return self.texts[guard]
+        self.length += (length := self.guards.num_paths(guard))
+        if length > _LONGEST or self.length > _LONGEST_ALL:
+            self.texts[guard] = f"condition {len(self.texts)}"
+            self.length -= length
+        else:
             cubes, _ = prime_cubes(guard, guard, self.guards)
             self.texts[guard] = _disjunction(
                 [[("" if v else "!") + proposition_text(self.names[p]) for p, v in cube]

@@ -237,6 +237,18 @@ def test_many_propositions_are_no_matter():
     assert bool(winning_region(found.game, found.objective).realizable)
 
 
+def test_conditions_too_long_to_write_have_names():
+    aliases = ["Alias: @x0 0"] + [
+        f"Alias: @x{i} (@x{i - 1} & !{i}) | (!@x{i - 1} & {i})" for i in range(1, 40)
+    ]
+    for controllable in (range(40), range(1, 40)):
+        text = text_of_game([[("@x39", 0, 1), ("!@x39", 0, 2)]], 40, controllable)
+        found = read_hoa_game(text.replace("Acceptance", "\n".join([*aliases, "Acceptance"])))
+        assert any(name.startswith("condition ") for name in found.game.mdp.action_names)
+        assert bool(winning_region(found.game, found.objective).realizable)
+        assert realizable(write_hoa_game(*found[:2]))
+
+
 def test_too_many_classes_are_refused(monkeypatch):
     monkeypatch.setattr(hoa_game, "_MAX_NODES", 2**14)
     both = " | ".join(f"{i} & {i + 20}" for i in range(20))

@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.logic.ltl import Formula, as_formula, holds_on_lasso, subformulas
+from jaxltl.core.logic.ltl import Formula, as_formula, subformulas, truth_on_lasso
 
 _BOOLEAN = frozenset(("true", "false", "ap", "!", "&", "|", "->", "<->", "xor"))
 
@@ -66,9 +66,9 @@ def satisfying(
     column = [list(propositions).index(p) for p in condition.propositions]
     rows, number = distinct_rows(np.asarray(label, bool)[:, column])
     names = np.array(condition.propositions, dtype=object)
-    # A formula without temporal operators has its truth in the first letter of any word.
-    truth = np.array([holds_on_lasso(condition, [], [set(names[row])]) for row in rows], bool)
-    return np.asarray(truth[number])
+    # At each letter of any word a formula without temporal operators has its truth in that letter.
+    truth = truth_on_lasso(condition, [], [set(names[row]) for row in rows]) if len(rows) else []
+    return np.array(truth, bool)[number]
 
 
 _COUNTED = 16  # columns up to which every combination has a counter of its own

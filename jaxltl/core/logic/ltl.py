@@ -428,6 +428,17 @@ def holds_on_lasso(
     >>> holds_on_lasso("G F a", prefix=[], cycle=[{"a"}, set()])
     True
     """
+    return truth_on_lasso(formula, prefix, cycle)[0]
+
+
+def truth_on_lasso(
+    formula: Formula | str, prefix: Iterable[Letter], cycle: Iterable[Letter]
+) -> list[bool]:
+    """Whether the formula holds from each of the `n + m` positions on, see `holds_on_lasso`.
+
+    >>> truth_on_lasso("a & X a", prefix=[], cycle=[{"a"}, {"a"}, set()])
+    [True, False, False]
+    """
     formula = as_formula(formula)
     stem = as_letters(prefix, "holds_on_lasso: prefix")
     word = stem + as_letters(cycle, "holds_on_lasso: cycle")
@@ -437,7 +448,7 @@ def holds_on_lasso(
     for node in subformulas(formula):
         operands = [truth[operand] for operand in node.operands]
         truth[node] = _truth(node, operands, word, loop=len(stem))
-    return truth[formula][0]
+    return truth[formula]
 
 
 _POINTWISE: dict[str, Callable[..., bool]] = {
