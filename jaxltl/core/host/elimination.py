@@ -16,7 +16,9 @@ from jaxltl.core.host.sparse import Floats
 _SMALL = 3000  # states of a component up to which it may be filled
 _SPREAD = 8  # how many times its mean bandwidth a larger one must have states
 _FILL = 4  # growth of the fill after which the order is sought anew
-_SWEEPS = 20_000
+_KRYLOV = 500  # steps of a Krylov method where elimination would fill
+_SWEEPS = 20_000  # and sweeps after it
+_LEFT = 1e-14  # largest residual of what they find, as a share of the right side
 
 
 class Factors(NamedTuple):
@@ -132,12 +134,18 @@ def _minus(matrix: Any) -> Any:
 
 
 def _swept(matrix: Any, b: Floats) -> Floats:
-    """By sweeps, as long as what is left shrinks."""
-    x, left = np.zeros(b.size), np.array(b)
-    limit = 1e-15 * np.abs(b).max(initial=0)
+    """By a Krylov method (van der Vorst 1992), and by sweeps as long as what is left shrinks."""
+    from scipy.sparse import linalg
+
+    size = np.abs(b).max(initial=0)
+    system = linalg.LinearOperator(matrix.shape, matvec=lambda x: x - matrix @ x, dtype=float)
+    x, _ = linalg.bicgstab(system, b, rtol=0, atol=_LEFT * size, maxiter=_KRYLOV)
+    left = b - (x - matrix @ x)
+    if not np.isfinite(x).all() or np.abs(left).max() > size:
+        x, left = np.zeros(b.size), np.array(b)
     for _ in range(_SWEEPS):
-        x += left
-        left = matrix @ left
-        if np.abs(left).max() <= limit:
+        if np.abs(left).max(initial=0) <= _LEFT * size:
             return x
+        x = x + left
+        left = matrix @ left
     return np.full(b.size, np.nan)
