@@ -122,6 +122,14 @@ def write_prism(
 # --- which files ----------------------------------------------------------------------------
 
 
+def files_beside(path: str | os.PathLike[str]) -> list[Path]:
+    """The files that are read with one of transitions; none beside others."""
+    found = _NAME.fullmatch(Path(path).name)
+    if found is None or found["kind"].lower() != "tra":
+        return []
+    return [other for _, _, other in _siblings(Path(path), found)]
+
+
 def _siblings(path: Path, found: re.Match[str]) -> Iterator[tuple[str, str, Path]]:
     """The files that belong to one with transitions: kind, number and path."""
     form = re.compile(re.escape(found["stem"]) + r"\.?(\d{0,9})\.(lab|sta|srew|trew)(\.gz|\.xz)?")

@@ -68,6 +68,14 @@ def test_a_model_in_any_format(tmp_path, task, name):
     assert set(world.mdp.propositions) >= {"Red cell", "goal"}
 
 
+def test_what_stands_beside_a_file_is_part_of_the_task(tmp_path, task):
+    write_model(tmp_path / "m.tra", MODEL)
+    before = read_task(task("m.tra")).digest
+    labels = tmp_path / "m.lab"
+    labels.write_text(labels.read_text().replace("goal", "gaol"))
+    assert read_task(task("m.tra")).digest != before
+
+
 def test_names_that_need_quotes(tmp_path, task):
     write_model(tmp_path / "m.umb", MODEL)
     text = TASK.replace("[task]", "initial = '!\"Red cell\" & !goal'\n[task]")

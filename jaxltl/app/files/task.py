@@ -27,6 +27,7 @@ from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.types import Solution
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
+from jaxltl.io.prism_explicit import files_beside
 
 
 @dataclass(frozen=True)
@@ -223,6 +224,8 @@ def read_task(path: str | Path) -> Task:
     text = world.get("map")
     named = [text["file"]] if isinstance(text, dict) else []
     named += [table[key] for table, key in ((world, "model"), (shown, "file")) if key in table]
+    if "model" in world:  # PRISM's labels stand in a file of their own
+        named += [str(x.absolute()) for x in files_beside(path.parent / world["model"])]
     return make_task(path, data, raw, named, "entry")
 
 
