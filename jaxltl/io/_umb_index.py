@@ -214,17 +214,16 @@ def _annotations(data: Any, place: str) -> tuple[Annotation, ...]:
             _table(data, "annotations", place).get(group, {}), f"the group {group}", place
         )
         found += [_annotation(group, key, value, place) for key, value in table.items()]
-    for labels in (True, False):
-        names = [
-            x.name
-            for x in found
-            if (x.group in ("aps", OTHER_LABELS)) == labels and x.group != INITIAL
-        ]
-        if len(set(names)) < len(names):
-            twice = next(x for x in names if names.count(x) > 1)
+    seen: set[tuple[bool, str]] = set()
+    for one in found:
+        if one.group == INITIAL:
+            continue
+        key = (one.group == "rewards", one.name)
+        if key in seen:
             raise ValueError(
-                f"{place}two annotations are named {twice!r}; expected distinct names."
+                f"{place}two annotations are named {one.name!r}; expected distinct names."
             )
+        seen.add(key)
     return tuple(found)
 
 
@@ -268,14 +267,17 @@ def _annotation(group: str, key: str, value: Any, place: str) -> Annotation:
     return Annotation(group, key, name, tuple(applies), kind)
 
 
-def _texts_of_ours(data: Mapping[str, Any]) -> list[Any]:
+def _texts_of_ours(data: Mapping[str, Any]) -> frozenset[str]:
     """The whole numbers that are those of texts; other tools refuse files with the type string."""
     for key in ("file-data", "parameters", TEXTS):
         data = data.get(key, {}) if isinstance(data, dict) else {}
-    return data if isinstance(data, list) else []
+    names = data if isinstance(data, list) else []
+    return frozenset(name for name in names if isinstance(name, str))
 
 
-def _records(data: Any, texts_of_ours: list[Any], place: str) -> tuple[tuple[Record, ...], int]:
+def _records(
+    data: Any, texts_of_ours: frozenset[str], place: str
+) -> tuple[tuple[Record, ...], int]:
     """The classes of states, and how many texts their variables have."""
     states = _table(data, "valuations", place).get("states")
     if states is None:
@@ -291,11 +293,11 @@ def _records(data: Any, texts_of_ours: list[Any], place: str) -> tuple[tuple[Rec
     return tuple(_record(one, texts_of_ours, f"{place}{VALUATIONS}: ") for one in classes), texts
 
 
-def _record(data: Any, texts_of_ours: list[Any], place: str) -> Record:
+def _record(data: Any, texts_of_ours: frozenset[str], place: str) -> Record:
     variables = _get(_table(data, "a class", place), "variables", place)
     if not isinstance(variables, list):
         raise ValueError(f"{place}variables is {_shown(variables)}; expected a list.")
-    found: list[Variable] = []
+    found: dict[str, Variable] = {}
     start = 0
     for one in variables:
         one = _table(one, "a variable", place)
@@ -303,7 +305,7 @@ def _record(data: Any, texts_of_ours: list[Any], place: str) -> Record:
             start += _count(one, "padding", place)
         else:
             name = _get(one, "name", place)
-            if not isinstance(name, str) or any(name == other.name for other in found):
+            if not isinstance(name, str) or name in found:
                 raise ValueError(
                     f"{place}a variable is named {_shown(name)}; expected distinct texts."
                 )
@@ -320,7 +322,7 @@ def _record(data: Any, texts_of_ours: list[Any], place: str) -> Record:
                 )
             presence, start = (start, start + 1) if optional else (None, start)
             is_text = kind.name == "uint" and name in texts_of_ours
-            found.append(Variable(name, kind, offset, start, presence, is_text))
+            found[name] = Variable(name, kind, offset, start, presence, is_text)
             start += kind.size
         if start > 8 * _MOST_RECORD:
             raise ValueError(
@@ -331,7 +333,7 @@ def _record(data: Any, texts_of_ours: list[Any], place: str) -> Record:
         raise ValueError(
             f"{place}a state's variables take {start} bits; expected a multiple of 8, with padding."
         )
-    return Record(tuple(found), start // 8)
+    return Record(tuple(found.values()), start // 8)
 
 
 def _type(data: Any, what: str, place: str) -> Type:

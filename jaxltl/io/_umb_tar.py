@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 _BLOCK = 512
 _LONGEST_NAME = 2**16  # bytes of an extended header
 _REGULAR = b"0\x007"
+_RECORD = re.compile(rb"([0-9]{1,6}) ([^=\n]{1,200})=")
 _NO_DATA = b"123456"  # links, devices and directories
 
 
@@ -167,16 +168,16 @@ def _extension(stream: Stream, name: str, size: int) -> bytes:
 
 def _extended(content: bytes, place: str, name: str | None) -> tuple[str | None, int | None]:
     """The name and the size that a POSIX extended header gives its member, if it does."""
-    size = None
-    while content:
-        record = re.match(rb"([0-9]{1,6}) ([^=\n]+)=", content)
-        length = int(record[1]) if record else 0
-        if not record or not record.end() < length <= len(content):
+    size, place_in = None, 0
+    while place_in < len(content):
+        record = _RECORD.match(content, place_in)
+        end = place_in + int(record[1]) if record else 0
+        if not record or not record.end() < end <= len(content):
             raise ValueError(
-                f"{place}an extended header reads {content[:40]!r}; expected records "
-                "of a length, a key and a value."
+                f"{place}an extended header reads {content[place_in : place_in + 40]!r}; expected "
+                "records of a length, a key and a value."
             )
-        value, content = content[record.end() : length - 1], content[length:]
+        value, place_in = content[record.end() : end - 1], end
         if record[2] == b"path":
             name = _text(value, place)
         elif record[2] == b"size":

@@ -202,11 +202,14 @@ def _check_chain(row_start: NDArray[np.int64], place: str) -> None:
 def _labels(
     found: dict[str, Bytes], index: Index, place: str
 ) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
-    all_of = [x for x in index.annotations if x.group == "aps"]
-    for one in index.annotations:
-        if one.group == OTHER_LABELS:
-            place_of = int(one.id) if one.id.isdecimal() else len(all_of)
-            all_of.insert(min(place_of, len(all_of)), one)
+    ours = {x.id: x for x in index.annotations if x.group == OTHER_LABELS}
+    others = iter([x for x in index.annotations if x.group == "aps"])
+    all_of = []
+    for i in range(len(index.annotations)):  # the ids of ours are their places
+        one = ours.pop(str(i), None) or next(others, None)
+        if one is not None:
+            all_of.append(one)
+    all_of += ours.values()
     label = np.zeros((index.states, len(all_of)), bool)
     for i, one in enumerate(all_of):
         label[:, i] = read_bits(_needed(found, one.member("states"), place), index.states)
