@@ -6,15 +6,18 @@ enclosed in advance: each product and sum adds less than a unit of rounding to t
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxltl.core.host.rows import Booleans, Integers, spans
 from jaxltl.core.host.sparse import Floats, HostMDP
+from jaxltl.core.host.sparse_graph import reaching
 
 UNDERFLOW = 1e-300  # more than all that is lost where numbers are too small
 _HUGE = 1e150
+_FEW = 16  # choices up to which they are gone through one by one
 
 
 class Steps(NamedTuple):
@@ -51,34 +54,50 @@ class Backup(NamedTuple):
     Attributes:
       matrix: ``P``, SciPy's sparse ``float64[R', N]``.
       taken: the same with the columns of all states, ``float64[R', S]``.
-      row: ``int[R']``, the model's rows, by state.
-      starts: ``int[N]``, where the rows of each state begin among these.
-      choices: ``int[N]``, how many there are.
-      places: ``int[N]``, the states.
+      row: ``int[R']``, the model's rows: all first choices, then all second ones, and so on; by
+        state where some state has many.
+      starts: where the first, second, ... choices begin among these, and R'; or where the rows of
+        each state begin.
+      places: ``int[N]``, the states, those with the most choices first; or ascending.
       operation: ``np.maximum``, ``np.minimum``, or None where no state has a choice.
+      by_choice: which of these orders it is. A reduction over short spans takes ten times what
+        going through few choices does.
     """
 
     matrix: Any
     taken: Any
     row: Integers
     starts: Integers
-    choices: Integers
     places: Integers
     operation: Any
+    by_choice: bool
 
     def best(self, quantity: Floats) -> Floats:
         """The optimum over each state's choices: ``[N]`` of a number a row."""
         if self.operation is None or not quantity.size:
             return quantity
-        return self.operation.reduceat(quantity, self.starts)
+        if not self.by_choice:
+            return self.operation.reduceat(quantity, self.starts)
+        ends = self.starts.tolist()
+        found = quantity[: ends[1]].copy()
+        for a, b in pairwise(ends[1:]):
+            self.operation(found[: b - a], quantity[a:b], out=found[: b - a])
+        return found
 
     def first(self, quantity: Floats, best: Floats) -> Integers:
         """The model's row of each state's first best choice: ``int32[N]``."""
         if self.operation is None:
             return self.row.astype(np.int32)
-        hit = np.flatnonzero(quantity == np.repeat(best, self.choices))
-        state = np.repeat(np.arange(self.places.size), self.choices)[hit]
         found = np.empty(self.places.size, np.int32)
+        if self.by_choice:
+            ends = self.starts.tolist()
+            for a, b in reversed(list(pairwise(ends))):
+                hit = quantity[a:b] == best[: b - a]
+                found[: b - a][hit] = self.row[a:b][hit]
+            return found
+        count = np.diff(self.starts, append=self.row.size)
+        hit = np.flatnonzero(quantity == np.repeat(best, count))
+        state = np.repeat(np.arange(self.places.size), count)[hit]
         found[state[::-1]] = self.row[hit[::-1]]  # the first one is written last
         return found
 
@@ -94,9 +113,9 @@ class Backup(NamedTuple):
           every: takes the choices of each backup.
 
         Returns:
-          The value, the choices of the last backup ``int32[N]``, and how many there were.
+          The value, the choices of the last backup ``int32[N]`` (of none the next one's), and how
+          many there were.
         """
-        row: Integers = self.row[self.starts].astype(np.int32)
         before, done = value, 0
         while done < num_steps:
             done += 1
@@ -107,21 +126,30 @@ class Backup(NamedTuple):
                 every.append(self.first(image, value))
             if np.array_equal(before, value):
                 break
-        if done:
-            image = cost + self.matrix @ before
-            row = self.first(image, self.best(image))
+        image = self.matrix @ before
+        image += cost
+        row = self.first(image, self.best(image))
         return value, row, done
 
 
 def backup_on(mdp: HostMDP, places: Integers, operation: Any) -> Backup:
     """The :class:`Backup` of some states, ascending."""
     count = np.diff(mdp.row_start)[places]
-    row = spans(mdp.row_start[places], count)
-    whole = places.size == mdp.num_states
-    taken = mdp.matrix if whole else mdp.matrix[row]
-    return Backup(
-        taken if whole else taken[:, places], taken, row, count.cumsum() - count, count, places,
-        None if row.size == places.size else operation)
+    most, whole = int(count.max(initial=1)), places.size == mdp.num_states
+    if most == 1 or most > _FEW:
+        row = spans(mdp.row_start[places], count)
+        taken = mdp.matrix if whole else mdp.matrix[row]
+        matrix = taken if whole else taken[:, places]
+        chain = row.size == places.size
+        return Backup(matrix, taken, row, count.cumsum() - count, places,
+                      None if chain else operation, False)
+    order = np.argsort(-count, kind="stable")
+    places, count = places[order], count[order]
+    sizes = [int(np.count_nonzero(count > k)) for k in range(most)]
+    row = np.concatenate([mdp.row_start[places[:n]] + k for k, n in enumerate(sizes)])
+    taken = mdp.matrix[row]
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    return Backup(taken[:, places], taken, row, starts, places, operation, True)
 
 
 def _policy(mdp: HostMDP, backup: Backup, row: Integers) -> Integers:
@@ -205,14 +233,22 @@ def total(
     """
     backup = backup_on(mdp, np.arange(mdp.num_states), operation)
     every: list[Integers] | None = [] if by_step else None
-    value, row, done = backup.sweeps(reward, start, num_steps, every)
-    size = value
+    places = backup.places
+    found, row, done = backup.sweeps(reward[backup.row], start[places], num_steps, every)
+    size = found
     if (start < 0).any() or (magnitude != reward).any():
         # What rounding is relative to: the largest sum of absolute values.
-        most = backup_on(mdp, backup.places, np.maximum)
-        size = most.sweeps(magnitude, np.abs(start), num_steps)[0]
-    error = size * relative_error(backup_unit(mdp), 2 * num_steps + 1)
-    error = np.where(size > 0, error + UNDERFLOW, 0)
+        most = backup if operation is np.maximum else backup_on(
+            mdp, np.arange(mdp.num_states), np.maximum)
+        size = most.sweeps(magnitude[backup.row], np.abs(start)[places], num_steps)[0]
+    error = size * relative_error(backup_unit(mdp), 2 * num_steps + 1) + UNDERFLOW
+    some = start != 0
+    some[mdp.state[magnitude > 0]] = True
+    value, off = np.zeros(mdp.num_states), np.zeros(mdp.num_states)
+    value[places], off[places] = found, error
+    off = np.where(reaching(mdp, some), off, 0)
+    if not num_steps:
+        off = np.zeros_like(off)
     if every is not None:
-        return Steps(value, error, _policies(mdp, backup, every, num_steps), done)
-    return Steps(value, error, row, done)
+        return Steps(value, off, _policies(mdp, backup, every, num_steps), done)
+    return Steps(value, off, _policy(mdp, backup, row), done)

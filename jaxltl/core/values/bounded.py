@@ -318,7 +318,7 @@ def enclosed(
     narrow = bool((error <= tolerance * np.maximum(np.abs(value), least)).all())
     status = Status.CONVERGED if narrow else Status.PRECISION if finite else Status.NONFINITE
     found: Any = {
-        "value": value, "policy": policy, "lower": lower, "upper": upper,
+        "value": value + 0.0, "policy": policy, "lower": lower, "upper": upper,
         "residual": np.float64(residual), "num_steps": np.int32(num_steps),
         "status": np.int32(status)}
     return Solution(**found)
