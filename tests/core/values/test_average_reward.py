@@ -74,6 +74,33 @@ def test_bounds_enclose_the_best_of_all_policies(seed):
             assert low - 1e-12 <= x <= high + 1e-12
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_bounds_enclose_however_narrow(seed):
+    """With nothing but rounding between them, of rows that sum to one but for theirs."""
+    rng = np.random.default_rng(seed)
+    model = random_sparse(rng, int(rng.integers(3, 6)), chain=True)
+    reward = rng.random(model.num_rows)
+    matrix = [[x / sum(row) for x in row] for row in exact_matrix(model)]
+    value = exact_average(matrix, [Fraction(float(x)) for x in reward])
+    found = average_reward(model, Rewards(choice=reward), tolerance=0, max_steps=1000)
+    for low, x, high in zip(found.lower, value, found.upper, strict=True):
+        assert Fraction(float(low)) <= x <= Fraction(float(high))
+        assert high - low < 1e-12
+
+
+def test_a_component_is_left_where_that_is_best():
+    """From the state where it can be left; the others go there, not round and round."""
+    model = make_sparse(
+        [0, 2, 4, 6, 7], np.arange(8), [0, 1, 1, 2, 0, 3, 3], np.ones(7))
+    reward = Rewards(choice=np.array([1.0, 0, 1.0, 0, 0, 0, 5.0]))
+    found = check(average_reward(model, reward))
+    assert found.policy.tolist() == [1, 3, 5, 6]
+    np.testing.assert_allclose(found.value, 5)
+    least = check(average_reward(model, reward, objective="min"))
+    assert least.policy.tolist() == [1, 3, 4, 6]
+    np.testing.assert_allclose(least.value, [0, 0, 0, 5], atol=1e-9)
+
+
 def ring(num_states, leave):
     """States that are left by two choices, with small probabilities, forth and back."""
     rows = []
