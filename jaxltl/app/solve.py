@@ -6,7 +6,7 @@ import json
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,10 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import NotConverged, Status
 from jaxltl.core.values.answer import Answer, Strategy, answer
+from jaxltl.core.values.answer_several import answer_several
+from jaxltl.core.values.multi_objective import Achievable, Best, Pareto
+
+Found = Answer | Achievable | Best | Pareto
 
 PROPERTY_FILES = (".props", ".prop", ".pctl")
 SHOWN = 10  # initial states whose values are printed
@@ -50,15 +54,13 @@ class Result:
       seconds: how long it took.
       error: why there is no answer, or None.
       fault: whose: NOT_CONVERGED the solver's, MISTAKEN the question's.
-      extra: further entries of its JSON object.
     """
 
     asked: Asked
-    answer: Answer | None
+    answer: Found | None
     seconds: float
     error: str | None = None
     fault: int = SOLVED
-    extra: dict[str, Any] = field(default_factory=dict)
 
     @property
     def exit_status(self) -> int:
@@ -124,13 +126,12 @@ def solve(model: SparseMDP, asked: Sequence[Asked], tolerance: float) -> Iterato
 
     for one in asked:
         begin = time.perf_counter()
-        found, error = None, one.error
-        fault, extra = MISTAKEN, {}  # type: int, dict[str, Any]
+        found: Found | None = None
+        error, fault = one.error, MISTAKEN
         if one.parsed is not None:
             try:
                 if one.parsed.operator == "multi":
-                    extra, status = _several(model, one.parsed, tolerance)
-                    fault = status
+                    found = answer_several(model, one.parsed, tolerance=tolerance)
                 else:
                     found = answer(model, one.parsed, tolerance=tolerance)
             except ValueError as mistake:
@@ -140,11 +141,7 @@ def solve(model: SparseMDP, asked: Sequence[Asked], tolerance: float) -> Iterato
             except Exception as failure:  # a mistake of ours must not lose the other answers
                 traceback.print_exc()
                 error, fault = f"{type(failure).__name__}: {failure}", NOT_CONVERGED
-        yield Result(one, found, time.perf_counter() - begin, error, fault, extra)
-
-
-def _several(model: SparseMDP, prop: Property, tolerance: float) -> tuple[dict[str, Any], Any]:
-    raise ValueError("multi")
+        yield Result(one, found, time.perf_counter() - begin, error, fault)
 
 
 # --- what is shown ----------------------------------------------------------------------------
@@ -163,7 +160,7 @@ def result_entry(result: Result) -> dict[str, Any]:
                              "upper": None, "status": "INVALID"}
     if result.asked.parsed is not None and result.asked.parsed.name is not None:
         entry["name"] = result.asked.parsed.name
-    if found is not None:
+    if isinstance(found, Answer):
         entry |= {
             "value": _over_states(found.value.tolist() if found.holds is None else found.holds),
             "lower": _over_states(found.lower.tolist()),
@@ -171,11 +168,25 @@ def result_entry(result: Result) -> dict[str, Any]:
             "status": found.status.name, "method": found.method}
         if found.states.size > 1:
             entry["states"] = found.states.tolist()
+    elif found is not None:
+        entry |= _several_entry(found)
     elif result.fault == NOT_CONVERGED:
         entry["status"] = "MAX_STEPS"
     if result.error is not None:
         entry["error"] = result.error
-    return entry | result.extra | {"seconds": result.seconds}
+    return entry | {"seconds": result.seconds}
+
+
+def _several_entry(found: Achievable | Best | Pareto) -> dict[str, Any]:
+    """Of several objectives: whether they are met, the best value, or the points of the curve."""
+    entry: dict[str, Any] = {"status": Status(found.status).name}
+    if isinstance(found, Pareto):
+        points = found.points.tolist()
+        return entry | {"value": points, "gap": _number(float(found.gap))}
+    if isinstance(found, Achievable):
+        return entry | {"value": found.holds}
+    return entry | {"value": _number(found.value), "lower": _number(found.lower),
+                    "upper": _number(found.upper), "achievable": found.holds}
 
 
 def _over_states(values: list[Any]) -> Any:
@@ -187,7 +198,7 @@ def _over_states(values: list[Any]) -> Any:
 def _number(x: Any) -> Any:
     if isinstance(x, float) and not np.isfinite(x):
         return None if np.isnan(x) else "inf" if x > 0 else "-inf"
-    return x
+    return x + 0.0 if isinstance(x, float) else x  # without a sign of zero
 
 
 def text(result: Result) -> str:
@@ -200,16 +211,28 @@ def text(result: Result) -> str:
         lines.append("  " + result.error.replace("\n", "\n  "))
     if found is None:
         return "\n".join(lines)
+    status = "" if found.status == Status.CONVERGED else f", {Status(found.status).name}"
+    if not isinstance(found, Answer):
+        return "\n".join([*lines, *_several_text(found), f"  {result.seconds:.3f} s{status}"])
     shown = found.states[:SHOWN].tolist()
     for i, state in enumerate(shown):
         where = f"state {state}: " if found.states.size > 1 else ""
         lines.append(f"  {where}{_value_text(found, i)}")
     if found.states.size > SHOWN:
         lines.append(f"  and {found.states.size - SHOWN} more initial states")
-    status = "" if found.status == Status.CONVERGED else f", {found.status.name}"
     how = f", {found.method}" if found.method else ""
     lines.append(f"  {result.seconds:.3f} s{how}{status}")
     return "\n".join(lines)
+
+
+def _several_text(found: Achievable | Best | Pareto) -> list[str]:
+    if isinstance(found, Pareto):
+        head = f"  {len(found.points)} points, whose mixtures are the curve up to {found.gap:.1e}"
+        return [head, *("  " + ", ".join(f"{x:.9g}" for x in p) for p in found.points.tolist())]
+    if isinstance(found, Best) and found.holds:
+        return [f"  {found.value!r}, in [{found.lower!r}, {found.upper!r}]"]
+    verdict = {True: "true", False: "false", None: "not decided"}[found.holds]
+    return [f"  the thresholds can be met: {verdict}"]
 
 
 def _value_text(found: Answer, i: int) -> str:
@@ -229,7 +252,7 @@ def strategies(model: SparseMDP, results: Sequence[Result], source: Path) -> byt
     """A file of the strategies that attain the answers, as JSON; see docs/solve.md."""
     found = [
         {"property": r.asked.text, **_strategy(model, r.answer.strategy)}
-        for r in results if r.answer is not None and r.answer.strategy is not None
+        for r in results if isinstance(r.answer, Answer) and r.answer.strategy is not None
         and not model.is_chain]
     table = {"model": source.name, "states": model.num_states, "strategies": found}
     return (json.dumps(table, allow_nan=False) + "\n").encode()

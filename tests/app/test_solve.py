@@ -136,6 +136,23 @@ def test_chains_and_several_initial_states(tmp_path):
     assert "state 2: " in run(path, 'P=? [ F "a" ]').stdout
 
 
+def test_several_objectives(model_file):
+    one = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
+                      initial=[1, 0, 0], label={"a": [1], "b": [2]})
+    write_model(model_file, one)
+    done = run(model_file, 'multi(P>=0.5 [ F "a" ], P>=0.25 [ F "b" ])',
+               'multi(Pmax=? [ F "a" ], P>=0.25 [ F "b" ])', '"c": multi(Pmax=? [ F "a" ], '
+               'Pmax=? [ F "b" ])', 'multi(Pmax=? [ F "a" ], P>0.25 [ F "b" ])',
+               'multi(Pmax=? [ F "a" ], P>=1 [ F "a" ], P>=0.25 [ F "b" ])', "--json")
+    assert done.exit_code == 2 and "thresholds can be met: true" in done.stdout
+    met, best, curve, wrong, never = json.loads(done.stdout.splitlines()[-1])["results"]
+    assert met["value"] is True and met["status"] == "CONVERGED"
+    assert best["lower"] <= 0.75 <= best["upper"] and best["achievable"] is True
+    assert curve["value"] == [[0, 1], [1, 0]] and curve["name"] == "c" and curve["gap"] <= 1e-4
+    assert "write >=" in wrong["error"] and wrong["status"] == "INVALID"
+    assert never["value"] is None and never["achievable"] is False
+
+
 # --- strategies -------------------------------------------------------------------------------
 
 

@@ -63,6 +63,8 @@ def states_satisfying(
     """
     condition = as_formula(condition)
     names = condition.propositions
+    if condition.operator == "ap":
+        return label_columns(model, names, place)[:, 0]
     return satisfying(label_columns(model, names, place), names, condition, place)
 
 
