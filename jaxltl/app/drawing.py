@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import signal
 import threading
@@ -41,7 +42,17 @@ Artist = Callable[[Drawing], Callable[[], bytes]]
 
 def drawing(function: str, *arguments: Any, **options: Any) -> Drawing:
     """The call of a function of :mod:`jaxltl.plot`, to be made later and elsewhere."""
-    return Drawing(function, arguments, options)
+    return Drawing(function, tuple(map(_on_the_host, arguments)), options)
+
+
+def _on_the_host(argument: Any) -> Any:
+    """An automaton or a world with NumPy's arrays; to read JAX's, a process has to load JAX."""
+    if not dataclasses.is_dataclass(argument) or isinstance(argument, type):
+        return argument
+    import jax
+    import numpy as np
+
+    return jax.tree.map(np.asarray, argument)
 
 
 def draw(picture: Drawing) -> bytes:

@@ -16,11 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.textpath import TextPath
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.runs import live_states
+from jaxltl.core.host.components import strong_components
 
 RADIUS = 0.24
 FONT_SIZE = 9.5
@@ -221,8 +220,7 @@ def _layers(delta: NDArray[np.integer], initial: int) -> NDArray[np.int64]:
     """Longest paths between components, breadth-first inside each: ``int[Q]``."""
     count = len(delta)
     source = np.repeat(np.arange(count), delta.shape[1])
-    links = csr_matrix((np.ones(source.size), (source, delta.ravel())), shape=(count, count))
-    _, component = connected_components(links, connection="strong")
+    component = strong_components(source, delta.ravel(), count)
     layer = np.full(count, -1)
     layer[initial] = 0
     for _ in range(count):  # longest paths need at most as many rounds as states

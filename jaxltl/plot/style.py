@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -33,9 +34,24 @@ def to_bytes(figure: Figure, kind: str = "svg", dpi: int = 150) -> bytes:
       dpi: dots per inch of a PNG.
     """
     buffer = io.BytesIO()
-    # Without a date, the same figure gives the same bytes.
-    metadata = {"Date": None} if kind == "svg" else None
-    figure.savefig(buffer, format=kind, dpi=dpi, metadata=metadata, facecolor=PAPER)
+    engine = figure.get_layout_engine()
+    if kind != "svg" or engine is None:
+        # Without a date, the same figure gives the same bytes.
+        metadata = {"Date": None} if kind == "svg" else None
+        figure.savefig(buffer, format=kind, dpi=dpi, metadata=metadata, facecolor=PAPER)
+        return buffer.getvalue()
+    # As savefig does it, but that draws everything twice, the first time for the layout alone.
+    canvas, before = FigureCanvasSVG(figure), (figure.dpi, figure.get_facecolor())
+    try:
+        figure.set_facecolor(PAPER)
+        engine.execute(figure)
+        figure.set_layout_engine("none")
+        figure.dpi = dpi  # of what is drawn as an image
+        canvas.print_svg(buffer, metadata={"Date": None})
+    finally:
+        figure.set_layout_engine(engine)
+        figure.dpi, facecolor = before
+        figure.set_facecolor(facecolor)
     return buffer.getvalue()
 
 

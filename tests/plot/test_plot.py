@@ -1,5 +1,7 @@
 """Pictures: they are drawn whole, labels stand free, and misfits are named."""
 
+import io
+import re
 import stat
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
@@ -194,6 +196,21 @@ def test_the_same_picture_has_the_same_bytes():
     first, second = (plot.to_bytes(plot.automaton(to_automaton("F a"))) for _ in range(2))
     assert b"<dc:date>" not in first
     assert len(first) == len(second)
+
+
+@pytest.mark.parametrize("draw", [
+    lambda: plot.grid(MAP, np.linspace(0, 1, 6), np.full((6, 4), 0.25), titles="memory 0"),
+    lambda: plot.curves({"loss": np.linspace(1, 0, 5)}),
+    lambda: plot.automaton(to_automaton("F a")),
+])
+def test_a_picture_is_what_matplotlib_saves(draw):
+    """Drawn once, not twice; but for names that are made up anew each time."""
+    figure, saved = draw(), io.BytesIO()
+    found = plot.to_bytes(figure)
+    assert b"</svg>" in plot.to_bytes(figure)  # once more
+    draw().savefig(saved, format="svg", dpi=150, metadata={"Date": None})
+    plain = [re.sub(rb"(p|m|image)[0-9a-f]{10}", b"", x) for x in (found, saved.getvalue())]
+    assert plain[0] == plain[1]
 
 
 def test_a_grid_with_values_and_policy():

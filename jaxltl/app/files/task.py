@@ -17,7 +17,6 @@ import jax
 import numpy as np
 
 from jaxltl.app.files import tables
-from jaxltl.app.files.models import read_padded
 from jaxltl.app.files.tables import COUNT, NAMES, TEXT, Rule, choice, is_list, is_number, number_in
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.logic.labels import satisfying
@@ -261,6 +260,9 @@ def load_world(task: Task) -> World:
     with tables.errors_in(f"{task.path}: [world] "):
         if "model" in spec:
             path = task.path.parent / spec["model"]
+            # Deferred: readers of all formats are more than a map needs.
+            from jaxltl.app.files.models import read_padded
+
             found = read_padded(path)
             mdp = initial_where(found.mdp, spec.get("initial"), path)
             return World(mdp, None, found.actions)
