@@ -46,6 +46,47 @@ class Enclosed(NamedTuple):
     method: str
 
 
+class Reduced(NamedTuple):
+    """What the graph leaves of a question.
+
+    Attributes:
+      mdp: the model.
+      whole: the model without chains.
+      part: of that, the model whose end components are states; None where there are none.
+      components: these end components.
+      problem: what is left, on the nodes of `part` or else of `whole`; None where nothing is.
+      known: ``float64[N]``, what is known of the nodes that are not open.
+      row: ``int[N]``, the rows of nodes that are not open.
+      sure: ``bool``, the nodes of `whole` that take the rows of `sure_row` whatever is found.
+      most: what no value exceeds.
+      maximize: whether the largest value is asked for.
+    """
+
+    mdp: HostMDP
+    whole: Contraction
+    part: Contraction | None
+    components: Components | None
+    problem: Transient | None
+    known: Floats
+    row: Integers
+    sure: Booleans | None
+    sure_row: Integers | None
+    most: float
+    maximize: bool
+
+
+class _Left(NamedTuple):
+    """The same without what came before: a problem or None, and what is known."""
+
+    problem: Transient | None
+    known: Floats
+    row: Integers
+    part: Contraction | None = None
+    components: Components | None = None
+    sure: Booleans | None = None
+    sure_row: Integers | None = None
+
+
 def reachability(
     mdp: HostMDP, target: Booleans, *, maximize: bool, stay: Booleans | None = None,
     tolerance: float = 1e-6,
@@ -59,22 +100,64 @@ def reachability(
       stay: ``bool[S]``, the states that may be passed; default all.
       tolerance: the width of the enclosure asked for.
     """
+    return _solved(reduce_reachability(mdp, target, maximize=maximize, stay=stay), tolerance)
+
+
+def reduce_reachability(
+    mdp: HostMDP, target: Booleans, *, maximize: bool, stay: Booleans | None = None
+) -> Reduced:
+    """What the graph leaves of :func:`reachability`, with the same arguments."""
     blocked = np.zeros(mdp.num_states, bool) if stay is None else ~stay & ~target
-    fixed = target | blocked
-    whole = without_chains(mdp, fixed, None) or _identity(mdp)
+    whole = without_chains(mdp, target | blocked, None) or _identity(mdp)
     small = whole.mdp
-    kept = np.zeros(small.num_states, bool)
-    goal, dead = kept.copy(), kept.copy()
+    goal, dead = (np.zeros(small.num_states, bool) for _ in range(2))
     goal[whole.node[target]], dead[whole.node[blocked]] = True, True
-    solve = _largest if maximize and not small.is_chain else _smallest
-    found = solve(small, goal, dead, whole.depth, tolerance)
-    return _expanded(mdp, whole, found)
+    reduce = _largest if maximize and not small.is_chain else _smallest
+    left = reduce(small, goal, dead, whole.depth)
+    return _reduced(mdp, whole, left, 1.0, maximize and not small.is_chain)
 
 
 def _identity(mdp: HostMDP) -> Contraction:
     return Contraction(
         mdp, np.arange(mdp.num_states), np.arange(mdp.num_rows), np.zeros(mdp.num_states),
         np.zeros(mdp.num_rows), 0)
+
+
+def _reduced(
+    mdp: HostMDP, whole: Contraction, left: _Left, most: float, maximize: bool
+) -> Reduced:
+    return Reduced(
+        mdp, whole, left.part, left.components, left.problem, left.known, left.row, left.sure,
+        left.sure_row, most, maximize)
+
+
+def _solved(reduced: Reduced, tolerance: float) -> Enclosed:
+    """What was asked, of the states of the model."""
+    found = _enclosed(reduced, tolerance)
+    part = reduced.part
+    if part is not None and reduced.components is not None:
+        row = towards(reduced.whole.mdp, reduced.components, part.row[found.row][part.node])
+        if reduced.sure is not None and reduced.sure_row is not None:
+            row = np.where(reduced.sure, reduced.sure_row, row)
+        found = found._replace(
+            value=found.value[part.node], lower=found.lower[part.node],
+            upper=found.upper[part.node], row=row)
+    return _expanded(reduced.mdp, reduced.whole, found)
+
+
+def _enclosed(reduced: Reduced, tolerance: float) -> Enclosed:
+    """What was asked, of the nodes."""
+    known, most, problem = reduced.known, reduced.most, reduced.problem
+    if problem is None:
+        return Enclosed(known, known, known, reduced.row, 0, 0.0, "the graph")
+    found = optimum(
+        problem, maximize=reduced.maximize, tolerance=tolerance, relative=not np.isfinite(most))
+    row = np.where(problem.open, found.row, reduced.row)
+    value, lower, upper = (
+        np.where(np.isinf(known), np.inf, x)
+        for x in (np.minimum(found.value, most), np.clip(found.lower, 0, most),
+                  np.minimum(found.upper, most)))
+    return Enclosed(value, lower, upper, row, found.rounds, found.residual, found.method)
 
 
 def _expanded(mdp: HostMDP, whole: Contraction, found: Enclosed) -> Enclosed:
@@ -97,46 +180,31 @@ def _expanded(mdp: HostMDP, whole: Contraction, found: Enclosed) -> Enclosed:
     return Enclosed(value, lower, upper, row, found.rounds, found.residual, found.method)
 
 
-def _decided(
-    mdp: HostMDP, one: Booleans, open_: Booleans, row: Integers
-) -> Enclosed:
-    value = one.astype(np.float64)
-    return Enclosed(value, value, value, row, 0, 0.0, "the graph")
-
-
-def _smallest(
-    mdp: HostMDP, goal: Booleans, dead: Booleans, depth: int, tolerance: float
-) -> Enclosed:
+def _smallest(mdp: HostMDP, goal: Booleans, dead: Booleans, depth: int) -> _Left:
     """The least probability of reaching a goal before anything dead."""
     outside = goal | dead
     zero = dead | ~forced(mdp, goal, among=~dead)
     one = goal | ~reaching(mdp, zero, _rows_of(mdp, ~outside))
-    open_ = ~(zero | one)
     stays = ~mdp.support.lead_to(~zero) & zero[mdp.state]
-    row = mdp.first_choice(stays)[1].astype(np.int64)
+    return _between(mdp, zero, one, mdp.first_choice(stays)[1].astype(np.int64), depth)
+
+
+def _between(
+    mdp: HostMDP, zero: Booleans, one: Booleans, row: Integers, depth: int
+) -> _Left:
+    """The probabilities that are neither zero nor one."""
+    open_, known = ~(zero | one), one.astype(np.float64)
     if not open_.any():
-        return _decided(mdp, one, open_, row)
-    problem = Transient(mdp, open_, one.astype(np.float64), np.zeros(mdp.num_rows), depth=depth)
-    return _enclosed(problem, row, maximize=False, tolerance=tolerance, most=1.0)
-
-
-def _enclosed(
-    problem: Transient, row: Integers, *, maximize: bool, tolerance: float, most: float
-) -> Enclosed:
-    found = optimum(problem, maximize=maximize, tolerance=tolerance, relative=not np.isfinite(most))
-    row = np.where(problem.open, found.row, row)
-    return Enclosed(
-        np.minimum(found.value, most), np.clip(found.lower, 0, most),
-        np.minimum(found.upper, most), row, found.rounds, found.residual, found.method)
+        return _Left(None, known, row)
+    problem = Transient(mdp, open_, known, np.zeros(mdp.num_rows), depth=depth)
+    return _Left(problem, known, row)
 
 
 def _rows_of(mdp: HostMDP, states: Booleans) -> Booleans:
     return states[mdp.state]
 
 
-def _largest(
-    mdp: HostMDP, goal: Booleans, dead: Booleans, depth: int, tolerance: float
-) -> Enclosed:
+def _largest(mdp: HostMDP, goal: Booleans, dead: Booleans, depth: int) -> _Left:
     """The largest probability of reaching a goal before anything dead."""
     outside = goal | dead
     open_ = ~outside
@@ -144,27 +212,23 @@ def _largest(
     open_ &= ~zero
     components = end_components(mdp, open_)
     if components.inside.any():
-        return _merged(mdp, goal, zero, components, depth, tolerance)
-    return _largest_apart(mdp, goal, zero, depth, tolerance)
+        return _merged(mdp, goal, zero, components, depth)
+    return _largest_apart(mdp, goal, zero, depth)
 
 
 def _merged(
-    mdp: HostMDP, goal: Booleans, zero: Booleans, components: Components, depth: int,
-    tolerance: float,
-) -> Enclosed:
+    mdp: HostMDP, goal: Booleans, zero: Booleans, components: Components, depth: int
+) -> _Left:
     """The same with end components as one state each, from which the best row leaves."""
     part = merged(mdp, components.component, components.inside, np.zeros(mdp.num_rows))
     small = part.mdp
     goal_, zero_ = (np.zeros(small.num_states, bool) for _ in range(2))
     goal_[part.node[goal]], zero_[part.node[zero]] = True, True
-    found = _largest_apart(small, goal_, zero_, depth, tolerance)
-    row = _towards(mdp, components, part.row[found.row][part.node])
-    return found._replace(
-        value=found.value[part.node], lower=found.lower[part.node], upper=found.upper[part.node],
-        row=row)
+    left = _largest_apart(small, goal_, zero_, depth)
+    return left._replace(part=part, components=components)
 
 
-def _towards(mdp: HostMDP, components: Components, row: Integers) -> Integers:
+def towards(mdp: HostMDP, components: Components, row: Integers) -> Integers:
     """A policy that goes round in an end component until it is where the given row leaves."""
     states = np.flatnonzero(components.region(mdp))
     exits = np.zeros(mdp.num_states, bool)
@@ -198,19 +262,12 @@ def _nearer(mdp: HostMDP, goal: Booleans, rows: Booleans) -> Integers:
     return found
 
 
-def _largest_apart(
-    mdp: HostMDP, goal: Booleans, zero: Booleans, depth: int, tolerance: float
-) -> Enclosed:
+def _largest_apart(mdp: HostMDP, goal: Booleans, zero: Booleans, depth: int) -> _Left:
     """The same where every policy leaves the open states almost surely."""
     one = ~forced(mdp, zero, among=~goal)
-    open_ = ~(zero | one)
     # From where the probability is one, rows that keep it so.
     stays = ~mdp.support.lead_to(~one) & one[mdp.state]
-    row = mdp.first_choice(stays)[1].astype(np.int64)
-    if not open_.any():
-        return _decided(mdp, one, open_, row)
-    problem = Transient(mdp, open_, one.astype(np.float64), np.zeros(mdp.num_rows), depth=depth)
-    return _enclosed(problem, row, maximize=True, tolerance=tolerance, most=1.0)
+    return _between(mdp, zero, one, mdp.first_choice(stays)[1].astype(np.int64), depth)
 
 
 def total_reward(
@@ -228,17 +285,30 @@ def total_reward(
       maximize: which of the two.
       tolerance: the width of the enclosure asked for, as a share of the value.
     """
-    whole = without_chains(mdp, target, reward) or _identity(mdp)._replace(cost=reward)
+    return _solved(reduce_total_reward(mdp, reward, target, maximize=maximize), tolerance)
+
+
+def reduce_total_reward(
+    mdp: HostMDP, reward: Floats, target: Booleans, *, maximize: bool,
+    kept: Booleans | None = None,
+) -> Reduced:
+    """What the graph leaves of :func:`total_reward`, with the same arguments.
+
+    Args:
+      mdp, reward, target, maximize: the question.
+      kept: ``bool[S]``, states that are no part of a chain.
+    """
+    fixed = target if kept is None else target | kept
+    whole = without_chains(mdp, fixed, reward) or _identity(mdp)._replace(cost=reward)
     small = whole.mdp
     goal = np.zeros(small.num_states, bool)
     goal[whole.node[target]] = True
-    solve = _most if maximize and not small.is_chain else _least
-    return _expanded(mdp, whole, solve(small, whole.cost, goal, whole.depth, tolerance))
+    reduce = _most if maximize and not small.is_chain else _least
+    left = reduce(small, whole.cost, goal, whole.depth)
+    return _reduced(mdp, whole, left, np.inf, maximize and not small.is_chain)
 
 
-def _most(
-    mdp: HostMDP, cost: Floats, goal: Booleans, depth: int, tolerance: float
-) -> Enclosed:
+def _most(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> _Left:
     never = ~forced(mdp, goal)
     before = _rows_of(mdp, ~goal)
     infinite = reaching(mdp, never, before)
@@ -246,7 +316,7 @@ def _most(
     # Where it is infinite: rows to where the target can be avoided, and there rows that avoid it.
     avoids = ~mdp.support.lead_to(~never) & never[mdp.state]
     row = np.where(never, mdp.first_choice(avoids)[1], _nearer(mdp, never, before))
-    return _finite(mdp, cost, goal, infinite, row, depth, tolerance, maximize=True)
+    return _finite(mdp, cost, goal, infinite, row, depth)
 
 
 def _nothing(mdp: HostMDP, cost: Floats, goal: Booleans, infinite: Booleans) -> Booleans:
@@ -261,30 +331,24 @@ def _nothing(mdp: HostMDP, cost: Floats, goal: Booleans, infinite: Booleans) -> 
 
 def _finite(
     mdp: HostMDP, cost: Floats, goal: Booleans, infinite: Booleans, row: Integers, depth: int,
-    tolerance: float, *, maximize: bool, rows: Booleans | None = None,
-    first: Integers | None = None,
-) -> Enclosed:
+    rows: Booleans | None = None, first: Integers | None = None,
+) -> _Left:
     """The finite ones, which never meet the others."""
     open_ = ~(goal | infinite)
     known = np.where(infinite, np.inf, 0.0)
     if not open_.any():
-        return Enclosed(known, known, known, row, 0, 0.0, "the graph")
+        return _Left(None, known, row)
     problem = Transient(mdp, open_, np.zeros(mdp.num_states), cost, rows, first, depth)
-    found = _enclosed(problem, row, maximize=maximize, tolerance=tolerance, most=np.inf)
-    value, lower, upper = (
-        np.where(infinite, np.inf, x) for x in (found.value, found.lower, found.upper))
-    return found._replace(value=value, lower=lower, upper=upper)
+    return _Left(problem, known, row)
 
 
-def _least(
-    mdp: HostMDP, cost: Floats, goal: Booleans, depth: int, tolerance: float
-) -> Enclosed:
+def _least(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> _Left:
     finite, rows = surely_reaching(mdp, goal, np.isfinite(cost) | goal[mdp.state])
     rows &= ~goal[mdp.state]
     if mdp.is_chain:
         row: Any = mdp.row_start[:-1].astype(np.int64)
         goal = _nothing(mdp, cost, goal, ~finite)
-        return _finite(mdp, cost, goal, ~finite, row, depth, tolerance, maximize=False, rows=rows)
+        return _finite(mdp, cost, goal, ~finite, row, depth, rows)
     # What can surely be done for nothing is worth nothing.
     free = rows & (cost == 0)
     nothing, stays = surely_reaching(mdp, goal, free | goal[mdp.state])
@@ -292,8 +356,7 @@ def _least(
     circles = end_components(mdp, finite & ~nothing, free)
     if not circles.inside.any():
         first = _nearer(mdp, nothing, rows)
-        return _finite(mdp, cost, nothing, ~finite, row, depth, tolerance, maximize=False,
-                       rows=rows, first=first)
+        return _finite(mdp, cost, nothing, ~finite, row, depth, rows, first)
     # Where going round costs nothing, states are one.
     part = merged(mdp, circles.component, circles.inside, cost)
     small = part.mdp
@@ -301,12 +364,9 @@ def _least(
     goal_[part.node[nothing]], finite_[part.node[finite]] = True, True
     kept = rows[part.row] & ~circles.inside[part.row]
     first = _nearer(small, goal_, kept)
-    found = _finite(small, part.cost, goal_, ~finite_, small.row_start[:-1].astype(np.int64),
-                    depth, tolerance, maximize=False, rows=kept, first=first)
-    towards = _towards(mdp, circles, part.row[found.row][part.node])
-    return found._replace(
-        value=found.value[part.node], lower=found.lower[part.node], upper=found.upper[part.node],
-        row=np.where(nothing, row, towards))
+    left = _finite(small, part.cost, goal_, ~finite_, small.row_start[:-1].astype(np.int64),
+                   depth, kept, first)
+    return left._replace(part=part, components=circles, sure=nothing, sure_row=row)
 
 
 def reward_forever(
@@ -342,12 +402,13 @@ def reward_forever(
     infinite_ = np.zeros(small.num_states, bool)
     infinite_[part.node[infinite]] = True
     row = small.row_start[:-1].astype(np.int64)
-    found = _finite(small, part.cost, ~left, infinite_, row, 0, tolerance, maximize=True)
-    towards = _towards(mdp, components, part.row[found.row][part.node])
+    rest = _finite(small, part.cost, ~left, infinite_, row, 0)
+    found = _enclosed(_reduced(mdp, part, rest, np.inf, True), tolerance)
+    leaving = towards(mdp, components, part.row[found.row][part.node])
     endless = _earning(mdp, components, rich, reward)
     return found._replace(
         value=found.value[part.node], lower=found.lower[part.node], upper=found.upper[part.node],
-        row=np.where(infinite, endless, towards))
+        row=np.where(infinite, endless, leaving))
 
 
 def _kept_away(mdp: HostMDP, rows: Booleans) -> Booleans:
