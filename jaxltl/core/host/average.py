@@ -32,6 +32,7 @@ _ROUNDS = 60  # policies at most
 _LOOKS = 30  # steps after which it is asked where a policy is most often
 _REFINED = 3  # solves of one bias, each of what the last ones left
 _ELIMINATED = 300_000  # states up to which they are
+_TINY = 1e-13
 _FLOOR = 1e-6  # of the tolerance, times the largest reward: what counts where a gain is near zero
 
 
@@ -54,7 +55,8 @@ class Average(NamedTuple):
 
 
 def average(
-    mdp: HostMDP, reward: Floats, magnitude: Floats, *, tolerance: float, max_steps: int
+    mdp: HostMDP, reward: Floats, magnitude: Floats, *, tolerance: float, max_steps: int,
+    sign: int = 1,
 ) -> Average:
     """The largest long-run average reward of a step.
 
@@ -64,6 +66,7 @@ def average(
       magnitude: ``float64[R]``, the sum of the absolute values of what a reward is made of.
       tolerance: the width asked for, as a share of the value.
       max_steps: sweeps at most.
+      sign: -1 where the rewards are the negatives of what is to be made small.
     """
     found = end_components(mdp)
     states = np.flatnonzero(found.region(mdp))
@@ -80,32 +83,41 @@ def average(
         return Average(value, value - half, value + half, _all_to(mdp, states, row), half,
                        gains.rounds)
     stopping = _with_stops(mdp, found, leaders)
-    least = float(np.abs(middle[middle != 0]).min())
+    least = max(float(np.abs(middle).min()), _FLOOR * float(magnitude.max()))
     width = tolerance / 4 * least
-    floor = _FLOOR * float(magnitude.max())
-    if half <= tolerance / 4 * max(float(np.abs(middle).min()), floor):
-        (low, high, taken, more), slack = _stopped(stopping, middle, width), half
+    if half <= width:
+        (low, high, taken, more), slack = _stopped(stopping, middle, tolerance, width, sign), half
     else:
         # Where little is earned what is not known of other components would be too much.
-        low, _, taken, more = _stopped(stopping, gains.lower, width)
-        high, slack = _stopped(stopping, gains.upper, width)[1], 0.0
+        low, _, taken, more = _stopped(stopping, gains.lower, tolerance, width, sign)
+        high, slack = _stopped(stopping, gains.upper, tolerance, width, sign)[1], 0.0
     return Average((low + high) / 2, low - slack, high + slack, _routed(mdp, found, taken, row),
                    half, gains.rounds + more)
 
 
 def _stopped(
-    stopping: _Stopping, gain: Floats, width: float
+    stopping: _Stopping, gain: Floats, tolerance: float, width: float, sign: int
 ) -> tuple[Floats, Floats, Integers, int]:
-    """Bounds on the best expected gain, rows that attain the lower one, and systems solved."""
+    """Bounds on the best expected gain, rows that attain the lower one, and systems solved.
+
+    What is to be made small, and was not negative, is made small as it is, and found to a share.
+    """
     node, mdp, origin = stopping
-    size, shift = mdp.num_states - gain.size, gain.min()
-    known = np.concatenate([np.zeros(size), gain - shift])
+    size, worth = mdp.num_states - gain.size, sign * gain
+    shift = min(float(worth.min()), 0.0)
+    # Beside large ones, a share of what is all but nothing cannot be had.
+    relative = shift == 0 and bool((worth[worth > 0] > _TINY * worth.max()).all())
+    known = np.concatenate([np.zeros(size), worth - shift])
     open_ = np.arange(mdp.num_states) < size
     problem = Transient(mdp, open_, known, np.zeros(mdp.num_rows))
-    best = optimum(problem, maximize=True, tolerance=width, relative=False)
-    slack = 4 * _EPS * (np.abs(shift) + known.max())
-    return (best.lower[node] + shift - slack, best.upper[node] + shift + slack,
-            origin[best.row[node]], best.rounds)
+    found = optimum(problem, maximize=sign > 0, relative=relative,
+                    tolerance=tolerance / 4 if relative else width)
+    slack = 4 * _EPS * (abs(shift) + known.max()) if shift else 0.0
+    low, high = (x[node] + shift for x in (found.lower, found.upper))
+    low, high = (low, high) if sign > 0 else (-high, -low)
+    # It is a mean of what the components earn.
+    low, high = np.maximum(low - slack, gain.min()), np.minimum(high + slack, gain.max())
+    return low, high, origin[found.row[node]], found.rounds
 
 
 def _all_to(mdp: HostMDP, states: Integers, row: Integers) -> Integers:

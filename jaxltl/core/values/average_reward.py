@@ -29,8 +29,8 @@ def average_reward(
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
       reward: as for :func:`~jaxltl.core.models.sparse.row_reward`; finite.
       objective: ``"max"`` or ``"min"``; of chains either.
-      tolerance: the width of the enclosure asked for, as a share of the value (of the largest
-        value, where one is smaller than a millionth of the largest reward).
+      tolerance: the width of the enclosure asked for, as a share of the value; where that is
+        small, of a millionth of the largest reward (a thousandth, if some are negative).
       max_steps: sweeps of value iteration at most.
 
     Returns:
@@ -52,8 +52,10 @@ def average_reward(
     model = to_sparse(model)
     sign = 1 if optimum_of(objective) is np.maximum else -1
     earned, magnitude = finite_reward(model, reward)
-    found = average(model.host, sign * earned, magnitude, tolerance=tolerance, max_steps=max_steps)
-    bounds = sorted((sign * found.lower, sign * found.upper), key=lambda x: float(x[0]))
-    error = np.maximum(bounds[1] - sign * found.value, sign * found.value - bounds[0])
+    found = average(model.host, sign * earned, magnitude, tolerance=tolerance,
+                    max_steps=max_steps, sign=sign)
+    small = 1e-6 if (earned >= 0).all() else 1e-3
+    error = np.maximum(found.upper - found.value, found.value - found.lower)
     return enclosed(sign * found.value, error, found.row.astype(np.int32), found.rounds,
-                    tolerance=tolerance, least=1e-6 * magnitude.max(), residual=found.residual)
+                    tolerance=tolerance, least=small * float(magnitude.max()),
+                    residual=found.residual)
