@@ -18,7 +18,7 @@ from jax import lax
 
 Step = Callable[[Any, Any, Any], Any]
 
-_ROW = 16  # lanes, the floats of the widest vector unit
+_ROW = 16  # the floats of the widest vector unit
 
 
 def iterate(
@@ -100,9 +100,6 @@ def in_turn(function: Callable[..., Any], *arguments: Any) -> Any:
 def side_by_side(function: Callable[..., Any], table: Any, *arguments: Any) -> Any:
     """``function(table, *arguments)``, whose lanes under ``vmap`` become a last axis.
 
-    The last lane is repeated until rows of lanes fill vector units: XLA vectorises a row of any
-    other length badly or not at all, and 16 exponentials then take a quarter of the time of 10.
-
     Args:
       function: of arrays with or without that axis; it closes over nothing that is traced.
       table: shared by the lanes; if it is batched too, they are mapped as usual.
@@ -119,13 +116,9 @@ def side_by_side(function: Callable[..., Any], table: Any, *arguments: Any) -> A
             axes = jax.tree.map(lambda b: 0 if b else None, (of_table, of_arguments))
             found = jax.vmap(lambda t, x: function(t, *x), axes)(table, arguments)
         else:
-            room = size if size < _ROW / 2 else -(-size // _ROW) * _ROW
-
             def last(x: jax.Array, b: bool) -> jax.Array:
-                if not b:
-                    return jnp.broadcast_to(x[..., None], (*x.shape, room))
-                again = jnp.broadcast_to(x[-1:], (room - size, *x.shape[1:]))
-                return jnp.moveaxis(jnp.concatenate([x, again]), 0, -1)
+                x = x if b else jnp.broadcast_to(x, (size, *x.shape))
+                return fill_row(jnp.moveaxis(x, 0, -1))
 
             found = function(table, *jax.tree.map(last, arguments, of_arguments))
             found = jax.tree.map(lambda x: jnp.moveaxis(x[..., :size], -1, 0), found)
@@ -133,3 +126,15 @@ def side_by_side(function: Callable[..., Any], table: Any, *arguments: Any) -> A
 
     table, arguments = lax.stop_gradient((table, arguments))
     return one(table, jax.tree.map(jnp.asarray, arguments))
+
+
+def fill_row(x: jax.Array) -> jax.Array:
+    """Lanes on the last axis, of which the last is repeated until they fill vector units.
+
+    XLA vectorises rows of any other length badly or not at all: 16 exponentials in a row take a
+    quarter of the time of 10. Few lanes stay as they are.
+    """
+    size = x.shape[-1]
+    room = size if size < _ROW / 2 else -(-size // _ROW) * _ROW
+    again = jnp.broadcast_to(x[..., -1:], (*x.shape[:-1], room - size))
+    return jnp.concatenate([x, again], axis=-1)

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.models.game import Game
+from jaxltl.core.values.iterate import fill_row
 
 _MOST_SWEEPS = 100_000
-_FEWEST = 16  # lanes that are worth a loop of their own
+_FEWEST = 16  # lanes that are worth a loop of their own, and fill its rows
 _WRITTEN_OUT = 16  # successors up to which a sum over them is written out
 
 
@@ -97,7 +98,7 @@ def _plain(graph: _Graph, models: _Models) -> tuple[jax.Array, jax.Array, jax.Ar
         jnp.full_like(models.enough, jnp.inf), jnp.int32(0),
     )
     lanes = models.active.shape
-    few = lanes[0] // 4 if lanes and lanes[0] >= 4 * _FEWEST else 0
+    few = lanes[0] // (4 * _FEWEST) * _FEWEST if lanes else 0
     found = _swept(graph, models, start, few)
     if few:
         found = _last_lanes(graph, models, found, few)
@@ -187,13 +188,15 @@ def _lanes_last(size: int, batched: Any, graph: _Graph, models: _Models) -> Any:
         axes = jax.tree.map(lambda b: 0 if b else None, (shared, own))
         return jax.vmap(_plain, axes)(graph, models), (True, True, True)
     lanes = models.value.ndim - own.value - 1
+    number = size * (models.value.shape[-1] if lanes else 1)
 
     def last(x: jax.Array, is_batched: bool) -> jax.Array:
         x = x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
         x = jnp.moveaxis(x, 0, -1)
-        return x.reshape(*x.shape[:-2], -1) if lanes else x
+        return fill_row(x.reshape(*x.shape[:-2], -1) if lanes else x)
 
     def first(x: jax.Array) -> jax.Array:
+        x = x[..., :number]
         return jnp.moveaxis(x.reshape(*x.shape[:-1], -1, size) if lanes else x, -1, 0)
 
     found = _iterate(graph, jax.tree.map(last, models, own))
