@@ -158,7 +158,11 @@ def _status(prop: Property, found: _Found, tolerance: float) -> Status:
         if prop.operator in ("R", "T"):
             most = np.maximum(tolerance * np.maximum(np.abs(lower), np.abs(upper)), TINY)
         narrow = (width == 0) | ((width <= most) & np.isfinite(width))
-    return Status.CONVERGED if narrow.all() else max(told, Status.PRECISION)
+    # An average near zero is narrow as a share of the rewards that cancel out in it.
+    told_narrow = prop.path == Earned("average") and told == Status.CONVERGED
+    if narrow.all() or told_narrow:
+        return Status.CONVERGED
+    return max(told, Status.PRECISION)
 
 
 def _is_exact(found: _Found) -> bool:
