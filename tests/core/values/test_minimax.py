@@ -489,7 +489,8 @@ def test_new_values_do_not_trace_again(cases):
 def test_how_it_ends_when_it_cannot_converge(cases, method):
     model, system, reward, _ = cases[0]
     game = as_game(model, system)
-    short = minimax_value(game, reward, 0.9, method=method, max_steps=1, tolerance=1e-9)
+    options = {"method": method, "max_steps": 1, "tolerance": 1e-9}  # one program for all
+    short = minimax_value(game, reward, 0.9, **options)
     assert short.status == Status.MAX_STEPS
     assert short.num_steps == 1
     assert_encloses(short, brute.minimax_value(model, system, reward, 0.9, "move"))
@@ -497,9 +498,9 @@ def test_how_it_ends_when_it_cannot_converge(cases, method):
     vain = minimax_value(single, reward, 0.9, method=method, tolerance=1e-12, max_steps=10_000)
     assert vain.status == Status.PRECISION
     assert vain.num_steps < 1000
-    for bad in (minimax_value(game, reward, 1.0, method=method),
-                minimax_value(game, reward, -0.5, method=method),
-                minimax_value(game, np.full_like(reward, np.nan), 0.5, method=method)):
+    for bad in (minimax_value(game, reward, 1.0, **options),
+                minimax_value(game, reward, -0.5, **options),
+                minimax_value(game, np.full_like(reward, np.nan), 0.5, **options)):
         assert bad.status == Status.NONFINITE
         assert (bad.lower == -np.inf).all()
         assert (bad.upper == np.inf).all()
