@@ -1,0 +1,587 @@
+"""Solves of one question with many numbers, inside ``jit``, ``vmap`` and ``grad``."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+
+from jaxltl.core.host.optimal import reduce_reachability, reduce_total_reward
+from jaxltl.core.host.plan import Plan, plan_optimum, plan_policy
+from jaxltl.core.models.concrete import is_traced, to_jax
+from jaxltl.core.models.convert import to_sparse
+from jaxltl.core.models.operators import is_deterministic
+from jaxltl.core.models.sparse import Rewards, row_reward
+from jaxltl.core.types import Solution, Status, require_shape, row_tolerance, status_code
+from jaxltl.core.values.evidence import refuse
+from jaxltl.core.values.fixed_point import implicit
+from jaxltl.core.values.sweeps import Blocks, Chosen, chosen_names, meets, sweep
+
+_NEAR = 0.9  # of the width asked for, how far the first guess of a bound is from the other
+_FINER = 0.25  # how much nearer values come before the next guess
+_PATIENCE = 20  # passes, and a quarter of those before, until a guess is given up
+_SLACK = 1e6  # smallest numbers that a guess is above nothing
+
+
+@struct.dataclass
+class Prepared:
+    """A question about a model, put in order for solves with other numbers.
+
+    Made by :func:`prepare`, read by :func:`solve_prepared`. Give it to a compiled function as an
+    argument: what a function closes over becomes part of the program.
+
+    Attributes:
+      segments: the blocks.
+      place: ``int32[S]``, where a state's value is.
+      own: ``int32[S]``, the place whose row a state takes, or -1.
+      row: ``int32[S]``, the row that it takes else.
+      entry_row: ``int32[T]``, the row of each transition.
+      row_state: ``int32[R]``, the state of each row.
+      probability, reward: ``float[T]`` and ``float[R]``, as they were.
+      loops: rows that lead to where they are: entries, groups, rows, groups of these; or None.
+      circles: end components that are one node, or None.
+      question: ``"probability"`` or ``"reward"``, static.
+      objective: ``"max"``, ``"min"`` or ``"policy"``, static.
+      cyclic: whether some nodes are on circles, static.
+      levels, choices, terms, groups: see the plan, static.
+    """
+
+    segments: tuple[Blocks, Blocks, Blocks]
+    place: Any
+    own: Any
+    row: Any
+    entry_row: Any
+    row_state: Any
+    probability: Any
+    reward: Any
+    loops: Any
+    circles: Any
+    question: str = struct.field(pytree_node=False)
+    objective: str = struct.field(pytree_node=False)
+    cyclic: bool = struct.field(pytree_node=False)
+    levels: int = struct.field(pytree_node=False)
+    choices: int = struct.field(pytree_node=False)
+    terms: int = struct.field(pytree_node=False)
+    groups: int = struct.field(pytree_node=False)
+
+    @property
+    def num_states(self) -> int:
+        return self.place.shape[-1]
+
+    @property
+    def num_rows(self) -> int:
+        return self.row_state.shape[-1]
+
+    @property
+    def size(self) -> int:
+        """The number N of places."""
+        return self.segments[2].last
+
+
+def prepare(
+    model: Any,
+    target: chex.Array,
+    *,
+    stay: chex.Array | None = None,
+    reward: str | Rewards | chex.Array | None = None,
+    objective: str = "max",
+) -> Prepared:
+    """Puts the states of a model in order, once, for solves with other numbers.
+
+    What the graph decides is decided here: chains of single successors, states worth nothing, one
+    or infinity, and end components are gone from what is solved. What is left stands in blocks of
+    equal shape, later states first, so that one pass solves what has no circles.
+
+    Args:
+      model: a concrete SparseMDP, or what :func:`~jaxltl.core.models.convert.to_sparse` takes.
+      target: ``bool[S]``.
+      stay: ``bool[S]``, the states that may be passed before; default all. Not with a reward.
+      reward: asks for the expected total reward until the target and not for the probability of
+        reaching it; as of :func:`~jaxltl.core.models.sparse.row_reward`, finite and at least 0.
+      objective: ``"max"``, ``"min"``, or ``"policy"`` for values of policies that are given later.
+
+    Returns:
+      A pytree of arrays. Which transitions are possible and which rewards are zero is settled.
+
+    Raises:
+      ValueError: a shape or the objective is wrong, a reward is negative or not finite, there is
+        `stay` with a reward, or something is traced.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> prepared = prepare(coin, [False, True, False])
+      >>> solve = jax.jit(lambda p: solve_prepared(prepared, probability=p).value[0])
+      >>> round(solve(jnp.array([0.25, 0.75, 1, 1])).item(), 3)
+      0.25
+    """
+    if objective not in ("max", "min", "policy"):
+        raise ValueError(f'objective={objective!r}; it must be "max", "min" or "policy".')
+    if is_traced((model, target, stay, reward)):
+        raise ValueError("prepare reads its model, so it works on concrete arrays only; call it "
+                         "before jit, and solve_prepared inside.")
+    if stay is not None and reward is not None:
+        raise ValueError("expected rewards are until the target alone: leave stay out.")
+    sparse = to_sparse(model)
+    host = sparse.host
+    target = np.asarray(target, bool).ravel()
+    require_shape("target", target, (host.num_states,))
+    if stay is not None:
+        stay = np.asarray(stay, bool).ravel()
+        require_shape("stay", stay, (host.num_states,))
+    cost = None if reward is None else row_reward(sparse, reward)
+    if cost is not None and not (np.isfinite(cost) & (cost >= 0)).all():
+        r = int(np.flatnonzero(~(np.isfinite(cost) & (cost >= 0)))[0])
+        raise ValueError(f"the reward of a choice of state {host.state[r]} is {cost[r]:.6g}; "
+                         "prepared solves need finite rewards of at least 0.")
+    if objective == "policy":
+        plan = plan_policy(host, target, stay, cost)
+    elif cost is None:
+        plan = plan_optimum(
+            reduce_reachability(host, target, maximize=objective == "max", stay=stay), None)
+    else:
+        kept = host.over_choices(np.maximum, cost) > 0
+        plan = plan_optimum(reduce_total_reward(
+            host, cost, target, maximize=objective == "max", kept=kept), cost)
+    return _prepared(host, plan, cost, objective)
+
+
+def _prepared(host: Any, plan: Plan, cost: Any, objective: str) -> Prepared:
+    dtype = jnp.zeros(()).dtype
+    vector = np.concatenate([
+        host.probability, np.zeros(host.num_rows) if cost is None else cost, [1.0, 0.0]])
+    if plan.loops is not None:
+        rest = np.bincount(plan.loops.group, host.probability[plan.loops.entry],
+                           plan.loops.count)
+        scale = np.ones(host.num_rows)
+        scale[plan.loops.row] = 1 / np.maximum(rest, 1e-300)[plan.loops.row_group]
+        vector[: host.num_transitions] *= scale[host.row]
+        vector[host.num_transitions : -2] *= scale
+    blocks, first = [], 0
+    for part in plan.schedule.segments:
+        weight = vector[part.source].astype(dtype)
+        blocks.append(Blocks(part.target, part.source, weight, part.name, first))
+        first = blocks[-1].last
+    loops = None if plan.loops is None else tuple(x.astype(np.int32) for x in plan.loops[:4])
+    circles = None if plan.circles is None else tuple(x.astype(np.int32) for x in plan.circles)
+    found = Prepared(
+        segments=(blocks[0], blocks[1], blocks[2]), place=plan.place, own=plan.own, row=plan.row,
+        entry_row=host.row.astype(np.int32), row_state=host.state.astype(np.int32),
+        probability=host.probability.astype(dtype),
+        reward=None if cost is None else cost.astype(dtype), loops=loops, circles=circles,
+        question="probability" if cost is None else "reward", objective=objective,
+        cyclic=plan.schedule.segments[1].target.size > 0, levels=plan.schedule.levels,
+        choices=plan.schedule.choices, terms=plan.terms + blocks[0].target.shape[2],
+        groups=0 if plan.loops is None else plan.loops.count)
+    return to_jax(found)
+
+
+def solve_prepared(
+    prepared: Prepared,
+    *,
+    probability: chex.Array | None = None,
+    reward: chex.Array | None = None,
+    policy: chex.Array | None = None,
+    tolerance: chex.Array | float | None = None,
+    max_steps: chex.Array | int = 100_000,
+) -> Solution:
+    """The answer to a prepared question, with other numbers where they are given.
+
+    Without circles one pass is exact but for rounding, which is known in advance. With circles a
+    lower bound rises from zero, and what is a little above it is an upper bound once a pass does
+    not raise it (Hartmanns and Kaminski 2020); each is rounded outwards in every step.
+
+    Args:
+      prepared: the question.
+      probability: ``float[T]``, of the same transitions, all positive; rows sum to one.
+      reward: ``float[R]``, finite, at least 0, and 0 where it was; also positive where it was, if
+        the least is asked for. Only if a reward was prepared.
+      policy: rows ``int32[S]`` or weights ``float[R]``, if it was prepared for policies; a chain
+        needs none.
+      tolerance: the width of the enclosure asked for, for rewards as a share of the value; default
+        1e-6 in double precision, 1e-3 in single.
+      max_steps: passes at most.
+
+    Returns:
+      :class:`Solution`; `value` ``float[S]``, exactly what the graph says where it decides, `policy`
+      ``int32[S]``, rows that attain the bound on the safe side, or the given policy. ``INVALID``
+      where probabilities, rewards or the policy are not as they must be, ``NONFINITE`` where they
+      are NaN or infinite.
+
+    Raises:
+      ValueError: a shape is wrong, or there is a policy and none was prepared for, or no policy.
+
+    Differentiable, forward and reverse, in the probabilities, in the rewards and in the weights of
+    a policy, along distributions; of an optimum with its policy held fixed.
+    """
+    if probability is not None:
+        require_shape("probability", probability, prepared.probability.shape)
+    if reward is not None:
+        if prepared.reward is None:
+            raise ValueError("a reward is given, but the question is a probability: prepare it "
+                             "with a reward.")
+        require_shape("reward", reward, prepared.reward.shape)
+    chain = prepared.num_rows == prepared.num_states
+    if prepared.objective == "policy":
+        if policy is None and not chain:
+            raise ValueError("the question was prepared for policies: give one.")
+        if policy is not None:
+            shape = prepared.place if is_deterministic(policy) else prepared.row_state
+            require_shape("policy", policy, shape.shape)
+    elif policy is not None:
+        raise ValueError(f'a policy is given, but the question is the optimum: prepare it with '
+                         f'objective="policy", not {prepared.objective!r}.')
+    dtype = prepared.probability.dtype
+    if tolerance is None:
+        tolerance = 1e-6 if dtype == jnp.float64 else 1e-3
+    return _solve(prepared, probability, reward, policy, tolerance, max_steps)
+
+
+@jax.jit
+def _solve(
+    prepared: Prepared, probability: Any, reward: Any, policy: Any, tolerance: Any, max_steps: Any
+) -> Solution:
+    dtype = prepared.probability.dtype
+    tolerance = jnp.asarray(tolerance, dtype)
+    share, taken = _shares(prepared, policy)
+    finite, valid = _checked(prepared, probability, reward, share)
+    if probability is not None or reward is not None or share is not None:
+        prepared = _refilled(prepared, probability, reward, share)
+    decided = None
+    if prepared.objective == "policy":
+        decided = _decided(prepared, share)
+    found = _enclosed(prepared, decided, tolerance, max_steps)
+    value = _attached(prepared, found, decided)
+    return _answer(prepared, found, decided, value, tolerance, finite, valid, policy, taken)
+
+
+class _Shares(NamedTuple):
+    weight: jax.Array
+    used: jax.Array
+    valid: jax.Array
+    finite: jax.Array
+
+
+def _shares(prepared: Prepared, policy: Any) -> tuple[_Shares | None, Any]:
+    """How much of each row is taken, summing to one in each state, and the policy to show."""
+    if prepared.objective != "policy":
+        return None, None
+    dtype = prepared.probability.dtype
+    if policy is None:
+        policy = jnp.ones(prepared.num_rows, dtype)
+    policy = jnp.asarray(policy)
+    if is_deterministic(policy):
+        rows = jnp.arange(prepared.num_rows, dtype=jnp.int32)
+        used = policy[prepared.row_state] == rows
+        weight = used.astype(dtype)
+    else:
+        weight = policy.astype(dtype)
+        used = weight > 0
+    total = jax.ops.segment_sum(
+        weight, prepared.row_state, prepared.num_states, indices_are_sorted=True)
+    slack = row_tolerance(dtype)
+    valid = jnp.all(jnp.abs(total - 1) <= slack) & jnp.all(weight >= 0)
+    finite = jnp.all(jnp.isfinite(weight))
+    total = jnp.where(total > 0, total, 1)
+    return _Shares(weight / total[prepared.row_state], used, valid, finite), policy
+
+
+def _checked(
+    prepared: Prepared, probability: Any, reward: Any, share: _Shares | None
+) -> tuple[jax.Array, jax.Array]:
+    """Whether numbers are finite, and whether they are what they must be."""
+    finite, valid = jnp.asarray(True), jnp.asarray(True)
+    if probability is not None:
+        probability = lax.stop_gradient(probability).astype(prepared.probability.dtype)
+        total = jax.ops.segment_sum(
+            probability, prepared.entry_row, prepared.num_rows, indices_are_sorted=True)
+        finite &= jnp.all(jnp.isfinite(total))
+        slack = row_tolerance(probability.dtype)
+        valid &= jnp.all(probability > 0) & jnp.all(jnp.abs(total - 1) <= slack)
+    if reward is not None:
+        finite &= jnp.all(jnp.isfinite(reward))
+        before = prepared.reward > 0
+        valid &= jnp.all(reward >= 0) & jnp.all(before | (reward == 0))
+        if prepared.objective == "min":
+            valid &= jnp.all((reward > 0) == before)
+    if share is not None:
+        finite, valid = finite & share.finite, valid & share.valid
+    return finite, valid
+
+
+def _refilled(
+    prepared: Prepared, probability: Any, reward: Any, share: _Shares | None
+) -> Prepared:
+    """The same blocks with other weights."""
+    dtype = prepared.probability.dtype
+    p = prepared.probability if probability is None else jnp.asarray(probability, dtype)
+    r = prepared.reward if reward is None else jnp.asarray(reward, dtype)
+    scale = None if share is None else share.weight
+    if prepared.loops is not None:
+        entry, group, row, row_group = prepared.loops
+        rest = p[entry] if scale is None else p[entry] * scale[prepared.entry_row[entry]]
+        total = jax.ops.segment_sum(rest, group, prepared.groups, indices_are_sorted=True)
+        inverse = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)[row_group]
+        if scale is None:
+            scale = jnp.ones(prepared.num_rows, dtype)
+        scale = scale.at[row].multiply(inverse, unique_indices=True)
+    if r is None:
+        r = jnp.zeros(prepared.num_rows, dtype)
+    if scale is not None:
+        p, r = p * scale[prepared.entry_row], r * scale
+    vector = jnp.concatenate([p, r, jnp.asarray([1, 0], dtype)])
+    one, two, three = (
+        x.replace(weight=vector.at[x.source].get(mode="promise_in_bounds"))
+        for x in prepared.segments)
+    return prepared.replace(segments=(one, two, three))
+
+
+class _Decided(NamedTuple):
+    """What the graph says of a policy: ``bool[N + 3]``."""
+
+    keep: jax.Array
+    put: jax.Array
+    infinite: jax.Array
+
+
+def _decided(prepared: Prepared, share: _Shares | None) -> _Decided:
+    """Which values of a policy are 0, 1 or infinite."""
+    assert share is not None
+    size = prepared.size
+    used = jnp.concatenate([
+        share.used[prepared.entry_row], jnp.zeros(prepared.num_rows, bool),
+        jnp.asarray([True, False])])
+    support = tuple(used[x.source] for x in prepared.segments)
+    goal = size if prepared.question == "probability" else size + 1
+    seed = jnp.zeros(size + 3, bool).at[goal].set(True)
+    reached = meets(prepared.segments, support, seed, prepared.cyclic)
+    # What never gets there may be met, or it may not.
+    never = ~reached
+    never = never.at[size:].set(jnp.asarray([False, False, True]))
+    lost = meets(prepared.segments, support, never, prepared.cyclic)
+    if prepared.question == "probability":
+        return _Decided(reached & lost, reached & ~lost, jnp.zeros(size + 3, bool))
+    return _Decided(~lost, jnp.zeros(size + 3, bool), lost)
+
+
+class _Found(NamedTuple):
+    """Enclosed values of the places, ``float[N]``, and how they were found."""
+
+    value: jax.Array
+    lower: jax.Array
+    upper: jax.Array
+    rank: jax.Array | None
+    residual: jax.Array
+    steps: jax.Array
+    proven: jax.Array
+
+
+def _enclosed(
+    prepared: Prepared, decided: _Decided | None, tolerance: jax.Array, max_steps: Any
+) -> _Found:
+    prepared = lax.stop_gradient(prepared)
+    dtype, size = prepared.probability.dtype, prepared.size
+    info = jnp.finfo(dtype)
+    unit = prepared.terms * float(info.eps)
+    least = 4 * prepared.terms * float(info.tiny)
+    given: dict[str, Any] = {"maximize": prepared.objective != "min"}
+    if decided is not None:
+        given["keep"] = decided.keep[:size].astype(dtype)
+        given["put"] = decided.put[:size].astype(dtype)
+    start = jnp.zeros(size + 3, dtype).at[size].set(1)
+    if prepared.cyclic:
+        return _circling(prepared, start, given, unit, least, tolerance, max_steps)
+    x, rank = sweep(prepared.segments[0], start, choose=decided is None, **given)
+    x = x[:size]
+    share = 1.3 * prepared.levels * unit
+    known = share <= 0.1
+    lower = jnp.maximum(x * (1 - share) - prepared.levels * least, 0) if known else x * 0
+    upper = x * (1 + share) + prepared.levels * least if known else x * 0 + jnp.inf
+    zero = jnp.zeros((), dtype)
+    return _Found(x, lower, upper, rank, zero, jnp.asarray(1, jnp.int32), jnp.asarray(known))
+
+
+# --- circles ------------------------------------------------------------------------------------
+
+
+class _State(NamedTuple):
+    low: jax.Array
+    high: jax.Array
+    guessed: jax.Array
+    proven: jax.Array
+    near: jax.Array  # how little values move before a guess
+    wide: jax.Array  # how far a guess is above
+    since: jax.Array
+    steps: jax.Array
+    moved: jax.Array
+
+
+def _circling(
+    prepared: Prepared, start: jax.Array, given: dict[str, Any], unit: float, least: float,
+    tolerance: jax.Array, max_steps: Any,
+) -> _Found:
+    """Bounds from both sides of what has circles."""
+    before, core, after = prepared.segments
+    size, relative = prepared.size, prepared.question == "reward"
+    down = partial(sweep, factor=1 - unit, shift=-least, **given)
+    up = partial(sweep, factor=1 + unit, shift=least, **given)
+    span = slice(core.first, core.last)
+    dtype = start.dtype
+    ceiling = jnp.inf if relative else 1.0
+
+    def above(low: jax.Array, high: jax.Array, wide: jax.Array) -> jax.Array:
+        x = low[span]
+        x = x * (1 + wide) + _SLACK * least if relative else jnp.minimum(x + wide, ceiling)
+        if "keep" in given:
+            x = x * given["keep"][span] + given["put"][span]
+        return high.at[span].set(x)
+
+    def body(s: _State) -> _State:
+        low = down(core, s.low)[0]
+        high = lax.cond(s.guessed, lambda x: up(core, x)[0], lambda x: x, s.high)
+        new, old = low[span], s.low[span]
+        change = jnp.abs(new - old)
+        if relative:
+            change = change / jnp.maximum(new, _SLACK * least)
+        moved = jnp.max(change)
+        proven = s.guessed & jnp.all(high[span] <= s.high[span])
+        crossed = jnp.any(high[span] < new) | jnp.all(high[span] >= s.high[span])
+        failed = s.guessed & ~proven & (crossed | (s.since > _PATIENCE + s.steps // 4))
+        near = jnp.where(failed, s.near * _FINER, s.near)
+        wide = jnp.where(failed & (moved <= 4 * unit), 4 * s.wide, s.wide)
+        guess = (~s.guessed | failed) & (moved <= jnp.maximum(near, 4 * unit))
+        high = jnp.where(guess, above(low, high, wide), high)
+        guessed = guess | (s.guessed & ~failed)
+        since = jnp.where(guess, 0, s.since + 1)
+        return _State(low, high, guessed, proven, near, wide, since, s.steps + 1, moved)
+
+    low, high = down(before, start)[0], up(before, start)[0]
+    none, zero = jnp.asarray(False), jnp.asarray(0, jnp.int32)
+    state = _State(low, high, none, none, tolerance, _NEAR * tolerance, zero, zero,
+                   jnp.asarray(jnp.inf, dtype))
+    most = jnp.asarray(max_steps, jnp.int32)
+    s = lax.while_loop(
+        lambda s: ~s.proven & (s.steps < most) & jnp.all(jnp.isfinite(s.low)), body, state)
+    high = s.high.at[span].set(jnp.where(s.proven, s.high[span], ceiling))
+    low, high = down(after, s.low)[0], up(after, high)[0]
+    rank = None
+    if "keep" not in given:
+        # Greedy in a bound that a pass does not worsen: its policy attains it.
+        safe = low if given["maximize"] else jnp.where(s.proven, high, low)
+        parts = []
+        for part in prepared.segments:
+            safe, ranks = sweep(part, safe, choose=True, **given)
+            parts.append(ranks)
+        rank = jnp.concatenate(parts)
+    low, high = low[:size], high[:size]
+    middle = jnp.where(s.proven, low + (high - low) / 2, low)
+    return _Found(middle, low, high, rank, s.moved, s.steps, s.proven)
+
+
+# --- what comes out -----------------------------------------------------------------------------
+
+
+def _attached(prepared: Prepared, found: _Found, decided: _Decided | None) -> jax.Array:
+    """The values of the places with their implicit derivative."""
+    size, dtype = prepared.size, prepared.probability.dtype
+    if not size:
+        return found.value
+    target = jnp.concatenate([x.target for x in prepared.segments])
+    weight = jnp.concatenate([x.weight for x in prepared.segments])
+    if found.rank is None:
+        target, weight = target[:, 0], weight[:, 0]
+    else:
+        at = found.rank[:, None, None]
+        target = jnp.take_along_axis(target, at, 1)[:, 0]
+        weight = jnp.take_along_axis(weight, at, 1)[:, 0]
+    put = jnp.zeros(size, dtype)
+    if decided is not None:
+        count, _, block = target.shape
+        keep = decided.keep[:size].astype(dtype)
+        weight = weight * keep.reshape(count, 1, block)
+        put = decided.put[:size].astype(dtype)
+    system = Chosen(target, weight, prepared.cyclic)
+    fixed = lax.stop_gradient(system)
+    one = jnp.asarray([1, 0, 0], dtype)
+
+    def operator(x: jax.Array) -> jax.Array:
+        return system.image(jnp.concatenate([x, one])) + put
+
+    return implicit(
+        operator, found.value, solve=fixed.solve, transpose_solve=fixed.transpose_solve)
+
+
+def _answer(
+    prepared: Prepared, found: _Found, decided: _Decided | None, value: jax.Array,
+    tolerance: jax.Array, finite: jax.Array, valid: jax.Array, policy: Any, taken: Any,
+) -> Solution:
+    dtype, size = prepared.probability.dtype, prepared.size
+    relative = prepared.question == "reward"
+    most = jnp.inf if relative else 1.0
+    ends = jnp.asarray([0, 0, jnp.inf] if relative else [1, 0, 0], dtype)
+
+    def everywhere(x: jax.Array, exact: bool) -> jax.Array:
+        if decided is not None:
+            x = jnp.where(decided.infinite[:size], jnp.inf, x)
+            if exact:
+                fixed = ~decided.keep[:size] & ~decided.infinite[:size]
+                x = jnp.where(fixed, decided.put[:size].astype(dtype), x)
+        return jnp.concatenate([x, ends]).at[prepared.place].get(mode="promise_in_bounds")
+
+    capped = value + lax.stop_gradient(jnp.clip(value, 0, most) - value)
+    lower, upper = everywhere(found.lower, True), everywhere(jnp.minimum(found.upper, most), True)
+    value = everywhere(capped, True)
+    width = jnp.where(lower == upper, 0, upper - jnp.where(jnp.isfinite(lower), lower, 0))
+    scale = jnp.where(jnp.isfinite(upper), upper, 1) if relative else 1
+    narrow = jnp.all(width <= tolerance * scale)
+    converged = found.proven & narrow
+    numbers = jnp.all(~jnp.isnan(lax.stop_gradient(value)))
+    status = status_code(converged, finite & numbers, found.proven, valid=valid | ~finite)
+    rows = _policy(prepared, found) if taken is None else taken
+    kind = Solution(
+        value=value, policy=rows, lower=lower, upper=upper, residual=found.residual,
+        num_steps=found.steps, status=status)
+    return refuse(kind, rows, valid & finite).replace(status=status)
+
+
+def _policy(prepared: Prepared, found: _Found) -> jax.Array:
+    """The rows of an optimum, ``int32[S]``."""
+    names = jnp.concatenate([x.name for x in prepared.segments])
+    if not names.shape[0]:
+        return prepared.row
+    chosen = chosen_names(names, found.rank, prepared.choices)
+    own = prepared.own
+    rows = jnp.where(own >= 0, chosen[jnp.maximum(own, 0)], prepared.row)
+    if prepared.circles is None:
+        return rows
+    return _going_round(prepared, rows)
+
+
+def _going_round(prepared: Prepared, rows: jax.Array) -> jax.Array:
+    """In an end component, rows that get to where the node's row leaves it."""
+    state, inside, owner, entry_row, successor = prepared.circles
+    picked = rows[state]
+    there = prepared.row_state[picked] == state
+    count, many = state.shape[0], inside.shape[0]
+    last = jnp.iinfo(jnp.int32).max
+
+    def further(carry: Any) -> Any:
+        there, row, _ = carry
+        leads = jax.ops.segment_max(
+            there[successor].astype(jnp.int32), entry_row, many, indices_are_sorted=True) > 0
+        first = jax.ops.segment_min(
+            jnp.where(leads, inside, last), owner, count, indices_are_sorted=True)
+        new = ~there & (first < last)
+        return there | new, jnp.where(new, first, row), jnp.any(new)
+
+    _, picked, _ = lax.while_loop(lambda c: c[2], further, (there, picked, jnp.asarray(True)))
+    return rows.at[state].set(picked, unique_indices=True)
+
+
+__all__ = ["Prepared", "Status", "prepare", "solve_prepared"]
