@@ -7,7 +7,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxltl.core.host.rows import Booleans, Integers, first_action, some_action, spans
+from jaxltl.core.host.rows import (
+    Booleans,
+    Integers,
+    count_down,
+    distinct,
+    first_action,
+    some_action,
+    spans,
+)
 
 SWEEPS = 12  # times the size of the graph that sweeps may cost, before a worklist takes over
 ALL: Any = slice(None)
@@ -158,24 +166,30 @@ def _into(worklist: _Worklist, frontier: Integers) -> Integers:
         return row
     s, a = np.divmod(row, graph.num_actions)
     read = np.repeat(target, count) if graph.on_entry else s
-    i, q = np.nonzero(graph.next_memory[read] == np.repeat(memory, count)[:, None])
-    return (s[i].astype(np.int64) * graph.num_memory + q) * graph.num_actions + a[i]
+    start, before = graph.memory_before
+    code = graph.letter[read].astype(np.int64) * graph.num_memory + np.repeat(memory, count)
+    count = start[code + 1] - start[code]
+    q = before[spans(start[code], count)]
+    return (np.repeat(s.astype(np.int64) * (graph.num_memory * graph.num_actions) + a, count)
+            + q * graph.num_actions)
 
 
 def _join_pairs(worklist: _Worklist, pairs: Integers) -> Integers:
     """The states that join by pairs of which some more successors are in the region."""
     search, missing, waiting, remaining, _ = worklist
-    np.subtract.at(missing, pairs, 1)
-    pair = np.unique(pairs[waiting[pairs] & (missing[pairs] <= 0)])
+    count_down(missing, pairs)
+    pair = distinct(pairs[waiting[pairs] & (missing[pairs] <= 0)], waiting.size)
     waiting[pair] = False
     state, a = np.divmod(pair, search.graph.num_actions)
-    np.subtract.at(remaining, state, 1)
+    count_down(remaining, state)
     flat = [x.reshape(-1) for x in (search.rule, search.open, search.action, search.region,
                                     search.rank)]
     rule, open_, action, region, rank = flat
     joins = (rule[state] | (remaining[state] == 0)) & open_[state]
-    frontier, first = np.unique(state[joins], return_index=True)
-    action[frontier] = a[joins][first]
+    state, a = state[joins], a[joins]
+    first = np.diff(state, prepend=-1) > 0  # pairs are in order, so one state's stand together
+    frontier = state[first]
+    action[frontier] = a[first]
     open_[frontier], region[frontier], rank[frontier] = False, True, search.round
     return frontier
 

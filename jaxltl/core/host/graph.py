@@ -61,6 +61,20 @@ class HostGraph:
         lazy = np.broadcast_to(lazy, shape) if self.allowed is None else lazy & self.allowed
         return lazy.reshape(*self.state_shape, -1)
 
+    @cached_property
+    def memory_before(self) -> tuple[Integers, Integers]:
+        """The memories q from which reading a letter leads to q', in order.
+
+        They are ``q[start[c] : start[c + 1]]`` for the letter and q' of ``c = letter * Q + q'``.
+        """
+        reader = np.zeros(int(self.letter.max(initial=0)) + 1, np.int64)
+        reader[self.letter[::-1]] = np.arange(self.letter.size)[::-1]
+        after = self.next_memory[reader].astype(np.int64)  # [L, Q]
+        code = (np.arange(reader.size)[:, None] * self.num_memory + after).ravel()
+        count = np.bincount(code, minlength=reader.size * self.num_memory)
+        order = np.argsort(code, kind="stable") % self.num_memory
+        return np.concatenate([[0], count.cumsum()]), order
+
     def exists(self, region: Booleans) -> Booleans:
         """Whether some successor lies in a region: ``bool[S, A]``; False where unavailable."""
         found = self.through(region, self.rows.lead_to).reshape(*self.state_shape, -1)

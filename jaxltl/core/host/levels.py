@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxltl.core.host.rows import Booleans, Integers, spans
+from jaxltl.core.host.rows import Booleans, Integers, count_down, distinct, spans
 
 _ROUNDS = 40  # levels, and
 _NODES = 32  # so many nodes for a further one, until elimination is faster
@@ -71,14 +71,8 @@ def peel(back: Edges, number: Integers, among: Booleans) -> Levels:
         among[frontier] = False
         first = back.start[frontier]
         source = back.target[spans(first, back.start[frontier + 1] - first)]
-        if source.size > number.size // 16:
-            number -= np.bincount(source, minlength=number.size).astype(number.dtype)
-            frontier = np.flatnonzero((number == 0) & among)
-        else:
-            np.subtract.at(number, source, 1)
-            source = source[(number[source] == 0) & among[source]]
-            source.sort()
-            frontier = source[np.diff(source, prepend=-1) > 0]
+        count_down(number, source)
+        frontier = distinct(source[(number[source] == 0) & among[source]], number.size)
     none: Any = np.zeros(0, np.int64)
     return Levels(np.concatenate(found) if found else none, start)
 

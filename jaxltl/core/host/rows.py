@@ -108,6 +108,28 @@ def spans(start: Integers, count: Integers) -> Integers:
     return np.arange(total) + np.repeat(start - end + count, count)
 
 
+def distinct(number: Integers, size: int) -> Integers:
+    """Numbers below a size in order, each once.
+
+    >>> distinct(np.array([3, 1, 3]), 5).tolist()
+    [1, 3]
+    """
+    if number.size < size // 8:
+        number = np.sort(number)
+        return number[np.diff(number, prepend=-1) > 0]
+    mark = np.zeros(size, bool)
+    mark[number] = True
+    return np.flatnonzero(mark)
+
+
+def count_down(counter: Integers, number: Integers) -> None:
+    """Takes one from a counter for each time that its number stands, in place."""
+    if number.size < counter.size // 16:
+        np.subtract.at(counter, number, 1)
+    else:
+        counter -= np.bincount(number, minlength=counter.size).astype(counter.dtype)
+
+
 def rows_of(successor: Integers, used: Booleans, num_states: int) -> Rows:
     """Rows from padded lists.
 

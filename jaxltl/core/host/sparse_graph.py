@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.host.components import strong_components
-from jaxltl.core.host.rows import LARGE, Booleans, Integers, spans
+from jaxltl.core.host.rows import LARGE, Booleans, Integers, count_down, distinct, spans
 from jaxltl.core.host.sparse import HostMDP
 
 _FEW = 24  # states of a frontier up to which Python's own loop beats NumPy's overhead
@@ -113,10 +113,10 @@ class _Forced(NamedTuple):
         row = row[self.waiting[row]]
         if not row.size:
             return row
-        row = _distinct(row, self.mdp.num_rows)
+        row = distinct(row, self.mdp.num_rows)
         self.waiting[row] = False
         state = self.mdp.state[row]
-        np.subtract.at(self.left, state, 1)
+        count_down(self.left, state)
         state = state[(self.left[state] == 0) & self.open[state]]
         self.open[state], self.region[state] = False, True
         # Rows are in order, so one state's stand together.
@@ -145,16 +145,6 @@ class _Forced(NamedTuple):
                             new.append(state)
             todo = new
         return np.array(todo, np.int64)
-
-
-def _distinct(number: Integers, size: int) -> Integers:
-    """Numbers below a size in order, each once."""
-    if number.size < size // 8:
-        number = np.sort(number)
-        return number[np.diff(number, prepend=-1) > 0]
-    mark = np.zeros(size, bool)
-    mark[number] = True
-    return np.flatnonzero(mark)
 
 
 def surely_reaching(
