@@ -1,0 +1,152 @@
+"""The engine of sparse rows and the padded one enclose the same numbers, with policies as good."""
+
+import numpy as np
+import pytest
+
+from jaxltl.core.models.convert import to_padded, to_sparse
+from jaxltl.core.models.mdp import to_dense
+from jaxltl.core.models.product import product
+from jaxltl.core.types import Status
+from jaxltl.core.values.reachability import reachability_probability
+from jaxltl.core.values.satisfaction import optimal_satisfaction
+from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
+from jaxltl.core.values.total_reward import total_reward
+from tests.core.models.test_sparse import random_padded
+
+ROUNDING = 1e-6  # of probabilities in single precision, which the padded models are in
+
+
+def overlap(one, other, slack=ROUNDING):
+    """Two enclosures of one number meet."""
+    lower = np.maximum(np.asarray(one.lower, float).ravel(), np.asarray(other.lower, float).ravel())
+    upper = np.minimum(np.asarray(one.upper, float).ravel(), np.asarray(other.upper, float).ravel())
+    finite = np.isfinite(upper)
+    assert (np.isinf(lower) == ~finite).all()
+    assert (lower[finite] <= upper[finite] + slack * np.maximum(upper[finite], 1)).all()
+
+
+def cases(count, seed):
+    rng = np.random.default_rng(seed)
+    for i in range(count):
+        sparse = to_sparse(random_padded(rng, int(rng.integers(2, 12)), 1 + i % 3, 1 + i % 3))
+        goal = rng.random(sparse.num_states) < 0.2
+        yield rng, sparse, to_padded(sparse), goal
+
+
+def reachability_agrees(rng, sparse, padded, goal):
+    for objective in ("max", "min"):
+        ours = reachability_probability(sparse, goal, objective=objective)
+        overlap(ours, reachability_probability(padded, goal, objective=objective))
+        assert ours.status == Status.CONVERGED
+        # What the policy attains is what was promised.
+        own = reachability_probability(sparse, goal, policy=ours.policy)
+        slack = 1e-12
+        if objective == "max":
+            assert (own.upper >= ours.lower - slack).all()
+        else:
+            assert (own.lower <= ours.upper + slack).all()
+    weight = rng.random(sparse.num_rows) + 0.01
+    total = np.add.reduceat(weight, sparse.row_start[:-1])
+    weight = weight / total[sparse.host.state]
+    table = np.zeros(padded.available.shape)
+    table[sparse.host.state, sparse.action] = weight
+    ours = reachability_probability(sparse, goal, policy=weight)
+    overlap(ours, reachability_probability(padded, goal, policy=table.astype(np.float32)), 1e-5)
+
+
+def test_reachability():
+    for case in cases(60, 0):
+        reachability_agrees(*case)
+
+
+def test_until_is_the_formula():
+    for rng, sparse, padded, goal in cases(25, 1):
+        stay = rng.random(sparse.num_states) < 0.7
+        sparse = sparse.replace(label=np.stack([stay, goal], -1), propositions=("a", "b"))
+        for objective in ("max", "min"):
+            until = reachability_probability(sparse, goal, stay=stay, objective=objective)
+            formula = sparse_satisfaction(
+                sparse, "a U b", objective=objective, states=np.arange(sparse.num_states))
+            overlap(until, formula.solution, 1e-12)
+            again = reachability_probability(padded, goal, stay=stay, objective=objective)
+            overlap(until, again)
+
+
+FORMULAS = ("G F a & G F b", "F G a | G F b", "F (a & X F b)", "G (a -> X b)", "F a & G !b",
+            "G F a -> G F b", "a U (b & X a)")
+
+
+@pytest.mark.parametrize("formula", FORMULAS)
+def test_formulas(formula):
+    for _, sparse, padded, _ in cases(8, FORMULAS.index(formula)):
+        lazy = product(padded, formula)
+        states = np.arange(sparse.num_states)
+        for objective in ("max", "min"):
+            ours = sparse_satisfaction(sparse, formula, objective=objective, states=states)
+            theirs = optimal_satisfaction(lazy, objective=objective)
+            automaton, letter = lazy.automaton, np.asarray(lazy.letter)
+            memory = np.asarray(automaton.delta)[int(automaton.initial), letter]
+            start = theirs.replace(**{name: np.asarray(getattr(theirs, name))[states, memory]
+                                      for name in ("lower", "upper", "value")})
+            overlap(ours.solution, start)
+
+
+def test_rewards_are_those_of_every_kind_of_model():
+    for rng, sparse, padded, goal in cases(25, 2):
+        reward = rng.integers(0, 3, padded.available.shape).astype(float)
+        rows = reward[sparse.host.state, sparse.action]
+        for objective in ("max", "min"):
+            ours = total_reward(sparse, rows, goal, objective=objective)
+            assert ours.status == Status.CONVERGED
+            for model in (padded, to_dense(padded)):
+                overlap(ours, total_reward(model, reward, goal, objective=objective), 1e-4)
+            own = total_reward(sparse, rows, goal, policy=ours.policy)
+            finite = np.isfinite(ours.upper)
+            if objective == "max":
+                assert (own.upper[finite] >= ours.lower[finite] * (1 - 1e-9)).all()
+                assert np.isinf(own.value[~finite]).all()
+            else:
+                assert (own.lower[finite] <= ours.upper[finite] * (1 + 1e-9)).all()
+
+
+def test_rewards_for_ever():
+    """Against the sum of so many steps that little is left to earn, where it is finite."""
+    some = 0
+    for rng, sparse, _, _ in cases(60, 3):
+        rows = rng.integers(0, 2, sparse.num_rows) * (rng.random(sparse.num_rows) < 0.4)
+        host = sparse.host
+        for objective, best in (("max", np.maximum), ("min", np.minimum)):
+            found = total_reward(sparse, rows.astype(float), objective=objective)
+            value = np.zeros(host.num_states)
+            for _ in range(3000):
+                value = best.reduceat(rows + host.matrix @ value, host.row_start[:-1])
+            finite = np.isfinite(found.upper)
+            assert (value[finite] <= found.upper[finite] * (1 + 1e-9) + 1e-9).all()
+            assert (value[finite] >= found.lower[finite] * (1 - 1e-6) - 1e-6).all()
+            assert (value[~finite] > 10).all()
+            some += (found.value[finite] > 0).any()
+    assert some > 15
+
+
+def test_what_is_wrong_is_named():
+    _, sparse, padded, goal = next(cases(1, 0))
+    with pytest.raises(ValueError, match="at least 0"):
+        total_reward(sparse, -np.ones(sparse.num_rows), goal)
+    with pytest.raises(ValueError, match="state 0, whose rows are 0"):
+        reachability_probability(
+            sparse, goal, policy=np.full(sparse.num_states, sparse.num_rows - 1, np.int32))
+    with pytest.raises(ValueError, match="policy has shape"):
+        reachability_probability(sparse, goal, policy=np.ones(3 + sparse.num_rows))
+    with pytest.raises(ValueError, match="sums to"):
+        reachability_probability(sparse, goal, policy=np.full(sparse.num_rows, 0.9))
+    with pytest.raises(ValueError, match="named rewards"):
+        total_reward(padded, "steps", goal)
+    with pytest.raises(ValueError, match="there is no reward 'steps'"):
+        total_reward(sparse, "steps", goal)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("seed", range(10))
+def test_many(seed):
+    for case in cases(5000, 1000 + seed):
+        reachability_agrees(*case)
