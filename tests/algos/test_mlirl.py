@@ -341,8 +341,11 @@ def masked(reward=mlirl.linear_reward, **options):
         lazy, features, demonstrations, allowed=allowed, **options)
 
 
-@pytest.mark.parametrize("kind", ["boltzmann", "soft"])
-@pytest.mark.parametrize("mu", [None, 0.5])
+@pytest.mark.parametrize(("kind", "mu"), [
+    ("boltzmann", None), ("soft", 0.5),
+    pytest.param("boltzmann", 0.5, marks=pytest.mark.exhaustive),
+    pytest.param("soft", None, marks=pytest.mark.exhaustive),
+])
 def test_inside_a_mask_the_policy_and_the_gradient_are_those_of_a_model_without_the_rest(kind, mu):
     lazy, allowed, _, problem = masked()
     flat = jl.restrict(lazy, np.full(lazy.state_shape, 1 / lazy.num_states), allowed=allowed).model
