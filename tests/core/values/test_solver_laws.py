@@ -463,8 +463,9 @@ def test_derivatives(name, kind):
     def answer(x):
         changed = world.replace(**{field: x["probability"]})
         changed = model.replace(mdp=changed) if kind == "product" else changed
-        # The tightest tolerance, so that the iteration's error does not drown the differences.
-        options = {"tolerance": 1e-13} if name in UNDISCOUNTED else {}
+        # So tight that the error does not drown the differences; a tenth of it is in places more
+        # than rounding lets a solver certify.
+        options = {"tolerance": 1e-12} if name in UNDISCOUNTED else {}
         solution = solver.solve(changed, {**inputs, **x}, **options)
         return (solution.value, solution.policy) if solver.stochastic else solution.value
 
