@@ -421,9 +421,11 @@ def infeasible_starts(model: Product) -> jax.Array:
       model: one product; on the host if it is concrete, else under ``jit`` and ``vmap``.
 
     Example:
-      >>> from jaxltl.envs.gridworld import gridworld
-      >>> infeasible_starts(product(gridworld("g # ."), "G F g")).tolist()
-      [False, False, True]
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl.core.models.product import product
+      >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
+      >>> [infeasible_starts(product(world, task)).tolist() for task in ("G F g", "G !g")]
+      [[False, False], [True, True]]
     """
     problem = as_reachability(model, "max")
     graph = graph_of(problem.model)
