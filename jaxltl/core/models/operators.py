@@ -146,7 +146,10 @@ def pushforward(model: Any, mass: jax.Array) -> jax.Array:
 
 
 def _unknown(model: Any) -> str:
-    return f"{type(model).__name__} is not a model: pass an MDP, a DenseMDP, a Product or a Game."
+    advice = "pad it by to_padded(model)"
+    if type(model).__name__ != "SparseMDP":
+        advice = "pass an MDP, a DenseMDP, a Product or a Game"
+    return f"{type(model).__name__} is not a model with padded successors: {advice}."
 
 
 @expectation.register

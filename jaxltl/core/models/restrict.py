@@ -10,18 +10,21 @@ import jax
 import numpy as np
 
 from jaxltl.core.models.concrete import is_traced, to_jax
+from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, make_mdp, support
+from jaxltl.core.models.part import part_of, reachable
 from jaxltl.core.models.product import Product, flat_successor
+from jaxltl.core.models.sparse import SparseMDP
 
 
 def with_allowed(model: Any, allowed: chex.Array) -> Any:
     """The same model in which only some of the actions are left.
 
     Args:
-      model: an MDP, a DenseMDP, a Product or a Game.
-      allowed: ``bool[S, A]``, in a product ``bool[S, Q, A]``, such as the actions that lose
-        nothing or a permissive strategy's mask.
+      model: an MDP, a DenseMDP, a SparseMDP, a Product or a Game.
+      allowed: ``bool[S, A]``, in a product ``bool[S, Q, A]``, of a sparse model ``bool[R]``,
+        such as the actions that lose nothing or a permissive strategy's mask.
 
     Returns:
       A model of the same kind and states, whose `available` is the mask.
@@ -36,6 +39,8 @@ def with_allowed(model: Any, allowed: chex.Array) -> Any:
       >>> with_allowed(mdp, np.array([[False, True]])).available.tolist()
       [[False, True]]
     """
+    if isinstance(model, SparseMDP):
+        return _with_rows(model, allowed)
     shape = (*model.state_shape, model.num_actions)
     if np.shape(allowed) != shape or allowed.dtype != bool:
         raise ValueError(
@@ -53,6 +58,14 @@ def with_allowed(model: Any, allowed: chex.Array) -> Any:
     if isinstance(model, Product):
         return replace(model, allowed=allowed)
     return replace(model, available=allowed)
+
+
+def _with_rows(model: SparseMDP, allowed: chex.Array) -> SparseMDP:
+    mask = np.asarray(allowed)
+    if mask.shape != (model.num_rows,) or mask.dtype != bool:
+        raise ValueError(f"allowed is {mask.dtype}{list(mask.shape)}; expected "
+                         f"bool[{model.num_rows}], one for each choice of the sparse model.")
+    return part_of(model, np.ones(model.num_states, bool), mask)
 
 
 def _named(state: list[int]) -> str:
@@ -77,20 +90,22 @@ def restrict(
     """The states that are reachable from initial ones by allowed actions, on the host.
 
     Args:
-      model: an MDP, a Product over one, or a Game on either.
+      model: an MDP, a SparseMDP, a Product over one, or a Game on either.
       initial: ``float[S]`` or ``[S, Q]``, a distribution to start from; default the model's.
       allowed: ``bool[S, A]`` or ``[S, Q, A]``, the actions to keep, such as a permissive
-        strategy's mask; default the available ones.
+        strategy's mask; default the available ones. Of a sparse model ``bool[R]``.
 
     Returns:
-      A :class:`Restriction` to an MDP, or to a Game on one; labels and propositions are
-      the world's.
+      A :class:`Restriction` to an MDP or SparseMDP, or to a Game on one; labels and propositions
+      are the world's.
 
     Raises:
       ValueError: the world has no successor lists, or a reachable state keeps no action.
     """
     lazy = model.mdp if isinstance(model, Game) else model
     world = lazy.mdp if isinstance(lazy, Product) else lazy
+    if isinstance(world, SparseMDP):
+        return _restrict_sparse(model, lazy, initial, allowed)
     if not isinstance(world, MDP):
         raise ValueError("restrict needs successor lists; convert the world by from_dense.")
     initial = np.asarray(model.initial if initial is None else initial).ravel()
@@ -145,6 +160,30 @@ def restrict(
         return Restriction(mdp, base, memory)
     owner = to_jax(np.asarray(model.system).ravel()[states])
     return Restriction(Game(mdp, owner), base, memory)
+
+
+def _restrict_sparse(
+    model: Any, lazy: Any, initial: chex.Array | None, allowed: chex.Array | None
+) -> Restriction:
+    """The same of a sparse model, or of a product of one, which is written out for it."""
+    sparse = to_sparse(lazy)
+    start = np.asarray(model.initial if initial is None else initial).ravel()
+    if not (start > 0).any():
+        raise ValueError("the initial distribution is zero; give a state to start from.")
+    rows = np.ones(sparse.num_rows, bool)
+    if allowed is not None:
+        rows = np.asarray(allowed)
+        if rows.shape != (sparse.num_rows,):
+            raise ValueError(f"allowed has shape {rows.shape}; expected ({sparse.num_rows},), the "
+                             "choices of to_sparse(model).")
+    states = reachable(sparse, start > 0, rows)
+    found = part_of(replace(sparse, initial=start / start.sum()), states, rows)
+    place = np.flatnonzero(states)
+    num_memory = lazy.num_memory if isinstance(lazy, Product) else 1
+    base, memory = to_jax(tuple(x.astype(np.int32) for x in np.divmod(place, num_memory)))
+    if not isinstance(model, Game):
+        return Restriction(found, base, memory)
+    return Restriction(Game(found, to_jax(np.asarray(model.system).ravel()[place])), base, memory)
 
 
 def _columns(s: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

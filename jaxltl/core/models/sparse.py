@@ -14,6 +14,9 @@ from jaxltl.core.host.rows import LARGE
 from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.models.mdp import checked_initial, checked_label
 
+_PADDED = ("this takes models that are padded: give to_padded(model). Sparse models have choices "
+           "in rows, and are solved by reachability_probability, total_reward, optimal_value, "
+           "policy_value, optimal_satisfaction, average_reward and prepare.")
 Array = Any  # NumPy's in double precision as it is read, or JAX's
 
 
@@ -84,6 +87,20 @@ class SparseMDP:
     def is_chain(self) -> bool:
         """Whether every state has one choice."""
         return self.num_rows == self.num_states
+
+    @property
+    def available(self) -> Array:
+        """Of padded models only.
+
+        Raises:
+          ValueError: always, with what to do.
+        """
+        raise ValueError(_PADDED)
+
+    @property
+    def num_actions(self) -> int:
+        """As `available`."""
+        raise ValueError(_PADDED)
 
     @property
     def state_shape(self) -> tuple[int, ...]:

@@ -30,6 +30,7 @@ from jaxltl.core.models.operators import (
 from jaxltl.core.models.tables import action_columns, mean, table
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values import newton
+from jaxltl.core.values.enclosed import discounted, is_sparse
 from jaxltl.core.values.evidence import Enclosure, enclose, refuse, rounding_unit
 from jaxltl.core.values.fixed_point import implicit
 from jaxltl.core.values.iterate import iterate
@@ -185,7 +186,8 @@ def policy_value(
     Args:
       model: the model.
       policy: ``float[S, A]`` or ``int32[S]``.
-      reward: ``float[S, A]`` or ``float[S, A, K]``.
+      reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
+        :func:`~jaxltl.core.models.sparse.row_reward`.
       discount: scalar in [0, 1).
       tolerance: certified absolute error asked for; default: what the dtype allows.
       max_steps: sweeps at most.
@@ -205,6 +207,8 @@ def policy_value(
       >>> round(policy_value(mdp, jnp.array([0]), jnp.ones((1, 1)), 0.5).value.item(), 4)
       2.0
     """
+    if is_sparse(model):
+        return discounted(model, reward, discount, policy=policy, tolerance=tolerance)
     require_policy(model, policy)
     return _policy_value(model, policy, reward, discount, tolerance, max_steps)
 
@@ -239,7 +243,6 @@ def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solu
 # --- optimal values --------------------------------------------------------------------------
 
 
-@partial(jax.jit, static_argnames=("method",))
 def optimal_value(
     model: Any,
     reward: jax.Array,
@@ -256,7 +259,8 @@ def optimal_value(
 
     Args:
       model: the model.
-      reward: ``float[S, A]`` or ``float[S, A, K]``.
+      reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
+        :func:`~jaxltl.core.models.sparse.row_reward`.
       discount: scalar in [0, 1).
       method: ``"policy_iteration"`` (Howard 1960, its systems solved to a hundredth),
         ``"modified_policy_iteration"`` (Puterman and Shin 1978: after each sweep of the
@@ -283,6 +287,24 @@ def optimal_value(
       >>> [round(v, 4) for v in best.value.tolist()], best.policy.tolist()
       ([1.0, 2.0], [1, 0])
     """
+    if is_sparse(model):
+        return discounted(model, reward, discount, tolerance=tolerance)
+    return _optimal_value(
+        model, reward, discount, method=method, tolerance=tolerance, max_steps=max_steps,
+        evaluation_sweeps=evaluation_sweeps)
+
+
+@partial(jax.jit, static_argnames=("method",))
+def _optimal_value(
+    model: Any,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    *,
+    method: str,
+    tolerance: jax.Array | float | None,
+    max_steps: jax.Array | int,
+    evaluation_sweeps: jax.Array | int,
+) -> Solution:
     if method not in _METHODS:
         raise ValueError(f"method={method!r}; choose {', '.join(_METHODS[:-1])} or {_METHODS[-1]}.")
     if method == "auto":

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.host import optimal
+from jaxltl.core.host.discounted import discounted_value
 from jaxltl.core.host.optimal import Enclosed
 from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.models.sparse import SparseMDP, row_reward
 from jaxltl.core.types import (
     Method,
     Solution,
@@ -171,6 +172,40 @@ def reachability(
     found = optimal.reachability(
         host, target, maximize=objective == "max", stay=stay, tolerance=asked)
     return given_policy(solution_of(model, sparse, found, asked, relative=False), policy)
+
+
+def discounted(
+    model: Any, reward: Any, discount: Any, *, policy: Any = None, tolerance: Any = None
+) -> Solution:
+    """Discounted values of a sparse model; arguments as of the functions for padded ones.
+
+    Rewards are named, or arrays on states, choices or transitions, see
+    :func:`~jaxltl.core.models.sparse.row_reward`.
+    """
+    if is_traced((model, reward, discount, policy, tolerance)):
+        raise ValueError("a sparse model is read on the host: give concrete arrays, or pad it by "
+                         "to_padded(model) to solve it inside jit.")
+    if not 0 <= float(discount) < 1:
+        raise ValueError(f"discount={float(discount):.6g}; it must be at least 0 and below 1.")
+    sparse = to_sparse(model)
+    earned = row_reward(sparse, reward)
+    if not np.isfinite(earned).all():
+        raise ValueError("the reward of a choice is not finite; give numbers.")
+    host = sparse.host
+    largest = float(np.abs(earned).max()) / (1 - float(discount))
+    asked = 1e-8 * max(largest, 1e-300) if tolerance is None else 2 * float(tolerance)
+    if policy is not None:
+        host, weight = chain_of(model, sparse, policy)
+        earned = np.add.reduceat(weight * earned, np.asarray(sparse.row_start)[:-1])
+    found = discounted_value(host, earned, float(discount), maximize=True, tolerance=asked)
+    width = found.upper - found.lower
+    status = Status.CONVERGED if (width <= asked).all() else Status.PRECISION
+    parts: dict[str, Any] = {
+        "value": found.value, "policy": found.row.astype(np.int32), "lower": found.lower,
+        "upper": found.upper, "residual": np.float64(found.residual),
+        "num_steps": np.int32(found.rounds), "status": np.int32(status)}
+    parts = {name: x.reshape(model.state_shape) if np.ndim(x) else x for name, x in parts.items()}
+    return given_policy(Solution(**parts, method=Method(found.method)), policy)
 
 
 def default_tolerance(model: Any) -> float:

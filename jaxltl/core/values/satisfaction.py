@@ -20,12 +20,14 @@ from jaxltl.core.models.concrete import is_traced, namespace, to_jax
 from jaxltl.core.models.operators import is_deterministic, require_policy
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Solution
+from jaxltl.core.values.enclosed import is_sparse
 from jaxltl.core.values.reachability import (
     QUICK_LIMIT,
     action_matrices,
     complement,
     reachability_probability,
 )
+from jaxltl.core.values.sparse_satisfaction import product_satisfaction
 
 
 def satisfaction_probability(
@@ -43,7 +45,8 @@ def satisfaction_probability(
 
     Args:
       model: the product.
-      policy: ``float[S, Q, A]`` or ``int32[S, Q]``.
+      policy: ``float[S, Q, A]`` or ``int32[S, Q]``; where the world is sparse ``float[R, Q]``, or
+        its rows ``int32[S, Q]``.
       method, tolerance: as in :func:`reachability_probability`.
 
     Returns:
@@ -53,6 +56,8 @@ def satisfaction_probability(
     Differentiable in the policy and in the world's transition probabilities, with the
     support held fixed.
     """
+    if is_sparse(model):
+        return product_satisfaction(model, policy=policy, tolerance=tolerance)
     kind = model.automaton.acceptance
     if kind in ("cosafe", "safety"):
         target = model.final if kind == "cosafe" else _not_final(model)
@@ -108,11 +113,14 @@ def optimal_satisfaction(
 
     Returns:
       :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``, memoryless in
-      the product: its memory is the automaton's state.
+      the product: its memory is the automaton's state. Where the world is sparse, it is one of the
+      best policies, of the world's rows.
 
     Raises:
       ValueError: the objective is unknown.
     """
+    if objective in ("max", "min") and is_sparse(model):
+        return product_satisfaction(model, objective=objective, tolerance=tolerance)
     problem = as_reachability(model, objective)
     found = reachability_probability(
         problem.model, problem.target, objective=problem.objective, tolerance=tolerance,

@@ -12,10 +12,14 @@ from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.host.accepting import accepting_region
 from jaxltl.core.host.product import HostProduct, host_product, without_memory
+from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.logic.ltl import as_formula
+from jaxltl.core.models.operators import is_deterministic
+from jaxltl.core.models.product import Product
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.models.state_formulas import letters_of
-from jaxltl.core.types import Solution
+from jaxltl.core.types import Solution, require_shape
+from jaxltl.core.values.enclosed import chain_of
 from jaxltl.core.values.reachability import reachability_probability
 
 
@@ -84,6 +88,16 @@ def sparse_satisfaction(
     yes, no = universal_states(automaton), ~live_states(automaton)
     on_entry = label_on == "entry"
     product = _product(model, automaton, letter, states, on_entry, yes | no)
+    found, row = _best(product, automaton, letter, yes, no, on_entry, objective, tolerance)
+    return Satisfaction(
+        at_states(found, product.start), automaton, letter, product, product.base_row[row])
+
+
+def _best(
+    product: HostProduct, automaton: Automaton, letter: np.ndarray, yes: np.ndarray,
+    no: np.ndarray, on_entry: bool, objective: str, tolerance: float | None,
+) -> tuple[Solution, np.ndarray]:
+    """The best probability from all states of a product, and the rows that attain it."""
     opposite = automaton.acceptance == "safety" or (
         automaton.acceptance in ("buchi", "parity") and objective == "min")
     goal: Any = (no if opposite else yes)[product.memory]
@@ -104,9 +118,66 @@ def sparse_satisfaction(
     row = np.asarray(found.policy)
     if visiting is not None:
         row = np.where(visiting.region, visiting.row, row)
-    return Satisfaction(
-        at_states(opposite_event(found) if opposite else found, product.start), automaton, letter,
-        product, product.base_row[row])
+    return (opposite_event(found) if opposite else found), row
+
+
+def product_satisfaction(
+    model: Product, *, policy: Any = None, objective: str = "max", tolerance: Any = None
+) -> Solution:
+    """The same from every pair of a state and a memory of a product of a sparse model.
+
+    Args:
+      model: a product of a concrete sparse model.
+      policy: rows of the world ``int32[S, Q]``, or their weights ``float[R, Q]``, to be evaluated;
+        default: optimise.
+      objective: ``"max"`` or ``"min"``; ignored when a policy is given.
+      tolerance: of :func:`~jaxltl.core.values.reachability.reachability_probability`.
+
+    Returns:
+      :class:`Solution`; `value` is ``float64[S, Q]``, `policy` rows of the world, ``int32[S, Q]``.
+
+    Raises:
+      ValueError: the product's actions are restricted, or a policy is none.
+    """
+    if model.allowed is not None:
+        raise ValueError("a product of a sparse model takes no mask of actions; restrict the world "
+                         "by with_allowed(world, rows), or write the product out by to_sparse.")
+    world: Any = model.mdp
+    task = model.automaton
+    automaton = replace(
+        task, delta=np.asarray(task.delta), priority=np.asarray(task.priority))
+    letter, shape = np.asarray(model.letter), model.state_shape
+    on_entry = model.label_on == "entry"
+    state, memory = (x.ravel() for x in np.indices(shape))
+    product = host_product(
+        world.host, automaton.delta, letter, state, memory, on_entry=on_entry)
+    if policy is not None:
+        product = product._replace(host=_chain(product, model, policy))
+    found, row = _best(
+        product, automaton, letter, universal_states(automaton), ~live_states(automaton), on_entry,
+        "max" if policy is not None else objective, tolerance)
+    parts: dict[str, Any] = {
+        name: np.asarray(getattr(found, name)).reshape(shape)
+        for name in ("value", "lower", "upper")}
+    parts["policy"] = (np.asarray(policy) if policy is not None
+                       else product.base_row[row].astype(np.int32).reshape(shape))
+    return replace(found, **parts)
+
+
+def _chain(product: HostProduct, model: Product, policy: Any) -> HostMDP:
+    """The chain of a policy of the world's rows."""
+    policy = np.asarray(policy)
+    written = as_sparse(product)
+    memory = product.memory[product.host.state]
+    if is_deterministic(policy):
+        require_shape("policy", policy, model.state_shape)
+        taken = policy.ravel()[product.host.state] == product.base_row
+        weight = taken.astype(np.float64)
+    else:
+        world: Any = model.mdp
+        require_shape("policy", policy, (world.num_rows, model.num_memory))
+        weight = policy[product.base_row, memory]
+    return chain_of(written, written, weight)[0]
 
 
 def _product(

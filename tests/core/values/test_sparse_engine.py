@@ -6,9 +6,11 @@ import pytest
 from jaxltl.core.models.convert import to_padded, to_sparse
 from jaxltl.core.models.mdp import to_dense
 from jaxltl.core.models.product import product
+from jaxltl.core.models.restrict import restrict, with_allowed
 from jaxltl.core.types import Status
+from jaxltl.core.values.discounted import optimal_value, policy_value
 from jaxltl.core.values.reachability import reachability_probability
-from jaxltl.core.values.satisfaction import optimal_satisfaction
+from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
 from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
 from jaxltl.core.values.total_reward import total_reward
 from tests.core.models.test_sparse import random_padded
@@ -107,6 +109,70 @@ def test_rewards_are_those_of_every_kind_of_model():
                 assert np.isinf(own.value[~finite]).all()
             else:
                 assert (own.lower[finite] <= ours.upper[finite] * (1 + 1e-9)).all()
+
+
+@pytest.mark.parametrize("formula", FORMULAS[:4])
+@pytest.mark.parametrize("label_on", ["entry", "exit"])
+def test_lazy_products_of_sparse_worlds(formula, label_on):
+    for rng, sparse, padded, _ in cases(4, 10 + FORMULAS.index(formula)):
+        ours, theirs = (product(m, formula, label_on=label_on) for m in (sparse, padded))
+        np.testing.assert_array_equal(ours.letter, theirs.letter)
+        for objective in ("max", "min"):
+            best = optimal_satisfaction(ours, objective=objective)
+            overlap(best, optimal_satisfaction(theirs, objective=objective))
+            own = satisfaction_probability(ours, best.policy)
+            if objective == "max":
+                assert (own.upper >= best.lower - 1e-12).all()
+            else:
+                assert (own.lower <= best.upper + 1e-12).all()
+        weight = rng.random((sparse.num_rows, ours.num_memory)) + 0.01
+        weight /= np.add.reduceat(weight, sparse.row_start[:-1])[sparse.host.state]
+        table = np.zeros((*ours.state_shape, padded.num_actions), np.float32)
+        table[sparse.host.state, :, sparse.action] = weight
+        overlap(satisfaction_probability(ours, weight), satisfaction_probability(theirs, table),
+                1e-4)
+
+
+def test_discounted_values():
+    for rng, sparse, padded, _ in cases(20, 4):
+        reward = rng.normal(size=padded.available.shape)
+        rows = reward[sparse.host.state, sparse.action]
+        discount = float(rng.choice([0.0, 0.5, 0.95, 0.999]))
+        ours = optimal_value(sparse, rows, discount)
+        assert ours.status == Status.CONVERGED
+        close(ours, optimal_value(padded, reward, discount), discount)
+        own = policy_value(sparse, ours.policy, rows, discount)
+        assert (own.upper >= ours.lower - 1e-9 / (1 - discount)).all()
+        value = np.zeros(sparse.num_states)
+        for _ in range(200):
+            image = rows + discount * (sparse.host.matrix @ value)
+            value = np.maximum.reduceat(image, sparse.row_start[:-1])
+        far = discount**200 * np.abs(rows).max() / (1 - discount) + 1e-9
+        assert (ours.lower <= value + far).all()
+        assert (value - far <= ours.upper).all()
+
+
+def close(ours, theirs, discount):
+    np.testing.assert_allclose(ours.value, theirs.value, atol=1e-4 / (1 - discount), rtol=1e-4)
+
+
+def test_restricted_models():
+    for rng, sparse, padded, goal in cases(20, 5):
+        start = np.zeros(sparse.num_states)
+        start[rng.integers(sparse.num_states)] = 1
+        ours, theirs = restrict(sparse, start), restrict(padded, start)
+        np.testing.assert_array_equal(ours.base_state, theirs.base_state)
+        theirs = to_sparse(theirs.model)
+        np.testing.assert_array_equal(ours.model.row_start, theirs.row_start)
+        np.testing.assert_array_equal(ours.model.successor, theirs.successor)
+        np.testing.assert_array_equal(ours.model.action, theirs.action)
+        np.testing.assert_allclose(ours.model.probability, theirs.probability, atol=1e-6)
+        rows = np.zeros(sparse.num_rows, bool)
+        rows[sparse.host.row_start[:-1]] = True
+        first = with_allowed(sparse, rows)
+        assert first.is_chain
+        overlap(reachability_probability(first, goal),
+                reachability_probability(sparse, goal, policy=sparse.row_start[:-1]), 1e-12)
 
 
 def test_rewards_for_ever():
