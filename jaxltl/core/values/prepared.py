@@ -220,6 +220,8 @@ def solve_prepared(
     Differentiable, forward and reverse, in the probabilities, in the rewards and in the weights of
     a policy, along distributions; of an optimum with its policy held fixed.
     """
+    probability, reward, policy = (
+        None if x is None else jnp.asarray(x) for x in (probability, reward, policy))
     if probability is not None:
         require_shape("probability", probability, prepared.probability.shape)
     if reward is not None:
@@ -361,12 +363,14 @@ def _decided(prepared: Prepared, share: _Shares | None) -> _Decided:
     goal = size if prepared.question == "probability" else size + 1
     seed = jnp.zeros(size + 3, bool).at[goal].set(True)
     reached = meets(prepared.segments, support, seed, prepared.cyclic)
-    # What never gets there may be met, or it may not.
-    never = ~reached
+    # States that never get there; other places are parts of rows, of which none may be taken.
+    states = jnp.zeros(size + 3, bool).at[prepared.place].set(True)
+    never = states & ~reached
     never = never.at[size:].set(jnp.asarray([False, False, True]))
     lost = meets(prepared.segments, support, never, prepared.cyclic)
     if prepared.question == "probability":
-        return _Decided(reached & lost, reached & ~lost, jnp.zeros(size + 3, bool))
+        return _Decided(
+            ~states | (reached & lost), states & reached & ~lost, jnp.zeros(size + 3, bool))
     return _Decided(~lost, jnp.zeros(size + 3, bool), lost)
 
 
@@ -382,14 +386,17 @@ class _Found(NamedTuple):
     proven: jax.Array
 
 
+def _least(prepared: Prepared) -> float:
+    """What a sum may lose to numbers that are too small."""
+    return 4 * prepared.terms * float(jnp.finfo(prepared.probability.dtype).tiny)
+
+
 def _enclosed(
     prepared: Prepared, decided: _Decided | None, tolerance: jax.Array, max_steps: Any
 ) -> _Found:
     prepared = lax.stop_gradient(prepared)
     dtype, size = prepared.probability.dtype, prepared.size
-    info = jnp.finfo(dtype)
-    unit = prepared.terms * float(info.eps)
-    least = 4 * prepared.terms * float(info.tiny)
+    unit, least = prepared.terms * float(jnp.finfo(dtype).eps), _least(prepared)
     given: dict[str, Any] = {"maximize": prepared.objective != "min"}
     if decided is not None:
         given["keep"] = decided.keep[:size].astype(dtype)
@@ -539,7 +546,8 @@ def _answer(
     value = everywhere(capped, True)
     width = jnp.where(lower == upper, 0, upper - jnp.where(jnp.isfinite(lower), lower, 0))
     scale = jnp.where(jnp.isfinite(upper), upper, 1) if relative else 1
-    narrow = jnp.all(width <= tolerance * scale)
+    floor = 1e3 * _SLACK * _least(prepared)  # what rewards of zero are known to
+    narrow = jnp.all((width <= tolerance * scale + floor) & (lower <= upper))
     converged = found.proven & narrow
     numbers = jnp.all(~jnp.isnan(lax.stop_gradient(value)))
     status = status_code(converged, finite & numbers, found.proven, valid=valid | ~finite)
