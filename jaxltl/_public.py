@@ -48,19 +48,37 @@ from jaxltl.core.models.restrict import restrict, with_allowed
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse, row_reward
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, rollout
 from jaxltl.core.types import NotConverged, Solution, Status, check
+from jaxltl.core.values.answer import answer
+from jaxltl.core.values.average_reward import average_reward
 from jaxltl.core.values.boltzmann import boltzmann_fixed_points, boltzmann_value
+from jaxltl.core.values.bounded import (
+    bounded_reachability,
+    cumulative_reward,
+    instantaneous_reward,
+    next_probability,
+    reward_bounded_reachability,
+)
 from jaxltl.core.values.discounted import optimal_value, policy_value
 from jaxltl.core.values.mean_payoff import mean_payoff
 from jaxltl.core.values.minimax import minimax_value, strategy_value
+from jaxltl.core.values.multi_objective import achievable, multi, pareto
+from jaxltl.core.values.objectives import Objective
 from jaxltl.core.values.occupancy import feature_expectation, occupancy_measure
 from jaxltl.core.values.optimal_actions import OptimalActions, optimal_actions
 from jaxltl.core.values.performance import task_performance, task_performances
+from jaxltl.core.values.prepared import Prepared, prepare, solve_prepared
 from jaxltl.core.values.reachability import reachability_probability
 from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
 from jaxltl.core.values.soft import soft_value
+from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
+from jaxltl.core.values.total_reward import total_reward
 from jaxltl.envs.gridworld import gridworld
+from jaxltl.envs.gymnasium_tables import from_gymnasium
 from jaxltl.envs.robots import grid_game
 from jaxltl.io.hoa import read_hoa, write_hoa
+from jaxltl.io.model_files import read_model, write_model
+from jaxltl.io.reward_machine import machine_reward, read_reward_machine
+from jaxltl.io.storm import from_stormpy, to_stormpy
 
 
 @picture.register
@@ -81,9 +99,11 @@ __all__ = [
     "Game",
     "Monitor",
     "NotConverged",
+    "Objective",
     "OptimalActions",
     "Parity",
     "Permissive",
+    "Prepared",
     "Product",
     "Rewards",
     "Solution",
@@ -93,17 +113,22 @@ __all__ = [
     "Verdict",
     "Verification",
     "Winning",
+    "achievable",
     "almost_sure_buchi",
     "almost_surely_reaching",
+    "answer",
     "apply_strategy",
     "attractor",
+    "average_reward",
     "avoidable",
     "boltzmann_fixed_points",
     "boltzmann_value",
+    "bounded_reachability",
     "buchi",
     "check",
     "cobuchi",
     "complement",
+    "cumulative_reward",
     "end_components",
     "exists_successor",
     "expectation",
@@ -111,16 +136,20 @@ __all__ = [
     "find_difference",
     "forall_successor",
     "from_dense",
+    "from_gymnasium",
+    "from_stormpy",
     "generalized_buchi",
     "gr1",
     "grid_game",
     "gridworld",
     "holds_on_lasso",
+    "instantaneous_reward",
     "is_equivalent",
     "letters",
     "lift_memory",
     "lift_policy",
     "lift_trajectories",
+    "machine_reward",
     "make_automaton",
     "make_game",
     "make_mdp",
@@ -130,14 +159,18 @@ __all__ = [
     "mean_payoff",
     "minimax_value",
     "monitor_step",
+    "multi",
+    "next_probability",
     "occupancy_measure",
     "optimal_actions",
     "optimal_satisfaction",
     "optimal_value",
+    "pareto",
     "parity",
     "parse_ltl",
     "permissive_strategy",
     "policy_value",
+    "prepare",
     "product",
     "project_policy",
     "project_trajectories",
@@ -145,7 +178,10 @@ __all__ = [
     "reach",
     "reachability_probability",
     "read_hoa",
+    "read_model",
+    "read_reward_machine",
     "restrict",
+    "reward_bounded_reachability",
     "rollout",
     "row_reward",
     "safety",
@@ -153,6 +189,8 @@ __all__ = [
     "satisfaction_probability",
     "shield",
     "soft_value",
+    "solve_prepared",
+    "sparse_satisfaction",
     "stack_products",
     "states_where",
     "strategy_value",
@@ -163,9 +201,12 @@ __all__ = [
     "to_dense",
     "to_padded",
     "to_sparse",
+    "to_stormpy",
+    "total_reward",
     "verdict",
     "verify",
     "winning_region",
     "with_allowed",
     "write_hoa",
+    "write_model",
 ]

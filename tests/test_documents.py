@@ -11,13 +11,15 @@ from nbclient import NotebookClient
 ROOT = Path(__file__).parent.parent
 
 
-def test_the_readme_example_runs():
+def test_the_readme_example_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     names: dict = {}
     for code in blocks:
         exec(compile(code, "README.md", "exec"), names)
     assert names["allowed"].maximal and not names["state"].violations
+    assert names["model"].num_transitions == names["coin"].num_transitions == 6
     assert names["metrics"].loss.shape == (4, 20)
     assert (names["metrics"].loss[:, -1] < names["metrics"].loss[:, 0]).all()
 
