@@ -15,7 +15,7 @@ from jaxltl.core.host.optimal import Reduced, towards
 from jaxltl.core.host.rows import Booleans, Integers, spans
 from jaxltl.core.host.schedule import GOAL, LOST, ONE, Nodes, Schedule, schedule
 from jaxltl.core.host.sparse import Floats, HostMDP
-from jaxltl.core.host.sparse_graph import Components, forced, reaching, surely_reaching
+from jaxltl.core.host.sparse_graph import forced, reaching, surely_reaching
 
 
 class Loops(NamedTuple):
@@ -26,14 +26,14 @@ class Loops(NamedTuple):
       group: ``int[E]``, their groups, ascending.
       row: ``int[L]``, the rows.
       row_group: ``int[L]``.
-      count: how many groups there are.
+      groups: how many there are.
     """
 
     entry: Integers
     group: Integers
     row: Integers
     row_group: Integers
-    count: int
+    groups: int
 
 
 class Circles(NamedTuple):
@@ -185,7 +185,8 @@ def _own(
     """The nodes whose rows states take, and the rows of the others."""
     mdp, whole, part = reduced.mdp, reduced.whole, reduced.part
     mine = mdp.state[whole.row[whole.mdp.row_start[:-1]]]  # the state that each node is
-    chosen, node = reduced.row, np.arange(mine.size)
+    chosen: Any = reduced.row
+    node: Any = np.arange(mine.size)
     if part is not None and reduced.components is not None:
         chosen = towards(whole.mdp, reduced.components, part.row[reduced.row][part.node])
         node = part.node
@@ -281,4 +282,4 @@ def plan_policy(
 def _terms(loops: Loops | None) -> int:
     if loops is None:
         return 6
-    return 10 + int(np.bincount(loops.group, minlength=loops.count).max(initial=0))
+    return 10 + int(np.bincount(loops.group, minlength=loops.groups).max(initial=0))

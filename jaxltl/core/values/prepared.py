@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,8 +19,7 @@ from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.models.sparse import Rewards, row_reward
-from jaxltl.core.types import Solution, Status, require_shape, row_tolerance, status_code
-from jaxltl.core.values.evidence import refuse
+from jaxltl.core.types import Solution, require_shape, row_tolerance, status_code
 from jaxltl.core.values.fixed_point import implicit
 from jaxltl.core.values.sweeps import Blocks, Chosen, chosen_names, meets, sweep
 
@@ -158,7 +158,7 @@ def _prepared(host: Any, plan: Plan, cost: Any, objective: str) -> Prepared:
         host.probability, np.zeros(host.num_rows) if cost is None else cost, [1.0, 0.0]])
     if plan.loops is not None:
         rest = np.bincount(plan.loops.group, host.probability[plan.loops.entry],
-                           plan.loops.count)
+                           plan.loops.groups)
         scale = np.ones(host.num_rows)
         scale[plan.loops.row] = 1 / np.maximum(rest, 1e-300)[plan.loops.row_group]
         vector[: host.num_transitions] *= scale[host.row]
@@ -178,7 +178,7 @@ def _prepared(host: Any, plan: Plan, cost: Any, objective: str) -> Prepared:
         question="probability" if cost is None else "reward", objective=objective,
         cyclic=plan.schedule.segments[1].target.size > 0, levels=plan.schedule.levels,
         choices=plan.schedule.choices, terms=plan.terms + blocks[0].target.shape[2],
-        groups=0 if plan.loops is None else plan.loops.count)
+        groups=0 if plan.loops is None else plan.loops.groups)
     return to_jax(found)
 
 
@@ -209,10 +209,10 @@ def solve_prepared(
       max_steps: passes at most.
 
     Returns:
-      :class:`Solution`; `value` ``float[S]``, exactly what the graph says where it decides, `policy`
-      ``int32[S]``, rows that attain the bound on the safe side, or the given policy. ``INVALID``
-      where probabilities, rewards or the policy are not as they must be, ``NONFINITE`` where they
-      are NaN or infinite.
+      :class:`Solution`; `value` ``float[S]``, exactly what the graph says where it decides,
+      `policy` ``int32[S]``, rows that attain the bound on the safe side, or the given policy.
+      ``INVALID`` where probabilities, rewards or the policy are not as they must be,
+      ``NONFINITE`` where they are NaN or infinite.
 
     Raises:
       ValueError: a shape is wrong, or there is a policy and none was prepared for, or no policy.
@@ -260,7 +260,7 @@ def _solve(
         decided = _decided(prepared, share)
     found = _enclosed(prepared, decided, tolerance, max_steps)
     value = _attached(prepared, found, decided)
-    return _answer(prepared, found, decided, value, tolerance, finite, valid, policy, taken)
+    return _answer(prepared, found, decided, value, tolerance, finite, valid, taken)
 
 
 class _Shares(NamedTuple):
@@ -339,9 +339,9 @@ def _refilled(
         p, r = p * scale[prepared.entry_row], r * scale
     vector = jnp.concatenate([p, r, jnp.asarray([1, 0], dtype)])
     one, two, three = (
-        x.replace(weight=vector.at[x.source].get(mode="promise_in_bounds"))
+        replace(x, weight=vector.at[x.source].get(mode="promise_in_bounds"))
         for x in prepared.segments)
-    return prepared.replace(segments=(one, two, three))
+    return replace(prepared, segments=(one, two, three))
 
 
 class _Decided(NamedTuple):
@@ -436,8 +436,8 @@ def _circling(
     """Bounds from both sides of what has circles."""
     before, core, after = prepared.segments
     size, relative = prepared.size, prepared.question == "reward"
-    down = partial(sweep, factor=1 - unit, shift=-least, **given)
-    up = partial(sweep, factor=1 + unit, shift=least, **given)
+    down: Any = partial(sweep, factor=1 - unit, shift=-least, **given)
+    up: Any = partial(sweep, factor=1 + unit, shift=least, **given)
     span = slice(core.first, core.last)
     dtype = start.dtype
     ceiling = jnp.inf if relative else 1.0
@@ -481,7 +481,7 @@ def _circling(
     if "keep" not in given:
         # Greedy in a bound that a pass does not worsen: its policy attains it.
         safe = low if given["maximize"] else jnp.where(s.proven, high, low)
-        parts = []
+        parts: list[Any] = []
         for part in prepared.segments:
             safe, ranks = sweep(part, safe, choose=True, **given)
             parts.append(ranks)
@@ -526,42 +526,42 @@ def _attached(prepared: Prepared, found: _Found, decided: _Decided | None) -> ja
 
 def _answer(
     prepared: Prepared, found: _Found, decided: _Decided | None, value: jax.Array,
-    tolerance: jax.Array, finite: jax.Array, valid: jax.Array, policy: Any, taken: Any,
+    tolerance: jax.Array, finite: jax.Array, valid: jax.Array, taken: Any,
 ) -> Solution:
+    """The answer of the states. All is judged and refused at the nodes, which may be few."""
     dtype, size = prepared.probability.dtype, prepared.size
     relative = prepared.question == "reward"
     most = jnp.inf if relative else 1.0
-    ends = jnp.asarray([0, 0, jnp.inf] if relative else [1, 0, 0], dtype)
-
-    def everywhere(x: jax.Array, exact: bool) -> jax.Array:
-        if decided is not None:
-            x = jnp.where(decided.infinite[:size], jnp.inf, x)
-            if exact:
-                fixed = ~decided.keep[:size] & ~decided.infinite[:size]
-                x = jnp.where(fixed, decided.put[:size].astype(dtype), x)
-        return jnp.concatenate([x, ends]).at[prepared.place].get(mode="promise_in_bounds")
-
-    capped = value + lax.stop_gradient(jnp.clip(value, 0, most) - value)
-    lower, upper = everywhere(found.lower, True), everywhere(jnp.minimum(found.upper, most), True)
-    value = everywhere(capped, True)
+    value = value + lax.stop_gradient(jnp.clip(value, 0, most) - value)
+    lower, upper = found.lower, jnp.minimum(found.upper, most)
+    if decided is not None:
+        keep, put, infinite = (x[:size] for x in decided)
+        known = jnp.where(infinite, jnp.inf, put.astype(dtype))
+        value, lower, upper = (jnp.where(keep, x, known) for x in (value, lower, upper))
     width = jnp.where(lower == upper, 0, upper - jnp.where(jnp.isfinite(lower), lower, 0))
     scale = jnp.where(jnp.isfinite(upper), upper, 1) if relative else 1
     floor = 1e3 * _SLACK * _least(prepared)  # what rewards of zero are known to
     narrow = jnp.all((width <= tolerance * scale + floor) & (lower <= upper))
-    converged = found.proven & narrow
-    numbers = jnp.all(~jnp.isnan(lax.stop_gradient(value)))
-    status = status_code(converged, finite & numbers, found.proven, valid=valid | ~finite)
-    rows = _policy(prepared, found) if taken is None else taken
-    kind = Solution(
-        value=value, policy=rows, lower=lower, upper=upper, residual=found.residual,
-        num_steps=found.steps, status=status)
-    return refuse(kind, rows, valid & finite).replace(status=status)
+    finite &= jnp.all(~jnp.isnan(lax.stop_gradient(value)))
+    status = status_code(found.proven & narrow, finite, found.proven, valid=valid | ~finite)
+    good = valid & finite
+    ends = jnp.asarray([0, 0, jnp.inf] if relative else [1, 0, 0], dtype)
+
+    def everywhere(x: jax.Array, bad: float) -> jax.Array:
+        x = jnp.where(good, jnp.concatenate([x, ends]), jnp.asarray(bad, dtype))
+        return x.at[prepared.place].get(mode="promise_in_bounds")
+
+    return Solution(
+        value=everywhere(value, jnp.nan), lower=everywhere(lower, -jnp.inf),
+        upper=everywhere(upper, jnp.inf),
+        policy=_policy(prepared, found) if taken is None else taken,
+        residual=jnp.where(good, found.residual, jnp.nan), num_steps=found.steps, status=status)
 
 
 def _policy(prepared: Prepared, found: _Found) -> jax.Array:
     """The rows of an optimum, ``int32[S]``."""
     names = jnp.concatenate([x.name for x in prepared.segments])
-    if not names.shape[0]:
+    if found.rank is None or not names.shape[0]:
         return prepared.row
     chosen = chosen_names(names, found.rank, prepared.choices)
     own = prepared.own
@@ -590,6 +590,3 @@ def _going_round(prepared: Prepared, rows: jax.Array) -> jax.Array:
 
     _, picked, _ = lax.while_loop(lambda c: c[2], further, (there, picked, jnp.asarray(True)))
     return rows.at[state].set(picked, unique_indices=True)
-
-
-__all__ = ["Prepared", "Status", "prepare", "solve_prepared"]

@@ -40,7 +40,8 @@ def escaping(model, among):
     rows = []
     for r, (a, b) in enumerate(zip(host.entry_start[:-1], host.entry_start[1:], strict=True)):
         last, share = [SIZE - 1][: among[r]], 1 - 0.1 * among[r]
-        rows.append((np.append(host.successor[a:b], last), np.append(share * p[a:b], [0.1][: among[r]])))
+        tenth = [0.1][: among[r]]
+        rows.append((np.append(host.successor[a:b], last), np.append(share * p[a:b], tenth)))
     return make_sparse(
         model.row_start, np.cumsum([0] + [x.size for x, _ in rows]),
         np.concatenate([x for x, _ in rows]).astype(int), np.concatenate([w for _, w in rows]))
@@ -54,7 +55,8 @@ def random_case(seed, question="probability"):
         return rng, model, np.arange(SIZE) == SIZE - 1, rng.random(SIZE) < 0.9, None
     target = np.arange(SIZE) >= SIZE - 2
     if seed % 2 == 0:  # some rows of most states lead to the target, those of state 1 do not
-        model = escaping(model, ((rng.random(model.num_rows) < 0.8) & (model.host.state != 1)).astype(int))
+        ends = (rng.random(model.num_rows) < 0.8) & (model.host.state != 1)
+        model = escaping(model, ends.astype(int))
     reward = rng.random(model.num_rows) * (rng.random(model.num_rows) < 0.7)
     return rng, model, target, None, reward
 
@@ -252,7 +254,8 @@ def test_other_rewards_are_judged(walk):
     prepared = prepare(model, target | (np.arange(5) == 0), reward=[0, 1, 0, 1, 0])
     assert int(solve_prepared(prepared, reward=[0, 2.0, 0, 3, 0]).status) == Status.CONVERGED
     for reward, status in (([0, 1, 1, 1, 0], "INVALID"), ([0, -1, 0, 1, 0], "INVALID"),
-                           ([0, np.nan, 0, 1, 0], "NONFINITE"), ([0, np.inf, 0, 1, 0], "NONFINITE")):
+                           ([0, np.nan, 0, 1, 0], "NONFINITE"),
+                           ([0, np.inf, 0, 1, 0], "NONFINITE")):
         assert int(solve_prepared(prepared, reward=np.asarray(reward)).status) == Status[status]
     endless = prepare(model, target, reward=[0, 1.0, 0, 1, 0])
     assert np.asarray(solve_prepared(endless).value).tolist() == [*[np.inf] * 4, 0]
@@ -264,7 +267,8 @@ def test_policies_are_judged():
     for policy, status, value in (
             (np.array([0, 2]), "CONVERGED", 0), (np.array([1, 2]), "CONVERGED", 1),
             (np.array([2, 2]), "INVALID", np.nan), (np.array([0.5, 0.5, 1]), "CONVERGED", 1),
-            (np.array([0.5, 0.6, 1]), "INVALID", np.nan), (np.array([-1.0, 2, 1]), "INVALID", np.nan),
+            (np.array([0.5, 0.6, 1]), "INVALID", np.nan),
+            (np.array([-1.0, 2, 1]), "INVALID", np.nan),
             (np.array([np.nan, 0.5, 1]), "NONFINITE", np.nan)):
         found = solve_prepared(prepared, policy=policy)
         assert int(found.status) == Status[status]
@@ -290,7 +294,8 @@ def test_wrong_arguments_are_named(walk):
             ("stay has shape", partial(prepare, model, target, stay=target[:3])),
             ("leave stay out", partial(prepare, model, target, stay=target, reward=np.ones(5))),
             ("choice of state 2 is -1", partial(prepare, model, target, reward=[0, 0, -1, 0, 0])),
-            ("choice of state 1 is inf", partial(prepare, model, target, reward=[0, np.inf, 0, 0, 0])),
+            ("choice of state 1 is inf",
+             partial(prepare, model, target, reward=[0, np.inf, 0, 0, 0])),
             ("probability has shape", partial(solve_prepared, prepared, probability=np.ones(3))),
             ("prepare it with a reward", partial(solve_prepared, prepared, reward=np.ones(5))),
             ("not 'max'", partial(solve_prepared, prepared, policy=np.arange(5))),
