@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import chex
@@ -111,9 +112,9 @@ class SparseMDP:
     def dtype(self) -> Any:
         return self.probability.dtype
 
-    @property
+    @cached_property
     def host(self) -> HostMDP:
-        """The transitions as the host engine takes them."""
+        """The transitions as the host engine takes them, with what it finds out about them."""
         row_start, entry_start, successor = (
             np.asarray(x) for x in (self.row_start, self.entry_start, self.successor))
         probability = np.asarray(self.probability, np.float64)
