@@ -9,8 +9,8 @@ import numpy as np
 
 from jaxltl.core.host.rows import Booleans, Integers, count_down, distinct, spans
 
-_ROUNDS = 40  # levels, and
-_NODES = 32  # so many nodes for a further one, until elimination is faster
+_ROUNDS = 16  # levels, and
+_NODES = 64  # so many nodes for a further one, until elimination is faster
 
 
 class Edges(NamedTuple):
