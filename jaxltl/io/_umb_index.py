@@ -271,7 +271,7 @@ def _texts_of_ours(data: Mapping[str, Any]) -> frozenset[str]:
     """The whole numbers that are those of texts; other tools refuse files with the type string."""
     for key in ("file-data", "parameters", TEXTS):
         data = data.get(key, {}) if isinstance(data, dict) else {}
-    names = data if isinstance(data, list) else []
+    names: list[Any] = data if isinstance(data, list) else []
     return frozenset(name for name in names if isinstance(name, str))
 
 
