@@ -19,7 +19,7 @@ from jaxltl.core.host.bounded import backup_unit
 from jaxltl.core.host.components import strong_components
 from jaxltl.core.host.elimination import factors
 from jaxltl.core.host.levels import Edges, components_in_order
-from jaxltl.core.host.rows import Booleans, Integers, spans
+from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import Components, end_components, reaching
 from jaxltl.core.host.transient import Transient, optimum
@@ -172,14 +172,8 @@ def _with_stops(mdp: HostMDP, found: Components, leaders: Integers) -> _Stopping
     begin = (width.cumsum() - width)[order]
     entry = spans(begin, width[order])
     count = np.bincount(owner, minlength=heads.size + stops.size)
-    small = HostMDP(_starts(count), _starts(width[order]), successor[entry], probability[entry])
+    small = HostMDP(starts_of(count), starts_of(width[order]), successor[entry], probability[entry])
     return _Stopping(node, small, origin[order])
-
-
-def _starts(count: Integers) -> Integers:
-    found: Any = np.zeros(count.size + 1, np.int32)
-    np.cumsum(count, out=found[1:])
-    return found
 
 
 # --- the gain of each component ------------------------------------------------------------------
@@ -247,7 +241,7 @@ def _part(
     width = np.diff(mdp.entry_start)[row]
     entry = spans(mdp.entry_start[row], width)
     count = np.bincount(number[mdp.state[row]], minlength=states.size)
-    small = HostMDP(_starts(count), _starts(width), number[mdp.successor[entry]],
+    small = HostMDP(starts_of(count), starts_of(width), number[mdp.successor[entry]],
                     mdp.probability[entry])
     return _Part(small, start, np.diff(start, append=states.size), row, reward[row],
                  magnitude[row], backup_unit(small))

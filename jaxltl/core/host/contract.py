@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxltl.core.host.rows import Booleans, Integers, spans
+from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 
 _WORTH = 8  # a model is contracted if more than one in so many of its states goes
@@ -95,14 +95,8 @@ def _taken(
     width = np.diff(mdp.entry_start)[row]
     entry = spans(mdp.entry_start[row], width)
     smaller = HostMDP(
-        _starts(count), _starts(width), node[mdp.successor[entry]], mdp.probability[entry])
+        starts_of(count), starts_of(width), node[mdp.successor[entry]], mdp.probability[entry])
     return smaller, entry
-
-
-def _starts(count: Integers) -> Integers:
-    found: Any = np.zeros(count.size + 1, np.int32)
-    np.cumsum(count, out=found[1:])
-    return found
 
 
 def merged(

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.host.rows import Booleans, Integers, spans
+from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import HostMDP
 
 MAX_PAIRS = 2**31  # pairs of a state and a memory; a bit vector of them takes 2 GB
@@ -200,14 +200,7 @@ def _written(world: _World, code: Integers, number: Any, start: Integers) -> Hos
     successor = number(np.where(alone, code[source], follower) if alone.any() else follower)
     probability = host.probability[entry]
     probability[alone] = 1.0
-    index: Any = np.int32 if entry.size < 2**31 else np.int64
-    product = HostMDP(_starts(choices, np.int32), _starts(width, index), successor, probability)
+    product = HostMDP(starts_of(choices), starts_of(width), successor, probability)
     return HostProduct(
         product, state.astype(np.int32), memory.astype(np.int32), base_row.astype(np.int32),
         number(start).astype(np.int64), still)
-
-
-def _starts(count: Integers, dtype: Any) -> Integers:
-    start: Integers = np.zeros(count.size + 1, dtype)
-    np.cumsum(count, out=start[1:])
-    return start

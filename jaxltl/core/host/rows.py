@@ -108,6 +108,17 @@ def spans(start: Integers, count: Integers) -> Integers:
     return np.arange(total) + np.repeat(start - end + count, count)
 
 
+def starts_of(count: Integers) -> Integers:
+    """Where spans of so many begin, and where the last one ends: ``int32[N + 1]``, if that fits.
+
+    >>> starts_of(np.array([2, 0, 1])).tolist()
+    [0, 2, 2, 3]
+    """
+    found: Any = np.zeros(count.size + 1, np.int64)
+    np.cumsum(count, out=found[1:])
+    return found.astype(np.int32) if found[-1] < 2**31 else found
+
+
 def distinct(number: Integers, size: int) -> Integers:
     """Numbers below a size in order, each once.
 

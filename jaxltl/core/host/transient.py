@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxltl.core.host.elimination import Factors, factors
 from jaxltl.core.host.levels import Edges, Levels, components_in_order, peel
-from jaxltl.core.host.rows import Booleans, Integers, spans
+from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import searched
 
@@ -107,14 +107,8 @@ class _System(NamedTuple):
         width = np.diff(self.entry_start)[row]
         entry = spans(self.entry_start[row], width)
         return _System(
-            _starts(count), _starts(width), self.target[entry], self.weight[entry],
+            starts_of(count), starts_of(width), self.target[entry], self.weight[entry],
             self.row[row], self.node[node])
-
-
-def _starts(count: Integers) -> Integers:
-    found: Any = np.zeros(count.size + 1, np.int32)
-    np.cumsum(count, out=found[1:])
-    return found
 
 
 def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: bool) -> Optimum:
@@ -230,13 +224,13 @@ def _system(problem: Transient) -> _System:
         target, weight, of = target[inner], weight[inner], of[inner]
     count = np.bincount(of, minlength=row.size)
     # What is known comes first in each row, which so is never empty.
-    start = _starts(count + 1)
+    start = starts_of(count + 1)
     first = start[:-1]
     place = np.arange(target.size) + of + 1
     targets, weights = np.empty(start[-1], np.int32), np.empty(start[-1])
     targets[first], weights[first] = node.size, known
     targets[place], weights[place] = number[target], weight
-    row_start = _starts(np.bincount(number[state], minlength=node.size))
+    row_start = starts_of(np.bincount(number[state], minlength=node.size))
     return _System(row_start, start, targets, weights, row, node)
 
 
@@ -395,7 +389,7 @@ def _circles(
     outer = ~inner
     earned = weight[outer] * middle[system.target[entry[outer]]]
     known: Any = np.bincount(of[outer], earned, row.size)
-    start = _starts(np.bincount(of[inner], minlength=row.size))
+    start = starts_of(np.bincount(of[inner], minlength=row.size))
     shape = (row.size, core.size)
     matrix = sparse.csr_array((weight[inner], target[inner], start), shape=shape)
     matrix.sum_duplicates()

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.host.accepting import towards
-from jaxltl.core.host.rows import Booleans, Integers, spans
+from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import Components, end_components, surely_reaching
 from jaxltl.core.host.transient import Transient, optimum
@@ -186,15 +186,9 @@ def _quotient(
     order = np.argsort(owner, kind="stable")
     taken = spans((width.cumsum() - width)[order], width[order])
     small = HostMDP(
-        _starts(np.bincount(owner, minlength=end + 1)), _starts(width[order]),
+        starts_of(np.bincount(owner, minlength=end + 1)), starts_of(width[order]),
         target[taken].astype(np.int32), chance[taken])
     return _Quotient(small, node, origin[order], known[order], stop)
-
-
-def _starts(count: Integers) -> Integers:
-    found: Any = np.zeros(count.size + 1, np.int32)
-    np.cumsum(count, out=found[1:])
-    return found
 
 
 def _solved(

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.host.rows import spans
+from jaxltl.core.host.rows import spans, starts_of
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.padded import to_padded as to_padded  # for whoever converts
 from jaxltl.core.models.product import Product, flat_successor
@@ -47,13 +47,9 @@ def to_sparse(model: Any) -> SparseMDP:
     state, action = np.nonzero(available)
     count = used.sum(-1)[state, action]
     return make_sparse(
-        _from_counts(available.sum(-1)), _from_counts(count), target,
+        starts_of(available.sum(-1)), starts_of(count), target,
         weight[s, a, k].astype(np.float64), initial=_distribution(model.initial),
         label=np.asarray(model.label), propositions=model.propositions, action=action)
-
-
-def _from_counts(count: np.ndarray) -> np.ndarray:
-    return np.concatenate([[0], count.cumsum()])
 
 
 def _distribution(initial: Any) -> np.ndarray:
@@ -91,7 +87,7 @@ def _product(model: Product) -> SparseMDP:
         None if x.transition is None else np.asarray(x.transition)[entry])
         for name, x in world.rewards.items()}
     return make_sparse(
-        _from_counts(per_state), _from_counts(width), target, host.probability[entry],
+        starts_of(per_state), starts_of(width), target, host.probability[entry],
         initial=_distribution(model.initial).ravel(),
         label=np.asarray(world.label)[state], propositions=world.propositions, rewards=rewards,
         action=None if world.action is None else np.asarray(world.action)[row],

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.host.components import reached
-from jaxltl.core.host.rows import spans
+from jaxltl.core.host.rows import spans, starts_of
 from jaxltl.core.models.sparse import Rewards, SparseMDP
 
 
@@ -43,15 +43,11 @@ def part_of(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMDP
     initial = np.asarray(model.initial)[kept]
     return replace(
         model,
-        row_start=_starts(choices), entry_start=_starts(width),
+        row_start=starts_of(choices), entry_start=starts_of(width),
         successor=number[host.successor[entry]], probability=host.probability[entry],
         initial=initial / initial.sum() if initial.sum() else initial,
         label=np.asarray(model.label)[kept], rewards=rewards, action=taken(model.action, row),
         valuation={name: taken(x, kept) for name, x in model.valuation.items()})
-
-
-def _starts(count: np.ndarray) -> np.ndarray:
-    return np.concatenate([[0], count.cumsum()]).astype(np.int32)
 
 
 def reachable(model: SparseMDP, start: np.ndarray, rows: np.ndarray) -> np.ndarray:
