@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxltl.core.host.rows import Booleans, Integers
 from jaxltl.core.host.sparse import HostMDP
-from jaxltl.core.host.sparse_graph import end_components
+from jaxltl.core.host.sparse_graph import end_components, towards
 
 
 class AcceptingRegion(NamedTuple):
@@ -57,36 +57,3 @@ def accepting_region(mdp: HostMDP, priority: Integers) -> AcceptingRegion:
         region |= new
         row = np.where(new, taken, row)
     return AcceptingRegion(region, row.astype(np.int32))
-
-
-def towards(mdp: HostMDP, goal: Booleans, rows: Booleans) -> Integers:
-    """A row by which each state may come nearer to a goal, among some rows: ``int32[S]``.
-
-    The first row of states at the goal, and of those that cannot get there.
-    """
-    first = mdp.row_start[:-1].astype(np.int32)
-    if not (rows & ~goal[mdp.state]).any():
-        return first
-    nearer = _next_on_the_way(mdp, goal, rows)
-    entry = np.flatnonzero(rows[mdp.row] & (nearer[mdp.state[mdp.row]] == mdp.successor))
-    row = mdp.row[entry][::-1]
-    first[mdp.state[row]] = row  # the first one is written last
-    return first
-
-
-def _next_on_the_way(mdp: HostMDP, goal: Booleans, rows: Booleans) -> Integers:
-    """The next state on a shortest path to a goal, ``int[S]``; -1 at it and where there is none."""
-    from scipy.sparse import csgraph, csr_array
-
-    start, row = mdp.predecessors
-    kept = rows[row]
-    last = np.flatnonzero(goal)
-    # One search backwards, from a node of its own that leads to every goal.
-    index = np.concatenate([[0], kept.cumsum()])[start]
-    edges = np.concatenate([mdp.state[row[kept]], last])
-    size = mdp.num_states + 1
-    graph: Any = csr_array(
-        (np.ones(edges.size), edges, np.append(index, edges.size)), shape=(size, size))
-    _, before = csgraph.breadth_first_order(graph, size - 1, return_predecessors=True)
-    before = before[:-1]
-    return np.where((before < 0) | (before == size - 1), -1, before)

@@ -14,14 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxltl.core.host.accepting import towards
 from jaxltl.core.host.bounded import backup_unit
 from jaxltl.core.host.components import strong_components
 from jaxltl.core.host.elimination import factors
 from jaxltl.core.host.levels import Edges, components_in_order
 from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
-from jaxltl.core.host.sparse_graph import Components, end_components, reaching
+from jaxltl.core.host.sparse_graph import Components, end_components, reaching, towards
 from jaxltl.core.host.transient import Transient, optimum
 
 _EPS = float(np.finfo(np.float64).eps)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.host.contract import Contraction, merged, without_chains
-from jaxltl.core.host.rows import Booleans, Integers, spans
+from jaxltl.core.host.rows import Booleans, Integers
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import (
     Components,
@@ -20,6 +20,7 @@ from jaxltl.core.host.sparse_graph import (
     forced,
     reaching,
     surely_reaching,
+    towards,
 )
 from jaxltl.core.host.transient import Transient, optimum
 
@@ -136,7 +137,7 @@ def _solved(reduced: Reduced, tolerance: float) -> Enclosed:
     found = _enclosed(reduced, tolerance)
     part = reduced.part
     if part is not None and reduced.components is not None:
-        row = towards(reduced.whole.mdp, reduced.components, part.row[found.row][part.node])
+        row = leaving_by(reduced.whole.mdp, reduced.components, part.row[found.row][part.node])
         if reduced.sure is not None and reduced.sure_row is not None:
             row = np.where(reduced.sure, reduced.sure_row, row)
         found = found._replace(
@@ -228,7 +229,7 @@ def _merged(
     return left._replace(part=part, components=components)
 
 
-def towards(mdp: HostMDP, components: Components, row: Integers) -> Integers:
+def leaving_by(mdp: HostMDP, components: Components, row: Integers) -> Integers:
     """A policy that goes round in an end component until it is where the given row leaves."""
     states = np.flatnonzero(components.region(mdp))
     exits = np.zeros(mdp.num_states, bool)
@@ -236,29 +237,11 @@ def towards(mdp: HostMDP, components: Components, row: Integers) -> Integers:
     found: Any = mdp.row_start[:-1].astype(np.int64)
     own = mdp.state[row] == np.arange(mdp.num_states)
     found[own] = row[own]
-    ranked = _nearer(mdp, exits, components.inside)
+    ranked = towards(mdp, exits, components.inside)
     inner = np.zeros(mdp.num_states, bool)
     inner[states] = True
     inner &= ~exits
     found[inner] = ranked[inner]
-    return found
-
-
-def _nearer(mdp: HostMDP, goal: Booleans, rows: Booleans) -> Integers:
-    """For each state the first row, of some, that may lead nearer to a goal, ``int64[S]``."""
-    found: Any = mdp.row_start[:-1].astype(np.int64)
-    seen, frontier = goal.copy(), np.flatnonzero(goal)
-    start, pred = mdp.predecessors
-    while frontier.size:
-        row: Any = pred[spans(start[frontier], start[frontier + 1] - start[frontier])]
-        row = row[rows[row]]
-        row = row[~seen[mdp.state[row]]]
-        row.sort()
-        state = mdp.state[row]
-        new = np.diff(state, prepend=-1) > 0
-        found[state[new]] = row[new]
-        frontier = state[new]
-        seen[frontier] = True
     return found
 
 
@@ -315,7 +298,7 @@ def _most(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> _Left:
     goal = _nothing(mdp, cost, goal, infinite)
     # Where it is infinite: rows to where the target can be avoided, and there rows that avoid it.
     avoids = ~mdp.support.lead_to(~never) & never[mdp.state]
-    row = np.where(never, mdp.first_choice(avoids)[1], _nearer(mdp, never, before))
+    row = np.where(never, mdp.first_choice(avoids)[1], towards(mdp, never, before))
     return _finite(mdp, cost, goal, infinite, row, depth)
 
 
@@ -352,10 +335,10 @@ def _least(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> _Left:
     # What can surely be done for nothing is worth nothing.
     free = rows & (cost == 0)
     nothing, stays = surely_reaching(mdp, goal, free | goal[mdp.state])
-    row = _nearer(mdp, goal, stays)
+    row = towards(mdp, goal, stays)
     circles = end_components(mdp, finite & ~nothing, free)
     if not circles.inside.any():
-        first = _nearer(mdp, nothing, rows)
+        first = towards(mdp, nothing, rows)
         return _finite(mdp, cost, nothing, ~finite, row, depth, rows, first)
     # Where going round costs nothing, states are one.
     part = merged(mdp, circles.component, circles.inside, cost)
@@ -363,7 +346,7 @@ def _least(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> _Left:
     goal_, finite_ = (np.zeros(small.num_states, bool) for _ in range(2))
     goal_[part.node[nothing]], finite_[part.node[finite]] = True, True
     kept = rows[part.row] & ~circles.inside[part.row]
-    first = _nearer(small, goal_, kept)
+    first = towards(small, goal_, kept)
     left = _finite(small, part.cost, goal_, ~finite_, small.row_start[:-1].astype(np.int64),
                    depth, kept, first)
     return left._replace(part=part, components=circles, sure=nothing, sure_row=row)
@@ -404,7 +387,7 @@ def reward_forever(
     row = small.row_start[:-1].astype(np.int64)
     rest = _finite(small, part.cost, ~left, infinite_, row, 0)
     found = _enclosed(_reduced(mdp, part, rest, np.inf, True), tolerance)
-    leaving = towards(mdp, components, part.row[found.row][part.node])
+    leaving = leaving_by(mdp, components, part.row[found.row][part.node])
     endless = _earning(mdp, components, rich, reward)
     return found._replace(
         value=found.value[part.node], lower=found.lower[part.node], upper=found.upper[part.node],
@@ -423,8 +406,8 @@ def _earning(
     """A policy that gets to components that earn, and earns there for ever."""
     paid = components.inside & (reward > 0)
     some, first = mdp.first_choice(paid)
-    inner = _nearer(mdp, some, components.inside)
-    outer = _nearer(mdp, rich, np.ones(mdp.num_rows, bool))
+    inner = towards(mdp, some, components.inside)
+    outer = towards(mdp, rich, np.ones(mdp.num_rows, bool))
     return np.where(some, first, np.where(rich, inner, outer))
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.host.contract import without_chains
-from jaxltl.core.host.optimal import Reduced, towards
+from jaxltl.core.host.optimal import Reduced, leaving_by
 from jaxltl.core.host.rows import Booleans, Integers, spans
 from jaxltl.core.host.schedule import GOAL, LOST, ONE, Nodes, Schedule, schedule
 from jaxltl.core.host.sparse import Floats, HostMDP
@@ -188,7 +188,7 @@ def _own(
     chosen: Any = reduced.row
     node: Any = np.arange(mine.size)
     if part is not None and reduced.components is not None:
-        chosen = towards(whole.mdp, reduced.components, part.row[reduced.row][part.node])
+        chosen = leaving_by(whole.mdp, reduced.components, part.row[reduced.row][part.node])
         node = part.node
     if reduced.sure is not None and reduced.sure_row is not None:
         chosen = np.where(reduced.sure, reduced.sure_row, chosen)

@@ -14,11 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxltl.core.host.accepting import towards
 from jaxltl.core.host.bounded import backup_unit
 from jaxltl.core.host.rows import Booleans, Integers, spans
 from jaxltl.core.host.sparse import Floats, HostMDP
-from jaxltl.core.host.sparse_graph import end_components, reaching
+from jaxltl.core.host.sparse_graph import end_components, reaching, towards
 
 _LEVELS = 10**7  # amounts of reward at most
 _LARGEST = 8 * 2**30  # bytes of the levels that are kept

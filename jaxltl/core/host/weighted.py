@@ -15,10 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.host.accepting import towards
 from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
-from jaxltl.core.host.sparse_graph import Components, end_components, surely_reaching
+from jaxltl.core.host.sparse_graph import Components, end_components, surely_reaching, towards
 from jaxltl.core.host.transient import Transient, optimum
 
 _EPS = float(np.finfo(np.float64).eps)
