@@ -20,14 +20,9 @@ from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.models.sparse import Rewards, row_reward
 from jaxltl.core.types import Solution, require_shape, row_tolerance, status_code
+from jaxltl.core.values.circles import SLACK, Problem, enclose_circles
 from jaxltl.core.values.fixed_point import implicit
 from jaxltl.core.values.sweeps import Blocks, Chosen, chosen_names, meets, sweep
-
-_NEAR = 0.9  # of the width asked for, how far the first guess of a bound is from the other
-_FINER = 0.25  # how much nearer values come before the next guess
-_PATIENCE = 20  # passes, and a quarter of those before, until a guess is given up
-_SLACK = 1e6  # smallest numbers that a guess is above nothing
-
 
 @struct.dataclass
 class Prepared:
@@ -193,9 +188,8 @@ def solve_prepared(
 ) -> Solution:
     """The answer to a prepared question, with other numbers where they are given.
 
-    Without circles one pass is exact but for rounding, which is known in advance. With circles a
-    lower bound rises from zero, and what is a little above it is an upper bound once a pass does
-    not raise it (Hartmanns and Kaminski 2020); each is rounded outwards in every step.
+    Without circles one pass is exact but for rounding, which is known in advance. With circles,
+    bounds of both sides are proven by passes, see :mod:`jaxltl.core.values.circles`.
 
     Args:
       prepared: the question.
@@ -414,69 +408,19 @@ def _enclosed(
     return _Found(x, lower, upper, rank, zero, jnp.asarray(1, jnp.int32), jnp.asarray(known))
 
 
-# --- circles ------------------------------------------------------------------------------------
-
-
-class _State(NamedTuple):
-    low: jax.Array
-    high: jax.Array
-    guessed: jax.Array
-    proven: jax.Array
-    near: jax.Array  # how little values move before a guess
-    wide: jax.Array  # how far a guess is above
-    since: jax.Array
-    steps: jax.Array
-    moved: jax.Array
-
-
 def _circling(
     prepared: Prepared, start: jax.Array, given: dict[str, Any], unit: float, least: float,
     tolerance: jax.Array, max_steps: Any,
 ) -> _Found:
     """Bounds from both sides of what has circles."""
     before, core, after = prepared.segments
-    size, relative = prepared.size, prepared.question == "reward"
+    size = prepared.size
     down: Any = partial(sweep, factor=1 - unit, shift=-least, **given)
     up: Any = partial(sweep, factor=1 + unit, shift=least, **given)
-    span = slice(core.first, core.last)
-    dtype = start.dtype
-    ceiling = jnp.inf if relative else 1.0
-
-    def above(low: jax.Array, high: jax.Array, wide: jax.Array) -> jax.Array:
-        x = low[span]
-        x = x * (1 + wide) + _SLACK * least if relative else jnp.minimum(x + wide, ceiling)
-        if "keep" in given:
-            x = x * given["keep"][span] + given["put"][span]
-        return high.at[span].set(x)
-
-    def body(s: _State) -> _State:
-        low = down(core, s.low)[0]
-        high = lax.cond(s.guessed, lambda x: up(core, x)[0], lambda x: x, s.high)
-        new, old = low[span], s.low[span]
-        change = jnp.abs(new - old)
-        if relative:
-            change = change / jnp.maximum(new, _SLACK * least)
-        moved = jnp.max(change)
-        proven = s.guessed & jnp.all(high[span] <= s.high[span])
-        crossed = jnp.any(high[span] < new) | jnp.all(high[span] >= s.high[span])
-        failed = s.guessed & ~proven & (crossed | (s.since > _PATIENCE + s.steps // 4))
-        near = jnp.where(failed, s.near * _FINER, s.near)
-        wide = jnp.where(failed & (moved <= 4 * unit), 4 * s.wide, s.wide)
-        guess = (~s.guessed | failed) & (moved <= jnp.maximum(near, 4 * unit))
-        high = jnp.where(guess, above(low, high, wide), high)
-        guessed = guess | (s.guessed & ~failed)
-        since = jnp.where(guess, 0, s.since + 1)
-        return _State(low, high, guessed, proven, near, wide, since, s.steps + 1, moved)
-
-    low, high = down(before, start)[0], up(before, start)[0]
-    none, zero = jnp.asarray(False), jnp.asarray(0, jnp.int32)
-    state = _State(low, high, none, none, tolerance, _NEAR * tolerance, zero, zero,
-                   jnp.asarray(jnp.inf, dtype))
-    most = jnp.asarray(max_steps, jnp.int32)
-    s = lax.while_loop(
-        lambda s: ~s.proven & (s.steps < most) & jnp.all(jnp.isfinite(s.low)), body, state)
-    high = s.high.at[span].set(jnp.where(s.proven, s.high[span], ceiling))
-    low, high = down(after, s.low)[0], up(after, high)[0]
+    problem = Problem(core, given, unit, least, tolerance, prepared.question == "reward")
+    s = enclose_circles(
+        problem, down(before, start)[0], up(before, start)[0], jnp.asarray(max_steps, jnp.int32))
+    low, high = down(after, s.low)[0], up(after, s.high)[0]
     rank = None
     if "keep" not in given:
         # Greedy in a bound that a pass does not worsen: its policy attains it.
@@ -540,7 +484,7 @@ def _answer(
         value, lower, upper = (jnp.where(keep, x, known) for x in (value, lower, upper))
     width = jnp.where(lower == upper, 0, upper - jnp.where(jnp.isfinite(lower), lower, 0))
     scale = jnp.where(jnp.isfinite(upper), upper, 1) if relative else 1
-    floor = 1e3 * _SLACK * _least(prepared)  # what rewards of zero are known to
+    floor = 1e3 * SLACK * _least(prepared)  # what rewards of zero are known to
     narrow = jnp.all((width <= tolerance * scale + floor) & (lower <= upper))
     finite &= jnp.all(~jnp.isnan(lax.stop_gradient(value)))
     status = status_code(found.proven & narrow, finite, found.proven, valid=valid | ~finite)

@@ -96,6 +96,11 @@ def sweep(
     return lax.scan(body, x, (numbers, blocks.target, blocks.weight))
 
 
+def images(blocks: Blocks, x: jax.Array) -> jax.Array:
+    """``sum_w weight * x`` of all rows at once, ``float[C, A, B]``."""
+    return jnp.sum(blocks.weight * _look(x, blocks.target), axis=2)
+
+
 def chosen_names(names: jax.Array, rank: jax.Array, rounds: int) -> jax.Array:
     """``int32[N]``, the names of the rows that nodes take.
 
