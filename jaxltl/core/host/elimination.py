@@ -89,8 +89,10 @@ def _order(matrix: Any, label: Integers) -> Integers | None:
     if size.max(initial=0) <= 1:
         return np.argsort(label, kind="stable")
     source = np.repeat(np.arange(label.size), np.diff(matrix.indptr))
+    between = label[source] != label[matrix.indices]
+    into, out_of = (int(size[label[x[between]]].sum()) for x in (matrix.indices, source))
     within = matrix.copy()
-    within.data[label[source] != label[matrix.indices]] = 0
+    within.data[between] = 0
     within.eliminate_zeros()
     both = (within + within.T).tocsr()
     order = csgraph.reverse_cuthill_mckee(both, symmetric_mode=True)
@@ -105,7 +107,8 @@ def _order(matrix: Any, label: Integers) -> Integers | None:
         largest = label == size.argmax()
         if furthest[largest].mean() * _SPREAD > np.count_nonzero(largest):
             return None
-    return order
+    # What leads from one component to another fills, of the two, the one that stands first.
+    return order[::-1] if out_of < into else order
 
 
 def _factored(rows: Any, label: Integers, order: Integers, chosen: Integers) -> Factors | None:

@@ -21,6 +21,7 @@ from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import searched
 
 _EPS = float(np.finfo(np.float64).eps)
+_TINY = 1e-290
 _AIM = 0.1  # of the tolerance: how much of it the extra cost of the steps may take
 _AIM_CHAIN = 1e-5  # where there is nothing to choose, so that ties do not matter
 _FIRST_SWEEPS = 60  # of value iteration, to begin with a policy that is not bad
@@ -158,8 +159,9 @@ def _found(
 ) -> Optimum:
     near, far, value = bounds
     low, high = (near, far) if sign > 0 else (far, near)
-    low = np.where(np.isfinite(low), np.maximum(low, 0), 0)
-    high = np.where(np.isnan(high), np.inf, high)
+    # Products too small for a float to hold are lost; relative errors do not count them.
+    low = np.where(np.isfinite(low), np.maximum(low - _TINY, 0), 0)
+    high = np.where(np.isnan(high), np.inf, high + _TINY)
     value = np.clip(value, low, high)
 
     def everywhere(x: Floats) -> Floats:
