@@ -75,13 +75,13 @@ def factors(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
       Its factors; None where it is singular.
     """
     matrix = rows[chosen]
-    order = _order(matrix, label)
+    order = order_of(matrix, label)
     if order is None:
         return Factors(rows, label, None, matrix, None, 0)
     return _factored(rows, label, order, chosen)
 
 
-def _order(matrix: Any, label: Integers) -> Integers | None:
+def order_of(matrix: Any, label: Integers) -> Integers | None:
     """By component, and in each one after its neighbours; None where that would not help."""
     from scipy.sparse import csgraph
 

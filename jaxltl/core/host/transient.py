@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxltl.core.host.elimination import Factors, factors
+from jaxltl.core.host.elimination import Factors, factors, order_of
+from jaxltl.core.host.exact import LARGEST, System, exact_optimum
 from jaxltl.core.host.levels import Edges, Levels, components_in_order, peel
 from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
@@ -78,7 +79,8 @@ class Optimum(NamedTuple):
 class _System(NamedTuple):
     """The open states as nodes, and a last node of value 1 through which what is known comes in.
 
-    Self-loops are eliminated. Attributes as of a HostMDP; `row` and `node` name what they were.
+    Self-loops are eliminated. Attributes as of a HostMDP; `row` and `node` name what they were, and
+    `leaving` is how likely a row leads to what is known.
     """
 
     row_start: Integers
@@ -87,6 +89,7 @@ class _System(NamedTuple):
     weight: Floats
     row: Integers
     node: Integers
+    leaving: Floats
 
     @property
     def num_nodes(self) -> int:
@@ -109,7 +112,7 @@ class _System(NamedTuple):
         entry = spans(self.entry_start[row], width)
         return _System(
             starts_of(count), starts_of(width), self.target[entry], self.weight[entry],
-            self.row[row], self.node[node])
+            self.row[row], self.node[node], self.leaving[row])
 
 
 def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: bool) -> Optimum:
@@ -199,9 +202,11 @@ def _system(problem: Transient) -> _System:
         of = np.repeat(np.arange(row.size, dtype=np.int32), width)
     state = mdp.state[row]
     inner = problem.open[target]
-    known = problem.cost[row]
+    known: Any = problem.cost[row]
+    leaving: Any = np.zeros(row.size)
     if not inner.all():
         outer = ~inner
+        leaving = np.bincount(of[outer], weight[outer], row.size)
         known = known + np.bincount(
             of[outer], weight[outer] * problem.known[target[outer]], row.size)
     loops = inner & (target == state[of])
@@ -213,13 +218,13 @@ def _system(problem: Transient) -> _System:
         looping = np.zeros(row.size, bool)
         looping[of[loops]] = True
         scale = np.where(looping & (rest > 0), rest, 1)
-        known, weight = known / scale, weight / scale[of]
+        known, leaving, weight = known / scale, leaving / scale, weight / scale[of]
         inner &= ~loops
         if (stuck := looping & (rest == 0)).any():  # rows that never get anywhere
             inner &= ~stuck[of]
             keep = ~stuck
             renumber = np.cumsum(keep) - 1
-            row, state, known = row[keep], state[keep], known[keep]
+            row, state, known, leaving = row[keep], state[keep], known[keep], leaving[keep]
             target, weight, of, inner = (
                 x[keep[of]] for x in (target, weight, renumber[of], inner))
     if not inner.all():
@@ -233,7 +238,7 @@ def _system(problem: Transient) -> _System:
     targets[first], weights[first] = node.size, known
     targets[place], weights[place] = number[target], weight
     row_start = starts_of(np.bincount(number[state], minlength=node.size))
-    return _System(row_start, start, targets, weights, row, node)
+    return _System(row_start, start, targets, weights, row, node, leaving)
 
 
 def _edges(system: _System) -> Edges:
@@ -324,6 +329,7 @@ class _Circles(NamedTuple):
     Attributes:
       matrix: ``float64[R, M]``, SciPy's.
       known: ``float64[R]``, what comes in from elsewhere.
+      leaving: ``float64[R]``, how likely a row leaves the core.
       owner: ``int[R]``, the node of a row.
       row: ``int[R]``, the row of the system that it is.
       starts: where the rows of each rank start, and R.
@@ -332,6 +338,7 @@ class _Circles(NamedTuple):
 
     matrix: Any
     known: Floats
+    leaving: Floats
     owner: Integers
     row: Integers
     starts: list[int]
@@ -391,6 +398,8 @@ def _circles(
     outer = ~inner
     earned = weight[outer] * middle[system.target[entry[outer]]]
     known: Any = np.bincount(of[outer], earned, row.size)
+    below = outer & (system.target[entry] != system.num_nodes)
+    leaving: Any = np.bincount(of[below], weight[below], row.size) + system.leaving[row]
     start = starts_of(np.bincount(of[inner], minlength=row.size))
     shape = (row.size, core.size)
     matrix = sparse.csr_array((weight[inner], target[inner], start), shape=shape)
@@ -398,7 +407,7 @@ def _circles(
     source = np.repeat(owner, np.diff(matrix.indptr))
     edges = sparse.coo_array((np.ones(source.size, bool), (source, matrix.indices)),
                              shape=(core.size, core.size)).tocsr()
-    circles = _Circles(matrix, known, owner, row, starts, sign)
+    circles = _Circles(matrix, known, leaving, owner, row, starts, sign)
     return circles, core, Edges(edges.indptr, edges.indices)
 
 
@@ -440,9 +449,7 @@ def _solve_core(
             near, far, time = found
             own = value - sign * extra * time
             best = _Core(core, near, far, own, chosen, rounds, solver.method)
-            width = sign * (far - near)
-            size = np.abs(near if sign > 0 else far) if relative else 1
-            if (width <= tolerance * np.abs(size) / 2).all():
+            if _narrow(best, sign, tolerance / 2, relative):
                 break
         else:
             time = solver.solve(np.ones(core.size))
@@ -450,11 +457,43 @@ def _solve_core(
         if smaller >= extra / 2:
             break
         extra = smaller
+    narrow = best is not None and _narrow(best, sign, tolerance, relative)
+    exact = None if narrow else _in_fractions(circles, core, label, chosen, unit)
+    if exact is not None:
+        best = exact._replace(rounds=rounds)
     if best is None:
         low, high = np.zeros(core.size), np.full(core.size, np.inf)
         near, far = (low, high) if sign > 0 else (high, low)
         best = _Core(core, near, far, low, chosen, rounds, "nothing proven")
     return best._replace(chosen=circles.row[best.chosen])
+
+
+def _narrow(found: _Core, sign: int, tolerance: float, relative: bool) -> bool:
+    width = sign * (found.far - found.near)
+    size = np.abs(found.near if sign > 0 else found.far) if relative else 1
+    return bool((width <= tolerance * size).all())
+
+
+def _in_fractions(
+    circles: _Circles, core: Integers, label: Integers, chosen: Integers, unit: float
+) -> _Core | None:
+    """The same of a small core that hardly ever ends: of the weights as floats give them.
+
+    Weights that err by a share `unit` change the solution by twice that for each of its unknowns.
+    """
+    if core.size > LARGEST:
+        return None
+    order = order_of(circles.matrix[chosen], label)
+    if order is None:
+        return None
+    system = System(circles.matrix, circles.leaving, circles.known, circles.owner)
+    found = exact_optimum(system, chosen, order, circles.sign)
+    if found is None:
+        return None
+    value, rows = found
+    share = 2.1 * (core.size + 2) * unit
+    near, far = (value * (1 - end * circles.sign * share) for end in (1, -1))
+    return _Core(core, near, far, value, rows, 0, "policy iteration in fractions")
 
 
 def _leaving(

@@ -194,6 +194,45 @@ def test_total_rewards(maximize):
     assert hard > 10
 
 
+def tug(length, chance):
+    """A run is thrown back to the middle by every other step (Haddad and Monmege 2018)."""
+    row_start, entry_start, successor, probability = [0], [0], [], []
+
+    def choice(*entries):
+        for target, p in entries:
+            successor.append(target)
+            probability.append(p)
+        entry_start.append(len(successor))
+
+    for x in range(2 * length + 1):
+        if x in (0, 2 * length):
+            choice((x, 1.0))
+        elif x == length:
+            choice((x - 1, chance), (x + 1, 1 - chance))
+            choice((x - 1, chance / 2), (x + 1, 1 - chance / 2))
+        else:
+            choice((x - 1 if x < length else x + 1, 0.5), (length, 0.5))
+        row_start.append(len(entry_start) - 1)
+    return make_sparse(row_start, entry_start, successor, probability).host
+
+
+@pytest.mark.parametrize("length", [4, 20, 40, 120])
+def test_runs_that_hardly_ever_end(length):
+    """The probability is the chance, whatever the length; runs take 2^length steps."""
+    host = tug(length, 0.75)
+    goal = np.zeros(host.num_states, bool)
+    goal[0] = True
+    for maximize, value in ((True, Fraction(3, 4)), (False, Fraction(3, 8))):
+        found = reachability(host, goal, maximize=maximize)
+        assert found.lower[length] <= value <= found.upper[length]
+        assert worst_width(found, relative=False) <= 1e-6
+    goal[-1] = True
+    found = total_reward(host, np.ones(host.num_rows), goal, maximize=True)
+    steps = 3 * 2 ** (length - 1) - 2
+    assert Fraction(found.lower[length]) <= steps <= Fraction(found.upper[length])
+    assert worst_width(found, relative=True) <= 1e-6
+
+
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("seed", range(20))
 def test_many(seed):
