@@ -24,6 +24,7 @@ from jaxltl.core.values.circles import SLACK, Problem, enclose_circles
 from jaxltl.core.values.fixed_point import implicit
 from jaxltl.core.values.sweeps import Blocks, Chosen, chosen_names, meets, sweep
 
+
 @struct.dataclass
 class Prepared:
     """A question about a model, put in order for solves with other numbers.

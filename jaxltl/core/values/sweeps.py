@@ -54,7 +54,8 @@ def _combined(target: jax.Array, weight: jax.Array, x: jax.Array) -> list[jax.Ar
 
 
 def sweep(
-    blocks: Blocks, x: jax.Array, *, maximize: bool, factor: float = 1.0, shift: float = 0.0,
+    blocks: Blocks, x: jax.Array, *, maximize: bool, factor: float = 1.0,
+    shift: float | jax.Array = 0.0,
     keep: jax.Array | None = None, put: jax.Array | None = None, choose: bool = False,
 ) -> tuple[jax.Array, jax.Array | None]:
     """One pass: ``x = opt_a sum_w weight * x`` from the first block on, in place.
@@ -85,7 +86,7 @@ def sweep(
         start = blocks.first + c * size
         if factor != 1.0:
             best = best * factor
-        if shift != 0.0:
+        if isinstance(shift, jax.Array) or shift != 0.0:
             best = jnp.maximum(best + shift, 0)
         if keep is not None and put is not None:
             best = best * lax.dynamic_slice(keep, (start,), (size,))
