@@ -15,7 +15,7 @@ from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
 from jaxltl.core.values.total_reward import total_reward
 from tests.core.models.test_sparse import random_padded
 
-ROUNDING = 1e-6  # of probabilities in single precision, which the padded models are in
+ROUNDING = 1e-12  # of the policies
 
 
 def overlap(one, other, slack=ROUNDING):
@@ -53,7 +53,7 @@ def reachability_agrees(rng, sparse, padded, goal):
     table = np.zeros(padded.available.shape)
     table[sparse.host.state, sparse.action] = weight
     ours = reachability_probability(sparse, goal, policy=weight)
-    overlap(ours, reachability_probability(padded, goal, policy=table.astype(np.float32)), 1e-5)
+    overlap(ours, reachability_probability(padded, goal, policy=table))
 
 
 def test_reachability():
@@ -101,7 +101,7 @@ def test_rewards_are_those_of_every_kind_of_model():
             ours = total_reward(sparse, rows, goal, objective=objective)
             assert ours.status == Status.CONVERGED
             for model in (padded, to_dense(padded)):
-                overlap(ours, total_reward(model, reward, goal, objective=objective), 1e-4)
+                overlap(ours, total_reward(model, reward, goal, objective=objective), 1e-9)
             own = total_reward(sparse, rows, goal, policy=ours.policy)
             finite = np.isfinite(ours.upper)
             if objective == "max":
@@ -127,10 +127,10 @@ def test_lazy_products_of_sparse_worlds(formula, label_on):
                 assert (own.lower <= best.upper + 1e-12).all()
         weight = rng.random((sparse.num_rows, ours.num_memory)) + 0.01
         weight /= np.add.reduceat(weight, sparse.row_start[:-1])[sparse.host.state]
-        table = np.zeros((*ours.state_shape, padded.num_actions), np.float32)
+        table = np.zeros((*ours.state_shape, padded.num_actions))
         table[sparse.host.state, :, sparse.action] = weight
         overlap(satisfaction_probability(ours, weight), satisfaction_probability(theirs, table),
-                1e-4)
+                1e-9)
 
 
 def test_discounted_values():
@@ -153,7 +153,7 @@ def test_discounted_values():
 
 
 def close(ours, theirs, discount):
-    np.testing.assert_allclose(ours.value, theirs.value, atol=1e-4 / (1 - discount), rtol=1e-4)
+    np.testing.assert_allclose(ours.value, theirs.value, atol=1e-7 / (1 - discount), rtol=1e-7)
 
 
 def test_restricted_models():
