@@ -25,7 +25,7 @@ _PATIENCE = 20  # passes, and a quarter of those before, until a guess is given 
 _PASSES = 100  # until policy iteration is tried
 _ROUNDS = 40  # of it
 _HASTY = 15  # of them, which go on by passes; then its own improvement alone, which must end
-_SWEEPS = 11
+_SWEEPS = 12
 _AIM = 0.1  # of the tolerance: how much of it the extra cost of the steps may take
 _KEPT = 0.75  # of the extra cost: who gains less stays, and the rest is what proves the bound
 
@@ -89,14 +89,18 @@ def enclose_circles(
     tolerance = problem.tolerance
     state = State(low, high, none, none, tolerance, _NEAR * tolerance, zero, zero,
                   jnp.full((), jnp.inf, low.dtype))
-    state = _rising(problem, state, jnp.minimum(max_steps, _PASSES))
 
-    def rounds(s: State) -> State:
-        s = _by_policies(problem, s, high)
-        return lax.cond(s.proven, lambda s: s, lambda s: _rising(problem, s, max_steps), s)
+    def body(state: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
+        s, tried = state
+        now = ~tried & (s.steps >= _PASSES)
+        s = lax.cond(now, lambda s: _by_policies(problem, s, high), partial(_risen, problem), s)
+        return s, tried | now
 
-    more = ~state.proven & (state.steps < max_steps) & jnp.all(jnp.isfinite(state.low))
-    state = lax.cond(more, rounds, lambda s: s, state)
+    def goes_on(state: tuple[State, jax.Array]) -> jax.Array:
+        s = state[0]
+        return ~s.proven & (s.steps < max_steps) & jnp.all(jnp.isfinite(s.low))
+
+    state, _ = lax.while_loop(goes_on, body, (state, none))
     top = jnp.where(state.proven, state.high[problem.span], problem.ceiling)
     return state._replace(high=state.high.at[problem.span].set(top))
 
@@ -112,32 +116,28 @@ def _above(problem: Problem, low: jax.Array, high: jax.Array, wide: jax.Array) -
     return high.at[span].set(x)
 
 
-def _rising(problem: Problem, state: State, max_steps: jax.Array) -> State:
+def _risen(problem: Problem, s: State) -> State:
+    """One pass for each side."""
     span, unit = problem.span, problem.unit
     down: Any = partial(sweep, factor=1 - unit, shift=-problem.least, **problem.given)
     up: Any = partial(sweep, factor=1 + unit, shift=problem.least, **problem.given)
-
-    def body(s: State) -> State:
-        low = down(problem.core, s.low)[0]
-        high = lax.cond(s.guessed, lambda x: up(problem.core, x)[0], lambda x: x, s.high)
-        new, old = low[span], s.low[span]
-        change = jnp.abs(new - old)
-        if problem.relative:
-            change = change / jnp.maximum(new, SLACK * problem.least)
-        moved = jnp.max(change)
-        proven = s.guessed & jnp.all(high[span] <= s.high[span])
-        crossed = jnp.any(high[span] < new) | jnp.all(high[span] >= s.high[span])
-        failed = s.guessed & ~proven & (crossed | (s.since > _PATIENCE + s.steps // 4))
-        near = jnp.where(failed, s.near * _FINER, s.near)
-        wide = jnp.where(failed & (moved <= 4 * unit), 4 * s.wide, s.wide)
-        guess = (~s.guessed | failed) & (moved <= jnp.maximum(near, 4 * unit))
-        high = jnp.where(guess, _above(problem, low, high, wide), high)
-        guessed = guess | (s.guessed & ~failed)
-        since = jnp.where(guess, 0, s.since + 1)
-        return State(low, high, guessed, proven, near, wide, since, s.steps + 1, moved)
-
-    return lax.while_loop(
-        lambda s: ~s.proven & (s.steps < max_steps) & jnp.all(jnp.isfinite(s.low)), body, state)
+    low = down(problem.core, s.low)[0]
+    high = lax.cond(s.guessed, lambda x: up(problem.core, x)[0], lambda x: x, s.high)
+    new, old = low[span], s.low[span]
+    change = jnp.abs(new - old)
+    if problem.relative:
+        change = change / jnp.maximum(new, SLACK * problem.least)
+    moved = jnp.max(change)
+    proven = s.guessed & jnp.all(high[span] <= s.high[span])
+    crossed = jnp.any(high[span] < new) | jnp.all(high[span] >= s.high[span])
+    failed = s.guessed & ~proven & (crossed | (s.since > _PATIENCE + s.steps // 4))
+    near = jnp.where(failed, s.near * _FINER, s.near)
+    wide = jnp.where(failed & (moved <= 4 * unit), 4 * s.wide, s.wide)
+    guess = (~s.guessed | failed) & (moved <= jnp.maximum(near, 4 * unit))
+    high = jnp.where(guess, _above(problem, low, high, wide), high)
+    guessed = guess | (s.guessed & ~failed)
+    since = jnp.where(guess, 0, s.since + 1)
+    return State(low, high, guessed, proven, near, wide, since, s.steps + 1, moved)
 
 
 # --- policy iteration ---------------------------------------------------------------------------
@@ -148,7 +148,8 @@ class _Policy(NamedTuple):
     rank: jax.Array
     time: jax.Array
     extra: jax.Array
-    done: jax.Array
+    done: jax.Array  # whether no row gains
+    ended: jax.Array  # and the time of the policy is known
     rounds: jax.Array
 
 
@@ -186,31 +187,31 @@ def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
         return rank, of(rank, image)
 
     def improve(p: _Policy) -> _Policy:
+        timing = (p.rounds == 1) | p.done
         rows = system(p.rank)
         residual = of(p.rank, image(middle, p.value)) + sign * p.extra - p.value
-        value = p.value + rows.solve(residual)
+        found = rows.solve(jnp.where(timing, 1, residual))
+        time = jnp.where(timing, found, p.time)
+        value = jnp.where(timing, p.value, p.value + found)
+        extra = jnp.where(p.rounds == 1, _extra(problem, value, time, keep), p.extra)
         now = image(middle, value)
         rank, optimum = best(now)
         own = of(p.rank, now)
-        better = (sign * (optimum - own) > _KEPT * p.extra).reshape(count, block)
-        exact = jnp.max(jnp.abs(own + sign * p.extra - value)) <= p.extra / 16
-        done = ~jnp.any(better) & exact
+        better = (sign * (optimum - own) > _KEPT * extra).reshape(count, block) & ~timing
+        exact = jnp.max(jnp.abs(own + sign * extra - value)) <= extra / 16
+        done = p.done | ((p.rounds > 1) & ~jnp.any(better) & exact)
         hasty = jnp.any(better) & (p.rounds < _HASTY)
-        ahead = partial(_swept, problem, middle, shift=p.extra * sign)
+        ahead = partial(_swept, problem, middle, shift=extra * sign, rank=p.rank)
         rank = lax.cond(hasty, ahead, lambda _: jnp.where(better, rank, p.rank), value)
-        return p._replace(value=value, rank=rank, done=done, rounds=p.rounds + 1)
+        return _Policy(value, rank, time, extra, done, p.done, p.rounds + 1)
 
     x = state.low[span]
-    rank, _ = best(image(middle, x))
-    rows = system(rank)
-    time = rows.solve(jnp.ones(size, dtype))
-    x = x + rows.solve(of(rank, image(middle, x)) - x)
-    extra = _extra(problem, x, time, keep)
+    none = jnp.asarray(False)
     p = lax.while_loop(
-        lambda p: ~p.done & (p.rounds < _ROUNDS) & jnp.all(jnp.isfinite(p.value)), improve,
-        _Policy(x, rank, time, extra, jnp.asarray(False), jnp.asarray(0, jnp.int32)))
-    rows = system(p.rank)
-    time = rows.solve(jnp.ones(size, dtype))
+        lambda p: ~p.ended & (p.rounds < _ROUNDS) & jnp.all(jnp.isfinite(p.value)), improve,
+        _Policy(x, best(image(middle, x))[0], jnp.ones_like(x), jnp.zeros((), dtype), none, none,
+                jnp.asarray(0, jnp.int32)))
+    rows, time = system(p.rank), p.time
     far, near = p.value, p.value - sign * 1.5 * p.extra * time
     outer_far, outer_near = (high, state.low) if sign > 0 else (state.low, high)
     beyond = sign * far - sign * best(image(outer_far, far))[1]
@@ -229,18 +230,18 @@ def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
     low_, top_ = state.low.at[span].set(low), high.at[span].set(top)
     return state._replace(
         low=jnp.where(good, low_, state.low), high=jnp.where(good, top_, state.high),
-        proven=good, steps=state.steps + p.rounds + 3,
+        proven=good, steps=state.steps + p.rounds + 1,
         moved=jnp.where(good, jnp.max(jnp.abs(beyond)), state.moved))
 
 
 def _swept(
-    problem: Problem, outer: jax.Array, value: jax.Array, *, shift: jax.Array
+    problem: Problem, outer: jax.Array, value: jax.Array, *, shift: jax.Array,
+    rank: jax.Array,
 ) -> jax.Array:
     """The greedy rows after some passes, by which news goes on from where policies change."""
     x: Any = outer.at[problem.span].set(value)
     going: Any = partial(sweep, problem.core, shift=shift, **problem.given)
-    x = lax.fori_loop(0, _SWEEPS, lambda _, x: going(x)[0], x)
-    return going(x, choose=True)[1]
+    return lax.fori_loop(0, _SWEEPS, lambda _, c: going(c[0], choose=True), (x, rank))[1]
 
 
 def _extra(problem: Problem, value: jax.Array, time: jax.Array, keep: jax.Array) -> jax.Array:
