@@ -1,5 +1,6 @@
 """Prepared solves against the host engine: other numbers, policies, lanes, precisions, slopes."""
 
+import itertools
 from functools import partial
 
 import jax
@@ -95,9 +96,17 @@ def other_numbers(rng, model):
     return p / np.add.reduceat(p, model.entry_start[:-1])[model.host.row]
 
 
-@pytest.mark.parametrize("objective", ["max", "min"])
-@pytest.mark.parametrize("question", ["probability", "reward"])
-@pytest.mark.parametrize("seed", [0, 1])
+def cases(*some, seeds=24):
+    """Some cases, and all of them where there is time."""
+    kinds = [sorted(set(x)) for x in zip(*some, strict=True)][1:]
+    every = itertools.product(range(seeds), *kinds)
+    more = [pytest.param(*x, marks=pytest.mark.exhaustive) for x in every if x not in some]
+    return [*some, *more]
+
+
+@pytest.mark.parametrize(("seed", "question", "objective"), cases(
+    (0, "probability", "max"), (0, "reward", "min"), (1, "probability", "min"),
+    (1, "reward", "max")))
 def test_optima_are_those_of_the_host_engine(seed, question, objective):
     rng, model, target, stay, reward = random_case(seed, question)
     maximize = objective == "max"
@@ -117,8 +126,7 @@ def test_optima_are_those_of_the_host_engine(seed, question, objective):
     agree(found, by_host(changed, target, stay, paid, maximize))
 
 
-@pytest.mark.parametrize("question", ["probability", "reward"])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("seed", "question"), cases((0, "reward"), (1, "probability")))
 def test_policies_are_evaluated_in_lanes(seed, question):
     rng, model, target, stay, reward = random_case(seed, question)
     prepared = prepare(model, target, stay=stay, reward=reward, objective="policy")
@@ -189,8 +197,8 @@ def fourth_order(f, x, along, h):
             - (f(x + 2 * h * along) - f(x - 2 * h * along))) / (12 * h)
 
 
-@pytest.mark.parametrize("objective", ["max", "policy"])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(
+    ("seed", "objective"), cases((0, "policy"), (1, "max"), seeds=4))
 def test_slopes_are_those_of_differences(seed, objective):
     rng, model, target, _, reward = random_case(seed, "reward")
     model, reward = escaping(model, np.ones(model.num_rows, int)), reward + 0.1
@@ -235,28 +243,25 @@ def walk():
 def test_other_numbers_are_judged(walk):
     model, target = walk
     prepared = prepare(model, target)
-    p = np.asarray(model.probability)
-    for place, number, status in ((1, 0.0, "INVALID"), (1, -0.5, "INVALID"), (1, 0.6, "INVALID"),
-                                  (1, np.nan, "NONFINITE"), (1, np.inf, "NONFINITE")):
-        bad = p.copy()
-        bad[place] = number
-        found = solve_prepared(prepared, probability=bad)
-        assert int(found.status) == Status[status]
-        assert np.isnan(found.value).all() and np.isinf(found.upper).all()
-    lanes = np.stack([p, p * [1, 0, 1, 1, 1, 1, 1, 1]])
+    lanes = np.tile(model.probability, (6, 1))
+    lanes[1:, 1] = 0, -0.5, 0.6, np.nan, np.inf
     found = jax.vmap(lambda x: solve_prepared(prepared, probability=x))(lanes)
-    assert found.status.tolist() == [Status.CONVERGED, Status.INVALID]
+    assert found.status.tolist() == [
+        Status.CONVERGED, *[Status.INVALID] * 3, *[Status.NONFINITE] * 2]
+    assert np.isnan(found.value[1:]).all() and np.isinf(found.upper[1:]).all()
     np.testing.assert_allclose(found.value[0], np.arange(5) / 4, atol=1e-6)
 
 
 def test_other_rewards_are_judged(walk):
     model, target = walk
     prepared = prepare(model, target | (np.arange(5) == 0), reward=[0, 1, 0, 1, 0])
-    assert int(solve_prepared(prepared, reward=[0, 2.0, 0, 3, 0]).status) == Status.CONVERGED
-    for reward, status in (([0, 1, 1, 1, 0], "INVALID"), ([0, -1, 0, 1, 0], "INVALID"),
-                           ([0, np.nan, 0, 1, 0], "NONFINITE"),
-                           ([0, np.inf, 0, 1, 0], "NONFINITE")):
-        assert int(solve_prepared(prepared, reward=np.asarray(reward)).status) == Status[status]
+    lanes = np.tile([0, 2.0, 0, 3, 0], (5, 1))
+    lanes[1, 2] = 1
+    lanes[2:, 1] = -1, np.nan, np.inf
+    found = jax.vmap(lambda x: solve_prepared(prepared, reward=x))(lanes)
+    assert found.status.tolist() == [
+        Status.CONVERGED, *[Status.INVALID] * 2, *[Status.NONFINITE] * 2]
+    np.testing.assert_allclose(found.value[0], [0, 4.5, 5, 5.5, 0], atol=1e-5)
     endless = prepare(model, target, reward=[0, 1.0, 0, 1, 0])
     assert np.asarray(solve_prepared(endless).value).tolist() == [*[np.inf] * 4, 0]
 
@@ -264,15 +269,14 @@ def test_other_rewards_are_judged(walk):
 def test_policies_are_judged():
     model = make_sparse([0, 2, 3], [0, 1, 2, 3], [0, 1, 1], [1, 1, 1])
     prepared = prepare(model, [False, True], objective="policy")
-    for policy, status, value in (
-            (np.array([0, 2]), "CONVERGED", 0), (np.array([1, 2]), "CONVERGED", 1),
-            (np.array([2, 2]), "INVALID", np.nan), (np.array([0.5, 0.5, 1]), "CONVERGED", 1),
-            (np.array([0.5, 0.6, 1]), "INVALID", np.nan),
-            (np.array([-1.0, 2, 1]), "INVALID", np.nan),
-            (np.array([np.nan, 0.5, 1]), "NONFINITE", np.nan)):
-        found = solve_prepared(prepared, policy=policy)
-        assert int(found.status) == Status[status]
-        np.testing.assert_equal(float(found.value[0]), value)
+    rows = np.array([[0, 2], [1, 2], [2, 2]])
+    weights = np.array([[0.5, 0.5, 1], [0.5, 0.6, 1], [-1, 2, 1], [np.nan, 0.5, 1]])
+    for policies, statuses, values in (
+            (rows, "CONVERGED CONVERGED INVALID", [0, 1, np.nan]),
+            (weights, "CONVERGED INVALID INVALID NONFINITE", [1, np.nan, np.nan, np.nan])):
+        found = jax.vmap(lambda x: solve_prepared(prepared, policy=x))(policies)
+        assert found.status.tolist() == [Status[x] for x in statuses.split()]
+        np.testing.assert_equal(np.asarray(found.value[:, 0]), values)
 
 
 def test_what_takes_too_long_is_not_called_converged(walk):
@@ -282,7 +286,9 @@ def test_what_takes_too_long_is_not_called_converged(walk):
     assert int(found.status) == Status.MAX_STEPS
     exact = np.arange(5) / 4
     assert (np.asarray(found.lower) <= exact).all() and (exact <= np.asarray(found.upper)).all()
-    assert int(solve_prepared(prepared, tolerance=1e-17).status) != Status.CONVERGED
+    found = solve_prepared(prepared, tolerance=1e-17, max_steps=300)
+    assert int(found.status) != Status.CONVERGED
+    assert (np.asarray(found.lower) <= exact).all() and (exact <= np.asarray(found.upper)).all()
 
 
 def test_wrong_arguments_are_named(walk):
