@@ -28,7 +28,7 @@ class Nodes(NamedTuple):
     """A system: every node is the optimum of its rows, and a row the sum of its entries.
 
     Attributes:
-      count: how many nodes there are.
+      number: how many nodes there are.
       owner: ``int[R]``, the node of each row, ascending.
       name: ``int[R]``, what a row is called, at least 0.
       row: ``int[T]``, the row of each entry, ascending.
@@ -36,7 +36,7 @@ class Nodes(NamedTuple):
       source: ``int[T]``, which number weighs the entry.
     """
 
-    count: int
+    number: int
     owner: Integers
     name: Integers
     row: Integers
@@ -84,12 +84,12 @@ def schedule(nodes: Nodes, one: int, nothing: int) -> Schedule:
       one: the source that is the number 1.
       nothing: the source that is 0.
     """
-    count, most, width = nodes.count, *_shape(nodes)
+    count, most, width = nodes.number, *_shape(nodes)
     nodes = _narrow_rows(nodes, width, one)
     nodes, choices = _narrow_nodes(nodes, most, one)
     parts = [[level for level in part if level.size] for part in _ordered(nodes)]
     size = _block_size([x.size for part in parts for x in part], most * width)
-    place: Any = np.zeros(nodes.count, np.int32)
+    place: Any = np.zeros(nodes.number, np.int32)
     blocks, start = [], 0
     for part in parts:
         blocks.append(start // size)
@@ -112,7 +112,7 @@ def _ranks(group: Integers, count: int) -> Integers:
 
 def _shape(nodes: Nodes) -> tuple[int, int]:
     """The numbers of rows and of entries that make the least work."""
-    rows = np.bincount(np.bincount(nodes.owner, minlength=nodes.count))
+    rows = np.bincount(np.bincount(nodes.owner, minlength=nodes.number))
     widths = np.bincount(np.bincount(nodes.row, minlength=nodes.owner.size))
     mosts = [a for a in _WIDTHS if a > 1 and a < 2 * rows.size] if rows.size > 2 else [1]
     best: tuple[float, int, int] | None = None
@@ -121,7 +121,7 @@ def _shape(nodes: Nodes) -> tuple[int, int]:
             continue
         more = _split(widths, w)
         for a in mosts:
-            cost = (nodes.count + more + _split(rows, a)) * (a * w + 1)
+            cost = (nodes.number + more + _split(rows, a)) * (a * w + 1)
             if best is None or cost < best[0]:
                 best = cost, a, w
     assert best is not None
@@ -210,11 +210,11 @@ def _narrow_nodes(nodes: Nodes, most: int, one: int) -> tuple[Nodes, int]:
 def _ordered(nodes: Nodes) -> list[list[Integers]]:
     """Levels before, among and after the circles."""
     edges = _edges(nodes)
-    back, among = edges.reverse(), np.ones(nodes.count, bool)
+    back, among = edges.reverse(), np.ones(nodes.number, bool)
     below = _peeled(back, np.diff(edges.start).astype(np.int32), among)
     if not among.any():
         return [below, [], []]
-    inner = among[np.repeat(np.arange(nodes.count), np.diff(back.start))] & among[back.target]
+    inner = among[np.repeat(np.arange(nodes.number), np.diff(back.start))] & among[back.target]
     left = np.concatenate([[0], inner.cumsum()])[back.start]
     above = _peeled(edges, np.diff(left).astype(np.int32), among)
     return [below, _layers(edges, np.flatnonzero(among)), above[::-1]]
@@ -223,7 +223,7 @@ def _ordered(nodes: Nodes) -> list[list[Integers]]:
 def _edges(nodes: Nodes) -> Edges:
     kept = nodes.target >= 0
     source = nodes.owner[nodes.row[kept]]
-    start = np.concatenate([[0], np.bincount(source, minlength=nodes.count).cumsum()])
+    start = np.concatenate([[0], np.bincount(source, minlength=nodes.number).cumsum()])
     return Edges(start, nodes.target[kept].astype(np.int64))
 
 
@@ -306,7 +306,7 @@ def _filled(
     source: Any = np.full((blocks, most, width, size), nothing, np.int32)
     name: Any = np.zeros((blocks, most, size), np.int32)
     at = place[nodes.owner].astype(np.int64)
-    rank = _ranks(nodes.owner, nodes.count)
+    rank = _ranks(nodes.owner, nodes.number)
     link = nodes.name < 0
     name[at // size, rank, at % size] = np.where(
         link, -1 - place[np.where(link, -1 - nodes.name, 0)], nodes.name)
@@ -318,7 +318,7 @@ def _filled(
     source.reshape(-1)[flat] = nodes.source
     # Rows that a node has not got are its first one again.
     count: Any = np.full(total, most)
-    count[place] = np.bincount(nodes.owner, minlength=nodes.count)
+    count[place] = np.bincount(nodes.owner, minlength=nodes.number)
     count = count.reshape(blocks, size)
     for a in range(1, most):
         c, b = np.nonzero(count <= a)

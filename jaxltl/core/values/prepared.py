@@ -22,6 +22,7 @@ from jaxltl.core.models.sparse import Rewards, row_reward
 from jaxltl.core.types import Solution, require_shape, row_tolerance, status_code
 from jaxltl.core.values.circles import SLACK, Problem, enclose_circles
 from jaxltl.core.values.fixed_point import implicit
+from jaxltl.core.values.iterate import in_turn
 from jaxltl.core.values.sweeps import Blocks, Chosen, chosen_names, meets, sweep
 
 
@@ -418,9 +419,16 @@ def _circling(
     size = prepared.size
     down: Any = partial(sweep, factor=1 - unit, shift=-least, **given)
     up: Any = partial(sweep, factor=1 + unit, shift=least, **given)
-    problem = Problem(core, given, unit, least, tolerance, prepared.question == "reward")
-    s = enclose_circles(
-        problem, down(before, start)[0], up(before, start)[0], jnp.asarray(max_steps, jnp.int32))
+    arrays = {k: x for k, x in given.items() if k != "maximize"}
+
+    def enclosed(core: Blocks, arrays: Any, tolerance: Any, low: Any, high: Any, most: Any) -> Any:
+        options = {"maximize": given["maximize"], **arrays}
+        problem = Problem(core, options, unit, least, tolerance, prepared.question == "reward")
+        return enclose_circles(problem, low, high, most)
+
+    # How much work it is depends on the lane.
+    s = in_turn(enclosed, core, arrays, tolerance, down(before, start)[0], up(before, start)[0],
+                jnp.asarray(max_steps, jnp.int32))
     low, high = down(after, s.low)[0], up(after, s.high)[0]
     rank = None
     if "keep" not in given:
