@@ -3,7 +3,8 @@
 Regions are Boolean, and only whether a probability is positive matters. There is one
 answer and two ways to it (:mod:`jaxltl.core.graphs.graph`). Sweeps of the primitives work inside
 ``jit`` and ``vmap`` and are fast where regions grow in few steps. On concrete arrays the host
-answers, in time linear in the transitions, so that depth costs nothing, and compiles nothing.
+answers, in time linear in the transitions, so that depth costs nothing, and compiles nothing. Of a
+sparse model allowed actions are ``bool[R]``, and an action is a row.
 """
 
 from __future__ import annotations

@@ -36,7 +36,8 @@ def end_components(
     Args:
       model: the model.
       region: ``bool[S]``.
-      allowed: ``bool[S, A]``, the actions that count; default the available ones.
+      allowed: ``bool[S, A]``, the actions that count; default the available ones. Of a sparse
+        model ``bool[R]``, as is `inside`.
     """
     graph = graph_of(model, region, allowed)
     return to_jax(components_within(graph, *take(graph, (region, allowed))))
@@ -47,7 +48,7 @@ def components_within(graph: Graph, region: Any, allowed: Any = None) -> EndComp
     allowed = graph.available if allowed is None else allowed & graph.available
     # Only states that can remain in the region matter; usually there are few.
     core = region & avoid(graph, ~region, allowed)
-    allowed = allowed & graph.forall(core) & core[..., None]
+    allowed = allowed & graph.forall(core) & graph.on_choices(core)
     return EndComponents(*graph.components(core, allowed, closed=False))
 
 

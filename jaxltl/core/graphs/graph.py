@@ -17,12 +17,14 @@ import numpy as np
 from jax import lax
 
 from jaxltl.core.host.graph import HostGraph
+from jaxltl.core.host.row_graph import RowGraph
 from jaxltl.core.host.rows import rows_of, rows_of_matrix
 from jaxltl.core.models import kernels, operators
 from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.product import Product, reads
+from jaxltl.core.models.sparse import SparseMDP
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,10 @@ class TracedGraph:
     def available(self) -> jax.Array:
         """``bool[S, A]``."""
         return self.model.available
+
+    def on_choices(self, states: jax.Array) -> jax.Array:
+        """What holds of states, of their actions: ``bool[S, 1]``."""
+        return states[..., None]
 
     def exists(self, region: jax.Array) -> jax.Array:
         """Whether some successor lies in a region: ``bool[S, A]``; False where unavailable."""
@@ -112,7 +118,7 @@ class TracedGraph:
 
 jax.tree_util.register_dataclass(TracedGraph, data_fields=["model"], meta_fields=[])
 
-Graph: TypeAlias = Any  # a HostGraph with NumPy's arrays, or a TracedGraph with JAX's
+Graph: TypeAlias = Any  # a HostGraph or RowGraph with NumPy's arrays, or a TracedGraph with JAX's
 
 
 @partial(jax.jit, static_argnames=("chance",))
@@ -136,6 +142,8 @@ def _sweeps(graph: TracedGraph, goal, allowed, rule, among, *, chance):
 
 def graph_of(model: Any, *arguments: Any) -> Graph:
     """The graph of a model: the host's, unless the model or an argument is traced."""
+    if isinstance(model, SparseMDP) and not is_traced((model, arguments)):
+        return RowGraph(model.host)
     if is_traced((model, arguments)) or not is_table(model):
         return TracedGraph(lax.stop_gradient(model))  # supports have no derivative
     return host_graph(model)

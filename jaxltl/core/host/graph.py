@@ -75,6 +75,10 @@ class HostGraph:
         order = np.argsort(code, kind="stable") % self.num_memory
         return np.concatenate([[0], count.cumsum()]), order
 
+    def on_choices(self, states: Booleans) -> Booleans:
+        """What holds of states, of their actions: ``bool[S, 1]``."""
+        return states[..., None]
+
     def exists(self, region: Booleans) -> Booleans:
         """Whether some successor lies in a region: ``bool[S, A]``; False where unavailable."""
         found = self.through(region, self.rows.lead_to).reshape(*self.state_shape, -1)

@@ -16,8 +16,9 @@ from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.models.mdp import checked_initial, checked_label
 
 _PADDED = ("this takes models that are padded: give to_padded(model). Sparse models have choices "
-           "in rows, and are solved by reachability_probability, total_reward, optimal_value, "
-           "policy_value, optimal_satisfaction, average_reward and prepare.")
+           "in rows, and are taken by the functions of graphs, reachability_probability, "
+           "total_reward, optimal_value, policy_value, optimal_satisfaction, average_reward and "
+           "prepare.")
 Array = Any  # NumPy's in double precision as it is read, or JAX's
 
 

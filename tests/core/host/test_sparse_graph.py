@@ -3,8 +3,19 @@
 import numpy as np
 import pytest
 
-from jaxltl.core.graphs.attractor import attract, avoid, surely
-from jaxltl.core.graphs.end_components import components_within
+from jaxltl.core.graphs.attractor import (
+    almost_surely_reaching,
+    attract,
+    attractor,
+    avoid,
+    avoidable,
+    surely,
+)
+from jaxltl.core.graphs.end_components import (
+    bottom_components,
+    components_within,
+    end_components,
+)
 from jaxltl.core.graphs.graph import host_graph
 from jaxltl.core.host import rows, sparse_graph
 from jaxltl.core.models.convert import to_padded, to_sparse
@@ -71,3 +82,32 @@ def test_end_components():
         np.testing.assert_array_equal(ours.region(host), np.asarray(theirs.inside).any(-1))
         some += ours.inside.any()
     assert some > 10
+
+
+def test_attractors_of_rows_are_those_of_actions():
+    for rng, sparse, padded in models():
+        host = sparse.host
+        goal = rng.random(host.num_states) < 0.2
+        among, rule = (rng.random(host.num_states) < 0.8 for _ in range(2))
+        allowed = np.asarray(padded.available) & (rng.random(padded.available.shape) < 0.8)
+        for chance in ("some", "all"):
+            ours = attractor(
+                sparse, goal, on_rows(sparse, allowed), rule=rule, chance=chance, among=among)
+            theirs = attractor(padded, goal, allowed, rule=rule, chance=chance, among=among)
+            np.testing.assert_array_equal(ours.region, theirs.region)
+            joined = np.asarray(ours.region)
+            np.testing.assert_array_equal(ours.rank[joined], theirs.rank[joined])
+            moves = joined & ~goal & (rule | allowed.any(-1))
+            np.testing.assert_array_equal(
+                sparse.action[np.asarray(ours.action)][moves], theirs.action[moves])
+        np.testing.assert_array_equal(avoidable(sparse, goal), avoidable(padded, goal))
+        np.testing.assert_array_equal(
+            almost_surely_reaching(sparse, goal).region,
+            almost_surely_reaching(padded, goal).region)
+        mine, other = (f(m, goal) for f, m in ((end_components, sparse), (end_components, padded)))
+        np.testing.assert_array_equal(mine.component, other.component)
+        np.testing.assert_array_equal(mine.inside, on_rows(sparse, other.inside))
+        mine, other = (bottom_components(sparse, on_rows(sparse, allowed)),
+                       bottom_components(padded, allowed))
+        np.testing.assert_array_equal(mine.component, other.component)
+        np.testing.assert_array_equal(mine.inside, on_rows(sparse, other.inside))
