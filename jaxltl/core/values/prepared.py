@@ -253,7 +253,7 @@ def _solve(
         prepared = _refilled(prepared, probability, reward, share)
     decided = None
     if prepared.objective == "policy":
-        decided = _decided(prepared, share)
+        decided = _decided(prepared, reward, share)
     found = _enclosed(prepared, decided, tolerance, max_steps)
     value = _attached(prepared, found, decided)
     return _answer(prepared, found, decided, value, tolerance, finite, valid, taken)
@@ -348,13 +348,13 @@ class _Decided(NamedTuple):
     infinite: jax.Array
 
 
-def _decided(prepared: Prepared, share: _Shares | None) -> _Decided:
+def _decided(prepared: Prepared, reward: Any, share: _Shares | None) -> _Decided:
     """Which values of a policy are 0, 1 or infinite."""
     assert share is not None
     size = prepared.size
-    used = jnp.concatenate([
-        share.used[prepared.entry_row], jnp.zeros(prepared.num_rows, bool),
-        jnp.asarray([True, False])])
+    earned = prepared.reward if reward is None else reward
+    paid = jnp.zeros(prepared.num_rows, bool) if earned is None else share.used & (earned > 0)
+    used = jnp.concatenate([share.used[prepared.entry_row], paid, jnp.asarray([True, False])])
     support = tuple(used[x.source] for x in prepared.segments)
     goal = size if prepared.question == "probability" else size + 1
     seed = jnp.zeros(size + 3, bool).at[goal].set(True)
@@ -367,7 +367,9 @@ def _decided(prepared: Prepared, share: _Shares | None) -> _Decided:
     if prepared.question == "probability":
         return _Decided(
             ~states | (reached & lost), states & reached & ~lost, jnp.zeros(size + 3, bool))
-    return _Decided(~lost, jnp.zeros(size + 3, bool), lost)
+    paying = jnp.zeros(size + 3, bool).at[size].set(True)
+    earns = meets(prepared.segments, support, paying, prepared.cyclic)
+    return _Decided(~lost & earns, jnp.zeros(size + 3, bool), lost)
 
 
 class _Found(NamedTuple):
