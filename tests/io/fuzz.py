@@ -318,7 +318,7 @@ def damaged_arrays(rng: np.random.Generator, data: bytes) -> bytes:
             try:
                 with np.errstate(all="ignore"):
                     arrays[name] = array.astype(_DTYPES[rng.integers(len(_DTYPES))])
-            except (ValueError, TypeError):
+            except (ValueError, TypeError, RuntimeError):
                 arrays[name] = np.zeros(array.shape, _DTYPES[rng.integers(len(_DTYPES))])
         elif kind == 4:
             arrays[name] = array[: rng.integers(len(array) + 1)] if array.ndim else array
