@@ -164,7 +164,8 @@ class _Reader:
                 line, f"the reward is {kind}(...), which depends on more than the labels; expected "
                 "ConstantRewardFunction(a number)."
             )  # fmt: skip
-        if not re.fullmatch(_NUMBER, given.strip()) or not np.isfinite(float(given)):
+        given = given.strip()  # of more than float() takes away
+        if not re.fullmatch(_NUMBER, given) or not np.isfinite(float(given)):
             raise self.error(line, f"the reward is {given[:40]!r}; expected a finite number.")
         guard = self._guard(line, single if double is None else double)
         return _Transition(int(source), int(target), guard, float(given))

@@ -114,6 +114,11 @@ def test_names_that_are_operators_elsewhere():
     assert machine.reward[0, letter_index(machine.automaton, {"G", "X"})] == 0
 
 
+def test_what_strip_takes_away_is_no_part_of_a_number():
+    machine = read_reward_machine("0\n[]\n(0,1,'a',ConstantRewardFunction(-2.\x1e))\n")
+    assert np.asarray(machine.reward).min() == -2
+
+
 @pytest.mark.parametrize(
     ("text", "line", "message"),
     [

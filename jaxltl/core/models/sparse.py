@@ -275,7 +275,7 @@ def _starts(name: str, start: Any, total: int, of: str) -> np.ndarray:
         i = int(np.flatnonzero(falls)[0])
         raise ValueError(f"{name} falls from {start[i]} to {start[i + 1]} at {i + 1}; it must "
                          "ascend.")
-    return start
+    return start.astype(np.int64)  # NumPy takes no unsigned ones for counts
 
 
 def _place(row_start: np.ndarray, row: int) -> str:

@@ -80,6 +80,13 @@ def test_repeated_successors_become_one():
     assert row_reward(model, np.array([1.0, 2.0])).tolist() == [1, 2]
 
 
+def test_unsigned_numbers_are_taken():
+    arrays = [np.array(x, np.uint64) for x in ([0, 1, 2], [0, 2, 3], [1, 0, 1])]
+    model = make_sparse(*arrays, [0.5, 0.5, 1.0])
+    assert model.row_start.dtype == model.entry_start.dtype == np.int32
+    assert model.successor.tolist() == [0, 1, 1]
+
+
 def test_a_model_passes_through_jit():
     model = make_sparse(None, [0, 1], [0], [1.0], rewards={"r": Rewards(state=[2.0])})
     found = jax.jit(lambda m: m.probability * 2 + m.rewards["r"].state)(model)
