@@ -1,7 +1,8 @@
 """Systems ``(I - P) x = b`` of policies that leave, solved by sparse elimination where it pays.
 
 Unknowns are ordered by strongly connected component, so that elimination fills at most these, and
-in each by minimum degree. Where even that would fill (graphs that mix well), sweeps converge.
+in each by Cuthill and McKee (1969). Where even that would fill (graphs that mix well), Krylov steps
+and sweeps converge.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class Factors(NamedTuple):
       rows: ``float64[R, M]``, all rows, SciPy's.
       label: ``int[M]``, components in order.
       order: ``int[M]``, or None where it is swept.
-      matrix: ``float64[M, M]``, the policy's, in order.
+      matrix: ``float64[M, M]``, the policy's, in that order if there is one.
       factor: of SuperLU, or None.
       fill: of the first factors in this order.
     """

@@ -35,6 +35,9 @@ _MAX_ROUNDS = 300
 class Transient(NamedTuple):
     """A problem whose every policy that counts leaves all of its states.
 
+    What a row leads to besides itself is taken to be all that it leads to, in these proportions:
+    rows sum to one.
+
     Attributes:
       mdp: the model; its rows may be unsorted and repeat successors.
       open: ``bool[S]``, the states to solve for.
@@ -80,7 +83,8 @@ class _System(NamedTuple):
     """The open states as nodes, and a last node of value 1 through which what is known comes in.
 
     Self-loops are eliminated. Attributes as of a HostMDP; `row` and `node` name what they were, and
-    `leaving` is how likely a row leads to what is known.
+    `leaving` is how likely a row leads to what is known. `widest` is the greatest number of
+    successors of a row, those that are known and itself included: sums go over all of them.
     """
 
     row_start: Integers
@@ -90,19 +94,11 @@ class _System(NamedTuple):
     row: Integers
     node: Integers
     leaving: Floats
+    widest: int
 
     @property
     def num_nodes(self) -> int:
         return self.node.size
-
-    @property
-    def widest(self) -> int:
-        return int(np.diff(self.entry_start).max(initial=1))
-
-    @property
-    def owner(self) -> Integers:
-        """The node of each row."""
-        return np.repeat(np.arange(self.num_nodes, dtype=np.int32), np.diff(self.row_start))
 
     def taken(self, node: Integers) -> _System:
         """The rows of some nodes, in their order; targets stay as they are numbered."""
@@ -112,7 +108,7 @@ class _System(NamedTuple):
         entry = spans(self.entry_start[row], width)
         return _System(
             starts_of(count), starts_of(width), self.target[entry], self.weight[entry],
-            self.row[row], self.node[node], self.leaving[row])
+            self.row[row], self.node[node], self.leaving[row], self.widest)
 
 
 def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: bool) -> Optimum:
@@ -150,6 +146,9 @@ def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: b
             rounds, method = found.rounds, found.method
             node = found.node
             bounds[:, node], chosen[node] = (found.near, found.far, found.value), found.chosen
+            # No sum is below nothing; with lower bounds that were, errors would not be shares.
+            low = 0 if maximize else 1
+            bounds[low, node] = np.maximum(bounds[low, node], 0)
         after = Levels(above.node[::-1], [above.start[-1] - x for x in above.start[::-1]])
         _sweep(system, after, bounds, chosen, sign)
         _widen(bounds, above.node, sign, (len(above.start) - 1) * unit)
@@ -193,10 +192,11 @@ def _system(problem: Transient) -> _System:
     if problem.rows is not None:
         kept &= problem.rows
     row = np.flatnonzero(kept)
+    width = np.diff(mdp.entry_start)[row]
+    widest = int(width.max(initial=1))
     if row.size == mdp.num_rows:
         target, weight, of = mdp.successor, mdp.probability, mdp.row
     else:
-        width = np.diff(mdp.entry_start)[row]
         entry = spans(mdp.entry_start[row], width)
         target, weight = mdp.successor[entry], mdp.probability[entry]
         of = np.repeat(np.arange(row.size, dtype=np.int32), width)
@@ -238,7 +238,7 @@ def _system(problem: Transient) -> _System:
     targets[first], weights[first] = node.size, known
     targets[place], weights[place] = number[target], weight
     row_start = starts_of(np.bincount(number[state], minlength=node.size))
-    return _System(row_start, start, targets, weights, row, node, leaving)
+    return _System(row_start, start, targets, weights, row, node, leaving, widest)
 
 
 def _edges(system: _System) -> Edges:
@@ -418,7 +418,7 @@ def _solve_core(
     """Policy iteration of the problem whose every step costs a little more."""
     circles, core, edges = _circles(system, core, bounds, sign)
     label = components_in_order(edges)
-    proper = partial(_proper, circles, _leaving(circles, system, core, problem))
+    proper = partial(_proper, circles, _way_out(circles, system, core, problem))
     chosen = proper(_greedy(circles, 0.0, np.zeros(core.size), _FIRST_SWEEPS))
     solver = factors(circles.matrix, label, chosen)
     aim = (_AIM_CHAIN if circles.is_chain else _AIM) * tolerance
@@ -496,7 +496,7 @@ def _in_fractions(
     return _Core(core, near, far, value, rows, 0, "policy iteration in fractions")
 
 
-def _leaving(
+def _way_out(
     circles: _Circles, system: _System, core: Integers, problem: Transient
 ) -> Integers | None:
     """Rows by which the core is left almost surely, where some policies never leave."""

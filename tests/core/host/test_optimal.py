@@ -245,3 +245,31 @@ def test_many(seed):
             attained(found, probability_of(host, found.row, target, stay), maximize=maximize)
             found = total_reward(host, cost, target, maximize=maximize)
             encloses(found, best_of(reward, maximize=maximize), maximize=maximize)
+
+
+def chain_of_rows(rows):
+    """A chain from lists of successors and probabilities."""
+    starts = np.concatenate([[0], np.cumsum([len(t) for t, _ in rows])])
+    return make_sparse(None, starts, np.concatenate([t for t, _ in rows]),
+                       np.concatenate([p for _, p in rows])).host
+
+
+@pytest.mark.parametrize("back", [None, 0, 1], ids=["straight on", "with a loop", "by a circle"])
+def test_sums_of_many_terms_are_rounded_outwards(back):
+    """The enclosure is of the numbers as they stand, though a sum of floats loses most of them."""
+    width = 20_000
+    ends = np.arange(2, 4 + width)
+    share = np.full(ends.size, 2.5e-17)  # less than half of what can be added to a half
+    share[0], share[-1] = 0.5, 0.5
+    if back is not None:
+        ends, share = np.append(back, ends), np.append(0.5, share / 2)
+    rows = [(ends, share), ([0], [1.0]), *(([t], [1.0]) for t in range(2, 4 + width))]
+    host = chain_of_rows(rows)
+    target = np.zeros(host.num_states, bool)
+    target[2:-1] = True
+    found = reachability(host, target, maximize=True)
+    weight = [Fraction(float(p)) for p in host.probability[host.row == 0]]
+    goes = list(zip(weight, host.successor[host.row == 0].tolist(), strict=True))
+    hit, left = (sum(w for w, t in goes if t >= 2 and (target[t] or which)) for which in (0, 1))
+    assert Fraction(float(found.lower[0])) <= hit / left <= Fraction(float(found.upper[0]))
+    assert found.upper[0] - found.lower[0] <= 1e-6
