@@ -6,24 +6,26 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.host.optimal import Enclosed
 from jaxltl.core.host.sparse import Floats, HostMDP
-from jaxltl.core.host.transient import Transient, optimum
+from jaxltl.core.host.transient import Enclosed, Transient, optimum
 
 _EPS = float(np.finfo(np.float64).eps)
 
 
 def discounted_value(
-    mdp: HostMDP, reward: Floats, discount: float, *, maximize: bool, tolerance: float
+    mdp: HostMDP, reward: Floats, magnitude: Floats, discount: float, *, maximize: bool,
+    tolerance: float, depth: int = 0,
 ) -> Enclosed:
     """``V = opt_r (reward_r + discount * P_r V)``, enclosed.
 
     Args:
       mdp: the model.
       reward: ``float64[R]``, of any sign.
+      magnitude: ``float64[R]``, the sum of the absolute values of what a reward is made of.
       discount: in ``[0, 1)``.
       maximize: which optimum.
       tolerance: the width of the enclosure asked for.
+      depth: how many roundings stand behind each number of the model.
     """
     least = float(reward.min())
     ending = _ending(mdp, discount)
@@ -31,11 +33,14 @@ def discounted_value(
     open_[-1] = False
     # What every step earns at least is earned for ever, and the rest is at least 0.
     cost = np.append(reward - least, 0)
-    problem = Transient(ending, open_, np.zeros(open_.size), cost)
+    problem = Transient(ending, open_, np.zeros(open_.size), cost, depth=depth)
     found = optimum(problem, maximize=maximize, tolerance=tolerance, relative=False)
     always = least / (1 - discount)
     value, lower, upper = (x[:-1] + always for x in (found.value, found.lower, found.upper))
-    slack = 4 * _EPS * (np.abs(found.value[:-1]) + abs(always))
+    # Terms of a reward may cancel, and their rounding stays.
+    terms = int(np.diff(mdp.entry_start).max()) + depth + 4
+    lost = terms * float(magnitude.max()) / (1 - discount)
+    slack = 4 * _EPS * (np.abs(found.value[:-1]) + abs(always) + lost)
     return Enclosed(
         value, lower - slack, upper + slack, found.row[:-1], found.rounds, found.residual,
         found.method)

@@ -22,29 +22,9 @@ from jaxltl.core.host.sparse_graph import (
     surely_reaching,
     towards,
 )
-from jaxltl.core.host.transient import Transient, optimum
+from jaxltl.core.host.transient import Enclosed, Transient, optimum
 
 _EPS = float(np.finfo(np.float64).eps)
-
-
-class Enclosed(NamedTuple):
-    """Certified values.
-
-    Attributes:
-      value, lower, upper: ``float64[S]``.
-      row: ``int64[S]``, a policy; of an optimum it attains the bound on the safe side.
-      rounds: systems solved.
-      residual: how far the value is from satisfying its equation.
-      method: how it was found, in words.
-    """
-
-    value: Floats
-    lower: Floats
-    upper: Floats
-    row: Integers
-    rounds: int
-    residual: float
-    method: str
 
 
 class Reduced(NamedTuple):
@@ -90,7 +70,7 @@ class _Left(NamedTuple):
 
 def reachability(
     mdp: HostMDP, target: Booleans, *, maximize: bool, stay: Booleans | None = None,
-    tolerance: float = 1e-6,
+    tolerance: float = 1e-6, depth: int = 0,
 ) -> Enclosed:
     """The largest or smallest probability of reaching a target through states where one may stay.
 
@@ -100,12 +80,15 @@ def reachability(
       maximize: which of the two; the same for a Markov chain.
       stay: ``bool[S]``, the states that may be passed; default all.
       tolerance: the width of the enclosure asked for.
+      depth: how many roundings stand behind each number of the model.
     """
-    return _solved(reduce_reachability(mdp, target, maximize=maximize, stay=stay), tolerance)
+    return _solved(
+        reduce_reachability(mdp, target, maximize=maximize, stay=stay, depth=depth), tolerance)
 
 
 def reduce_reachability(
-    mdp: HostMDP, target: Booleans, *, maximize: bool, stay: Booleans | None = None
+    mdp: HostMDP, target: Booleans, *, maximize: bool, stay: Booleans | None = None,
+    depth: int = 0,
 ) -> Reduced:
     """What the graph leaves of :func:`reachability`, with the same arguments."""
     blocked = np.zeros(mdp.num_states, bool) if stay is None else ~stay & ~target
@@ -114,7 +97,7 @@ def reduce_reachability(
     goal, dead = (np.zeros(small.num_states, bool) for _ in range(2))
     goal[whole.node[target]], dead[whole.node[blocked]] = True, True
     reduce = _largest if maximize and not small.is_chain else _smallest
-    left = reduce(small, goal, dead, whole.depth)
+    left = reduce(small, goal, dead, whole.depth + depth)
     return _reduced(mdp, whole, left, 1.0, maximize and not small.is_chain)
 
 
@@ -254,7 +237,8 @@ def _largest_apart(mdp: HostMDP, goal: Booleans, zero: Booleans, depth: int) -> 
 
 
 def total_reward(
-    mdp: HostMDP, reward: Floats, target: Booleans, *, maximize: bool, tolerance: float = 1e-6
+    mdp: HostMDP, reward: Floats, target: Booleans, *, maximize: bool, tolerance: float = 1e-6,
+    depth: int = 0,
 ) -> Enclosed:
     """The largest or smallest expected reward until a target is reached.
 
@@ -267,22 +251,25 @@ def total_reward(
       target: ``bool[S]``.
       maximize: which of the two.
       tolerance: the width of the enclosure asked for, as a share of the value.
+      depth: how many roundings stand behind each number of the model.
     """
-    return _solved(reduce_total_reward(mdp, reward, target, maximize=maximize), tolerance)
+    return _solved(
+        reduce_total_reward(mdp, reward, target, maximize=maximize, depth=depth), tolerance)
 
 
 def reduce_total_reward(
     mdp: HostMDP, reward: Floats, target: Booleans, *, maximize: bool,
-    kept: Booleans | None = None,
+    kept: Booleans | None = None, depth: int = 0,
 ) -> Reduced:
     """What the graph leaves of :func:`total_reward`, with the same arguments.
 
     Args:
-      mdp, reward, target, maximize: the question.
+      mdp, reward, target, maximize, depth: the question.
       kept: ``bool[S]``, states that are no part of a chain.
     """
     fixed = target if kept is None else target | kept
     whole = without_chains(mdp, fixed, reward) or _identity(mdp)._replace(cost=reward)
+    whole = whole._replace(depth=whole.depth + depth)
     small = whole.mdp
     goal = np.zeros(small.num_states, bool)
     goal[whole.node[target]] = True
@@ -353,7 +340,7 @@ def _least(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> _Left:
 
 
 def reward_forever(
-    mdp: HostMDP, reward: Floats, *, maximize: bool, tolerance: float = 1e-6
+    mdp: HostMDP, reward: Floats, *, maximize: bool, tolerance: float = 1e-6, depth: int = 0
 ) -> Enclosed:
     """The largest or smallest expected reward in all.
 
@@ -366,11 +353,13 @@ def reward_forever(
       reward: ``float[R]``, at least 0.
       maximize: which of the two.
       tolerance: the width of the enclosure asked for, as a share of the value.
+      depth: how many roundings stand behind each number of the model.
     """
     if not maximize or mdp.is_chain:
         earning = reward > 0
         never = ~_kept_away(mdp, earning)
-        found = total_reward(mdp, reward, never, maximize=False, tolerance=tolerance)
+        found = total_reward(
+            mdp, reward, never, maximize=False, tolerance=tolerance, depth=depth)
         quiet = never[mdp.state] & ~earning & ~mdp.support.lead_to(~never)
         return found._replace(row=np.where(never, mdp.first_choice(quiet)[1], found.row))
     components = end_components(mdp)
@@ -385,7 +374,7 @@ def reward_forever(
     infinite_ = np.zeros(small.num_states, bool)
     infinite_[part.node[infinite]] = True
     row = small.row_start[:-1].astype(np.int64)
-    rest = _finite(small, part.cost, ~left, infinite_, row, 0)
+    rest = _finite(small, part.cost, ~left, infinite_, row, depth)
     found = _enclosed(_reduced(mdp, part, rest, np.inf, True), tolerance)
     leaving = leaving_by(mdp, components, part.row[found.row][part.node])
     endless = _earning(mdp, components, rich, reward)

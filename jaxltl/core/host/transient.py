@@ -58,8 +58,8 @@ class Transient(NamedTuple):
     depth: int = 0
 
 
-class Optimum(NamedTuple):
-    """An enclosed optimum.
+class Enclosed(NamedTuple):
+    """Certified values of an optimum, or of a chain.
 
     Attributes:
       value, lower, upper: ``float64[S]``; where nothing could be proven, 0 and infinity.
@@ -111,7 +111,7 @@ class _System(NamedTuple):
             self.row[row], self.node[node], self.leaving[row], self.widest)
 
 
-def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: bool) -> Optimum:
+def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: bool) -> Enclosed:
     """The optimal sums, enclosed.
 
     Args:
@@ -158,7 +158,7 @@ def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: b
 def _found(
     problem: Transient, system: _System, bounds: Floats, chosen: Integers, sign: int, rounds: int,
     method: str,
-) -> Optimum:
+) -> Enclosed:
     near, far, value = bounds
     low, high = (near, far) if sign > 0 else (far, near)
     # Products too small for a float to hold are lost; relative errors do not count them.
@@ -173,7 +173,7 @@ def _found(
 
     row = problem.mdp.row_start[:-1].astype(np.int64)
     row[system.node] = system.row[chosen]
-    return Optimum(
+    return Enclosed(
         everywhere(value), everywhere(low), everywhere(high), row, rounds,
         _residual(system, value, sign), method)
 

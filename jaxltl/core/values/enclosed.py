@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxltl.core.host import optimal
 from jaxltl.core.host.discounted import discounted_value
-from jaxltl.core.host.optimal import Enclosed
 from jaxltl.core.host.sparse import HostMDP
+from jaxltl.core.host.transient import Enclosed
 from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.sparse import SparseMDP, row_reward
+from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import (
     Method,
     Solution,
@@ -24,6 +24,7 @@ from jaxltl.core.types import (
     require_shape,
     row_tolerance,
 )
+from jaxltl.core.values.bounded import finite_reward
 
 
 def is_sparse(model: Any) -> bool:
@@ -76,8 +77,27 @@ def solution_of(
     return Solution(**to_jax(parts), method=method)
 
 
-def chain_of(model: Any, sparse: SparseMDP, policy: Any) -> tuple[HostMDP, np.ndarray]:
-    """The Markov chain of a policy, and how much of each row it takes, ``float64[R]``.
+class Chain(NamedTuple):
+    """The Markov chain of a policy.
+
+    Attributes:
+      mdp: the chain.
+      weight: ``float64[R]``, how much of each row it takes; a state's sum to one.
+      depth: how many roundings stand behind a number of the chain.
+    """
+
+    mdp: HostMDP
+    weight: np.ndarray
+    depth: int
+
+    def mean(self, quantity: np.ndarray, row_start: np.ndarray) -> np.ndarray:
+        """The mean of a quantity on rows in each state, ``float64[S]``; 0 of rows not taken."""
+        taken = np.where(self.weight > 0, self.weight * quantity, 0)
+        return np.add.reduceat(taken, row_start[:-1])
+
+
+def chain_of(model: Any, sparse: SparseMDP, policy: Any) -> Chain:
+    """The Markov chain of a policy.
 
     Args:
       model: the model that the policy is for.
@@ -102,12 +122,14 @@ def chain_of(model: Any, sparse: SparseMDP, policy: Any) -> tuple[HostMDP, np.nd
     taken = np.flatnonzero(weight > 0)
     count = np.bincount(host.state[taken], minlength=host.num_states)
     starts = np.concatenate([[0], count.cumsum()])
-    share = (weight / total[host.state])[taken]
-    mix = csr_array((share, taken, starts), shape=(host.num_states, host.num_rows))
+    weight = weight / total[host.state]
+    mix = csr_array((weight[taken], taken, starts), shape=(host.num_states, host.num_rows))
     chain = (mix @ host.matrix).tocsr()
     chain.sort_indices()
+    most = int(count.max())
+    depth = 2 * most + 4 if most > 1 else 0  # two sums of so many terms, one to divide by
     states = np.arange(host.num_states + 1)
-    return HostMDP(states, chain.indptr, chain.indices, chain.data), weight
+    return Chain(HostMDP(states, chain.indptr, chain.indices, chain.data), weight, depth)
 
 
 def _weights(model: Any, sparse: SparseMDP, policy: np.ndarray) -> np.ndarray:
@@ -140,7 +162,6 @@ def _weights(model: Any, sparse: SparseMDP, policy: np.ndarray) -> np.ndarray:
     return policy.astype(np.float64)
 
 
-
 def given_policy(solution: Solution, policy: Any) -> Solution:
     """A solution with the policy that it is of, where one was given."""
     if policy is None:
@@ -168,9 +189,11 @@ def reachability(
         require_shape("stay", stay, model.state_shape)
         stay = np.asarray(stay, bool).ravel()
     asked = default_tolerance(model) if tolerance is None else float(tolerance)
-    host = sparse.host if policy is None else chain_of(model, sparse, policy)[0]
+    host, depth = sparse.host, 0
+    if policy is not None:
+        host, _, depth = chain_of(model, sparse, policy)
     found = optimal.reachability(
-        host, target, maximize=objective == "max", stay=stay, tolerance=asked)
+        host, target, maximize=objective == "max", stay=stay, tolerance=asked, depth=depth)
     return given_policy(solution_of(model, sparse, found, asked, relative=False), policy)
 
 
@@ -180,7 +203,7 @@ def discounted(
     """Discounted values of a sparse model; arguments as of the functions for padded ones.
 
     Rewards are named, or arrays on states, choices or transitions, see
-    :func:`~jaxltl.core.models.sparse.row_reward`.
+    :func:`~jaxltl.core.models.sparse.row_reward`; they are finite.
     """
     if is_traced((model, reward, discount, policy, tolerance)):
         raise ValueError("a sparse model is read on the host: give concrete arrays, or pad it by "
@@ -188,16 +211,16 @@ def discounted(
     if not 0 <= float(discount) < 1:
         raise ValueError(f"discount={float(discount):.6g}; it must be at least 0 and below 1.")
     sparse = to_sparse(model)
-    earned = row_reward(sparse, reward)
-    if not np.isfinite(earned).all():
-        raise ValueError("the reward of a choice is not finite; give numbers.")
-    host = sparse.host
+    earned, magnitude = finite_reward(sparse, reward)
+    host, depth = sparse.host, 0
     largest = float(np.abs(earned).max()) / (1 - float(discount))
     asked = 1e-8 * max(largest, 1e-300) if tolerance is None else 2 * float(tolerance)
     if policy is not None:
-        host, weight = chain_of(model, sparse, policy)
-        earned = np.add.reduceat(weight * earned, np.asarray(sparse.row_start)[:-1])
-    found = discounted_value(host, earned, float(discount), maximize=True, tolerance=asked)
+        chain = chain_of(model, sparse, policy)
+        earned, magnitude = (chain.mean(x, host.row_start) for x in (earned, magnitude))
+        host, depth = chain.mdp, chain.depth
+    found = discounted_value(
+        host, earned, magnitude, float(discount), maximize=True, tolerance=asked, depth=depth)
     width = found.upper - found.lower
     status = Status.CONVERGED if (width <= asked).all() else Status.PRECISION
     parts: dict[str, Any] = {

@@ -294,7 +294,7 @@ class _Search:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What a policy attains, with bounds, all to be made large."""
         sums, sparse = self.sums, as_sparse(self.product)
-        chain, _ = chain_of(sparse, sparse, weight)
+        chain = chain_of(sparse, sparse, weight)
         inside = (weight > 0) & home[sums.mdp.state]
         component = end_components(sums.mdp, rows=inside).component
         found = []
@@ -305,12 +305,14 @@ class _Search:
                 np.minimum.at(least, leader, level[inside])
                 good = home & (least[component] % 2 == 0)
                 x = optimal.reachability(
-                    chain, good, maximize=True, tolerance=self.tolerance / 8)
+                    chain.mdp, good, maximize=True, tolerance=self.tolerance / 8,
+                    depth=chain.depth)
             else:
                 rows = (sums.gain if part.kind == "gain" else sums.cost)[part.place]
-                earned = np.add.reduceat(weight * rows, sums.mdp.row_start[:-1])
+                earned = chain.mean(rows, sums.mdp.row_start)
                 x = optimal.total_reward(
-                    chain, earned, home, maximize=False, tolerance=self.tolerance / 8)
+                    chain.mdp, earned, home, maximize=False, tolerance=self.tolerance / 8,
+                    depth=chain.depth)
             found.append(self._expected(part, x))
         return tuple(np.array(x) for x in zip(*found, strict=True))  # type: ignore[return-value]
 

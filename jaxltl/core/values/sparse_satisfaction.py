@@ -11,16 +11,15 @@ from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.host.accepting import accepting_region
+from jaxltl.core.host.optimal import reachability
 from jaxltl.core.host.product import HostProduct, host_product, without_memory
-from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.logic.ltl import as_formula
 from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.models.state_formulas import letters_of
 from jaxltl.core.types import Solution, require_shape
-from jaxltl.core.values.enclosed import chain_of
-from jaxltl.core.values.reachability import reachability_probability
+from jaxltl.core.values.enclosed import Chain, chain_of, default_tolerance, solution_of
 
 
 class Satisfaction(NamedTuple):
@@ -95,7 +94,7 @@ def sparse_satisfaction(
 
 def _best(
     product: HostProduct, automaton: Automaton, letter: np.ndarray, yes: np.ndarray,
-    no: np.ndarray, on_entry: bool, objective: str, tolerance: float | None,
+    no: np.ndarray, on_entry: bool, objective: str, tolerance: float | None, depth: int = 0,
 ) -> tuple[Solution, np.ndarray]:
     """The best probability from all states of a product, and the rows that attain it."""
     opposite = automaton.acceptance == "safety" or (
@@ -113,8 +112,12 @@ def _best(
         aim = "max"
     else:
         aim = objective if not opposite else {"max": "min", "min": "max"}[objective]
-    found = reachability_probability(
-        as_sparse(product), goal, objective=aim, tolerance=tolerance)
+    whole = as_sparse(product)
+    asked = default_tolerance(whole) if tolerance is None else float(tolerance)
+    found = solution_of(
+        whole, whole, reachability(
+            product.host, goal, maximize=aim == "max", tolerance=asked, depth=depth),
+        asked, relative=False)
     row = np.asarray(found.policy)
     if visiting is not None:
         row = np.where(visiting.region, visiting.row, row)
@@ -151,11 +154,13 @@ def product_satisfaction(
     state, memory = (x.ravel() for x in np.indices(shape))
     product = host_product(
         world.host, automaton.delta, letter, state, memory, on_entry=on_entry)
+    depth = 0
     if policy is not None:
-        product = product._replace(host=_chain(product, model, policy))
+        chain = _chain(product, model, policy)
+        product, depth, objective = product._replace(host=chain.mdp), chain.depth, "max"
     found, row = _best(
         product, automaton, letter, universal_states(automaton), ~live_states(automaton), on_entry,
-        "max" if policy is not None else objective, tolerance)
+        objective, tolerance, depth)
     parts: dict[str, Any] = {
         name: np.asarray(getattr(found, name)).reshape(shape)
         for name in ("value", "lower", "upper")}
@@ -164,7 +169,7 @@ def product_satisfaction(
     return replace(found, **parts)
 
 
-def _chain(product: HostProduct, model: Product, policy: Any) -> HostMDP:
+def _chain(product: HostProduct, model: Product, policy: Any) -> Chain:
     """The chain of a policy of the world's rows."""
     policy = np.asarray(policy)
     written = as_sparse(product)
@@ -177,7 +182,7 @@ def _chain(product: HostProduct, model: Product, policy: Any) -> HostMDP:
         world: Any = model.mdp
         require_shape("policy", policy, (world.num_rows, model.num_memory))
         weight = policy[product.base_row, memory]
-    return chain_of(written, written, weight)[0]
+    return chain_of(written, written, weight)
 
 
 def _product(

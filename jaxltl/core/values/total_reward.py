@@ -80,16 +80,17 @@ def total_reward(
         require_shape("target", target, model.state_shape)
         target = np.asarray(target, bool).ravel()
     asked = default_tolerance(model) if tolerance is None else float(tolerance)
-    host, maximize = sparse.host, objective == "max"
-    weight = None
+    host, depth, maximize = sparse.host, 0, objective == "max"
     if policy is not None:
-        host, weight = chain_of(model, sparse, policy)
-        taken = np.where(weight > 0, weight * earned, 0)
-        earned = np.add.reduceat(taken, np.asarray(sparse.row_start)[:-1])
+        chain = chain_of(model, sparse, policy)
+        earned = chain.mean(earned, host.row_start)
+        host, depth = chain.mdp, chain.depth
     if target is None:
-        found = optimal.reward_forever(host, earned, maximize=maximize, tolerance=asked)
+        found = optimal.reward_forever(
+            host, earned, maximize=maximize, tolerance=asked, depth=depth)
     else:
-        found = optimal.total_reward(host, earned, target, maximize=maximize, tolerance=asked)
+        found = optimal.total_reward(
+            host, earned, target, maximize=maximize, tolerance=asked, depth=depth)
     return given_policy(
         solution_of(model, sparse, found, asked, relative=True), policy)
 

@@ -69,11 +69,12 @@ def by_host(model, target, stay, reward, maximize):
 
 
 def of_policy(model, policy, target, stay, reward):
-    chain, weight = chain_of(model, model, policy)
+    chain = chain_of(model, model, policy)
     if reward is None:
-        return optimal.reachability(chain, target, maximize=True, stay=stay)
-    paid = np.add.reduceat(weight * reward, model.row_start[:-1])
-    return optimal.total_reward(chain, paid, target, maximize=True)
+        return optimal.reachability(
+            chain.mdp, target, maximize=True, stay=stay, depth=chain.depth)
+    paid = chain.mean(reward, model.row_start)
+    return optimal.total_reward(chain.mdp, paid, target, maximize=True, depth=chain.depth)
 
 
 def agree(found, expected, tolerance=1e-6):

@@ -1,5 +1,7 @@
 """The engine of sparse rows and the padded one enclose the same numbers, with policies as good."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from jaxltl.core.models.convert import to_padded, to_sparse
 from jaxltl.core.models.mdp import to_dense
 from jaxltl.core.models.product import product
 from jaxltl.core.models.restrict import restrict, with_allowed
+from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.types import Status
 from jaxltl.core.values.discounted import optimal_value, policy_value
 from jaxltl.core.values.reachability import reachability_probability
@@ -150,6 +153,28 @@ def test_discounted_values():
         far = discount**200 * np.abs(rows).max() / (1 - discount) + 1e-9
         assert (ours.lower <= value + far).all()
         assert (value - far <= ours.upper).all()
+
+
+def test_policies_of_many_choices_are_enclosed():
+    """What a sum over choices loses counts too: here most of what they add up to."""
+    count = 20_000
+    weight = np.full(count + 2, 2.5e-17)
+    weight[0], weight[-1] = 0.5, 0.5
+    successor = np.concatenate([np.ones(count + 1, int), [2], [1, 2]])
+    model = make_sparse([0, count + 2, count + 3, count + 4], np.arange(count + 5), successor,
+                        np.ones(count + 4))
+    policy = np.concatenate([weight, [1, 1]])
+    exact = [Fraction(float(w)) for w in weight]
+    share = sum(exact[:-1]) / sum(exact)
+    goal = np.array([False, True, False])
+    found = reachability_probability(model, goal, policy=policy)
+    assert Fraction(float(found.lower[0])) <= share <= Fraction(float(found.upper[0]))
+    reward = np.concatenate([np.ones(count + 1), [0, 0, 0]])
+    for target in (~np.array([True, False, False]), None):
+        earned = total_reward(model, reward, target, policy=policy)
+        assert Fraction(float(earned.lower[0])) <= share <= Fraction(float(earned.upper[0]))
+    value = policy_value(model, policy, reward, 0.5)
+    assert Fraction(float(value.lower[0])) <= share <= Fraction(float(value.upper[0]))
 
 
 def close(ours, theirs, discount):
