@@ -137,7 +137,9 @@ def weigh(
     first = np.flatnonzero(sums.start)
     share, high = sums.start[first], bound[quotient.node[first]]
     total = float(share @ high)
-    total += 4 * _EPS * float(share @ np.abs(high)) * (1 + first.size)
+    # What ends are worth may cancel what is spent, and its rounding stays.
+    size = float(share @ np.abs(high)) + float(np.abs(worth).max(initial=0))
+    total += 4 * _EPS * size * (1 + first.size)
     weight, home = _policy(mdp, where, free, best, quotient, row)
     return Weighed(total, weight, home)
 
