@@ -103,6 +103,9 @@ def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:
       solution: one, or a batch.
       certified: insist on bounds; False accepts ``UNCERTIFIED``, a small residual, too.
 
+    Returns:
+      The solution that was given.
+
     Raises:
       NotConverged: some lane did not converge. The message names the status, the
         first such lane, the residual and what to do.

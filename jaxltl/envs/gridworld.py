@@ -41,6 +41,9 @@ def gridworld(
       initial: where runs start, uniformly: a propositional formula over the labels
         (``"!r & !y"``), or a distribution ``float[S]``; default every cell.
 
+    Returns:
+      :class:`MDP` with ``rows * columns`` states and four actions.
+
     Raises:
       ValueError: a malformed map, a cell that the legend lacks, a probability outside
         [0, 1], an unknown proposition, or no initial cell.

@@ -202,6 +202,23 @@ _TO_BLANKS = bytes.maketrans(b":(),", b"    ")
 
 
 def read_rewards(sections: list[Section], model: SparseMDP, is_chain: bool) -> dict[str, Rewards]:
+    """The reward structures of a model's files.
+
+    Args:
+      sections: all that the files hold; those of rewards, ``"srew"`` of states and ``"trew"`` of
+        transitions, are read.
+      model: the model that they are for.
+      is_chain: whether it is a Markov chain, whose transitions have no choice to name.
+
+    Returns:
+      The structures by the names that the files give in their first lines. One without a name goes
+      by "", or by the number of its file where several have none; a state reward and a transition
+      reward of one name are one structure.
+
+    Raises:
+      ValueError: naming the file and the line: two rewards of one name and kind, text that breaks
+        the format, or a state, a choice or a transition that the model has not.
+    """
     parts: dict[str, tuple[str, Text, Rewards]] = {}
     found = [s for s in sections if s[0] in ("srew", "trew")]
     unnamed = len({number for _, number, text in found if not _reward_name(text)})

@@ -113,6 +113,9 @@ def make_automaton(
         acceptance: `"cosafe"` or `"safety"` with `final`; else follows from what is given.
         state_names: `[Q]` names, or none.
 
+    Returns:
+        The `Automaton`, on the host.
+
     Raises:
         ValueError: Naming the table, the entry and the fix.
 
@@ -331,6 +334,12 @@ def complement(automaton: Automaton) -> Automaton:
 
     The run is the same. Final states become the others, which turns co-safe into safety
     acceptance; other priorities grow by one, which turns Buchi into parity.
+
+    Args:
+      automaton: with any acceptance.
+
+    Returns:
+      The automaton of the other words, over the same letters.
 
     >>> from jaxltl.core.automata.translate import to_automaton
     >>> complement(to_automaton("F a")).state_names

@@ -84,6 +84,12 @@ def find_difference(a: Task, b: Task) -> Lasso | None:
 def is_equivalent(a: Task, b: Task) -> bool:
     """Whether two automata or formulas accept the same words over their joint letters, see `align`.
 
+    Args:
+      a, b: automata with any acceptance, formulas or their texts.
+
+    Returns:
+      Whether they do; :func:`find_difference` gives a word that tells them apart.
+
     >>> from jaxltl.core.automata.translate import to_automaton
     >>> is_equivalent(to_automaton("F a"), to_automaton("a | X F a"))
     True

@@ -66,6 +66,9 @@ def states_where(model: Any, condition: States, place: str = "condition") -> jax
         speaks of the world's states.
       place: what is asked for, to begin an error with.
 
+    Returns:
+      ``bool[S]``, or ``bool[S, Q]`` in a product.
+
     Raises:
       ValueError: wrong shape or dtype, an unknown proposition, or a temporal operator.
 
@@ -96,23 +99,62 @@ def states_where(model: Any, condition: States, place: str = "condition") -> jax
 
 
 def safety(game: Any, safe: States) -> Parity:
-    """Stay in `safe` for ever: ``G safe``."""
+    """Stay in `safe` for ever: ``G safe``.
+
+    Args:
+      game: the game.
+      safe: ``bool[S]`` or a Boolean formula over propositions.
+
+    Raises:
+      ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
+        proposition.
+    """
     return _parity(game, 0, 1, safe)
 
 
 def reach(game: Any, goal: States, *, safe: States = "true") -> Parity:
-    """Reach `goal`, through `safe` states until then: ``safe U goal``."""
+    """Reach `goal`, through `safe` states until then: ``safe U goal``.
+
+    Args:
+      game: the game.
+      goal: ``bool[S]`` or a Boolean formula over propositions.
+      safe: states not to leave before.
+
+    Raises:
+      ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
+        proposition.
+    """
     return _parity(game, 1, 2, safe, won=states_where(game, goal, "goal"))
 
 
 def buchi(game: Any, accepting: States, *, safe: States = "true") -> Parity:
-    """Meet `accepting` infinitely often and stay in `safe`: ``G F accepting & G safe``."""
+    """Meet `accepting` infinitely often and stay in `safe`: ``G F accepting & G safe``.
+
+    Args:
+      game: the game.
+      accepting: ``bool[S]`` or a Boolean formula over propositions.
+      safe: states never to leave.
+
+    Raises:
+      ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
+        proposition.
+    """
     xp, accepting = namespace(states_where(game, accepting, "accepting"))
     return _parity(game, xp.where(accepting, 0, 1), 2, safe)
 
 
 def cobuchi(game: Any, persistent: States, *, safe: States = "true") -> Parity:
-    """Stay in `persistent` from some point on: ``F G persistent & G safe``."""
+    """Stay in `persistent` from some point on: ``F G persistent & G safe``.
+
+    Args:
+      game: the game.
+      persistent: ``bool[S]`` or a Boolean formula over propositions.
+      safe: states never to leave.
+
+    Raises:
+      ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
+        proposition.
+    """
     xp, persistent = namespace(states_where(game, persistent, "persistent"))
     return _parity(game, xp.where(persistent, 2, 1), 3, safe)
 
@@ -128,6 +170,9 @@ def parity(
       safe: states never to leave.
       num_priorities: an upper bound on ``1 + priority``; needed only where the
         priorities are traced.
+
+    Returns:
+      :class:`Parity`.
 
     Raises:
       ValueError: negative or non-integer priorities, or a wrong shape.
@@ -161,7 +206,20 @@ def _parity(
 
 
 def generalized_buchi(game: Any, sets: Sequence[States], *, safe: States = "true") -> GR1:
-    """Meet each of several sets infinitely often and stay in `safe`."""
+    """Meet each of several sets infinitely often and stay in `safe`.
+
+    Args:
+      game: the game.
+      sets: of states, each ``bool[S]`` or a Boolean formula over propositions.
+      safe: states never to leave.
+
+    Returns:
+      :class:`GR1`, whose one assumption always holds.
+
+    Raises:
+      ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
+        proposition.
+    """
     return gr1(game, (), sets, safe=safe)
 
 
@@ -179,6 +237,9 @@ def gr1(
       assumptions, guarantees: sets of states, arrays or Boolean formulas, each of which is
         to be met infinitely often; G and F are not written.
       safe: states never to leave, whatever the environment does.
+
+    Returns:
+      :class:`GR1`.
 
     Raises:
       ValueError: an entry is not Boolean or mentions an unknown proposition.

@@ -146,6 +146,9 @@ def apply_strategy(strategy: Permissive) -> Restriction:
     What is reachable from the initial states where the strategy wins, as an ordinary game
     (dissertation, algorithm 3, step 2). Every run of it wins.
 
+    Args:
+      strategy: of :func:`permissive_strategy`, winning from some initial state.
+
     Returns:
       A :class:`~jaxltl.core.models.restrict.Restriction`; ``base_state`` and ``memory`` number the
       states of ``strategy.game``.

@@ -128,6 +128,12 @@ def almost_sure_buchi(game: Any, accepting: States) -> Winning:
       game: the game.
       accepting: ``bool[S]``, or a Boolean formula.
 
+    Returns:
+      :class:`Winning`, of the objective :func:`buchi`.
+
+    Raises:
+      ValueError: as of :func:`buchi`.
+
     Example:
       >>> from jaxltl.core.models.mdp import from_dense
       >>> world = from_dense([[[1.0, 0, 0, 0]], [[0.5, 0.5, 0, 0]], [[0.5, 0, 0, 0.5]],

@@ -104,6 +104,11 @@ def avoidable(model: Any, goal: jax.Array, allowed: jax.Array | None = None) -> 
 
     The complement of the ``"forall"`` attractor; the minimal reachability probability is
     zero exactly there.
+
+    Args:
+      model: the model.
+      goal: ``bool[S]``.
+      allowed: ``bool[S, A]``, the actions that count; default the available ones.
     """
     graph = graph_of(model, goal, allowed)
     return to_jax(avoid(graph, *take(graph, (goal, allowed))))

@@ -38,6 +38,9 @@ def end_components(
       region: ``bool[S]``.
       allowed: ``bool[S, A]``, the actions that count; default the available ones. Of a sparse
         model ``bool[R]``, as is `inside`.
+
+    Returns:
+      :class:`EndComponents`.
     """
     graph = graph_of(model, region, allowed)
     return to_jax(components_within(graph, *take(graph, (region, allowed))))

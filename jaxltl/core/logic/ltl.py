@@ -203,6 +203,9 @@ def parse_ltl(text: str) -> Formula:
     Args:
         text: The formula.
 
+    Returns:
+        The `Formula`; its ``str`` is text that is read as the same formula.
+
     Raises:
         ValueError: With the column of the first error and what was expected there.
 
@@ -421,6 +424,9 @@ def holds_on_lasso(
         formula: A formula or its text.
         prefix: `[n]` letters, each the collection of the propositions true there; may be empty.
         cycle: `[m]` letters, at least one.
+
+    Returns:
+        Whether it does.
 
     Raises:
         ValueError: For an empty cycle or a letter that is a bare string.

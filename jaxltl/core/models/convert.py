@@ -20,6 +20,12 @@ def to_sparse(model: Any) -> SparseMDP:
     actions, whose number is ``action[i]``. A product's states are numbered ``s * Q + q``, and
     labels are the world's.
 
+    Args:
+      model: the model.
+
+    Returns:
+      :class:`SparseMDP`; what is sparse already comes back as it is.
+
     Raises:
       ValueError: the model is none of these.
 

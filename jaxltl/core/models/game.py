@@ -84,6 +84,9 @@ def make_game(model: Any, system: Sequence[bool] | chex.Array) -> Game:
       model: an MDP, a DenseMDP, a SparseMDP or a Product.
       system: whose turn it is in each state: True the system's, False the environment's.
 
+    Returns:
+      :class:`Game`.
+
     Raises:
       ValueError: a state has no owner, or no move.
 

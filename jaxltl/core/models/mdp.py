@@ -140,6 +140,9 @@ def make_mdp(
         ``{"goal": [15]}``; default: no propositions.
       propositions: P distinct names; default: those of a label by names, in its order.
 
+    Returns:
+      :class:`MDP`, in JAX's current default dtype.
+
     Raises:
       ValueError: an array has the wrong shape, a probability is negative or not
         finite, a row does not sum to one, a successor is out of range, a state
@@ -207,6 +210,9 @@ def from_dense(
       transition: ``float[S, A, S]``.
       available, initial, label, propositions: as for :func:`make_mdp`.
 
+    Returns:
+      :class:`MDP`.
+
     Raises:
       ValueError: as :func:`make_mdp`, and when the matrix is not ``[S, A, S]``.
 
@@ -232,7 +238,13 @@ def from_dense(
 def to_dense(mdp: MDP) -> DenseMDP:
     """The same process as a :class:`DenseMDP`; memory grows with S squared.
 
+    Args:
+      mdp: concrete or traced.
+
     Differentiable in the transition probabilities.
+
+    Returns:
+      :class:`DenseMDP`.
 
     Example:
       >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
@@ -293,6 +305,19 @@ def _checked_available(available: chex.Array, shape: tuple[int, int]) -> np.ndar
 
 
 def checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
+    """An initial distribution, checked, on the host.
+
+    Args:
+      initial: ``float[S]``, a distribution within 1e-6; None for the uniform one.
+      num_states: S.
+
+    Returns:
+      ``float64[S]``, which sums to one.
+
+    Raises:
+      ValueError: a wrong shape, a probability that is negative or NaN, with its state, or a sum
+        that is not 1.
+    """
     if initial is None:
         return np.full(num_states, 1 / num_states)
     initial = np.asarray(initial, np.float64)
@@ -312,6 +337,21 @@ def checked_label(
     label: chex.Array | Mapping[str, Sequence[int]] | None, propositions: Sequence[str],
     num_states: int,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Where propositions hold, and their names, checked, on the host.
+
+    Args:
+      label: ``bool[S, P]``, or the states where each proposition holds, by its name; None for no
+        propositions.
+      propositions: P distinct names; of a label by names, default its own, in their order.
+      num_states: S.
+
+    Returns:
+      ``bool[S, P]`` and the P names.
+
+    Raises:
+      ValueError: names that are not distinct or not those of the label, names without a label, a
+        wrong shape, or a state that does not exist.
+    """
     names = tuple(propositions)
     if len(set(names)) != len(names):
         raise ValueError(f"propositions {names} are not distinct.")

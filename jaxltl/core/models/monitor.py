@@ -56,6 +56,9 @@ def verdict(automaton: Automaton, word: Iterable[Letter]) -> Verdict:
       automaton: the task, with any acceptance.
       word: T letters, each the collection of the propositions that hold.
 
+    Returns:
+      :class:`Verdict`: whether every, none or some of the word's continuations satisfy the task.
+
     Raises:
       ValueError: a letter is not among the automaton's.
 
@@ -78,6 +81,12 @@ def verdicts(automaton: Automaton) -> np.ndarray:
 def make_monitor(automaton: Automaton) -> Monitor:
     """The monitor of an automaton, with any acceptance; made on the host.
 
+    Args:
+      automaton: the task.
+
+    Returns:
+      :class:`Monitor`, for :func:`monitor_step`.
+
     Example:
       >>> from jaxltl.core.automata.translate import to_automaton
       >>> make_monitor(to_automaton("G a")).verdict.tolist()
@@ -97,6 +106,9 @@ def monitor_step(monitor: Monitor, state: chex.Array, letter: chex.Array) -> jax
       monitor: from :func:`make_monitor`.
       state: ``int32[...]``; start with ``monitor.initial``.
       letter: ``int[...]`` in 0..L-1, of a shape that broadcasts with the state's.
+
+    Returns:
+      ``int32[...]``; its verdict is ``monitor.verdict[state]``.
 
     Raises:
       TypeError: letters that are not integers, such as a row of booleans.

@@ -38,6 +38,9 @@ def expectation(model: Any, value: jax.Array) -> jax.Array:
       ``float[S, A]``, zero at unavailable actions. Linear in `value` and in the
       transition probabilities, and differentiable in both.
 
+    Raises:
+      TypeError: the model is none.
+
     Example:
       >>> from jaxltl.core.models.mdp import from_dense
       >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
@@ -52,6 +55,13 @@ def exists_successor(model: Any, region: jax.Array) -> jax.Array:
     """Whether some successor lies in a region: ``bool[S, A]`` from ``bool[S]``.
 
     Decided on the support of the transition function. False at unavailable actions.
+
+    Args:
+      model: the model.
+      region: ``bool[S]``.
+
+    Raises:
+      TypeError: the model is none.
     """
     raise TypeError(_unknown(model))
 
@@ -61,6 +71,13 @@ def forall_successor(model: Any, region: jax.Array) -> jax.Array:
     """Whether all successors lie in a region: ``bool[S, A]`` from ``bool[S]``.
 
     Decided on the support; padding counts as true, so unavailable actions are True.
+
+    Args:
+      model: the model.
+      region: ``bool[S]``.
+
+    Raises:
+      TypeError: the model is none.
     """
     raise TypeError(_unknown(model))
 
@@ -89,6 +106,9 @@ def sample_successor(
 
     Returns:
       ``int32[]``, the successor.
+
+    Raises:
+      TypeError: the model is none.
     """
     raise TypeError(_unknown(model))
 

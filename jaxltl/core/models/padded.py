@@ -16,6 +16,12 @@ def to_padded(model: SparseMDP) -> MDP:
     An action of the padded model is the number of a choice's action where actions have numbers
     without names, as :func:`to_sparse` gives them, else its rank among the choices of its state.
 
+    Args:
+      model: the sparse model.
+
+    Returns:
+      :class:`MDP`, with A the largest number of choices and K that of successors.
+
     Raises:
       ValueError: padding would take more than 8 GB, with the size; or two choices of a state have
         one number.

@@ -167,6 +167,9 @@ def letters(world: MDP | DenseMDP, propositions: Collection[str] | None = None) 
       world: the model.
       propositions: keep only these; default all.
 
+    Returns:
+      The letters, each once.
+
     Example:
       >>> from jaxltl.core.models.mdp import from_dense
       >>> world = from_dense([[[1.0, 0]], [[0, 1.0]]], label=[[0], [1]], propositions=["a"])
@@ -430,6 +433,9 @@ def project_trajectories(model: Product, trajectories: Trajectories) -> Trajecto
       model: the product.
       trajectories: of the product, such as those of a rollout in it.
 
+    Returns:
+      :class:`Trajectories` of the world.
+
     Raises:
       ValueError: they are not the product's.
     """
@@ -479,7 +485,15 @@ def allowed_steps(model: Any, trajectories: Trajectories) -> np.ndarray:
 
 
 def lift_policy(model: Product, policy: jax.Array) -> jax.Array:
-    """A memoryless policy of the world as a policy of the product: ``[S, Q, ...]``."""
+    """A memoryless policy of the world as a policy of the product: ``[S, Q, ...]``.
+
+    Args:
+      model: the product.
+      policy: ``[S, ...]``, of the world.
+
+    Returns:
+      ``[S, Q, ...]``: the policy does not see the memory.
+    """
     return jnp.repeat(policy[:, None], model.num_memory, axis=1)
 
 
@@ -506,6 +520,13 @@ class FiniteMemoryPolicy:
 
 def project_policy(model: Product, policy: jax.Array) -> FiniteMemoryPolicy:
     """A product policy as a finite-memory policy that runs on the world alone.
+
+    Args:
+      model: the product.
+      policy: ``float[S, Q, A]`` or ``int32[S, Q]``.
+
+    Returns:
+      :class:`FiniteMemoryPolicy`.
 
     Raises:
       ValueError: the policy does not have the product's shape.

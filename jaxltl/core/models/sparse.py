@@ -218,6 +218,9 @@ def make_sparse(
       action_names: the names of the actions.
       valuation: values of named variables, ``[S]`` each.
 
+    Returns:
+      :class:`SparseMDP`, as NumPy arrays of ``float64``.
+
     Raises:
       ValueError: naming the state, the choice and the value: a shape is wrong, starts do not
         ascend, a state has no choice, a choice no successor, a successor is out of range, a

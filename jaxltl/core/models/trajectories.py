@@ -49,6 +49,9 @@ def make_trajectories(
       model: the model in which they were recorded.
       sequences: N sequences of at least one pair each.
 
+    Returns:
+      :class:`Trajectories` with N rows.
+
     Raises:
       ValueError: a state or action does not exist, an action is not available, or a
         step leads where the model cannot go. The message names the trajectory, the

@@ -120,6 +120,9 @@ def achievable(
       tolerance: how near to the border it need not be told.
       max_points: weighted sums at most.
 
+    Returns:
+      :class:`Achievable`, with the front that shows it.
+
     Raises:
       ValueError: an objective's name, reward or shape, or an expected reward that is infinite.
 
@@ -153,6 +156,10 @@ def pareto(
       model, objectives: as for :func:`achievable`.
       tolerance: how far the curve may be beyond the mixtures of points.
       max_points: weighted sums at most.
+
+    Returns:
+      :class:`Pareto`; CONVERGED if nothing lies farther beyond its points' mixtures than
+      `tolerance`.
 
     Raises:
       ValueError: as for :func:`achievable`.

@@ -113,5 +113,8 @@ def feature_expectation(occupancy: jax.Array, features: jax.Array) -> jax.Array:
     Args:
       occupancy: ``float[S, A]``, the value of :func:`occupancy_measure`.
       features: ``float[S, A, F]``.
+
+    Returns:
+      ``float[F]``; linear in both, and differentiable in them.
     """
     return jnp.tensordot(occupancy, features, axes=occupancy.ndim)

@@ -67,6 +67,9 @@ def sparse_satisfaction(
         left. The probabilities are the same, for the run shows the same word.
       tolerance: of :func:`~jaxltl.core.values.reachability.reachability_probability`.
 
+    Returns:
+      :class:`Satisfaction`.
+
     Raises:
       ValueError: an unknown label, objective or reading, or a product beyond 2^31 states.
 
