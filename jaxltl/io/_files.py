@@ -79,6 +79,27 @@ def pieces(data: bytes, name: str, limit: int = MAX_BYTES) -> Iterator[bytes]:
         ) from None
 
 
+def read_text(path: str | os.PathLike[str], expected: str) -> str:
+    """The text of a file, decompressed as by :func:`read_bytes`.
+
+    Args:
+      path: the file.
+      expected: what the file should hold, to be named in an error: "a game".
+
+    Raises:
+      ValueError: naming the file: it cannot be read; or the first line and byte that are no UTF-8.
+    """
+    data = read_bytes(path)
+    try:
+        return data.decode()
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise ValueError(
+            f"{path}, line {line}: byte {data[error.start]:#x} is no UTF-8 text; {expected} is "
+            "expected."
+        ) from None
+
+
 def compression_of(data: bytes) -> Compression | None:
     """How bytes are compressed, by how they begin."""
     return next((kind for kind, begin in _BEGINS.items() if data.startswith(begin)), None)

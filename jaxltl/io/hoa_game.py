@@ -21,7 +21,7 @@ from jaxltl.core.logic.diagram import FALSE, TRUE, Diagrams, prime_cubes
 from jaxltl.core.logic.ltl import Formula, parse_ltl, proposition_text, subformulas
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
-from jaxltl.io._files import read_bytes
+from jaxltl.io._files import read_text
 from jaxltl.io._hoa_acceptance import condition_given, decisive_sets, edge_priority
 from jaxltl.io._hoa_grammar import Edge, State, error_at, parse_tokens, split_texts
 from jaxltl.io._hoa_header import Header, read_header
@@ -97,15 +97,7 @@ def read_hoa_game(source: str | os.PathLike[str]) -> HoaGame:
     if isinstance(source, str) and ("\n" in source or source.lstrip()[:4] in ("HOA:", "/*")):
         place, text = "read_hoa_game", source
     else:
-        place, data = str(source), read_bytes(source)
-        try:
-            text = data.decode()
-        except UnicodeDecodeError as error:
-            line = data.count(b"\n", 0, error.start) + 1
-            raise ValueError(
-                f"{place}, line {line}: byte {data[error.start]:#x} is no UTF-8 text; a game in "
-                "the Hanoi format is expected."
-            ) from None
+        place, text = str(source), read_text(source, "a game in the Hanoi format")
     try:
         found = split_texts(text)
         if len(found) != 1:

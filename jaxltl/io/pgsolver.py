@@ -20,7 +20,7 @@ from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import support
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
-from jaxltl.io._files import read_bytes, write_bytes
+from jaxltl.io._files import read_text, write_bytes
 
 MAX_NUMBER = 2**31 - 1  # of vertices and of priorities
 
@@ -65,16 +65,7 @@ def read_pgsolver(path: str | os.PathLike[str]) -> ParityGame:
       >>> winning_region(game, objective).region.tolist()
       [True, True, False]
     """
-    name, data = str(path), read_bytes(path)
-    try:
-        text = data.decode()
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise ValueError(
-            f"{name}, line {line}: byte {data[error.start]:#x} is no UTF-8 text; "
-            "a game of PGSolver's format is expected."
-        ) from None
-    return _Reader(name, text).game()
+    return _Reader(str(path), read_text(path, "a game of PGSolver's format")).game()
 
 
 def min_even(priority: NDArray[Any], neutral: NDArray[np.bool_] | None = None) -> NDArray[Any]:

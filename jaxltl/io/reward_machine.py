@@ -24,7 +24,7 @@ from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.product import Product, expected_reads
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.io._files import read_bytes
+from jaxltl.io._files import read_text
 from jaxltl.io._hoa_table import alphabet_of
 
 
@@ -88,13 +88,7 @@ def read_reward_machine(
     """
     is_text = isinstance(source, str) and "\n" in source
     place = "read_reward_machine" if is_text else str(source)
-    if is_text:
-        text = str(source)
-    else:
-        try:
-            text = read_bytes(source).decode()
-        except UnicodeDecodeError as error:
-            raise ValueError(f"{place}: this is no UTF-8 text: {error}.") from None
+    text = str(source) if is_text else read_text(source, "a reward machine")
     reader = _Reader(place, text)
     initial, terminal, transitions = reader.statements()
     names = tuple(sorted({name for x in transitions for name in x.guard.propositions}))
