@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.models.sparse import Rewards, SparseMDP
+from jaxltl.io._init_label import labels_with_init
 from jaxltl.io._tokens import joined_lines
 
 _STEP = 2**17  # lines that are held at a time
@@ -108,25 +109,8 @@ def _action_texts(model: SparseMDP) -> Callable[[int], str] | None:
 
 def _labels(model: SparseMDP, storm: bool) -> tuple[list[str], list[NDArray[np.bool_]]]:
     """The names of the labels, "init" first, and where they hold."""
-    initial = np.asarray(model.initial)
-    where = initial > 0
-    if np.ptp(initial[where]) > 1e-12:
-        raise ValueError(
-            "the initial states are not equally likely, and the format has a set of "
-            "them; add a state whose one choice leads to them."
-        )
-    label = np.asarray(model.label, bool)
-    names, holds = ["init"], [where]
-    for i, name in enumerate(_plain(model.propositions, "label", ' "' if storm else '"')):
-        if name != "init":
-            names.append(name)
-            holds.append(label[:, i])
-        elif not np.array_equal(label[:, i], where):
-            raise ValueError(
-                "the label 'init' is that of the initial states, and the model has "
-                "another of this name; rename it."
-            )
-    return names, holds
+    found = labels_with_init(model)
+    return _plain(tuple(found), "label", ' "' if storm else '"'), list(found.values())
 
 
 def _label_lines(names: list[str], holds: list[NDArray[np.bool_]], storm: bool) -> Iterator[bytes]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.io._drn_body import NO_LABEL, Body, Header, names_of, read_body, read_header, rewards_of
 from jaxltl.io._files import read_bytes, write_bytes
+from jaxltl.io._init_label import labels_with_init
 from jaxltl.io._tokens import (
     Text,
     as_double,
@@ -257,25 +258,11 @@ def _bracketed(rewards: list[Any], part: slice, count: int) -> list[str]:
 
 def _label_texts(model: SparseMDP) -> list[tuple[str, NDArray[np.bool_]]]:
     """What stands after a state that has a label, and where it does; first the initial states."""
-    initial = np.asarray(model.initial)
-    where = initial > 0
-    if np.ptp(initial[where]) > 1e-12:
-        raise ValueError(
-            "the initial states are not equally likely, and the format has a set of "
-            "them; add a state whose one choice leads to them."
-        )
-    found, label = [(" init", where)], np.asarray(model.label, bool)
-    for i, name in enumerate(model.propositions):
+    found = []
+    for name, where in labels_with_init(model).items():
         _check_name("label", name, '"')
-        if name == "init":
-            if not np.array_equal(label[:, i], where):
-                raise ValueError(
-                    "the label 'init' is that of the initial states, and the model "
-                    "has another of this name; rename it."
-                )
-            continue
         plain = re.fullmatch(r"[^\s\[\]]+", name)
-        found.append((f" {name}" if plain else f' "{name}"', label[:, i]))
+        found.append((f" {name}" if plain else f' "{name}"', where))
     return found
 
 
