@@ -5,12 +5,18 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from hashlib import sha256
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
+from jaxltl.core.models.parametric import Ends, ParametricMDP, box_of, point_inside
+from jaxltl.core.models.rational import Rationals, make_rationals
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.io._drn_body import names_of, read_body, read_header, rewards_of
 from jaxltl.io._files import read_bytes
@@ -102,6 +108,133 @@ class ParametricModel:
             rewards=rewards,
             **self.names,
         )
+
+    def over(self, low: Ends, high: Ends) -> ParametricMDP:
+        """The same as JAX functions of the parameters, over a box of them.
+
+        Args:
+          low, high: one number for all parameters, a number for each name, or ``float[D]``; such
+            that no probability becomes zero in the box.
+
+        Raises:
+          ValueError: a name is missing, the ends cross, or the functions are no probabilities in
+            the box.
+
+        Example:
+          >>> import tempfile, pathlib
+          >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
+          >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n2\\n@model\\n"
+          ...     "state 0 init\\n\\taction 0\\n\\t\\t0 : 1-p\\n\\t\\t1 : p\\n"
+          ...     "state 1\\n\\taction 0\\n\\t\\t1 : 1\\n")
+          >>> coin = read_parametric(path).over(0.01, 0.99)
+          >>> coin.numbers(np.array([0.25]))[0].tolist()
+          [0.75, 0.25, 1.0]
+        """
+        low, high = box_of(low, high, self.parameters)
+        some = np.array([bool(f.numerator) for f in self.functions])[self.probability]
+        row = np.repeat(np.arange(self.entry_start.size - 1), np.diff(self.entry_start))
+        row, successor, function = (x[some] for x in (row, self.successor, self.probability))
+        order = np.lexsort((successor, row))
+        row, successor, function = (x[order] for x in (row, successor, function))
+        new = np.ones(row.size, bool)
+        new[1:] = (row[1:] != row[:-1]) | (successor[1:] != successor[:-1])
+        exact = _Exact(self, successor[new])
+        inside, model = point_inside(low, high, exact)
+        states = np.repeat(np.arange(self.row_start.size - 1), np.diff(self.row_start))
+        pairs = [(f.numerator, f.denominator) for f in self.functions]
+        numbers = _Numbers(
+            make_rationals(pairs, len(self.parameters)),
+            function.astype(np.int32),
+            None if new.all() else (new.cumsum() - 1).astype(np.int32),
+            {
+                name: (of_state[states].astype(np.int32), of_choice.astype(np.int32))
+                for name, (of_state, of_choice) in self.rewards.items()
+            },
+            int(new.sum()),
+        )
+        widest = int(np.bincount(row).max(initial=1))
+        return ParametricMDP(
+            replace(model, valuation={}),
+            numbers,
+            low,
+            high,
+            inside,
+            self.parameters,
+            exact,
+            2 * widest + 6,
+        )
+
+
+@struct.dataclass
+class _Numbers:
+    """The probabilities and rewards of a model, from the values of its functions.
+
+    Attributes:
+      functions: all of them.
+      function: ``int32[E]``, the function of each entry that is not zero, in order.
+      entry: ``int32[E]``, the transitions that these are parts of; None if they are all of them.
+      rewards: the functions on the states of choices and on choices, ``int32[R]`` both.
+      num_transitions: static.
+    """
+
+    functions: Rationals
+    function: Any
+    entry: Any
+    rewards: dict[str, tuple[Any, Any]]
+    num_transitions: int = struct.field(pytree_node=False)
+
+    def __call__(self, x: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
+        value = self.functions(jnp.asarray(x))
+        probability = value[self.function]
+        if self.entry is not None:
+            probability = jax.ops.segment_sum(
+                probability, self.entry, self.num_transitions, indices_are_sorted=True
+            )
+        rewards = {
+            name: value[of_state] + value[of_choice]
+            for name, (of_state, of_choice) in self.rewards.items()
+        }
+        return probability, rewards
+
+
+class _Exact:
+    """Exact instantiation; equal for equal models, so that reading a file again compiles nothing.
+
+    Attributes:
+      model: what is instantiated.
+      successor: what its transitions lead to wherever none of them is gone.
+    """
+
+    def __init__(self, model: ParametricModel, successor: Integers) -> None:
+        self.model, self.successor = model, successor
+        parts = repr((model.parameters, model.functions, sorted(model.rewards))).encode()
+        arrays = (
+            model.row_start,
+            model.entry_start,
+            model.successor,
+            model.probability,
+            *(x for name in sorted(model.rewards) for x in model.rewards[name]),
+        )
+        self.digest = sha256(
+            parts + b"".join(np.asarray(x, np.int64).tobytes() for x in arrays)
+        ).hexdigest()
+
+    def __call__(self, point: np.ndarray) -> SparseMDP:
+        found = self.model.at(dict(zip(self.model.parameters, point.tolist(), strict=True)))
+        if not np.array_equal(found.successor, self.successor):
+            raise ValueError(
+                "some transitions are gone; keep the box away from where probabilities become zero."
+            )
+        return found
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Exact) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    def __repr__(self) -> str:
+        return f"exact {self.digest[:16]}"
 
 
 def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
@@ -203,7 +336,8 @@ def _value(polynomial: Polynomial, point: tuple[Fraction, ...]) -> Fraction:
     total = Fraction(0)
     for powers, coefficient in polynomial.items():
         for x, power in zip(point, powers, strict=True):
-            coefficient *= x**power
+            if power:
+                coefficient *= x**power
         total += coefficient
     return total
 

@@ -1,0 +1,555 @@
+"""Parameters for which a model has a property, by gradients from many starts (Heck et al. 2022).
+
+Given a model whose probabilities and rewards are functions of parameters in a box, is there a point
+at which a reachability probability or an expected reward is on the right side of a threshold? From
+each start the value climbs (or falls) along its gradient, which is the implicit derivative of a
+prepared solve, and stays in the box by projection. Coordinates are shares of the box, so that a
+rate means the same for every parameter. A run ends when it is past the threshold.
+
+What floats say there is no proof: :func:`feasible` has each point that is claimed certified by the
+host engine, on the model at that point, with bounds of both sides. Gradients find local optima;
+that nothing was found says nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+from jax import lax
+from jax.tree_util import Partial
+
+from jaxltl.algos import learner
+from jaxltl.algos.schedules import Schedule, at
+from jaxltl.core.host import optimal
+from jaxltl.core.models.concrete import to_jax
+from jaxltl.core.models.parametric import Ends, ParametricMDP
+from jaxltl.core.models.sparse import row_reward
+from jaxltl.core.types import Solution, Status, require_shape
+from jaxltl.core.values.prepared import Prepared, prepare, solve_prepared
+
+_UNIT = float(np.finfo(np.float64).eps)
+
+
+@struct.dataclass
+class Problem:
+    """A question about a parametric model; made by :func:`make_problem`.
+
+    Attributes:
+      model: the model; its box may be made smaller by :func:`within`.
+      prepared: the question, put in order.
+      weight: ``float[S]``, the initial distribution.
+      low, high, inside: ``float[D]``, the box and a point of it, in the precision of the search.
+      target, stay: ``bool[S]``, where to get, and what may be passed or None.
+      reward: the name of the reward, or None for a probability; static.
+      objective: ``"max"`` or ``"min"``, over policies; static.
+      bound: ``">="`` or ``"<="``, which side of the threshold is asked for; static.
+    """
+
+    model: ParametricMDP
+    prepared: Prepared
+    weight: Any
+    low: Any
+    high: Any
+    inside: Any
+    target: Any
+    stay: Any
+    reward: str | None = struct.field(pytree_node=False)
+    objective: str = struct.field(pytree_node=False)
+    bound: str = struct.field(pytree_node=False)
+
+    @property
+    def sign(self) -> float:
+        """What makes the side that is asked for the larger one."""
+        return 1.0 if self.bound == ">=" else -1.0
+
+
+@struct.dataclass
+class Hparams:
+    """How to search. Numbers are traced, so new values do not recompile.
+
+    Attributes:
+      learning_rate: in shares of the box; a schedule.
+      optimizer: ``"adam"``, ``"rmsprop"``, ``"sgd"``, or ``"sign"``, which takes the signs of the
+        gradient alone; static.
+      tolerance: of the solves, see :func:`~jaxltl.core.values.prepared.solve_prepared`; None is its
+        default.
+    """
+
+    learning_rate: Schedule = 0.1
+    optimizer: str = struct.field(pytree_node=False, default="adam")
+    tolerance: jax.Array | float | None = None
+
+
+@struct.dataclass
+class Best:
+    """A point, ``float[D]``, and its value; NaN before there is one."""
+
+    parameters: jax.Array
+    value: jax.Array
+
+
+@struct.dataclass
+class State:
+    """A search on its way.
+
+    Attributes:
+      key, step: the root key and the number of steps made.
+      parameters: ``float[D]``, where the next step looks.
+      inside: ``float[D]``, the newest point at which the functions were a model.
+      best: of all points seen.
+      optimizer: optax's state.
+    """
+
+    key: jax.Array
+    step: jax.Array
+    parameters: jax.Array
+    inside: jax.Array
+    best: Best
+    optimizer: Any
+
+
+@struct.dataclass
+class Metrics:
+    """Figures of the point before a step.
+
+    Attributes:
+      value: there.
+      best_value: of all points seen, this one included.
+      gradient_norm: Euclidean, with respect to shares of the box.
+      status: of the solve; INVALID where the functions are no model.
+    """
+
+    value: jax.Array
+    best_value: jax.Array
+    gradient_norm: jax.Array
+    status: jax.Array
+
+
+# --- problems, on the host ------------------------------------------------------------------
+
+
+def make_problem(
+    model: ParametricMDP,
+    target: str | chex.Array,
+    *,
+    bound: str,
+    reward: str | None = None,
+    stay: chex.Array | None = None,
+    objective: str = "max",
+) -> Problem:
+    """A checked :class:`Problem`, on the host: for which parameters is a value past a threshold?
+
+    Args:
+      model: made by :func:`~jaxltl.core.models.parametric.make_parametric`, or by
+        ``read_parametric(path).over(low, high)``.
+      target: ``bool[S]``, or a label.
+      bound: ``">="`` or ``"<="``: the value shall be at least or at most the threshold.
+      reward: the name of a reward asks for its expected total until the target; default: for the
+        probability of reaching it.
+      stay: ``bool[S]``, the states that may be passed before, of probabilities.
+      objective: ``"max"`` or ``"min"`` over the policies of a decision process: with ``"max"``,
+        ``">="`` asks for some policy and ``"<="`` for all of them. Of no effect on a chain.
+
+    Raises:
+      ValueError: an unknown bound, objective, reward or label, or a shape that does not fit; or
+        the reward is infinite at every point, as the target is not reached almost surely.
+    """
+    if bound not in (">=", "<="):
+        raise ValueError(f'bound={bound!r}; it must be ">=" or "<=".')
+    if objective not in ("max", "min"):
+        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    here = model.model
+    target = here.states_where(target) if isinstance(target, str) else np.asarray(target, bool)
+    require_shape("target", target, (here.num_states,))
+    if here.is_chain:
+        objective = "max"  # with it a reward may become zero
+    if reward is not None:
+        row_reward(here, reward)  # refuses an unknown name
+    prepared = prepare(here, target, stay=stay, reward=reward, objective=objective)
+    weight = np.asarray(here.initial, np.float64)
+    found = Problem(
+        model,
+        prepared,
+        weight,
+        model.low,
+        model.high,
+        model.inside,
+        target,
+        stay,
+        reward,
+        objective,
+        bound,
+    )
+    if reward is not None:
+        value = _certified(found, here, 1e-3)[1]
+        if np.isinf(value):
+            raise ValueError(
+                "the expected reward is infinite at every point: from some initial state the "
+                "target is not reached almost surely"
+                + ("." if here.is_chain else f' (objective="{objective}").')
+            )
+    return _rounded_inward(found)
+
+
+def within(problem: Problem, low: Ends, high: Ends) -> Problem:
+    """The same question over a smaller box; nothing is compiled anew.
+
+    Args:
+      problem: the question.
+      low, high: as of :func:`~jaxltl.core.models.parametric.make_parametric`.
+
+    Raises:
+      ValueError: the box is none, or reaches out of the problem's.
+    """
+    return _rounded_inward(replace(problem, model=problem.model.within(low, high)))
+
+
+def _rounded_inward(problem: Problem) -> Problem:
+    """The box in the precision of the search."""
+    dtype = np.dtype(jnp.zeros(()).dtype)
+    model = problem.model
+    low, high, inside = (x.astype(dtype) for x in (model.low, model.high, model.inside))
+    low = np.where(low < model.low, np.nextafter(low, dtype.type(np.inf)), low)
+    high = np.where(high > model.high, np.nextafter(high, dtype.type(-np.inf)), high)
+    if not (low < high).all():
+        d = int(np.flatnonzero(~(low < high))[0])
+        raise ValueError(
+            f"the interval of {model.parameters[d]} has no two numbers in {dtype}; widen it, or "
+            "use float64."
+        )
+    inside = np.clip(inside, low, high)
+    low, high, inside, weight = to_jax(
+        (low, high, inside, np.asarray(problem.weight).astype(dtype))
+    )
+    return replace(problem, low=low, high=high, inside=inside, weight=weight)
+
+
+# --- the search -----------------------------------------------------------------------------
+
+
+def solve(parameters: jax.Array, problem: Problem, hparams: Hparams) -> tuple[jax.Array, Solution]:
+    """The value at a point, and the solution of all states that it is of.
+
+    Args:
+      parameters: ``float[D]``.
+      problem, hparams: what and how.
+
+    Returns:
+      The mean over the initial distribution, and :class:`Solution`, whose status is ``INVALID``
+      where the functions are no model. Differentiable in the parameters; for an optimum over
+      policies with the optimal policy held fixed.
+    """
+    probability, rewards = problem.model.numbers(parameters)
+    found = solve_prepared(
+        problem.prepared,
+        probability=probability,
+        tolerance=hparams.tolerance,
+        reward=None if problem.reward is None else rewards.get(problem.reward),
+    )
+    start = problem.weight > 0
+    value = jnp.where(start, found.value, 0)
+    return jnp.sum(problem.weight * value), found
+
+
+def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """A point drawn uniformly from the box."""
+    share = jax.random.uniform(learner.init_key(key), problem.low.shape, problem.low.dtype)
+    return start_at(problem.low + share * (problem.high - problem.low), key, problem, hparams)
+
+
+def start_at(parameters: jax.Array, key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """A search that starts at a point, ``float[D]``, or at the nearest of the box."""
+    point = jnp.clip(jnp.asarray(parameters, problem.low.dtype), problem.low, problem.high)
+    best = Best(jnp.full_like(point, jnp.nan), jnp.full((), jnp.nan, point.dtype))
+    optimizer = learner.strong(_optimizer(hparams, 0).init(point))
+    return State(key, jnp.int32(0), point, problem.inside, best, optimizer)
+
+
+def _optimizer(hparams: Hparams, step: Any) -> optax.GradientTransformationExtraArgs:
+    rate = at(hparams.learning_rate, step)
+    if hparams.optimizer == "sign":
+        return optax.with_extra_args_support(
+            optax.chain(optax.scale_by_sign(), optax.scale_by_learning_rate(rate))
+        )
+    if hparams.optimizer == "lbfgs":
+        raise ValueError('optimizer="lbfgs" leaves the box; choose adam, rmsprop, sgd or sign.')
+    return learner.optimizer(hparams.optimizer, rate)
+
+
+def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """One step along the gradient, projected to the box; back half the way from where no model is.
+
+    Points where a solve failed count as such too.
+    """
+    x = state.parameters
+    size = problem.high - problem.low
+
+    def loss(x: jax.Array) -> tuple[jax.Array, Any]:
+        value, found = solve(x, problem, hparams)
+        return -problem.sign * value, (value, found.status)
+
+    slope, (value, status) = jax.grad(loss, has_aux=True)(x)
+    slope = slope * size
+    good = (status < Status.NONFINITE) & jnp.isfinite(value) & jnp.all(jnp.isfinite(slope))
+    updates, optimizer = _optimizer(hparams, state.step).update(
+        jnp.where(good, slope, 0), state.optimizer, x
+    )
+    moved = jnp.clip(x + updates * size, problem.low, problem.high)
+    back = x + (state.inside - x) / 2
+    gain = problem.sign * (value - state.best.value)
+    better = good & ~(gain <= 0)  # also if there was none
+    best = learner.choose(better, Best(x, value), state.best)
+    after = State(
+        state.key,
+        state.step + 1,
+        jnp.where(good, moved, back),
+        jnp.where(good, x, state.inside),
+        best,
+        learner.choose(good, optimizer, state.optimizer),
+    )
+    status = jnp.where(good | (status >= Status.NONFINITE), status, Status.NONFINITE)
+    return after, Metrics(value, best.value, optax.tree.norm(slope), status.astype(jnp.int32))
+
+
+run, train, run_until, train_until = learner.bind(init, step)
+
+
+def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """What was found: the parameters ``float[D]`` of the best value; NaN before there is one."""
+    del problem, hparams
+    return state.best.parameters
+
+
+# --- many starts, and what is proven ----------------------------------------------------------
+
+
+@struct.dataclass
+class Feasible:
+    """What searches from N starts found.
+
+    Attributes:
+      parameters: ``float64[N, D]``, the best point of each; NaN if the functions were a model
+        nowhere.
+      value: ``float64[N]``, there, as the search found it.
+      lower, upper: ``float64[N]``, certified bounds of the value of the model at that point, where
+        the threshold is claimed to be met; else what is known of any value, 0 and 1 or infinity.
+      feasible: ``bool[N]``, whether these bounds prove it.
+      num_steps: ``int32[N]``, of the searches.
+      status: ``int32[N]``: CONVERGED if it is proven; PRECISION if it seems met and the bounds do
+        not tell; MAX_STEPS if the search was stopped; INVALID or NONFINITE if nothing was found.
+      names: of the parameters, static.
+    """
+
+    parameters: np.ndarray
+    value: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    feasible: np.ndarray
+    num_steps: np.ndarray
+    status: np.ndarray
+    names: tuple[str, ...] = struct.field(pytree_node=False)
+
+    def valuation(self, i: int | None = None) -> dict[str, float]:
+        """The parameters of one by name; default the first that is feasible.
+
+        Raises:
+          ValueError: none is.
+        """
+        if i is None:
+            if not self.feasible.any():
+                raise ValueError("no parameters were proven feasible; read value and status.")
+            i = int(np.argmax(self.feasible))
+        return dict(zip(self.names, self.parameters[i].tolist(), strict=True))
+
+
+def feasible(
+    problem: Problem,
+    threshold: float,
+    *,
+    starts: int | chex.Array = 100,
+    key: chex.PRNGKey | None = None,
+    hparams: Hparams | None = None,
+    num_steps: int = 200,
+    tolerance: float = 1e-6,
+    report: Callable[[int, int], None] | None = None,
+) -> Feasible:
+    """Parameters for which a value is past a threshold, from many starts, proven.
+
+    Is there a point x of the box with ``V(x) >= threshold`` (or ``<=``)? All starts are one
+    compiled program, in which each ends for itself; new thresholds, boxes and numbers of steps
+    do not recompile it. Then each point at which the search saw the threshold met is certified by
+    the host engine, on the model at exactly that point where the model is read from a file.
+
+    Args:
+      problem: the question.
+      threshold: finite.
+      starts: how many random starts, or where to start, ``float[N, D]``.
+      key: of the random starts; default ``jax.random.key(0)``.
+      hparams: how to search.
+      num_steps: steps at most of each.
+      tolerance: the width of the certified bounds, of rewards as a share.
+      report: called with how many are certified and how many there are to certify.
+
+    Returns:
+      :class:`Feasible`; `feasible` only where the certified bound meets the threshold.
+
+    Raises:
+      ValueError: the threshold is not finite, or starts are none or not in the box.
+
+    Example:
+      >>> from jaxltl.core.models.parametric import make_parametric
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> twice = make_sparse(None, [0, 2, 4, 5, 6], [1, 3, 2, 3, 2, 3], [0.5] * 4 + [1, 1],
+      ...                     initial=[1, 0, 0, 0])
+      >>> def numbers(x):  # head, then tail
+      ...     p = x[0]
+      ...     return jnp.array([p, 1 - p, 1 - p, p, 1, 1])
+      >>> model = make_parametric(twice, numbers, [0.01], [0.99], parameters=["p"])
+      >>> problem = make_problem(model, np.arange(4) == 2, bound=">=")
+      >>> found = feasible(problem, 0.2499, starts=4)
+      >>> found.feasible.all().item(), round(found.valuation()["p"], 1)
+      (True, 0.5)
+      >>> feasible(problem, 0.2501, starts=4).feasible.any().item()
+      False
+    """
+    if not np.isfinite(threshold):
+        raise ValueError(f"threshold={threshold}; give a finite number.")
+    hparams = Hparams() if hparams is None else hparams
+    key = jax.random.key(0) if key is None else key
+    goal = np.asarray(threshold, problem.low.dtype)
+    most = np.int32(_positive("num_steps", num_steps))
+    points = None
+    if np.ndim(starts) == 0:
+        keys = jax.random.split(key, _positive("starts", int(starts)))
+    else:
+        points = _checked_starts(problem, np.asarray(starts))
+        keys = jax.random.split(key, len(points))
+    # Which model is proven is of no concern to the search.
+    lean = replace(
+        problem,
+        target=None,
+        stay=None,
+        model=replace(
+            problem.model,
+            model=None,
+            low=None,
+            high=None,
+            inside=None,
+            exact=None,
+            roundings=0,
+            parameters=(),
+        ),
+    )
+    found = _search(keys, points, lean, hparams, goal, most)
+    return _proven(problem, float(threshold), found, tolerance, report)
+
+
+@jax.jit
+def _search(
+    keys: Any, points: Any, problem: Problem, hparams: Hparams, goal: jax.Array, most: jax.Array
+) -> learner.Learned:
+    """All starts: side by side, or in turn where the amount of work depends on the start."""
+
+    def one(key: Any, point: Any) -> learner.Learned:
+        state = (
+            init(key, problem, hparams) if point is None else start_at(point, key, problem, hparams)
+        )
+        return run_until(
+            state,
+            problem,
+            hparams,
+            until=Partial(_met, problem.sign * goal, problem.sign),
+            num_steps=most,
+        )
+
+    if problem.prepared.cyclic:
+        return lax.map(lambda given: one(*given), (keys, points))
+    return jax.vmap(one)(keys, points)
+
+
+def _met(goal: Any, sign: Any, before: Any, after: Any, metrics: Any) -> jax.Array:
+    return sign * metrics.best_value >= goal
+
+
+def _proven(
+    problem: Problem, threshold: float, found: learner.Learned, tolerance: float, report: Any
+) -> Feasible:
+    """Certified bounds of what was claimed."""
+    state = found.state
+    dtype = state.best.value.dtype
+    points, value, steps, last = (
+        np.asarray(x)
+        for x in (state.best.parameters, state.best.value, found.num_steps, found.metrics.status)
+    )
+    points, value = points.astype(np.float64), value.astype(np.float64)
+    slack = max(1e-6, 1e4 * float(jnp.finfo(dtype).eps))
+    off = problem.sign * (threshold - value)
+    claimed = np.flatnonzero(off <= slack * max(abs(threshold), slack))
+    lower = np.zeros(value.size)
+    upper = np.full(value.size, 1.0 if problem.reward is None else np.inf)
+    for count, i in enumerate(claimed):
+        lower[i], upper[i] = _certified(problem, problem.model.at(points[i]), tolerance)
+        if report is not None:
+            report(count + 1, claimed.size)
+    certain = np.zeros(value.size, bool)
+    side = lower[claimed] >= threshold if problem.sign > 0 else upper[claimed] <= threshold
+    certain[claimed] = side
+    open_ = (lower < threshold) & (threshold < upper)
+    status = np.full(value.size, Status.MAX_STEPS, np.int32)
+    status[claimed] = np.where(open_[claimed], Status.PRECISION, Status.MAX_STEPS)
+    status = np.where(np.isnan(value), np.maximum(last, Status.NONFINITE), status)
+    status = np.where(certain, Status.CONVERGED, status).astype(np.int32)
+    return Feasible(points, value, lower, upper, certain, steps, status, problem.model.parameters)
+
+
+def _certified(problem: Problem, model: Any, tolerance: float) -> tuple[float, float]:
+    """Bounds of the value of a model, rounding of its numbers included."""
+    given: dict[str, Any] = {
+        "maximize": problem.objective == "max",
+        "tolerance": tolerance,
+        "depth": problem.model.roundings,
+    }
+    if problem.reward is None:
+        found = optimal.reachability(model.host, problem.target, stay=problem.stay, **given)
+    else:
+        earned = row_reward(model, problem.reward)
+        found = optimal.total_reward(model.host, earned, problem.target, **given)
+    weight = np.asarray(model.initial, np.float64)
+    start = np.flatnonzero(weight)
+    weight, lower, upper = weight[start], found.lower[start], found.upper[start]
+    if start.size == 1:
+        return float(lower[0]), float(upper[0])
+    share = (start.size + 2) * _UNIT
+    low, high = float(weight @ lower) * (1 - share), float(weight @ upper) * (1 + share)
+    return (low, high) if problem.reward is not None else (low, min(high, 1.0))
+
+
+def _positive(name: str, number: int) -> int:
+    if number < 1:
+        raise ValueError(f"{name}={number}; it must be at least 1.")
+    return number
+
+
+def _checked_starts(problem: Problem, starts: np.ndarray) -> np.ndarray:
+    names, model = problem.model.parameters, problem.model
+    if starts.ndim != 2 or starts.shape[1] != len(names) or not len(starts):
+        raise ValueError(
+            f"starts has shape {starts.shape}; expected (N, {len(names)}), a number "
+            f"for each of {', '.join(names)}."
+        )
+    out = ~((starts >= model.low) & (starts <= model.high))
+    if out.any():
+        n, d = (int(i) for i in np.argwhere(out)[0])
+        raise ValueError(
+            f"start {n} has {names[d]} = {starts[n, d]:.9g}; its interval is "
+            f"[{model.low[d]:.9g}, {model.high[d]:.9g}]."
+        )
+    return starts.astype(problem.low.dtype)
