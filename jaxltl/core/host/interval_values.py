@@ -1,0 +1,432 @@
+"""Certified values of interval models: policy and nature together, or one against the other.
+
+Together they are one player (`joint_bound`). Against each other, the side that makes a probability
+large (or a sum small, which must reach its target) improves its choices as long as something is
+gained, while the other one answers best; what is found at last is bounded from each side by fixing
+the one player and optimising the other (strategy improvement, Hoffman and Karp 1966).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxltl.core.host import optimal
+from jaxltl.core.host.interval import HostInterval
+from jaxltl.core.host.interval_graph import decided, joint_components, surely
+from jaxltl.core.host.interval_optimum import Joint, joint_bound
+from jaxltl.core.host.rows import Booleans, Integers
+from jaxltl.core.host.sparse import Floats, HostMDP
+from jaxltl.core.host.sparse_graph import reaching, towards
+from jaxltl.core.host.transient import Enclosed
+
+_EPS = float(np.finfo(np.float64).eps)
+_ROUNDS = 100
+
+
+class Robust(NamedTuple):
+    """Certified values, with both players' choices.
+
+    Attributes:
+      value, lower, upper: ``float64[S]``.
+      row: ``int64[S]``, a policy.
+      probability: ``float64[T]``, nature's distributions.
+      rounds: systems solved.
+      residual: how far the value is from satisfying its equation.
+      method: how it was found, in words.
+    """
+
+    value: Floats
+    lower: Floats
+    upper: Floats
+    row: Integers
+    probability: Floats
+    rounds: int
+    residual: float
+    method: str
+
+
+class _Solve(NamedTuple):
+    """How a question is answered: of a decision process, and of policy and nature together.
+
+    Attributes:
+      exact: an enclosure of an MDP's optimum, from the MDP and whether to maximise.
+      joint: values of an interval model's joint optimum; from the model, its rewards of rows, and
+        whether to maximise.
+      cost: ``float64[R]``.
+    """
+
+    exact: Callable[[HostMDP, Floats, bool], Enclosed]
+    joint: Callable[[HostInterval, Floats, bool], Robust]
+    cost: Floats
+
+
+def reachability(
+    model: HostInterval, target: Booleans, *, maximize: bool, helpful: bool,
+    stay: Booleans | None = None, tolerance: float = 1e-6, depth: int = 0,
+) -> Robust:
+    """The probability of reaching a target, optimal for policy and nature.
+
+    Args:
+      model: the model.
+      target: ``bool[S]``.
+      maximize: whether the policy makes it large.
+      helpful: whether nature makes it large.
+      stay: ``bool[S]``, the states that may be passed; default all.
+      tolerance: the width of the enclosure asked for.
+      depth: how many roundings stand behind each number of the model.
+    """
+    blocked = np.zeros(target.size, bool) if stay is None else ~stay & ~target
+    halted, row = model.halted(target | blocked)
+
+    def exact(mdp: HostMDP, _: Floats, up: bool) -> Enclosed:
+        return optimal.reachability(
+            mdp, target, maximize=up, tolerance=tolerance / 2, depth=depth + _terms(mdp))
+
+    def joint(part: HostInterval, _: Floats, up: bool) -> Robust:
+        return _joint_reachability(part, target, up, tolerance, depth, exact)
+
+    solve = _Solve(exact, joint, np.zeros(halted.mdp.num_rows))
+    if maximize == helpful:
+        found = joint(halted, solve.cost, maximize)
+    elif maximize:
+        found = _led_by_policy(halted, _greedy_start(halted, target), solve, 1)
+    else:
+        start = halted.nature(
+            _sweeps(halted, target)[halted.mdp.successor], maximize=True)
+        found = _led_by_nature(halted, start, solve, 1)
+    return _unhalted(model, halted, row, target | blocked, found)
+
+
+def total_reward(
+    model: HostInterval, reward: Floats, target: Booleans, *, maximize: bool, large: bool,
+    tolerance: float = 1e-6, depth: int = 0,
+) -> Robust:
+    """The expected reward until a target is reached, optimal for policy and nature.
+
+    Infinite where the target is not surely reached: by both sides' choice if they make the reward
+    small, by the choice of that side which does, or at all if none does.
+
+    Args:
+      model: the model.
+      reward: ``float64[R]``, at least 0.
+      target: ``bool[S]``.
+      maximize: whether the policy makes the reward large.
+      large: whether nature does.
+      tolerance: the width of the enclosure asked for, as a share of the value.
+      depth: how many roundings stand behind each number of the model.
+    """
+    halted, row = model.halted(target)
+    cost = np.where(target[halted.mdp.state], 0, reward[row])
+    if maximize and large:
+        one = decided(halted, target, maximize=False, helpful=False).one
+        finite, kept = one, one[halted.mdp.state]
+    else:
+        finite, kept = surely(
+            halted, target, np.ones(target.size, bool), maximize=not maximize,
+            helpful=not large)
+    part, origin, entry = _restricted(halted, finite, kept)
+
+    def exact(mdp: HostMDP, earned: Floats, up: bool) -> Enclosed:
+        return optimal.total_reward(
+            mdp, earned, ends, maximize=up, tolerance=tolerance / 2, depth=depth + _terms(mdp))
+
+    def joint(some: HostInterval, earned: Floats, up: bool) -> Robust:
+        return _joint_reward(some, earned, ends, up, tolerance, depth, exact)
+
+    ends = target | ~finite
+    cost = np.where(ends[part.mdp.state], 0, cost[origin])
+    solve = _Solve(exact, joint, cost)
+    if maximize == large:
+        found = joint(part, cost, maximize)
+    elif maximize:
+        found = _led_by_nature(
+            part, part.within(np.ones(part.mdp.num_transitions, bool)), solve, -1)
+    else:
+        first = _attracting(part, ends)
+        found = _led_by_policy(part, first, solve, -1)
+    value, lower, upper = (
+        np.where(finite, x, np.inf) for x in (found.value, found.lower, found.upper))
+    chance = halted.mdp.probability.copy()
+    chance[entry] = found.probability
+    found = found._replace(
+        value=value, lower=lower, upper=upper, row=origin[found.row], probability=chance)
+    return _unhalted(model, halted, row, target, found)
+
+
+def _terms(mdp: HostMDP) -> int:
+    """How many roundings may stand behind nature's distributions."""
+    return int(np.diff(mdp.entry_start).max()) + 4
+
+
+def _joint_reachability(
+    model: HostInterval, target: Booleans, up: bool, tolerance: float, depth: int,
+    exact: Callable[[HostMDP, Floats, bool], Enclosed],
+) -> Robust:
+    """Policy and nature together make the probability large, or small."""
+    mdp = model.mdp
+    zero, one = decided(model, target, maximize=up, helpful=up)
+    open_ = ~(zero | one)
+    row: Integers = mdp.row_start[:-1].astype(np.int64)
+    chance = mdp.probability.copy()
+    bound, rounds = one.astype(np.float64), 0
+    component: Integers = np.arange(mdp.num_states)
+    if open_.any():
+        if up:
+            component, inside, used = _components(model, open_, None)
+        found = joint_bound(
+            Joint(model, open_, bound, np.zeros(mdp.num_rows), component, depth),
+            maximize=up, tolerance=tolerance, relative=False)
+        bound, rounds = np.clip(found.bound, 0, 1), found.rounds
+        row, chance = np.where(open_, found.row, row), found.probability
+        if up and inside.any():
+            row, chance = _inner(model, row, chance, component, inside, used)
+    # Where it is decided: choices that keep it so.
+    keep = one if up else zero
+    rows = model.may_stay(keep) & keep[mdp.state]
+    entries = keep[mdp.successor] & rows[mdp.row]
+    chance = np.where(rows[mdp.row], model.within(entries), chance)
+    some = towards(model.fixed(chance), target, rows) if up else mdp.first_choice(rows)[1]
+    row = np.where(keep, some, row)
+    chain, entry = model.chain(row)
+    of = exact(chain.fixed(chance[entry]), np.zeros(0), up)
+    low, high = (of.lower, np.maximum(bound, of.lower)) if up else (
+        np.minimum(bound, of.upper), of.upper)
+    return Robust(of.value, low, high, row, chance, rounds + of.rounds, of.residual, _METHOD)
+
+
+def _joint_reward(
+    model: HostInterval, cost: Floats, target: Booleans, up: bool, tolerance: float, depth: int,
+    exact: Callable[[HostMDP, Floats, bool], Enclosed],
+) -> Robust:
+    """Policy and nature together make the reward large, or small, in a model that surely ends."""
+    mdp = model.mdp
+    row: Integers = mdp.row_start[:-1].astype(np.int64)
+    chance = mdp.probability.copy()
+    bound, rounds = np.zeros(mdp.num_states), 0
+    earning = np.zeros(mdp.num_states, bool)
+    earning[mdp.state[cost > 0]] = True
+    open_ = ~target & (reaching(mdp, earning) if up else True)
+    component: Integers = np.arange(mdp.num_states)
+    inside, used = (np.zeros(size, bool) for size in (mdp.num_rows, mdp.num_transitions))
+    if open_.any():
+        if not up:
+            component, inside, used = _components(model, open_, cost == 0)
+        found = joint_bound(
+            Joint(model, open_, bound, cost, component, depth, wandering=not up),
+            maximize=up, tolerance=tolerance, relative=True)
+        bound, rounds = found.bound, found.rounds
+        row, chance = np.where(open_, found.row, row), found.probability
+        if inside.any():
+            row, chance = _inner(model, row, chance, component, inside, used)
+    chain, entry = model.chain(row)
+    of = exact(chain.fixed(chance[entry]), cost[row], up)
+    low, high = (of.lower, np.maximum(bound, of.lower)) if up else (
+        np.minimum(bound, of.upper), of.upper)
+    return Robust(of.value, low, high, row, chance, rounds + of.rounds, of.residual, _METHOD)
+
+
+_METHOD = "policy iteration with nature"
+
+
+def _components(
+    model: HostInterval, open_: Booleans, rows: Booleans | None
+) -> tuple[Integers, Booleans, Booleans]:
+    """Components of policy and nature among some states, by some rows, with their entries."""
+    entries = None if rows is None else rows[model.mdp.row]
+    found, used = joint_components(model, open_, entries)
+    return found.component, found.inside, used
+
+
+def _inner(
+    model: HostInterval, row: Integers, chance: Floats, component: Integers, inside: Booleans,
+    used: Booleans,
+) -> tuple[Integers, Floats]:
+    """A policy that moves inside each component until it is where its row leaves."""
+    mdp = model.mdp
+    number = np.arange(mdp.num_states)
+    exits = mdp.state[row] == number
+    held = np.zeros(mdp.num_states, bool)
+    held[mdp.state[inside]] = True
+    moving = held & ~exits
+    taken = inside & moving[mdp.state]
+    chance = np.where(taken[mdp.row], model.within(used & taken[mdp.row]), chance)
+    goal = exits | ~held
+    return np.where(moving, towards(model.fixed(chance), goal, taken), row), chance
+
+
+def _led_by_policy(
+    model: HostInterval, row: Integers, solve: _Solve, sign: int
+) -> Robust:
+    """The policy improves, nature answers best.
+
+    Args:
+      sign: 1 if the policy makes the sum large, else -1.
+    """
+    mdp, up = model.mdp, sign > 0
+    rounds = 0
+    while True:
+        rounds += 1
+        part, _ = model.chain(row)
+        inner = solve.joint(part, solve.cost[row], not up)
+        gain, p = _gains(model, inner.value, solve.cost, up=not up)
+        best = mdp.over_choices(np.maximum, sign * gain)
+        better = best > _noise(inner.value)
+        if rounds == _ROUNDS or not better.any():
+            break
+        new = mdp.first_choice(sign * gain == best[mdp.state])[1]
+        row = np.where(better, new, row)
+    other = solve.exact(model.fixed(p), solve.cost, up)
+    low, high = (inner.lower, other.upper) if up else (other.lower, inner.upper)
+    return _between(inner.value, low, high, row, p, rounds + other.rounds, float(best.max()))
+
+
+def _led_by_nature(
+    model: HostInterval, p: Floats, solve: _Solve, sign: int
+) -> Robust:
+    """Nature improves, the policy answers best.
+
+    Args:
+      sign: 1 if nature makes the sum large, else -1.
+    """
+    mdp, up = model.mdp, sign > 0
+    rounds = 0
+    while True:
+        rounds += 1
+        found = solve.exact(model.fixed(p), solve.cost, not up)
+        gain, q = _gains(model, found.value, solve.cost, up=up)
+        now = model.total(p * _differences(model, found.value)) + solve.cost
+        more = sign * (gain - now)
+        better = more > _noise(found.value)[mdp.state]
+        if rounds == _ROUNDS or not better.any():
+            break
+        p = np.where(better[mdp.row], q, p)
+    best = mdp.over_choices(np.minimum, sign * gain)
+    row = mdp.first_choice(sign * gain == best[mdp.state])[1].astype(np.int64)
+    part, _ = model.chain(row)
+    inner = solve.joint(part, solve.cost[row], up)
+    low, high = (found.lower, inner.upper) if up else (inner.lower, found.upper)
+    return _between(found.value, low, high, row, p, rounds + inner.rounds, float(more.max()))
+
+
+def _between(
+    value: Floats, low: Floats, high: Floats, row: Integers, p: Floats, rounds: int,
+    residual: float,
+) -> Robust:
+    return Robust(
+        np.clip(value, low, np.maximum(low, high)), low, np.maximum(low, high), row, p, rounds,
+        abs(residual), "strategy improvement against nature")
+
+
+def _differences(model: HostInterval, value: Floats) -> Floats:
+    mdp = model.mdp
+    return value[mdp.successor] - value[mdp.state[mdp.row]]
+
+
+def _gains(
+    model: HostInterval, value: Floats, cost: Floats, *, up: bool
+) -> tuple[Floats, Floats]:
+    """What each row gains when nature makes that large or small, and nature's distributions."""
+    ahead = _differences(model, value)
+    p = model.nature(ahead, maximize=up)
+    return model.total(p * ahead) + cost, p
+
+
+def _noise(value: Floats) -> Floats:
+    """Differences that rounding makes."""
+    return 64 * _EPS * (np.abs(value) + np.abs(value).max(initial=0))
+
+
+def _sweeps(model: HostInterval, target: Booleans) -> Floats:
+    """Some sweeps of value iteration of a policy that makes the probability small."""
+    value = target.astype(np.float64)
+    for _ in range(60):
+        image = model.total(
+            model.nature(value[model.mdp.successor], maximize=True)
+            * value[model.mdp.successor])
+        new = np.maximum(model.mdp.over_choices(np.minimum, image), value)
+        if (new - value).max() <= 1e-3:
+            return new
+        value = new
+    return value
+
+
+def _greedy_start(model: HostInterval, target: Booleans) -> Integers:
+    """Rows that come near the target against nature, after some sweeps."""
+    mdp, value = model.mdp, target.astype(np.float64)
+    row = mdp.row_start[:-1].astype(np.int64)
+    for _ in range(60):
+        ahead = value[mdp.successor]
+        image = model.total(model.nature(ahead, maximize=False) * ahead)
+        new = mdp.over_choices(np.maximum, image)
+        better = new > value
+        found = mdp.first_choice(image == new[mdp.state])[1]
+        row = np.where(better, found, row)
+        if not better.any() or (new - value).max() <= 1e-3:
+            break
+        value = np.maximum(new, value)
+    return row
+
+
+def _attracting(model: HostInterval, goal: Booleans) -> Integers:
+    """Rows by which each state must come nearer to a goal that can be forced."""
+    mdp = model.mdp
+    row = mdp.row_start[:-1].astype(np.int64)
+    region = goal.copy()
+    while not region.all():
+        some, first = mdp.first_choice(
+            ~model.may_stay(~region) & ~region[mdp.state])
+        if not some.any():
+            break
+        row = np.where(some, first, row)
+        region |= some
+    return row
+
+
+def _restricted(
+    model: HostInterval, inside: Booleans, rows: Booleans
+) -> tuple[HostInterval, Integers, Integers]:
+    """Some rows, kept to some states by nature; all else stands still.
+
+    Returns:
+      The model, which row each row was, and which entry each entry was.
+    """
+    mdp = model.mdp
+    whole = inside.all() and rows.all()
+    if whole:
+        return model, np.arange(mdp.num_rows), np.arange(mdp.num_transitions)
+    some, first = mdp.first_choice(rows & inside[mdp.state])
+    taken = rows & inside[mdp.state]
+    taken[first[~some]] = True
+    row = np.flatnonzero(taken)
+    count = np.bincount(mdp.state[row], minlength=mdp.num_states)
+    starts = np.concatenate([[0], count.cumsum()])
+    part, entry = model.of_rows(starts, row)
+    source = part.mdp.state[part.mdp.row]
+    kept = inside[part.mdp.successor] & inside[source]
+    lone = ~some[source]
+    head = np.zeros(entry.size, bool)
+    head[part.mdp.entry_start[:-1]] = True
+    kept = np.where(lone, head, kept)
+    successor = np.where(lone, source, part.mdp.successor)[kept]
+    lower, upper = (np.where(lone, 1, x)[kept] for x in (part.lower, part.upper))
+    width = np.add.reduceat(kept.astype(np.int64), part.mdp.entry_start[:-1])
+    inner = part.within(kept)
+    chance = np.where(lone, 1, inner)[kept]
+    small = HostMDP(
+        starts, np.concatenate([[0], width.cumsum()]), successor.astype(np.int32), chance)
+    return HostInterval(small, lower, upper), row, entry[kept]
+
+
+def _unhalted(
+    model: HostInterval, halted: HostInterval, row: Integers, states: Booleans, found: Robust
+) -> Robust:
+    """What was found of a model in which some states stand still, for the model."""
+    if halted is model:
+        return found
+    chance = model.mdp.probability.copy()
+    moves, moved = (~states[x.state[x.row]] for x in (model.mdp, halted.mdp))
+    chance[moves] = found.probability[moved]
+    return found._replace(row=row[found.row], probability=chance)

@@ -1,0 +1,253 @@
+"""Models whose probabilities are known to lie in intervals only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from flax import struct
+
+from jaxltl.core.host.interval import HostInterval
+from jaxltl.core.host.rows import starts_of
+from jaxltl.core.host.sparse import HostMDP
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.sparse import Array, Rewards, SparseMDP, make_sparse
+
+_NEAR = 1e-6  # how far a row may miss a distribution and still be scaled to one
+_ENDS = "\0lower", "\0upper"  # names under which ends travel with the entries
+
+
+@struct.dataclass
+class IntervalMDP:
+    """A labelled decision process with an interval for each probability.
+
+    A row stands for all distributions p with ``lower <= p <= upper``. Each time that it is taken,
+    nature picks one of them, to make a value small or large (`nature="min"`, `"max"`). Build one
+    with :func:`make_interval` or :func:`interval_rows`, which check it.
+
+    Attributes:
+      nominal: the graph, labels, rewards and names; its probabilities are one distribution of
+        each row, positive wherever nature may put any mass.
+      lower, upper: ``float64[T]``, one for each entry of `nominal`.
+    """
+
+    nominal: SparseMDP
+    lower: Array
+    upper: Array
+
+    @property
+    def num_states(self) -> int:
+        return self.nominal.num_states
+
+    @property
+    def num_rows(self) -> int:
+        return self.nominal.num_rows
+
+    @property
+    def num_transitions(self) -> int:
+        return self.nominal.num_transitions
+
+    @property
+    def is_chain(self) -> bool:
+        """Whether every state has one choice."""
+        return self.nominal.is_chain
+
+    @property
+    def state_shape(self) -> tuple[int, ...]:
+        """The shape of a value: ``(S,)``."""
+        return self.nominal.state_shape
+
+    @property
+    def dtype(self) -> Any:
+        return self.nominal.dtype
+
+    @property
+    def initial(self) -> Array:
+        return self.nominal.initial
+
+    @property
+    def label(self) -> Array:
+        return self.nominal.label
+
+    @property
+    def propositions(self) -> tuple[str, ...]:
+        return self.nominal.propositions
+
+    @property
+    def rewards(self) -> dict[str, Rewards]:
+        return self.nominal.rewards
+
+    @cached_property
+    def host(self) -> HostInterval:
+        """The transitions as the host engine takes them."""
+        lower, upper = (np.asarray(x, np.float64) for x in (self.lower, self.upper))
+        return HostInterval(self.nominal.host, lower, upper)
+
+    def states_where(self, proposition: str) -> Array:
+        """``bool[S]``, where a proposition holds.
+
+        Raises:
+          ValueError: there is no such proposition.
+        """
+        return self.nominal.states_where(proposition)
+
+    def changed(self, change: Callable[[SparseMDP], SparseMDP]) -> IntervalMDP:
+        """The model after a change that drops, repeats or moves entries, but adds up none."""
+        ends = {name: Rewards(transition=x)
+                for name, x in zip(_ENDS, (self.lower, self.upper), strict=True)}
+        return _taken_apart(
+            change(self.nominal.replace(rewards=self.rewards | ends)))  # type: ignore[attr-defined]
+
+
+def _taken_apart(model: SparseMDP) -> IntervalMDP:
+    rewards = dict(model.rewards)
+    lower, upper = (np.asarray(rewards.pop(name).transition) for name in _ENDS)
+    nominal = model.replace(rewards=rewards)  # type: ignore[attr-defined]
+    return IntervalMDP(nominal=nominal, lower=lower, upper=upper)
+
+
+def make_interval(model: MDP | SparseMDP, lower: Array, upper: Array) -> IntervalMDP:
+    """A model whose probabilities are replaced by intervals.
+
+    Args:
+      model: its graph, labels, rewards, names and initial distribution count, its probabilities
+        do not. A successor in the padding of an MDP, with an upper end above 0, counts.
+      lower, upper: shaped as ``model.probability``: ``float[T]``, or ``float[S, A, K]``.
+
+    Returns:
+      :class:`IntervalMDP`. Entries to which nature cannot give any mass are left out. A padded
+      model's row i of a state is the i-th of its available actions.
+
+    Raises:
+      ValueError: naming the state and the choice: ends that are crossed, negative or above 1, or
+        between which there is no distribution.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> model = make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
+      >>> model.lower.tolist(), model.upper.tolist()
+      ([0.4, 0.3, 1.0, 1.0], [0.7, 0.6, 1.0, 1.0])
+    """
+    lower, upper = (np.asarray(x, np.float64) for x in (lower, upper))
+    shape = np.shape(model.probability)
+    for name, ends in (("lower", lower), ("upper", upper)):
+        if ends.shape != shape:
+            raise ValueError(f"{name} has shape {ends.shape}; expected {shape}, an end for each "
+                             "probability of the model.")
+    if isinstance(model, SparseMDP):
+        return interval_rows(
+            model.row_start, model.entry_start, model.successor, lower, upper,
+            initial=model.initial, label=model.label, propositions=model.propositions,
+            rewards=model.rewards, action=model.action, action_names=model.action_names,
+            valuation=model.valuation)
+    available = np.asarray(model.available)
+    used = available[..., None] & ~((lower == 0) & (upper == 0))
+    state, action = np.nonzero(available)
+    initial = np.asarray(model.initial, np.float64)
+    return interval_rows(
+        starts_of(available.sum(-1)), starts_of(used.sum(-1)[state, action]),
+        np.asarray(model.successor)[used], lower[used], upper[used],
+        initial=initial / initial.sum(), label=np.asarray(model.label),
+        propositions=model.propositions, action=action)
+
+
+def interval_rows(
+    row_start: Array | None, entry_start: Array, successor: Array, lower: Array, upper: Array,
+    *, rewards: Mapping[str, Rewards] | None = None, **rest: Any,
+) -> IntervalMDP:
+    """A checked :class:`IntervalMDP` from arrays, on the host.
+
+    Successors that stand twice in a row become one, whose ends are the sums. Ends that miss a
+    distribution by less than 1e-6 are scaled to one.
+
+    Args:
+      row_start, entry_start, successor: as of :func:`~jaxltl.core.models.sparse.make_sparse`.
+      lower, upper: ``float[T]``.
+      rewards: named structures.
+      rest: `initial`, `label`, `propositions`, `action`, `action_names` and `valuation` of
+        :func:`~jaxltl.core.models.sparse.make_sparse`.
+
+    Raises:
+      ValueError: as of :func:`make_interval` and :func:`~jaxltl.core.models.sparse.make_sparse`.
+    """
+    entry_start, successor = np.asarray(entry_start), np.asarray(successor)
+    lower, upper = (np.asarray(x, np.float64) for x in (lower, upper))
+    if not lower.shape == upper.shape == successor.shape:
+        raise ValueError(f"successor has shape {successor.shape}, lower {lower.shape} and upper "
+                         f"{upper.shape}; all must be [transitions].")
+    starts = np.arange(entry_start.size) if row_start is None else np.asarray(row_start)
+    row = np.repeat(np.arange(entry_start.size - 1), np.diff(entry_start))
+    _check_ends(starts, row, successor, lower, upper)
+    rewards = dict(rewards or {})
+    if np.unique(np.stack([row, successor]), axis=1).shape[1] < row.size:
+        row, successor, lower, upper, rewards = _merged(row, successor, lower, upper, rewards)
+        entry_start = starts_of(np.bincount(row, minlength=entry_start.size - 1))
+    lower, upper = _scaled(starts, entry_start, row, lower, upper)
+    states: Any = np.zeros(entry_start.size, np.int64)  # the host's rows need no states here
+    ends = HostInterval(HostMDP(states, entry_start, successor, lower), lower, upper)
+    # Nature has nothing left to give where lower ends add up to one.
+    possible = (upper > 0) & ((lower > 0) | (ends.rest > ends.rounding)[row])
+    centre = np.where(possible, ends.within(possible), 0)
+    extra = {name: Rewards(transition=x) for name, x in zip(_ENDS, (lower, upper), strict=True)}
+    return _taken_apart(make_sparse(
+        row_start, entry_start, successor, centre, rewards=rewards | extra, **rest))
+
+
+def _place(row_start: np.ndarray, row: int) -> str:
+    state = int(np.searchsorted(row_start, row, "right")) - 1
+    return f"state {state}, choice {row - int(row_start[state])}"
+
+
+def _check_ends(
+    row_start: np.ndarray, row: np.ndarray, successor: np.ndarray, lower: np.ndarray,
+    upper: np.ndarray,
+) -> None:
+    bad = ~((lower >= 0) & (lower <= upper) & (upper <= 1 + _NEAR))
+    if bad.any():
+        e = int(np.flatnonzero(bad)[0])
+        raise ValueError(
+            f"{_place(row_start, int(row[e]))}: the interval of successor {successor[e]} is "
+            f"[{lower[e]:.9g}, {upper[e]:.9g}]; ends must satisfy 0 <= lower <= upper <= 1.")
+
+
+def _scaled(
+    row_start: np.ndarray, entry_start: np.ndarray, row: np.ndarray, lower: np.ndarray,
+    upper: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The ends, such that each row has a distribution between them."""
+    low, high = (np.add.reduceat(x, entry_start[:-1]) for x in (lower, upper))
+    bad = (low > 1 + _NEAR) | (high < 1 - _NEAR)
+    if bad.any():
+        r = int(np.flatnonzero(bad)[0])
+        what = (f"the lower ends sum to {low[r]:.9g}, which is above 1" if low[r] > 1 else
+                f"the upper ends sum to {high[r]:.9g}, which is below 1")
+        raise ValueError(f"{_place(row_start, r)}: {what}; no distribution lies between them.")
+    lower = np.where((low > 1)[row], lower / low[row], lower)
+    upper = np.where((high < 1)[row], upper / high[row], upper)
+    return lower, np.clip(np.maximum(upper, lower), 0, 1)
+
+
+def _merged(
+    row: np.ndarray, successor: np.ndarray, lower: np.ndarray, upper: np.ndarray,
+    rewards: dict[str, Rewards],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Rewards]]:
+    """Entries of one row with one successor as one, if they earn the same."""
+    order = np.lexsort((successor, row))
+    row, successor = row[order], successor[order]
+    new = np.append(True, (row[1:] != row[:-1]) | (successor[1:] != successor[:-1]))
+    start = np.flatnonzero(new)
+    for name, reward in rewards.items():
+        if reward.transition is None:
+            continue
+        earned = np.asarray(reward.transition)[order]
+        if (np.maximum.reduceat(earned, start) != np.minimum.reduceat(earned, start)).any():
+            raise ValueError(
+                f"reward {name!r} differs between entries of one row that lead to one state; give "
+                "one entry for each state.")
+        rewards = rewards | {name: reward.replace(  # type: ignore[attr-defined]
+            transition=earned[start])}
+    lower, upper = (np.add.reduceat(x[order], start) for x in (lower, upper))
+    return row[start], successor[start], lower, np.minimum(upper, 1), rewards
