@@ -183,6 +183,11 @@ def _several_entry(found: Achievable | Best | Pareto) -> dict[str, Any]:
     if isinstance(found, Pareto):
         points = found.points.tolist()
         return entry | {"value": points, "gap": _number(float(found.gap))}
+    if found.nearest is not None:
+        near = found.nearest
+        entry["nearest"] = {"lower": _over_states(near.lower.tolist()),
+                            "upper": _over_states(near.upper.tolist()),
+                            "gap": _over_states(near.gap.tolist())}
     if isinstance(found, Achievable):
         return entry | {"value": found.holds}
     return entry | {"value": _number(found.value), "lower": _number(found.lower),
@@ -232,7 +237,14 @@ def _several_text(found: Achievable | Best | Pareto) -> list[str]:
     if isinstance(found, Best) and found.holds:
         return [f"  {found.value!r}, in [{found.lower!r}, {found.upper!r}]"]
     verdict = {True: "true", False: "false", None: "not decided"}[found.holds]
-    return [f"  the thresholds can be met: {verdict}"]
+    lines = [f"  the thresholds can be met: {verdict}"]
+    if found.nearest is not None:
+        near = found.nearest
+        lines += [f"  attained: in [{low!r}, {high!r}]"
+                  + (f", at most {gap:.1e} short of what is asked" if gap else "")
+                  for low, high, gap in zip(near.lower.tolist(), near.upper.tolist(),
+                                            near.gap.tolist(), strict=True)]
+    return lines
 
 
 def _value_text(found: Answer, i: int) -> str:

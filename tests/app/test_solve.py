@@ -143,14 +143,19 @@ def test_several_objectives(model_file):
     done = run(model_file, 'multi(P>=0.5 [ F "a" ], P>=0.25 [ F "b" ])',
                'multi(Pmax=? [ F "a" ], P>=0.25 [ F "b" ])', '"c": multi(Pmax=? [ F "a" ], '
                'Pmax=? [ F "b" ])', 'multi(Pmax=? [ F "a" ], P>0.25 [ F "b" ])',
-               'multi(Pmax=? [ F "a" ], P>=1 [ F "a" ], P>=0.25 [ F "b" ])', "--json")
+               'multi(Pmax=? [ F "a" ], P>=1 [ F "a" ], P>=0.25 [ F "b" ])',
+               'multi(P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])', "--json")
     assert done.exit_code == 2 and "thresholds can be met: true" in done.stdout
-    met, best, curve, wrong, never = json.loads(done.stdout.splitlines()[-1])["results"]
+    assert "not decided" in done.stdout and "short of" in done.stdout
+    met, best, curve, wrong, never, border = json.loads(done.stdout.splitlines()[-1])["results"]
     assert met["value"] is True and met["status"] == "CONVERGED"
     assert best["lower"] <= 0.75 <= best["upper"] and best["achievable"] is True
     assert curve["value"] == [[0, 1], [1, 0]] and curve["name"] == "c" and curve["gap"] <= 1e-4
     assert "write >=" in wrong["error"] and wrong["status"] == "INVALID"
     assert never["value"] is None and never["achievable"] is False
+    assert border["value"] is None and border["status"] == "PRECISION"
+    assert border["nearest"]["lower"] == pytest.approx([1 / 3, 2 / 3])
+    assert 0 < max(border["nearest"]["gap"]) < 1e-12
 
 
 # --- strategies -------------------------------------------------------------------------------

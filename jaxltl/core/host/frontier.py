@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from jaxltl.core.host.sparse import Floats
 
 _EPS = float(np.finfo(np.float64).eps)
-_MARGIN = 1e-9  # by which a program asks for more than is needed, as its answer is rounded
+_NEAR = 1e-6  # of the size of a program: what it may not tell from what is farthest out
+_ZOOMS = 12
+_EXACT = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 
 
 class Separation(NamedTuple):
@@ -36,25 +38,53 @@ class Separation(NamedTuple):
 def separation(points: Floats, vector: Floats, scale: Floats) -> Separation:
     """How far a vector is beyond the mixtures of points.
 
+    A program tells distances as shares of its largest one. So it is solved again for the points
+    near the face that it finds, measured from the vector, until all of these are far apart.
+
     Args:
       points: ``float64[N, n]``.
       vector: ``float64[n]``.
       scale: ``float64[n]``, the unit of each objective.
     """
+    ahead = (points - vector) / scale
+    chosen = np.arange(len(points))
+    distance, normal, share = 0.0, np.full(scale.size, 1 / scale.size), np.eye(len(points))[0]
+    for _ in range(_ZOOMS):
+        size = float(np.abs(ahead[chosen]).max())
+        found = _apart(ahead[chosen] / size) if size > 0 else None
+        if found is None:
+            break
+        distance, normal, share = found[0] * size, found[1], np.zeros(len(points))
+        share[chosen] = found[2]
+        height = ahead @ normal
+        top = height[chosen].max()
+        beyond = np.flatnonzero(height > top + 8 * _EPS * np.abs(ahead).max(1))
+        near = np.flatnonzero(height >= top - _NEAR * size)
+        if beyond.size:
+            chosen = np.union1d(chosen, beyond)
+        elif np.abs(ahead[near]).max() > size / 2:
+            break
+        else:
+            chosen = near
+    return Separation(distance, normal / scale, share)
+
+
+def _apart(ahead: Floats) -> tuple[float, Floats, Floats] | None:
+    """The least t with ``sum_i share_i ahead_i >= -t``, the normal of that face, and the shares."""
     from scipy import optimize
 
-    count, size = points.shape
-    # Least t with sum_i share_i points_i >= vector - t scale.
-    sums = np.hstack([-(points / scale).T, -np.ones((size, 1))])
+    count, size = ahead.shape
     found = optimize.linprog(
-        np.append(np.zeros(count), 1.0), A_ub=sums, b_ub=-vector / scale,
-        A_eq=np.append(np.ones(count), 0.0)[None], b_eq=[1.0],
-        bounds=[(0, None)] * count + [(None, None)], method="highs")
+        np.append(np.zeros(count), 1.0), A_ub=np.hstack([-ahead.T, -np.ones((size, 1))]),
+        b_ub=np.zeros(size), A_eq=np.append(np.ones(count), 0.0)[None], b_eq=[1.0],
+        bounds=[(0, None)] * count + [(None, None)], method="highs", options=_EXACT)
+    if found.status != 0:
+        return None
     normal = np.maximum(-np.asarray(found.ineqlin.marginals), 0)
     total = normal.sum()
-    normal = normal / total if total > 0 else np.full(size, 1 / size)
     share = np.maximum(found.x[:-1], 0)
-    return Separation(float(found.x[-1]), normal / scale, share / share.sum())
+    return (float(found.x[-1]), normal / total if total > 0 else np.full(size, 1 / size),
+            share / share.sum())
 
 
 def mixture(lower: Floats, share: Floats) -> Floats:
@@ -87,6 +117,16 @@ def meets(lower: Floats, share: Floats, wanted: Floats) -> bool:
     return True
 
 
+def plain(share: Floats) -> Floats:
+    """A mixture with simple fractions in place of what rounding made of them.
+
+    >>> plain(np.array([0.25000000000000006, 0.75])).tolist()
+    [0.25, 0.75]
+    """
+    near = np.array([float(Fraction(float(x)).limit_denominator(1000)) for x in share])
+    return np.where(np.abs(near - share) < 1e-12, near, share)
+
+
 def exceeds(normal: Floats, bound: float, vector: Floats) -> bool:
     """Whether a vector is surely outside of a half-space ``normal @ y <= bound``."""
     slack = 4 * _EPS * (vector.size + 2) * (normal @ np.abs(vector) + abs(bound))
@@ -110,7 +150,8 @@ class Largest(NamedTuple):
 
 
 def largest(
-    points: Floats, normals: Floats, bounds: Floats, index: int, least: Floats, scale: Floats
+    points: Floats, normals: Floats, bounds: Floats, index: int, least: Floats, scale: Floats,
+    known: Floats | None = None,
 ) -> Largest:
     """The largest value of an objective, by what is known.
 
@@ -120,21 +161,15 @@ def largest(
       index: which objective.
       least: ``float64[n]``, what the others must be; minus infinity where nothing is asked.
       scale: ``float64[n]``.
+      known: a mixture of the first points, to be tried too.
     """
-    from scipy import optimize
-
     count = len(points)
     asked = np.flatnonzero(np.isfinite(least))
     lower, share = -np.inf, np.full(count, 1 / count)
-    for margin in (_MARGIN, 0.0):
-        found = optimize.linprog(
-            -points[:, index] / scale[index], A_ub=-(points[:, asked] / scale[asked]).T,
-            b_ub=-(least[asked] / scale[asked] + margin), A_eq=np.ones((1, count)), b_eq=[1.0],
-            bounds=[(0, None)] * count, method="highs")
-        if found.status != 0:
-            continue
-        tried = np.maximum(found.x, 0)
-        tried /= tried.sum()
+    mixtures = _largest_mixtures(points, index, least, asked, scale) if asked.size else []
+    if known is not None:
+        mixtures.append(np.append(known, np.zeros(count - known.size)))
+    for tried in mixtures:
         value = mixture(points, tried)
         if value[index] > lower and meets(points, tried, least):
             lower, share = float(value[index]), tried
@@ -145,17 +180,44 @@ def largest(
     return Largest(lower, share, upper, vector)
 
 
+def _largest_mixtures(
+    points: Floats, index: int, least: Floats, asked: Any, scale: Floats
+) -> list[Floats]:
+    """Mixtures that may be the best of an objective, the others being at least something."""
+    from scipy import optimize
+
+    count = len(points)
+    found = optimize.linprog(
+        -points[:, index] / scale[index], A_ub=-(points[:, asked] / scale[asked]).T,
+        b_ub=-least[asked] / scale[asked], A_eq=np.ones((1, count)), b_eq=[1.0],
+        bounds=[(0, None)] * count, method="highs", options=_EXACT)
+    inner = separation(points[:, asked], least[asked], scale[asked]).share
+    if found.status != 0:
+        return [inner]
+    best = np.maximum(found.x, 0)
+    best /= best.sum()
+    # A program's answer is rounded: what it misses, a little of what is well inside makes up for.
+    misses = (least - mixture(points, best))[asked] + 4 * _EPS * np.abs(least[asked])
+    misses = np.maximum(misses, 0)
+    spare = (mixture(points, inner) - least)[asked]
+    if not (spare > 0).all():
+        return [best, inner]
+    part = float((misses / (misses + spare)).max())
+    return [best, (1 - part) * best + part * inner]
+
+
 def _outer(
     normals: Floats, bounds: Floats, index: int, least: Floats, asked: Any, scale: Floats
 ) -> tuple[float, Floats | None]:
     from scipy import optimize
 
+    normals, bounds = normals[np.isfinite(bounds)], bounds[np.isfinite(bounds)]
     size = len(scale)
     goal = np.zeros(size)
     goal[index] = -1
     floor = [(float(least[i] / scale[i]) if i in asked else None, None) for i in range(size)]
     found = optimize.linprog(
-        goal, A_ub=normals * scale, b_ub=bounds, bounds=floor, method="highs")
+        goal, A_ub=normals * scale, b_ub=bounds, bounds=floor, method="highs", options=_EXACT)
     if found.status != 0:
         return np.inf, None
     weight = np.maximum(-np.asarray(found.ineqlin.marginals), 0)
@@ -176,6 +238,7 @@ def _outer(
 
 def corners(normals: Floats, bounds: Floats, floor: Floats) -> NDArray[Any]:
     """The corners of half-spaces above a floor, ``float64[V, n]``."""
+    normals, bounds = normals[np.isfinite(bounds)], bounds[np.isfinite(bounds)]
     size = len(floor)
     if size == 2:
         return _corners_of_two(normals, bounds, floor)

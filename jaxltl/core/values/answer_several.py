@@ -21,7 +21,15 @@ from jaxltl.core.models.sparse import SparseMDP, row_reward
 from jaxltl.core.models.state_formulas import states_satisfying
 from jaxltl.core.types import Status
 from jaxltl.core.values.answer import TOLERANCE
-from jaxltl.core.values.multi_objective import Achievable, Best, Objective, Pareto, multi
+from jaxltl.core.values.multi_objective import (
+    Achievable,
+    Best,
+    Nearest,
+    Objective,
+    Pareto,
+    multi,
+    nearest_of,
+)
 
 
 def answer_several(
@@ -58,21 +66,34 @@ def answer_several(
     loose = _solved(model, prop, tolerance, strict=False)
     if isinstance(strict, Achievable) or isinstance(loose, Achievable):
         if isinstance(loose, Achievable) and loose.holds:
-            return loose._replace(holds=None, share=None, status=Status.PRECISION)
+            return loose._replace(
+                holds=None, share=None, status=Status.PRECISION, nearest=_missing(prop, loose))
         return loose
     assert isinstance(strict, Best) and isinstance(loose, Best)
-    return _between(strict, loose)
+    return _between(prop, strict, loose)
 
 
-def _between(strict: Best, loose: Best) -> Best:
+def _between(prop: Property, strict: Best, loose: Best) -> Best:
     """What is true of thresholds between these two."""
     if loose.holds is False or strict.holds is None:
         return loose if loose.holds is False else strict
     if not strict.holds:
-        return loose._replace(holds=None, share=None, status=Status.PRECISION)
+        return loose._replace(
+            holds=None, share=None, status=Status.PRECISION, nearest=_missing(prop, loose))
     return strict._replace(
         lower=min(strict.lower, loose.lower), upper=max(strict.upper, loose.upper),
         status=max(strict.status, loose.status))
+
+
+def _missing(prop: Property, loose: Achievable | Best) -> Nearest | None:
+    """What is attained where thresholds that are a little easier are met, or nearly met."""
+    if loose.share is None:
+        return loose.nearest
+    wanted = [_rounded(x, True) for x in prop.parts]
+    signs = np.array([-1 if x.relation == "<=" or x.objective == "min" else 1 for x in prop.parts])
+    thresholds = np.array([-s * np.inf if x is None else x
+                           for x, s in zip(wanted, signs, strict=True)])
+    return nearest_of(loose.front, loose.share, thresholds, signs)
 
 
 def _solved(

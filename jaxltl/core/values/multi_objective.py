@@ -23,7 +23,10 @@ from jaxltl.core.values.enclosed import chain_of
 from jaxltl.core.values.objectives import Objective, Part, sums_of
 from jaxltl.core.values.sparse_satisfaction import as_sparse
 
-__all__ = ["Achievable", "Best", "Front", "Objective", "Pareto", "achievable", "multi", "pareto"]
+__all__ = ["Achievable", "Best", "Front", "Nearest", "Objective", "Pareto", "achievable", "multi",
+           "pareto"]
+
+_SHARPEST = 1e-12  # to which sums are solved where the border is near
 
 
 class Front(NamedTuple):
@@ -47,6 +50,21 @@ class Front(NamedTuple):
     product: HostProduct
 
 
+class Nearest(NamedTuple):
+    """What is attained nearest to thresholds of which it is not known whether they can be met.
+
+    Attributes:
+      share: the probabilities with which the front's policies are drawn at the start.
+      lower, upper: ``float64[n]``, certified bounds on what that attains.
+      gap: ``float64[n]``, how far it may miss each threshold at most.
+    """
+
+    share: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    gap: np.ndarray
+
+
 class Achievable(NamedTuple):
     """Whether thresholds can be met together.
 
@@ -56,6 +74,7 @@ class Achievable(NamedTuple):
       normal: of False, a half-space of the front that leaves the thresholds out; its number.
       front: the evidence.
       status: CONVERGED if it is known.
+      nearest: of None, the mixture of policies that comes nearest to the thresholds.
     """
 
     holds: bool | None
@@ -63,6 +82,7 @@ class Achievable(NamedTuple):
     normal: int | None
     front: Front
     status: Status
+    nearest: Nearest | None = None
 
 
 class Best(NamedTuple):
@@ -70,11 +90,14 @@ class Best(NamedTuple):
 
     Attributes:
       value, lower, upper: the value and its certified bounds; NaN where thresholds cannot be met.
+        Where that is not known they are what the value is if they can be; one bound is infinite.
       holds: whether the thresholds can be met; None where the bounds do not tell.
       share: the probabilities with which the front's policies are drawn at the start, by which the
         bound on the safe side is attained; None where there is none.
       front: the evidence.
       status: CONVERGED if the bounds are narrow, or the thresholds are known not to be met.
+      nearest: where it is not known whether thresholds can be met, the best mixture of policies
+        among those that come nearest to them.
     """
 
     value: float
@@ -84,6 +107,7 @@ class Best(NamedTuple):
     share: np.ndarray | None
     front: Front
     status: Status
+    nearest: Nearest | None = None
 
 
 class Pareto(NamedTuple):
@@ -111,13 +135,14 @@ def achievable(
 
     A policy may remember and may draw lots. Weighted sums are solved in turn: each attains a point,
     and bounds a half-space that no policy leaves (Forejt, Kwiatkowska and Parker 2012). Thresholds
-    are met if a mixture of points meets them, and not if a half-space leaves them out.
+    are met if a mixture of points meets them, and not if a half-space leaves them out. Near to the
+    border sums are solved again, more exactly, down to rounding.
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
       objectives: two or more, as of :class:`Objective`.
       thresholds: at least that for ``"max"``, at most that for ``"min"``; default the objectives'.
-      tolerance: how near to the border it need not be told.
+      tolerance: how exactly sums are solved at first.
       max_points: weighted sums at most.
 
     Returns:
@@ -137,14 +162,16 @@ def achievable(
     """
     if thresholds is None:
         thresholds = [np.nan if o.threshold is None else o.threshold for o in objectives]
-    if len(thresholds) != len(objectives) or np.isnan(np.asarray(thresholds, float)).any():
-        raise ValueError(f"thresholds={list(thresholds)}; give one number for each of the "
+    if len(thresholds) != len(objectives) or not np.isfinite(np.asarray(thresholds, float)).all():
+        raise ValueError(f"thresholds={list(thresholds)}; give one finite number for each of the "
                          f"{len(objectives)} objectives.")
     search = _Search(model, objectives, tolerance)
     wanted = search.signs * np.asarray(thresholds, np.float64)
     holds, share, normal = search.decide(wanted, max_points)
-    status = Status.PRECISION if holds is None else Status.CONVERGED
-    return Achievable(holds, share, normal, search.front(), status)
+    if holds is None:
+        return Achievable(None, None, None, search.front(), Status.PRECISION,
+                          search.nearest(wanted))
+    return Achievable(holds, share, normal, search.front(), Status.CONVERGED)
 
 
 def pareto(
@@ -219,6 +246,24 @@ def multi(
     return search.best(free[0], wanted, max_points)
 
 
+def nearest_of(
+    front: Front, share: np.ndarray, thresholds: np.ndarray, signs: np.ndarray
+) -> Nearest:
+    """What a mixture of a front's policies attains, and misses of thresholds.
+
+    Args:
+      front: the front.
+      share: ``float64[N]``, the mixture.
+      thresholds: ``float64[n]``, infinite where nothing is asked.
+      signs: ``int[n]``, 1 of objectives to be made large, -1 of others.
+    """
+    used = share > 0
+    lower = frontier.mixture(front.lower[used], share[used])
+    upper = -frontier.mixture(-front.upper[used], share[used])
+    missed = signs * (thresholds - np.where(signs > 0, lower, upper))
+    return Nearest(share, lower, upper, np.maximum(missed, 0))
+
+
 class _Search:
     """Points and half-spaces that are known, and what asks for more of them.
 
@@ -247,6 +292,7 @@ class _Search:
         self.upper: list[np.ndarray] = []
         self.normals: list[np.ndarray] = []
         self.bounds: list[float] = []
+        self.exactness: list[float] = []  # the tolerance by which each sum was solved
         self.policies: list[np.ndarray] = []
         size = len(self.parts)
         self.scale = np.ones(size)
@@ -294,6 +340,7 @@ class _Search:
         self.upper.append(upper)
         self.policies.append(found.weight)
         self.normals.append(np.array(normal))
+        self.exactness.append(self.tolerance)
         self.bounds.append(found.bound - shift + 1e-15 * (abs(found.bound) + shift))
 
     def evaluate(
@@ -364,66 +411,99 @@ class _Search:
             for i in np.flatnonzero((lower >= wanted).all(1)):
                 return True, np.eye(len(lower))[int(i)], None
             apart = frontier.separation(lower, wanted, self.scale)
-            if frontier.meets(lower, apart.share, wanted):
-                return True, apart.share, None
-            if looked >= max_points or self._known(apart.normal):
+            for share in (apart.share, frontier.plain(apart.share)):
+                if frontier.meets(lower, share, wanted):
+                    return True, share, None
+            if looked >= max_points or not self.ask_anew(apart.normal):
                 return None, None, None
-            self.ask(apart.normal)
+
+    def ask_anew(self, normal: np.ndarray) -> bool:
+        """Solves a weighted sum, more exactly where it was solved; False where that cannot be."""
+        while self._known(normal):
+            if self.tolerance <= _SHARPEST:
+                return False
+            self.tolerance = max(self.tolerance / 1000, _SHARPEST)
+        self.ask(normal)
+        return True
 
     def _known(self, normal: np.ndarray) -> bool:
-        """Whether a weighted sum was solved already, but for rounding."""
+        """Whether a weighted sum was solved as exactly already, but for rounding."""
         size = normal * self.scale
         return any(
             np.abs(size / size.sum() - x * self.scale / (x * self.scale).sum()).max() < 1e-12
-            for x in self.normals)
+            for x, exactness in zip(self.normals, self.exactness, strict=True)
+            if exactness <= self.tolerance)
+
+    def nearest(self, wanted: np.ndarray, index: int | None = None) -> Nearest:
+        """The mixture that comes nearest to thresholds, with the best of an objective if asked."""
+        lower, asked = np.stack(self.lower), np.isfinite(wanted)
+        apart = frontier.separation(lower[:, asked], wanted[asked], self.scale[asked])
+        share = apart.share
+        if index is not None:
+            enough = wanted - (apart.distance + 1e-15) * self.scale
+            found = frontier.largest(
+                lower, np.stack(self.normals), np.array(self.bounds), index, enough, self.scale)
+            share = found.share if np.isfinite(found.lower) else share
+        return nearest_of(self.front(), share, self.signs * wanted, self.signs)
 
     def best(self, index: int, wanted: np.ndarray, max_points: int) -> Best:
         """The best value of one objective, the others being at least something."""
-        sign = self.signs[index]
+        sign, tolerance = self.signs[index], self.tolerance
         enough = wanted.copy()
         enough[index] = min(x[index] for x in self.lower) - self.scale[index]
-        holds, _, _ = self.decide(enough, max_points)
+        holds, share, _ = self.decide(enough, max_points)
         if holds is False:
             nan = float("nan")
             return Best(nan, nan, nan, False, None, self.front(), Status.CONVERGED)
         while True:
             lower = np.stack(self.lower)
             known = frontier.largest(
-                lower, np.stack(self.normals), np.array(self.bounds), index, wanted, self.scale)
+                lower, np.stack(self.normals), np.array(self.bounds), index, wanted, self.scale,
+                share)
             size = max(1.0 if self.parts[index].kind == "sure" else abs(known.upper), 1e-300)
-            narrow = known.upper - known.lower <= self.tolerance * size
+            narrow = known.upper - known.lower <= tolerance * size
             if narrow or known.vector is None or len(lower) >= max_points:
                 break
-            apart = frontier.separation(lower, known.vector, self.scale)
-            if self._known(apart.normal):
+            if not self.ask_anew(frontier.separation(lower, known.vector, self.scale).normal):
                 break
-            self.ask(apart.normal)
         met = np.isfinite(known.lower)
         low, high = sorted((float(sign * known.lower), float(sign * known.upper)))
         if self.parts[index].kind == "sure":
             low, high = max(low, 0.0), min(high, 1.0)
-        value = (low + high) / 2 if met else float(sign * known.upper)
-        return Best(value, low, high, True if met else holds, known.share if met else None,
-                    self.front(), Status.CONVERGED if narrow else Status.PRECISION)
+        if met:
+            return Best((low + high) / 2, low, high, True, known.share, self.front(),
+                        Status.CONVERGED if narrow else Status.PRECISION)
+        near = self.nearest(wanted, index)
+        value = float(np.clip((near.lower[index] + near.upper[index]) / 2, low, high))
+        return Best(value, low, high, holds, None, self.front(), Status.PRECISION, near)
 
     def close(self, tolerance: float, max_points: int) -> float:
         """Asks until no value is farther beyond the mixtures than the tolerance; how far it is."""
         if len(self.parts) > 1:
             self.ask(1 / self.scale / len(self.parts))
+        held: dict[bytes, frontier.Separation] = {}
         while True:
-            lower = np.stack(self.lower)
+            lower, before = np.stack(self.lower), self.scale
             self._rescale()
+            if not np.array_equal(before, self.scale):
+                held.clear()
             floor = lower.min(0) - self.scale
             far = frontier.corners(np.stack(self.normals), np.array(self.bounds), floor)
-            apart = [frontier.separation(lower, corner, self.scale)
-                     for corner in np.maximum(far, lower.min(0))]
-            if not apart:
+            if not len(far):
                 return float("inf")
-            worst = max(apart, key=lambda x: x.distance)
+            worst = self._farthest(np.maximum(far, lower.min(0)), held)
             gap = max(worst.distance, 0.0)
-            if gap <= tolerance or len(lower) >= max_points:
+            if gap <= tolerance or len(lower) >= max_points or not self.ask_anew(worst.normal):
                 return gap
-            fresh = [x for x in apart if x.distance > tolerance and not self._known(x.normal)]
-            if not fresh:
-                return gap
-            self.ask(max(fresh, key=lambda x: x.distance).normal)
+
+    def _farthest(
+        self, corners: np.ndarray, held: dict[bytes, frontier.Separation]
+    ) -> frontier.Separation:
+        """Of the corner farthest beyond the mixtures. Those of fewer points were not nearer."""
+        lower, names, fresh = np.stack(self.lower), [x.tobytes() for x in corners], set()
+        far = np.array([held[x].distance if x in held else np.inf for x in names])
+        while (i := int(far.argmax())) not in fresh:
+            held[names[i]] = frontier.separation(lower, corners[i], self.scale)
+            far[i] = held[names[i]].distance
+            fresh.add(i)
+        return held[names[i]]

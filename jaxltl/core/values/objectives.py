@@ -181,7 +181,6 @@ def _product(
     model: SparseMDP, trackers: list[_Tracker], all_end: bool
 ) -> tuple[HostProduct, np.ndarray]:
     """The model beside all trackers, and the memory of each in each joint one, ``int[J, n]``."""
-    shape = tuple(len(x.delta) for x in trackers)
     first = np.flatnonzero(np.asarray(model.initial) > 0)
     letters: Any = np.zeros((model.num_states, len(trackers)), np.int64)
     for i, x in enumerate(trackers):
@@ -205,7 +204,7 @@ def _product(
         reached = after(np.repeat(frontier, len(shown), 0), np.tile(shown, (len(frontier), 1)))
         steps.append(reached)
         new = [x for x in map(tuple, np.unique(reached, axis=0).tolist()) if x not in codes]
-        frontier = np.array(new, np.int64).reshape(-1, len(shape))
+        frontier = np.array(new, np.int64).reshape(len(new), len(trackers))
     delta = np.array([codes[tuple(x)] for x in np.vstack(steps).tolist()]).reshape(
         len(known), len(shown))
     still = np.full(len(known), all_end)

@@ -46,6 +46,12 @@ def test_a_threshold_that_no_double_is_is_not_guessed():
     # 1/3 and 2/3 can just be met, but no double says so.
     found = answer_several(fork(), 'multi(P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])')
     assert found.holds is None and found.status == Status.PRECISION
+    np.testing.assert_allclose(found.nearest.lower, [1 / 3, 2 / 3], rtol=1e-14)
+    assert (found.nearest.gap <= 1e-14).all() and found.nearest.gap.any()
+    best = answer_several(
+        fork(), 'multi(Pmin=? [ F "b" ], P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])')
+    assert best.holds is None and (best.nearest.gap <= 1e-14).all()
+    assert best.nearest.gap[0] == 0 and best.nearest.lower[0] <= 2 / 3 <= best.nearest.upper[0]
 
 
 def test_the_curve():

@@ -242,6 +242,62 @@ def test_storm_finds_the_same(seed):
         storm_values(storm, 'Pmax=? [ F "a" ]')[0], atol=1e-6)
 
 
+def arc(corners):
+    """Choices whose rewards lie on a quarter of a circle; every one is a corner of the curve."""
+    angle = np.linspace(0, np.pi / 2, corners)
+    x, y = (np.append(f(angle), 0.0) for f in (np.cos, np.sin))
+    model = make_sparse(
+        [0, corners, corners + 1], np.arange(corners + 2), np.ones(corners + 1, int),
+        np.ones(corners + 1), initial=[1, 0],
+        rewards={"x": Rewards(choice=x), "y": Rewards(choice=y)})
+    return model, x[:-1], y[:-1]
+
+
+@pytest.mark.parametrize("corners", (20, 1000))
+def test_a_border_of_many_corners(corners):
+    model, x, y = arc(corners)
+    for least in (0.28, 0.7, 0.99999):
+        most = np.interp(least, y, x)  # mixtures of neighbours are the border
+        best = multi(model, [Objective(reward="x"), Objective(reward="y", threshold=least)])
+        assert best.status == Status.CONVERGED
+        assert best.lower - 1e-12 <= most <= best.upper + 1e-12
+        assert best.upper - best.lower <= 1e-6 * best.upper
+        for beyond, holds in ((-1e-10, True), (1e-10, False)):
+            found = achievable(
+                model, [Objective(reward="x"), Objective(reward="y")], [most + beyond, least])
+            assert found.holds is holds and found.nearest is None
+            if holds:
+                assert (found.share @ found.front.lower >= [most + beyond, least]).all()
+
+
+def test_what_is_attained_nearest_to_a_border_is_told():
+    model, x, y = arc(200)
+    for k in (60, 150):
+        thresholds = np.array([x[k], y[k]])
+        found = achievable(model, [Objective(reward="x"), Objective(reward="y")], thresholds)
+        near = found.nearest
+        assert found.holds is None and found.status == Status.PRECISION
+        assert (near.lower <= thresholds).all() and (thresholds <= near.upper).all()
+        assert (near.lower + near.gap >= thresholds - 1e-15).all() and (near.gap <= 1e-13).all()
+        assert (near.share @ found.front.points >= thresholds - 1e-12).all()
+    # All that can be had of y, and the most of x beside it, which is none.
+    best = multi(model, [Objective(reward="x"), Objective(reward="y", threshold=1.0)])
+    assert best.holds is None and best.status == Status.PRECISION
+    assert best.upper <= 1e-6 and best.value <= best.upper
+    assert best.nearest.gap.tolist() == [0, pytest.approx(0, abs=1e-13)]
+    assert best.nearest.lower[1] <= 1 <= best.nearest.upper[1]
+
+
+def test_all_corners_are_found():
+    model, x, y = arc(16)
+    found = pareto(model, [Objective(reward="x"), Objective(reward="y")], tolerance=1e-6)
+    assert found.status == Status.CONVERGED and found.gap <= 1e-6
+    np.testing.assert_allclose(found.points, np.stack([x, y], 1)[::-1], atol=1e-9)
+    few = pareto(model, [Objective(reward="x"), Objective(reward="y")], tolerance=1e-6,
+                 max_points=12)
+    assert few.status == Status.MAX_STEPS and 1e-6 < few.gap < 0.01
+
+
 def test_what_is_wrong_is_named():
     model = make_sparse([0, 2, 3], [0, 1, 2, 3], [0, 1, 1], np.ones(3), initial=[1, 0],
                         rewards={"r": Rewards(choice=[1.0, 0, 0])})
@@ -259,7 +315,7 @@ def test_what_is_wrong_is_named():
                        Objective(target=end)])
     with pytest.raises(ValueError, match="rewards of at least 0"):
         pareto(model, [Objective(reward=[-1.0, 0, 0]), Objective(target=end)])
-    with pytest.raises(ValueError, match="give one number for each"):
+    with pytest.raises(ValueError, match="give one finite number for each"):
         achievable(model, [Objective(target=end), Objective(avoid=end)])
     with pytest.raises(ValueError, match="to all but one"):
         multi(model, [Objective(target=end), Objective(avoid=end),
