@@ -83,7 +83,7 @@ def reachability(
 
     def exact(mdp: HostMDP, _: Floats, up: bool) -> Enclosed:
         return optimal.reachability(
-            mdp, target, maximize=up, tolerance=tolerance / 2, depth=depth + _terms(mdp))
+            mdp, target, maximize=up, tolerance=tolerance / 2, depth=depth + terms(mdp))
 
     def joint(part: HostInterval, _: Floats, up: bool) -> Robust:
         return _joint_reachability(part, target, up, tolerance, depth, exact)
@@ -131,7 +131,7 @@ def total_reward(
 
     def exact(mdp: HostMDP, earned: Floats, up: bool) -> Enclosed:
         return optimal.total_reward(
-            mdp, earned, ends, maximize=up, tolerance=tolerance / 2, depth=depth + _terms(mdp))
+            mdp, earned, ends, maximize=up, tolerance=tolerance / 2, depth=depth + terms(mdp))
 
     def joint(some: HostInterval, earned: Floats, up: bool) -> Robust:
         return _joint_reward(some, earned, ends, up, tolerance, depth, exact)
@@ -156,7 +156,7 @@ def total_reward(
     return _unhalted(model, halted, row, target, found)
 
 
-def _terms(mdp: HostMDP) -> int:
+def terms(mdp: HostMDP) -> int:
     """How many roundings may stand behind nature's distributions."""
     return int(np.diff(mdp.entry_start).max()) + 4
 
@@ -271,7 +271,7 @@ def _led_by_policy(
         rounds += 1
         part, _ = model.chain(row)
         inner = solve.joint(part, solve.cost[row], not up)
-        gain, p = _gains(model, inner.value, solve.cost, up=not up)
+        gain, p = gains(model, inner.value, solve.cost, up=not up)
         best = mdp.over_choices(np.maximum, sign * gain)
         better = best > _noise(inner.value)
         if rounds == _ROUNDS or not better.any():
@@ -296,7 +296,7 @@ def _led_by_nature(
     while True:
         rounds += 1
         found = solve.exact(model.fixed(p), solve.cost, not up)
-        gain, q = _gains(model, found.value, solve.cost, up=up)
+        gain, q = gains(model, found.value, solve.cost, up=up)
         now = model.total(p * _differences(model, found.value)) + solve.cost
         more = sign * (gain - now)
         better = more > _noise(found.value)[mdp.state]
@@ -325,7 +325,7 @@ def _differences(model: HostInterval, value: Floats) -> Floats:
     return value[mdp.successor] - value[mdp.state[mdp.row]]
 
 
-def _gains(
+def gains(
     model: HostInterval, value: Floats, cost: Floats, *, up: bool
 ) -> tuple[Floats, Floats]:
     """What each row gains when nature makes that large or small, and nature's distributions."""
