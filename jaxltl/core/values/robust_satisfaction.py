@@ -1,0 +1,164 @@
+"""The probability of a formula of linear temporal logic when probabilities lie in intervals."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.runs import live_states, universal_states
+from jaxltl.core.automata.translate import Task
+from jaxltl.core.host.interval import HostInterval
+from jaxltl.core.host.interval_graph import joint_accepting
+from jaxltl.core.host.interval_parity import parity_against_nature
+from jaxltl.core.host.interval_values import Robust, reachability
+from jaxltl.core.host.product import HostProduct, host_product
+from jaxltl.core.host.rows import Booleans, Integers
+from jaxltl.core.host.sparse import Floats, HostMDP
+from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.types import Method, Status
+from jaxltl.core.values.robust import TOLERANCE, RobustSolution, require_direction
+from jaxltl.core.values.sparse_satisfaction import automaton_of
+
+
+class RobustSatisfaction(NamedTuple):
+    """The probability of a task, with a policy that has a memory, and nature's choices.
+
+    Attributes:
+      solution: value, lower and upper are ``float64[I]``, one for each state that was asked for;
+        `policy` is ``int32[N]``, the world's row in each state of the product, and `nature`
+        ``float64[T']``, its distributions.
+      automaton: the task, over the letters that occur; letters are read as a state is left.
+      letter: ``int[S]``, the letter that each state shows.
+      product: what is reached of the model beside the automaton, N states.
+    """
+
+    solution: RobustSolution
+    automaton: Automaton
+    letter: np.ndarray
+    product: HostProduct
+
+
+def robust_satisfaction(
+    model: IntervalMDP, task: Task, *, objective: str = "max", nature: str | None = None,
+    states: Any = None, tolerance: float | None = None,
+) -> RobustSatisfaction:
+    """Largest or smallest probability of a formula that nature, for or against it, leaves.
+
+    In the product with the formula's automaton: where policy and nature want the same, they reach
+    the end components that both can keep to (Baier and Katoen 2008, section 10.6.4, with nature's
+    choices as actions). Where they want the opposite it is a stochastic parity game; with lower
+    ends of 0 nature may cut edges, so that neither the graph nor its end components are fixed.
+
+    Args:
+      model: the model.
+      task: a formula, its text, or an automaton over the letters that occur in the model.
+      objective: ``"max"`` or ``"min"``, what the policy makes of the probability.
+      nature: ``"min"`` or ``"max"``; default: the opposite of `objective`.
+      states: ``int[I]``, where runs start; default the initial states.
+      tolerance: the width of the enclosure asked for, 1e-6.
+
+    Returns:
+      :class:`RobustSatisfaction`.
+
+    Raises:
+      ValueError: an unknown label or direction, or a product beyond 2^31 states.
+
+    Example:
+      >>> from jaxltl.core.models.interval import interval_rows
+      >>> model = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1],
+      ...                       initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["a"])
+      >>> robust_satisfaction(model, "F G a").solution.value.tolist()
+      [0.4]
+    """
+    nature = require_direction(nature, objective)
+    asked = TOLERANCE if tolerance is None else float(tolerance)
+    automaton, letter = automaton_of(model.nominal, task)
+    states = np.flatnonzero(np.asarray(model.initial) > 0) if states is None else states
+    states = np.asarray(states, np.int64)
+    yes, no = universal_states(automaton), ~live_states(automaton)
+    product, host = _product(model, automaton, letter, states, yes | no)
+    maximize, helpful = objective == "max", nature == "max"
+    priority = None
+    if automaton.acceptance in ("buchi", "parity"):
+        source = product.memory, letter[product.base_state]
+        priority = np.asarray(automaton.priority)[source]
+    found = _solved(
+        host, yes[product.memory], no[product.memory], priority, maximize, helpful,
+        automaton.acceptance == "safety", asked)
+    solution = RobustSolution(
+        value=found.value[product.start], policy=product.base_row[found.row].astype(np.int32),
+        nature=found.probability, lower=found.lower[product.start],
+        upper=found.upper[product.start], residual=np.float64(found.residual),
+        num_steps=np.int32(found.rounds), status=np.int32(_status(found, asked)),
+        method=Method(found.method))
+    return RobustSatisfaction(solution, automaton, letter, product)
+
+
+def _status(found: Robust, tolerance: float) -> Status:
+    narrow = (found.upper - found.lower <= tolerance).all()
+    return Status.CONVERGED if narrow else Status.PRECISION
+
+
+def _product(
+    model: IntervalMDP, automaton: Automaton, letter: np.ndarray, states: np.ndarray,
+    still: Booleans,
+) -> tuple[HostProduct, HostInterval]:
+    """What is reached of the product, with its intervals."""
+    mdp = model.nominal.host
+    # Entries travel by number, from 1; a loop of what stands still has 1 too.
+    numbered = HostMDP(mdp.row_start, mdp.entry_start, mdp.successor,
+                       np.arange(1.0, mdp.num_transitions + 1))
+    initial = np.broadcast_to(automaton.initial, states.shape)
+    found = host_product(
+        numbered, automaton.delta, letter, states, initial, on_entry=False, still=still)
+    entry = found.host.probability.astype(np.int64) - 1
+    loop = found.still[found.host.state[found.host.row]]
+    chance, lower, upper = (
+        np.where(loop, 1.0, x[entry]) for x in (mdp.probability, model.host.lower,
+                                                model.host.upper))
+    host = HostMDP(
+        found.host.row_start, found.host.entry_start, found.host.successor, chance)
+    return found._replace(host=host), HostInterval(host, lower, upper)
+
+
+def _solved(
+    host: HostInterval, yes: Booleans, no: Booleans, priority: Integers | None, maximize: bool,
+    helpful: bool, safety: bool, tolerance: float,
+) -> Robust:
+    """The probability from all states of a product."""
+    if priority is None:
+        goal = no if safety else yes
+        if safety:
+            return _opposite(reachability(
+                host, goal, maximize=not maximize, helpful=not helpful, tolerance=tolerance))
+        return reachability(
+            host, goal, maximize=maximize, helpful=helpful, tolerance=tolerance)
+    if not maximize:
+        # The least probability is one minus the largest of the opposite.
+        priority = np.where(no, 0, np.where(yes, 1, priority + 1))
+        return _opposite(_largest(host, priority, not helpful, tolerance))
+    priority = np.where(yes, 0, np.where(no, 1, priority))
+    return _largest(host, priority, helpful, tolerance)
+
+
+def _largest(
+    host: HostInterval, priority: Integers, helpful: bool, tolerance: float
+) -> Robust:
+    if not helpful:
+        return parity_against_nature(host, priority, tolerance=tolerance)
+    mdp = host.mdp
+    good = joint_accepting(host, priority[mdp.state[mdp.row]])
+    found = reachability(host, good.region, maximize=True, helpful=True, tolerance=tolerance)
+    inside: Floats = np.where(
+        good.region[mdp.state[mdp.row]], good.probability, found.probability)
+    return found._replace(row=np.where(good.region, good.row, found.row), probability=inside)
+
+
+def _opposite(found: Robust) -> Robust:
+    """One minus, rounded outwards; 0 and 1 stay what they are."""
+    lower, upper = (np.where((x == 0) | (x == 1), 1 - x, 1 - x + side * 1e-16)
+                    for x, side in ((found.upper, -1), (found.lower, 1)))
+    lower, upper = np.clip(lower, 0, 1), np.clip(upper, 0, 1)
+    return found._replace(value=np.clip(1 - found.value, lower, upper), lower=lower, upper=upper)
