@@ -13,7 +13,14 @@ from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.rows import starts_of
 from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.sparse import Array, Rewards, SparseMDP, make_sparse
+from jaxltl.core.models.sparse import (
+    Array,
+    Rewards,
+    SparseMDP,
+    check_entries,
+    checked_starts,
+    make_sparse,
+)
 
 _NEAR = 1e-6  # how far a row may miss a distribution and still be scaled to one
 _ENDS = "\0lower", "\0upper"  # names under which ends travel with the entries
@@ -178,11 +185,19 @@ def interval_rows(
     if not lower.shape == upper.shape == successor.shape:
         raise ValueError(f"successor has shape {successor.shape}, lower {lower.shape} and upper "
                          f"{upper.shape}; all must be [transitions].")
-    starts = np.arange(entry_start.size) if row_start is None else np.asarray(row_start)
-    row = np.repeat(np.arange(entry_start.size - 1), np.diff(entry_start))
+    entry_start = checked_starts("entry_start", entry_start, successor.size, "transitions")
+    num_rows = entry_start.size - 1
+    starts = checked_starts(
+        "row_start", np.arange(num_rows + 1) if row_start is None else row_start, num_rows,
+        "choices")
+    if starts.size < 2:
+        raise ValueError("the model has no state; it needs at least one.")
+    check_entries(starts, entry_start, successor, np.ones(successor.size))
+    row = np.repeat(np.arange(num_rows), np.diff(entry_start))
     _check_ends(starts, row, successor, lower, upper)
     rewards = dict(rewards or {})
-    if np.unique(np.stack([row, successor]), axis=1).shape[1] < row.size:
+    place = row * np.int64(starts.size) + successor.astype(np.int64)
+    if not (place[1:] > place[:-1]).all() and np.unique(place).size < place.size:
         row, successor, lower, upper, rewards = _merged(row, successor, lower, upper, rewards)
         entry_start = starts_of(np.bincount(row, minlength=entry_start.size - 1))
     lower, upper = _scaled(starts, entry_start, row, lower, upper)
@@ -219,14 +234,15 @@ def _scaled(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The ends, such that each row has a distribution between them."""
     low, high = (np.add.reduceat(x, entry_start[:-1]) for x in (lower, upper))
+    rounding = (np.diff(entry_start) + 2) * np.finfo(np.float64).eps  # what is no miss
     bad = (low > 1 + _NEAR) | (high < 1 - _NEAR)
     if bad.any():
         r = int(np.flatnonzero(bad)[0])
         what = (f"the lower ends sum to {low[r]:.9g}, which is above 1" if low[r] > 1 else
                 f"the upper ends sum to {high[r]:.9g}, which is below 1")
         raise ValueError(f"{_place(row_start, r)}: {what}; no distribution lies between them.")
-    lower = np.where((low > 1)[row], lower / low[row], lower)
-    upper = np.where((high < 1)[row], upper / high[row], upper)
+    lower = np.where((low > 1 + rounding)[row], lower / low[row], lower)
+    upper = np.where((high < 1 - rounding)[row], upper / high[row], upper)
     return lower, np.clip(np.maximum(upper, lower), 0, 1)
 
 
@@ -242,7 +258,11 @@ def _merged(
     for name, reward in rewards.items():
         if reward.transition is None:
             continue
-        earned = np.asarray(reward.transition)[order]
+        earned = np.asarray(reward.transition)
+        if earned.shape != order.shape:
+            raise ValueError(f"reward {name!r} has shape {earned.shape} on its transition part; "
+                             f"expected {order.shape}.")
+        earned = earned[order]
         if (np.maximum.reduceat(earned, start) != np.minimum.reduceat(earned, start)).any():
             raise ValueError(
                 f"reward {name!r} differs between entries of one row that lead to one state; give "

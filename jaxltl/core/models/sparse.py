@@ -238,15 +238,15 @@ def make_sparse(
             "both must be [transitions].")
     if not np.issubdtype(successor.dtype, np.integer):
         raise ValueError(f"successor has dtype {successor.dtype}; it must hold integers.")
-    entry_start = _starts("entry_start", entry_start, successor.size, "transitions")
+    entry_start = checked_starts("entry_start", entry_start, successor.size, "transitions")
     num_rows = entry_start.size - 1
     if row_start is None:
         row_start = np.arange(num_rows + 1)
-    row_start = _starts("row_start", row_start, num_rows, "choices")
+    row_start = checked_starts("row_start", row_start, num_rows, "choices")
     num_states = row_start.size - 1
     if num_states == 0:
         raise ValueError("the model has no state; it needs at least one.")
-    _check_entries(row_start, entry_start, successor, probability)
+    check_entries(row_start, entry_start, successor, probability)
     rewards = {name: _checked_rewards(name, x, num_states, num_rows, successor.size)
                for name, x in (rewards or {}).items()}
     label, names = checked_label(label, propositions, num_states)
@@ -265,7 +265,12 @@ def make_sparse(
         propositions=names, action_names=tuple(action_names))
 
 
-def _starts(name: str, start: Any, total: int, of: str) -> np.ndarray:
+def checked_starts(name: str, start: Any, total: int, of: str) -> np.ndarray:
+    """Where spans start, as ``int64``; they go from 0 to a total and ascend.
+
+    Raises:
+      ValueError: they do not.
+    """
     start = np.asarray(start)
     if start.ndim != 1 or not start.size or not np.issubdtype(start.dtype, np.integer):
         raise ValueError(f"{name} is {start.dtype}{list(start.shape)}; expected integers, one more "
@@ -287,9 +292,10 @@ def _place(row_start: np.ndarray, row: int) -> str:
     return f"state {state}, choice {row - int(row_start[state])}"
 
 
-def _check_entries(
+def check_entries(
     row_start: np.ndarray, entry_start: np.ndarray, successor: np.ndarray, probability: np.ndarray
 ) -> None:
+    """Raises a ValueError where a state, a row or an entry is not what a model may have."""
     num_states = row_start.size - 1
     if (np.diff(row_start) == 0).any():
         raise ValueError(f"state {np.flatnonzero(np.diff(row_start) == 0)[0]} has no choice; give "
