@@ -3,8 +3,9 @@
 Given a model whose probabilities and rewards are functions of parameters in a box, is there a point
 at which a reachability probability or an expected reward is on the right side of a threshold? From
 each start the value climbs (or falls) along its gradient, which is the implicit derivative of a
-prepared solve, and stays in the box by projection. Coordinates are shares of the box, so that a
-rate means the same for every parameter. A run ends when it is past the threshold.
+prepared solve, and stays in the box by projection. Values are measured by their logarithms, those
+of probabilities by that of the odds, and coordinates are shares of the box, so that a rate means
+the same everywhere. A run ends when it is past the threshold.
 
 What floats say there is no proof: :func:`feasible` has each point that is claimed certified by the
 host engine, on the model at that point, with bounds of both sides. Gradients find local optima;
@@ -32,8 +33,9 @@ from jaxltl.core.host import optimal
 from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.parametric import Ends, ParametricMDP
 from jaxltl.core.models.sparse import row_reward
-from jaxltl.core.types import Solution, Status, require_shape
+from jaxltl.core.types import Status, require_shape
 from jaxltl.core.values.prepared import Prepared, prepare, solve_prepared
+from jaxltl.core.values.prepared_chain import evaluate_prepared, is_direct
 
 _UNIT = float(np.finfo(np.float64).eps)
 
@@ -79,8 +81,8 @@ class Hparams:
       learning_rate: in shares of the box; a schedule.
       optimizer: ``"adam"``, ``"rmsprop"``, ``"sgd"``, or ``"sign"``, which takes the signs of the
         gradient alone; static.
-      tolerance: of the solves, see :func:`~jaxltl.core.values.prepared.solve_prepared`; None is its
-        default.
+      tolerance: of the solves of decision processes, see
+        :func:`~jaxltl.core.values.prepared.solve_prepared`; None is its default.
     """
 
     learning_rate: Schedule = 0.1
@@ -123,7 +125,8 @@ class Metrics:
     Attributes:
       value: there.
       best_value: of all points seen, this one included.
-      gradient_norm: Euclidean, with respect to shares of the box.
+      gradient_norm: of the logarithm of the value, of probabilities of the odds, with respect to
+        shares of the box; Euclidean.
       status: of the solve; INVALID where the functions are no model.
     """
 
@@ -235,28 +238,36 @@ def _rounded_inward(problem: Problem) -> Problem:
 # --- the search -----------------------------------------------------------------------------
 
 
-def solve(parameters: jax.Array, problem: Problem, hparams: Hparams) -> tuple[jax.Array, Solution]:
-    """The value at a point, and the solution of all states that it is of.
+def evaluate(parameters: jax.Array, problem: Problem, hparams: Hparams) -> Any:
+    """The value at a point: the mean over the initial distribution.
 
     Args:
       parameters: ``float[D]``.
       problem, hparams: what and how.
 
     Returns:
-      The mean over the initial distribution, and :class:`Solution`, whose status is ``INVALID``
-      where the functions are no model. Differentiable in the parameters; for an optimum over
-      policies with the optimal policy held fixed.
+      The value and a status, ``INVALID`` where the functions are no model; of decision processes
+      the solves have bounds of their own, of chains they have none (``UNCERTIFIED``).
+      Differentiable in the parameters; for an optimum over policies with the optimal policy held
+      fixed.
     """
     probability, rewards = problem.model.numbers(parameters)
-    found = solve_prepared(
-        problem.prepared,
-        probability=probability,
-        tolerance=hparams.tolerance,
-        reward=None if problem.reward is None else rewards.get(problem.reward),
-    )
+    prepared = problem.prepared
+    given = {
+        "probability": probability,
+        "reward": None if problem.reward is None else rewards.get(problem.reward),
+    }
+    if _is_chain(prepared):
+        value, status = evaluate_prepared(prepared, **given)
+    else:
+        found = solve_prepared(prepared, tolerance=hparams.tolerance, **given)
+        value, status = found.value, found.status
     start = problem.weight > 0
-    value = jnp.where(start, found.value, 0)
-    return jnp.sum(problem.weight * value), found
+    return jnp.sum(problem.weight * jnp.where(start, value, 0)), status
+
+
+def _is_chain(prepared: Prepared) -> bool:
+    return prepared.num_rows == prepared.num_states
 
 
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
@@ -293,11 +304,11 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     size = problem.high - problem.low
 
     def loss(x: jax.Array) -> tuple[jax.Array, Any]:
-        value, found = solve(x, problem, hparams)
-        return -problem.sign * value, (value, found.status)
+        value, status = evaluate(x, problem, hparams)
+        return -problem.sign * value, (value, status)
 
     slope, (value, status) = jax.grad(loss, has_aux=True)(x)
-    slope = slope * size
+    slope = slope * size / _unit(problem, value)
     good = (status < Status.NONFINITE) & jnp.isfinite(value) & jnp.all(jnp.isfinite(slope))
     updates, optimizer = _optimizer(hparams, state.step).update(
         jnp.where(good, slope, 0), state.optimizer, x
@@ -317,6 +328,18 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     )
     status = jnp.where(good | (status >= Status.NONFINITE), status, Status.NONFINITE)
     return after, Metrics(value, best.value, optax.tree.norm(slope), status.astype(jnp.int32))
+
+
+def _unit(problem: Problem, value: jax.Array) -> jax.Array:
+    """What the value is measured in: a gradient by it is that of the logarithm of the value.
+
+    Of probabilities, of the odds. So where values are 1e-30, or 1 - 1e-9, steps are of a size.
+    """
+    limits = jnp.finfo(value.dtype)
+    unit = jnp.abs(value)
+    if problem.reward is None:
+        unit = unit * jnp.maximum(1 - value, 1e3 * limits.eps)
+    return jnp.maximum(unit, limits.tiny)
 
 
 run, train, run_until, train_until = learner.bind(init, step)
@@ -470,7 +493,8 @@ def _search(
             num_steps=most,
         )
 
-    if problem.prepared.cyclic:
+    prepared = problem.prepared
+    if not (is_direct(prepared) and (_is_chain(prepared) or not prepared.cyclic)):
         return lax.map(lambda given: one(*given), (keys, points))
     return jax.vmap(one)(keys, points)
 

@@ -36,6 +36,7 @@ class Prepared:
     Attributes:
       segments: the blocks.
       place: ``int32[S]``, where a state's value is.
+      nodes: ``int32[M]``, the places with rows; others fill blocks.
       own: ``int32[S]``, the place whose row a state takes, or -1.
       row: ``int32[S]``, the row that it takes else.
       entry_row: ``int32[T]``, the row of each transition.
@@ -51,6 +52,7 @@ class Prepared:
 
     segments: tuple[Blocks, Blocks, Blocks]
     place: Any
+    nodes: Any
     own: Any
     row: Any
     entry_row: Any
@@ -160,15 +162,18 @@ def _prepared(host: Any, plan: Plan, cost: Any, objective: str) -> Prepared:
         scale[plan.loops.row] = 1 / np.maximum(rest, 1e-300)[plan.loops.row_group]
         vector[: host.num_transitions] *= scale[host.row]
         vector[host.num_transitions : -2] *= scale
-    blocks, first = [], 0
+    blocks, nodes, first = [], [], 0
     for part in plan.schedule.segments:
+        full = (part.source != vector.size - 1).any((1, 2)).ravel()
+        nodes.append(first + np.flatnonzero(full))
         weight = vector[part.source].astype(dtype)
         blocks.append(Blocks(part.target, part.source, weight, part.name, first))
         first = blocks[-1].last
     loops = None if plan.loops is None else tuple(x.astype(np.int32) for x in plan.loops[:4])
     circles = None if plan.circles is None else tuple(x.astype(np.int32) for x in plan.circles)
     found = Prepared(
-        segments=(blocks[0], blocks[1], blocks[2]), place=plan.place, own=plan.own, row=plan.row,
+        segments=(blocks[0], blocks[1], blocks[2]), place=plan.place,
+        nodes=np.concatenate(nodes).astype(np.int32), own=plan.own, row=plan.row,
         entry_row=host.row.astype(np.int32), row_state=host.state.astype(np.int32),
         probability=host.probability.astype(dtype),
         reward=None if cost is None else cost.astype(dtype), loops=loops, circles=circles,
@@ -216,15 +221,8 @@ def solve_prepared(
     Differentiable, forward and reverse, in the probabilities, in the rewards and in the weights of
     a policy, along distributions; of an optimum with its policy held fixed.
     """
-    probability, reward, policy = (
-        None if x is None else jnp.asarray(x) for x in (probability, reward, policy))
-    if probability is not None:
-        require_shape("probability", probability, prepared.probability.shape)
-    if reward is not None:
-        if prepared.reward is None:
-            raise ValueError("a reward is given, but the question is a probability: prepare it "
-                             "with a reward.")
-        require_shape("reward", reward, prepared.reward.shape)
+    probability, reward = given_numbers(prepared, probability, reward)
+    policy = None if policy is None else jnp.asarray(policy)
     chain = prepared.num_rows == prepared.num_states
     if prepared.objective == "policy":
         if policy is None and not chain:
@@ -241,6 +239,19 @@ def solve_prepared(
     return _solve(prepared, probability, reward, policy, tolerance, max_steps)
 
 
+def given_numbers(prepared: Prepared, probability: Any, reward: Any) -> tuple[Any, Any]:
+    """Numbers that are given, with the shapes that they must have."""
+    probability, reward = (None if x is None else jnp.asarray(x) for x in (probability, reward))
+    if probability is not None:
+        require_shape("probability", probability, prepared.probability.shape)
+    if reward is not None:
+        if prepared.reward is None:
+            raise ValueError("a reward is given, but the question is a probability: prepare it "
+                             "with a reward.")
+        require_shape("reward", reward, prepared.reward.shape)
+    return probability, reward
+
+
 @jax.jit
 def _solve(
     prepared: Prepared, probability: Any, reward: Any, policy: Any, tolerance: Any, max_steps: Any
@@ -248,9 +259,9 @@ def _solve(
     dtype = prepared.probability.dtype
     tolerance = jnp.asarray(tolerance, dtype)
     share, taken = _shares(prepared, policy)
-    finite, valid = _checked(prepared, probability, reward, share)
+    finite, valid = checked_numbers(prepared, probability, reward, share)
     if probability is not None or reward is not None or share is not None:
-        prepared = _refilled(prepared, probability, reward, share)
+        prepared = refilled(prepared, probability, reward, share)
     decided = None
     if prepared.objective == "policy":
         decided = _decided(prepared, reward, share)
@@ -290,7 +301,7 @@ def _shares(prepared: Prepared, policy: Any) -> tuple[_Shares | None, Any]:
     return _Shares(weight / total[prepared.row_state], used, valid, finite), policy
 
 
-def _checked(
+def checked_numbers(
     prepared: Prepared, probability: Any, reward: Any, share: _Shares | None
 ) -> tuple[jax.Array, jax.Array]:
     """Whether numbers are finite, and whether they are what they must be."""
@@ -313,7 +324,7 @@ def _checked(
     return finite, valid
 
 
-def _refilled(
+def refilled(
     prepared: Prepared, probability: Any, reward: Any, share: _Shares | None
 ) -> Prepared:
     """The same blocks with other weights."""
@@ -454,21 +465,13 @@ def _attached(prepared: Prepared, found: _Found, decided: _Decided | None) -> ja
     size, dtype = prepared.size, prepared.probability.dtype
     if not size:
         return found.value
-    target = jnp.concatenate([x.target for x in prepared.segments])
-    weight = jnp.concatenate([x.weight for x in prepared.segments])
-    if found.rank is None:
-        target, weight = target[:, 0], weight[:, 0]
-    else:
-        at = found.rank[:, None, None]
-        target = jnp.take_along_axis(target, at, 1)[:, 0]
-        weight = jnp.take_along_axis(weight, at, 1)[:, 0]
+    system = chosen_rows(prepared, found.rank)
     put = jnp.zeros(size, dtype)
     if decided is not None:
-        count, _, block = target.shape
+        count, _, block = system.target.shape
         keep = decided.keep[:size].astype(dtype)
-        weight = weight * keep.reshape(count, 1, block)
+        system = replace(system, weight=system.weight * keep.reshape(count, 1, block))
         put = decided.put[:size].astype(dtype)
-    system = Chosen(target, weight, prepared.cyclic)
     fixed = lax.stop_gradient(system)
     one = jnp.asarray([1, 0, 0], dtype)
 
@@ -477,6 +480,18 @@ def _attached(prepared: Prepared, found: _Found, decided: _Decided | None) -> ja
 
     return implicit(
         operator, found.value, solve=fixed.solve, transpose_solve=fixed.transpose_solve)
+
+
+def chosen_rows(prepared: Prepared, rank: jax.Array | None) -> Chosen:
+    """The rows that nodes take; without ranks the first ones."""
+    target = jnp.concatenate([x.target for x in prepared.segments])
+    weight = jnp.concatenate([x.weight for x in prepared.segments])
+    if rank is None:
+        return Chosen(target[:, 0], weight[:, 0], prepared.cyclic)
+    at = rank[:, None, None]
+    return Chosen(
+        jnp.take_along_axis(target, at, 1)[:, 0], jnp.take_along_axis(weight, at, 1)[:, 0],
+        prepared.cyclic)
 
 
 def _answer(
