@@ -103,6 +103,19 @@ class HostInterval:
         """Whether nature may keep to a region: ``bool[R]`` from ``bool[S]``."""
         return self.may_keep(region[self.mdp.successor])
 
+    def must_enter(self, row: Integers, region: Booleans) -> Booleans:
+        """Whether every distribution of some rows enters a region: ``bool[N]``."""
+        if not row.size:
+            return np.zeros(0, bool)
+        mdp = self.mdp
+        count = mdp.entry_start[row + 1] - mdp.entry_start[row]
+        entry = spans(mdp.entry_start[row], count)
+        start = count.cumsum() - count
+        inside = region[mdp.successor[entry]]
+        room = np.add.reduceat(np.where(inside, 0, self.upper[entry]), start)
+        sure = np.logical_or.reduceat(inside & (self.lower[entry] > 0), start)
+        return sure | (room < 1 - self.rounding[row])
+
     def within(self, entries: Booleans) -> Floats:
         """Distributions with all of some entries as their support, where nature may keep to them.
 

@@ -40,7 +40,7 @@ def compelled(
     while frontier.size:
         row = before[spans(start[frontier], start[frontier + 1] - start[frontier])]
         row = distinct(row[waiting[row]], mdp.num_rows)
-        row = row[_must_enter(model, row, region)]
+        row = row[model.must_enter(row, region)]
         waiting[row] = False
         state = mdp.state[row]
         if every:
@@ -49,20 +49,6 @@ def compelled(
         frontier = distinct(state[~region[state]], mdp.num_states)
         region[frontier] = True
     return region
-
-
-def _must_enter(model: HostInterval, row: Integers, region: Booleans) -> Booleans:
-    """:meth:`HostInterval.must_enter` of some rows."""
-    if not row.size:
-        return np.zeros(0, bool)
-    mdp = model.mdp
-    count = mdp.entry_start[row + 1] - mdp.entry_start[row]
-    entry = spans(mdp.entry_start[row], count)
-    start = count.cumsum() - count
-    inside = region[mdp.successor[entry]]
-    room = np.add.reduceat(np.where(inside, 0, model.upper[entry]), start)
-    sure = np.logical_or.reduceat(inside & (model.lower[entry] > 0), start)
-    return sure | (room < 1 - model.rounding[row])
 
 
 class Decided(NamedTuple):
