@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.io._intervals import intervals, point_rewards, with_whole_brackets
 from jaxltl.io._tokens import Block, Integers, Text, decoded, numbered, refuse
 
 # Reads tokens of a block as numbers, or as something else that NumPy can hold.
 Values = Callable[[Block, Integers], NDArray[Any]]
 
 NO_LABEL = b"__NOLABEL__"  # the name of actions that have none
+INTERVALS = ("double-interval", "rational-interval")  # types of values
 _MODEL = re.compile(rb"^@model[ \t\r]*$", re.MULTILINE)
 _LINE = re.compile(
     rb"(?:state|action)\s+\S+?\s*(?:\[([^\[\]]*)\]\s*)?((?:(?<=\s)[^\[\]].*)?)", re.DOTALL
@@ -56,7 +58,7 @@ class Body:
       state: of each action, ``int32[R]``.
       line: of each action, ``int64[R]``.
       row: of each successor, ``int32[T]``.
-      successor, value: of each successor, ``[T]``.
+      successor, value: of each successor, ``[T]``; values of interval models ``[T, 2]``.
       action: the number of each action's name, ``int32[R]``.
       action_names, label_names: names by number.
       labelled, label: which states have which label, a pair each.
@@ -91,7 +93,7 @@ def read_header(text: Text) -> Header:
     """What stands before ``@model``.
 
     Raises:
-      ValueError: naming the line; for models of other types, and those with intervals.
+      ValueError: naming the line; for models of other types.
     """
     found = _MODEL.search(text.data)
     if found is None:
@@ -161,11 +163,11 @@ def _kind(text: Text, given: dict[str, tuple[int, str]], line: int) -> str:
 
 def _value_type(text: Text, given: dict[str, tuple[int, str]]) -> str:
     line, found = given.get("@value_type", (0, ""))
-    if found in ("double-interval", "rational-interval"):
-        raise text.error(line, "models whose probabilities are intervals are not read.")
-    if found not in ("", "double", "rational", "parametric"):
+    if found not in ("", "double", "rational", "parametric", *INTERVALS):
         raise text.error(
-            line, f"the value type is {found[:60]!r}; expected double, rational or parametric."
+            line,
+            f"the value type is {found[:60]!r}; expected double, rational, {' or '.join(INTERVALS)}"
+            ", or parametric.",
         )
     return found
 
@@ -187,16 +189,20 @@ def read_body(header: Header, probabilities: Values, numbers: Values) -> Body:
 
     Args:
       header: what stands before.
-      probabilities: reads those.
+      probabilities: reads those; of interval models their ends are read.
       numbers: reads rewards.
 
     Raises:
       ValueError: naming the line and what was expected.
     """
     body, text = Body(), header.body
-    for block in text.blocks(b"//"):
+    is_interval = header.value_type in INTERVALS
+    for block in (point_rewards(text) if is_interval else text).blocks(b"//"):
         at = block.first[:-1]
         is_state, is_action = _begins(block, at, b"state"), _begins(block, at, b"action")
+        if is_interval:
+            block = with_whole_brackets(block, 2, ~is_state & ~is_action)
+            at = block.first[:-1]
         order = _order(block, body, is_state, is_action)
         state = body.num_states - 1 + np.cumsum(is_state)
         row = body.num_rows - 1 + np.cumsum(is_action)
@@ -213,7 +219,11 @@ def read_body(header: Header, probabilities: Values, numbers: Values) -> Body:
             if wrong.any():
                 raise block.malformed(int(entry[int(wrong.argmax())]), form)
             body.successor.append(block.integers(first, "a state", header.num_states))
-            body.value.append(probabilities(block, first + 2))
+            body.value.append(
+                np.stack(intervals(block, first + 2), 1)
+                if is_interval
+                else probabilities(block, first + 2)
+            )
             body.row.append(row[entry].astype(np.int32))
         body.num_states, body.num_rows, body.after_action = (
             int(state[-1]) + 1,

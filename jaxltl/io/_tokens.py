@@ -101,8 +101,8 @@ class Block:
         shown = (
             self.data[self.start[token] : self.end[token]][:60].tobytes().decode(errors="replace")
         )
-        if shown.startswith("["):
-            expected = "one number; models whose probabilities are intervals are not read"
+        if shown.startswith("[") and "[" not in expected:
+            expected = f"{expected}, no interval,"
         line = int(np.searchsorted(self.first, token, "right")) - 1
         return self.text.error(
             int(self.line[line]), f"{shown!r} stands where {expected} is expected."
@@ -203,8 +203,6 @@ class Block:
     def malformed(self, line: int, form: str) -> ValueError:
         """The error of a line that has not the form that it should have."""
         shown = self.whole(line)[:60].decode(errors="replace")
-        if "[" in shown and "," in shown and "probability" in form:
-            form += "; models whose probabilities are intervals are not read"
         return self.text.error(int(self.line[line]), f"{shown!r}; expected {form}.")
 
 

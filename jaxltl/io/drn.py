@@ -10,10 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
-from jaxltl.io._drn_body import NO_LABEL, Body, Header, names_of, read_body, read_header, rewards_of
+from jaxltl.io._drn_body import (
+    INTERVALS,
+    NO_LABEL,
+    Body,
+    Header,
+    names_of,
+    read_body,
+    read_header,
+    rewards_of,
+)
 from jaxltl.io._files import read_bytes, write_bytes
 from jaxltl.io._init_label import labels_with_init
+from jaxltl.io._intervals import exact_part, first_without_distribution, value_texts
 from jaxltl.io._tokens import (
     Text,
     as_double,
@@ -23,7 +34,7 @@ from jaxltl.io._tokens import (
 _STEP = 2**16  # states that are written at a time
 
 
-def read_drn(path: str | os.PathLike[str]) -> SparseMDP:
+def read_drn(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
     """The Markov chain or decision process in a DRN file, which may be compressed.
 
     The states labelled ``init`` are the initial ones, each as likely as another. Numbers are the
@@ -31,13 +42,15 @@ def read_drn(path: str | os.PathLike[str]) -> SparseMDP:
     Actions whose names are all numbers have numbers and no names, and where all are
     ``__NOLABEL__`` there are none; where some are, their name is "". Comments, in which Storm
     writes the values of variables, are passed over. Labels are in the order in which they occur.
+    The value types ``double-interval`` and ``rational-interval`` make it an interval model, whose
+    probabilities are ``[l, u]`` and whose rewards are numbers, or points ``[r, r]``.
 
     Args:
       path: the file, plain or compressed with gzip or xz.
 
     Raises:
       ValueError: naming file and line, and what was expected; for models with parameters, with
-        intervals or observations, or in continuous time.
+        observations, or in continuous time.
 
     Example:
       >>> import pathlib, tempfile
@@ -94,29 +107,23 @@ def _placeholders(header: Header) -> dict[bytes, float]:
     return known
 
 
-def _model(header: Header, body: Body) -> SparseMDP:
+def _model(header: Header, body: Body) -> SparseMDP | IntervalMDP:
     text = header.body
     state, row, line = (np.concatenate(x) for x in (body.state, body.row, body.line))
     probability = np.concatenate(body.value)
     start = np.concatenate([[0], np.bincount(row, minlength=body.num_rows).cumsum()])
     total = np.add.reduceat(probability, start[:-1])
-    wrong = np.abs(total - 1) > 1e-6
-    if wrong.any():
-        bad = int(wrong.argmax())
+    if (bad := first_without_distribution(total)) is not None:
+        action, what, how = bad
         raise text.error(
-            int(line[bad]),
-            f"the probabilities of this action of state {state[bad]} "
-            f"sum to {total[bad]:.9g}; expected 1.",
+            int(line[action]), f"{what} of this action of state {state[action]} {how}."
         )
     count = np.bincount(state, minlength=body.num_states)
-    return make_sparse(
-        np.concatenate([[0], count.cumsum()]),
-        start,
-        np.concatenate(body.successor),
-        probability,
-        rewards=_rewards(header, body),
-        **names_of(header, body),
-    )
+    rows = np.concatenate([[0], count.cumsum()]), start, np.concatenate(body.successor)
+    options: Any = {"rewards": _rewards(header, body), **names_of(header, body)}
+    if header.value_type in INTERVALS:
+        return interval_rows(*rows, *probability.T, **options)
+    return make_sparse(*rows, probability, **options)
 
 
 def _rewards(header: Header, body: Body) -> dict[str, Rewards]:
@@ -132,11 +139,11 @@ def _rewards(header: Header, body: Body) -> dict[str, Rewards]:
 # --- writing --------------------------------------------------------------------------------
 
 
-def write_drn(path: str | os.PathLike[str], model: SparseMDP) -> None:
+def write_drn(path: str | os.PathLike[str], model: SparseMDP | IntervalMDP) -> None:
     """Writes a model as a DRN file, from which :func:`read_drn` and Storm read the same doubles.
 
     The format has no place for the values of variables, for labels that hold nowhere and for the
-    order of labels.
+    order of labels. Rewards of interval models are written as numbers, as Storm reads no points.
 
     Args:
       path: the file; compressed if its name ends in ``.gz`` or ``.xz``.
@@ -151,8 +158,9 @@ def write_drn(path: str | os.PathLike[str], model: SparseMDP) -> None:
         file.writelines(lines)
 
 
-def _written(model: SparseMDP) -> Iterator[bytes]:
+def _written(given: SparseMDP | IntervalMDP) -> Iterator[bytes]:
     """The file in pieces; what cannot be written is found before the first."""
+    model = exact_part(given)
     labels, actions = _label_texts(model), _action_texts(model)
     rewards = []
     for name, reward in model.rewards.items():
@@ -168,7 +176,7 @@ def _written(model: SparseMDP) -> Iterator[bytes]:
     head = [
         "// Written by jaxltl",
         f"@type: {'DTMC' if model.is_chain else 'MDP'}",
-        "@value_type: double",
+        f"@value_type: {'double' if model is given else 'double-interval'}",
         "@parameters",
         "",
         "@reward_models",
@@ -180,12 +188,14 @@ def _written(model: SparseMDP) -> Iterator[bytes]:
         "@model",
         "",
     ]
-    return _pieces("\n".join(head).encode(), model, labels, actions, rewards)
+    values = value_texts(given, ", ")
+    return _pieces("\n".join(head).encode(), model, values, labels, actions, rewards)
 
 
 def _pieces(
     head: bytes,
     model: SparseMDP,
+    values: Callable[[slice], list[str]],
     labels: list[tuple[str, NDArray[np.bool_]]],
     actions: Callable[[int], str] | None,
     rewards: list[tuple[Any, Any]],
@@ -209,10 +219,8 @@ def _pieces(
         )
         found = np.empty(num_entries + num_rows + end - begin, object)
         found[at_entry] = [
-            f"\t\t{t} : {p!r}\n"
-            for t, p in zip(
-                host.successor[entries].tolist(), host.probability[entries].tolist(), strict=True
-            )
+            f"\t\t{t} : {p}\n"
+            for t, p in zip(host.successor[entries].tolist(), values(entries), strict=True)
         ]
         found[at_row] = _action_lines(model, rows, actions, rewards)
         found[at_state] = _state_lines(states, labels, rewards)

@@ -22,7 +22,7 @@ from jaxltl.core.models.sparse import (
     make_sparse,
 )
 
-_NEAR = 1e-6  # how far a row may miss a distribution and still be scaled to one
+NEAR = 1e-6  # how far a row may miss a distribution and still be scaled to one
 _ENDS = "\0lower", "\0upper"  # names under which ends travel with the entries
 
 
@@ -220,7 +220,7 @@ def _check_ends(
     row_start: np.ndarray, row: np.ndarray, successor: np.ndarray, lower: np.ndarray,
     upper: np.ndarray,
 ) -> None:
-    bad = ~((lower >= 0) & (lower <= upper) & (upper <= 1 + _NEAR))
+    bad = ~((lower >= 0) & (lower <= upper) & (upper <= 1 + NEAR))
     if bad.any():
         e = int(np.flatnonzero(bad)[0])
         raise ValueError(
@@ -235,7 +235,7 @@ def _scaled(
     """The ends, such that each row has a distribution between them."""
     low, high = (np.add.reduceat(x, entry_start[:-1]) for x in (lower, upper))
     rounding = (np.diff(entry_start) + 2) * np.finfo(np.float64).eps  # what is no miss
-    bad = (low > 1 + _NEAR) | (high < 1 - _NEAR)
+    bad = (low > 1 + NEAR) | (high < 1 - NEAR)
     if bad.any():
         r = int(np.flatnonzero(bad)[0])
         what = (f"the lower ends sum to {low[r]:.9g}, which is above 1" if low[r] > 1 else

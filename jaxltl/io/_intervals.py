@@ -1,0 +1,176 @@
+"""Intervals in text files: probabilities such as ``[0.4, 0.6]``, and rewards that are points."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.models.interval import NEAR, IntervalMDP
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.io._tokens import Block, Floats, Integers, Text, as_double, bytes_of
+
+EXPECTED = "a probability or an interval [l, u] with 0 <= l <= u <= 1"
+_SIGN = bytes_of(b"[,]\n")
+_TO_BLANKS = bytes.maketrans(b"[,]", b"   ")
+_SHAPE = re.compile(rb"(?:\[,\]\n|\n)*+")
+# A line of a state or an action whose rewards hold brackets.
+_REWARDS = re.compile(
+    rb"^([ \t]*(?:state|action)[ \t]+\S+[ \t]*\[)"
+    rb"((?:[^\"\n\[\]]*\[[^\"\n\[\]]*\])+[^\"\n\[\]]*)(\])",
+    re.MULTILINE,
+)
+_POINT = re.compile(rb"\[([^\[\],]*),([^\[\],]*)\]")
+
+
+def has_bracket(block: Block, token: Integers) -> bool:
+    """Whether some tokens begin with a bracket."""
+    return bool((block.data[block.start[token]] == ord("[")).any())
+
+
+def with_whole_brackets(block: Block, column: int, lines: NDArray[np.bool_] | None = None) -> Block:
+    """A block in which what begins with a bracket in a column is one token, up to the closing one.
+
+    Lines that are shorter, and brackets that nothing closes, stay as they are.
+
+    Args:
+      block: the block.
+      column: of the token in its line, from 0.
+      lines: ``bool[L]``, those that are looked at; default all.
+    """
+    long_enough = block.count > column
+    lines = np.flatnonzero(long_enough if lines is None else long_enough & lines)
+    at = block.first[:-1][lines] + column
+    at = at[block.data[block.start[at]] == ord("[")]
+    closing = np.flatnonzero(block.data[block.end - 1] == ord("]"))
+    if not at.size or not closing.size:
+        return block
+    place = np.searchsorted(closing, at)
+    last = closing[np.minimum(place, closing.size - 1)]
+    line = np.searchsorted(block.first, at, "right") - 1
+    closes = (place < closing.size) & (last < block.first[line + 1])
+    at, last, line = at[closes], last[closes], line[closes]
+    end, first = block.end.copy(), block.first.copy()
+    end[at] = block.end[last]
+    inner = np.zeros(end.size + 1, np.int64)  # 1 from behind a bracket's first token to its last
+    np.add.at(inner, at + 1, 1)
+    np.add.at(inner, last + 1, -1)
+    kept = inner.cumsum()[:-1] == 0
+    count = block.count
+    count[line] -= last - at
+    first[1:] = count.cumsum()
+    return replace(block, start=block.start[kept], end=end[kept], first=first)
+
+
+def intervals(block: Block, token: Integers) -> tuple[Floats, Floats]:
+    """Tokens as lower and upper ends, each a number or ``[l, u]``: ``float64[...]`` twice.
+
+    Raises:
+      ValueError: one is neither, or the ends are crossed or no probabilities, naming its line.
+    """
+    # A line for each token, whose blanks may be inside of it.
+    length = block.end[token] - block.start[token] + 1
+    joined = block.joined(token)
+    joined[length.cumsum() - 1] = ord("\n")
+    sign = joined[_SIGN[joined]].tobytes()
+    begins = np.concatenate([[0], length.cumsum()[:-1]])
+    opened = joined[begins] == ord("[")
+    fits = (
+        _SHAPE.fullmatch(sign) is not None
+        and opened.sum() == sign.count(b"[")
+        and ((joined[begins + length - 2] == ord("]")) == opened).all()
+    )
+    data = np.frombuffer(joined.tobytes().translate(_TO_BLANKS), np.uint8)
+    blank = np.ones(data.size + 1, bool)
+    np.less_equal(data, 32, out=blank[1:])
+    edge = np.flatnonzero(blank[1:] != blank[:-1])
+    start, end = edge[::2], edge[1::2]
+    count = np.diff(np.searchsorted(start, np.append(begins, data.size)))
+    if not fits or (count != 1 + opened).any():
+        raise block.error(_first_wrong(block, token), EXPECTED)
+    first = np.concatenate([[0], count.cumsum()])
+    line = block.line[np.searchsorted(block.first, token, "right") - 1]
+    numbers = Block(block.text, data, start, end, first, line)
+    lower = numbers.floats(first[:-1], EXPECTED)
+    upper = numbers.floats(first[1:] - 1, EXPECTED) if opened.any() else lower
+    bad = ~((lower >= 0) & (lower <= upper) & (upper <= 1 + NEAR))
+    if bad.any():
+        raise block.error(int(token[int(bad.argmax())]), EXPECTED)
+    return lower, upper
+
+
+def _first_wrong(block: Block, token: Integers) -> int:
+    """The first token that has not the form of a number or of an interval."""
+    for one in token.tolist():
+        text = block.data[block.start[one] : block.end[one]].tobytes()
+        inner = text[1:-1].split(b",") if text[:1] == b"[" else [text]
+        closed = text[:1] != b"[" or (text[-1:] == b"]" and len(inner) == 2)
+        if not closed or any(len(x.split()) != 1 or _SIGN[list(x)].any() for x in inner):
+            return one
+    raise AssertionError(token)
+
+
+def point_rewards(text: Text) -> Text:
+    """A text in which rewards such as ``[[1, 1], 0]`` are numbers, ``[1, 0]``; lines stay.
+
+    Raises:
+      ValueError: an interval is no point, naming its line.
+    """
+
+    def changed(found: re.Match[bytes]) -> bytes:
+        return found[1] + _POINT.sub(lambda point: _number(text, found, point), found[2]) + found[3]
+
+    data = _REWARDS.sub(changed, text.data[text.begin : text.stop])
+    return Text(text.name, data, 0, len(data), text.line)
+
+
+def _number(text: Text, found: re.Match[bytes], point: re.Match[bytes]) -> bytes:
+    lower, upper = point[1].strip(), point[2].strip()
+    if lower == upper or (as_double(lower) == as_double(upper) and as_double(lower) is not None):
+        return lower
+    line = text.line + found.string.count(b"\n", 0, found.start())
+    raise text.error(
+        line,
+        f"the reward {point[0][:60].decode(errors='replace')} is an interval; single numbers, or "
+        "intervals of one point, are read.",
+    )
+
+
+def first_without_distribution(total: Floats) -> tuple[int, str, str] | None:
+    """The first choice with no distribution, what of it is wrong, and how; None if there is none.
+
+    Args:
+      total: the sums of each choice, ``float64[R]``, or those of lower and upper ends,
+        ``float64[R, 2]``.
+    """
+    ends = total.reshape(len(total), -1)
+    above, below = ends[:, 0] > 1 + NEAR, ends[:, -1] < 1 - NEAR
+    if not (above | below).any():
+        return None
+    row = int((above | below).argmax())
+    if total.ndim == 1:
+        return row, "the probabilities", f"sum to {total[row]:.9g}; expected 1"
+    what, side, place = ("lower", "most", 0) if above[row] else ("upper", "least", 1)
+    return row, f"the {what} ends", f"sum to {ends[row, place]:.9g}; expected at {side} 1"
+
+
+# --- writing --------------------------------------------------------------------------------
+
+
+def exact_part(model: SparseMDP | IntervalMDP) -> SparseMDP:
+    """All of a model but its intervals."""
+    return model.nominal if isinstance(model, IntervalMDP) else model
+
+
+def value_texts(model: SparseMDP | IntervalMDP, comma: str) -> Callable[[slice], list[str]]:
+    """What gives the texts of some entries' probabilities, ``0.5`` or ``[0.4,0.6]``."""
+    if not isinstance(model, IntervalMDP):
+        probability = model.host.probability
+        return lambda part: list(map(repr, probability[part].tolist()))
+    lower, upper, form = model.host.lower, model.host.upper, f"[%r{comma}%r]"
+    return lambda part: [
+        form % ends for ends in zip(lower[part].tolist(), upper[part].tolist(), strict=True)
+    ]
