@@ -111,7 +111,8 @@ def _of_distinct(
         some = number > 0
         end[some] = lower_ends(number[some], n[some], failure)
     upper = np.where(mirrored > 0, np.nextafter(1 - mirrored, 2), 1)
-    return tuple(x[place].reshape(count.shape) for x in (lower, np.minimum(upper, 1)))
+    upper = np.minimum(upper, 1)
+    return lower[place].reshape(count.shape), upper[place].reshape(count.shape)
 
 
 def _tails(k: Integers, n: Integers, failure: float) -> Floats:

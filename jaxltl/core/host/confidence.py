@@ -72,6 +72,7 @@ def intervals_from_counts(
     used: Any = None,
     rows: Any = None,
     num_outcomes: Any = None,
+    num_claims: int | None = None,
 ) -> ConfidenceSets:
     """Sets that hold the probabilities of all rows at once, with a chance of `confidence`.
 
@@ -110,6 +111,8 @@ def intervals_from_counts(
       num_outcomes: J, an integer or one of each row: how many outcomes a row may truly have, listed
         or not; of an unknown graph, all S states. Default: those listed. What is not listed shares
         what the others leave, `rest`, and none of it has more than an outcome that never came.
+      num_claims: M, at least as many as these rows make. Where data decided which rows there are,
+        it must have been fixed before: ``S * A * S``, say. Default: as many as these rows make.
 
     Returns:
       The sets; rounding never makes them smaller.
@@ -140,7 +143,7 @@ def intervals_from_counts(
         )
     by_row = method == "weissman"
     claims = np.where((outcomes > 2) & ~np.array(by_row), outcomes, outcomes > 1)
-    num_claims = int(claims[asked].sum())
+    num_claims = _claims(num_claims, int(claims[asked].sum()))
     failure = (1 - confidence) / max(num_claims, 1)
     center = np.where(total[row] > 0, frequency(count, total[row]), 1 / np.maximum(listed, 1)[row])
     radius = None
@@ -330,6 +333,14 @@ def _outcomes(num_outcomes: Any, listed: Integers, shape: tuple[int, ...]) -> In
             f"num_outcomes, {outcomes[row]}."
         )
     return outcomes
+
+
+def _claims(given: int | None, made: int) -> int:
+    if given is None:
+        return made
+    if not given >= made or given != int(given):
+        raise ValueError(f"num_claims={given}; the rows make {made}, and no fewer can be counted.")
+    return int(given)
 
 
 def _name(row: int, shape: tuple[int, ...]) -> str:

@@ -173,6 +173,8 @@ def test_dtypes_and_empty_tables():
         ({"counts": [1, 1], "entry_start": [0, 2], "used": [True, True]}, "both given"),
         ({"rows": [1]}, "rows is int64"),
         ({"num_outcomes": 1}, r"row \[0\] lists 2 successors, more than its num_outcomes, 1"),
+        ({"num_claims": 0}, "num_claims=0; the rows make 1"),
+        ({"num_claims": 1.5}, "num_claims=1.5"),
         ({"num_outcomes": 2.5}, "num_outcomes is float64"),
     ],
 )
@@ -249,3 +251,11 @@ def test_many_rows_at_once():
         one = intervals_from_counts(counts[i : i + 1], 1 - (1 - 0.9) / 64)
         assert np.abs(one.lower[0] - sets.lower[i]).max() < 1e-9
         assert np.abs(one.upper[0] - sets.upper[i]).max() < 1e-9
+
+
+def test_more_claims_than_rows():
+    rows = [[3, 4], [6, 2], [1, 9]]
+    for method in METHODS:
+        few = intervals_from_counts(rows[:1], 0.9, method=method, num_claims=3)
+        all_rows = intervals_from_counts(rows, 0.9, method=method)
+        assert few.num_claims == 3 and (few.lower[0] == all_rows.lower[0]).all()
