@@ -47,7 +47,7 @@ from jaxltl.algos.play import (
     take,
 )
 from jaxltl.core.graphs.end_components import bottom_components
-from jaxltl.core.models.game import Game, as_game
+from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.operators import action_argmax
 from jaxltl.core.models.restrict import restrict
@@ -220,7 +220,7 @@ def make_problem(
     """
     if method not in ("generalized", "maximin"):
         raise ValueError(f'method={method!r}; choose "generalized" or "maximin".')
-    game = as_game(game)
+    game = as_padded_game(game)
     if not isinstance(game.mdp, MDP):
         raise ValueError(
             f"the game's model is a {type(game.mdp).__name__}; learning plays in an explicit MDP: "

@@ -55,7 +55,7 @@ from jaxltl.core.games.objective import Parity, buchi
 from jaxltl.core.games.winning import solve
 from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models.game import Game, as_game
+from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.operators import forall_successor
 from jaxltl.core.models.restrict import restrict
 from jaxltl.core.types import Solution, require_shape, status_code
@@ -265,7 +265,7 @@ def make_problem(
       >>> bool(sure.almost_sure), sure.epsilon_optimal.all().tolist()
       (True, True)
     """
-    game = as_game(game)
+    game = as_padded_game(game)
     reward = shaped_reward(game, reward)
     start = np.asarray(game.initial if start is None else start, float)
     require_shape("start", start, (game.num_states,))

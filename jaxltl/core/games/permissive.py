@@ -25,7 +25,7 @@ from jaxltl.core.host.rows import first_action
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models import operators
 from jaxltl.core.models.concrete import namespace, to_jax
-from jaxltl.core.models.game import Game, as_game
+from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.restrict import Restriction, restrict
 
@@ -106,7 +106,7 @@ def permissive_strategy(
         raise ValueError(f"method={method!r}; choose one of {', '.join(METHODS)}.")
     if bound is not None and bound < 1:
         raise ValueError(f"bound={bound}; it must be at least 1.")
-    game, goal = on_states(as_game(game), spec)
+    game, goal = on_states(as_padded_game(game), spec)
     graph = _concrete_graph(game, goal)
     objective: Any
     game, objective = jax.tree.map(np.asarray, (game, goal))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.games.objective import GR1, Parity
 from jaxltl.core.host.components import reached, strong_components
-from jaxltl.core.models.game import as_game
+from jaxltl.core.models.game import as_padded_game
 from jaxltl.core.models.mdp import DenseMDP, support
 
 Booleans = NDArray[np.bool_]
@@ -104,7 +104,7 @@ class _Claim(NamedTuple):
 
 
 def _claim(winning: Any) -> _Claim:
-    game, objective = as_game(winning.game), winning.objective
+    game, objective = as_padded_game(winning.game), winning.objective
     shape = game.state_shape
     if isinstance(objective, GR1):
         sets = tuple(

@@ -21,7 +21,7 @@ from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.concrete import namespace, to_jax
-from jaxltl.core.models.game import Game, as_game
+from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.mdp import make_mdp, support
 from jaxltl.core.models.product import product
 from jaxltl.core.models.restrict import restrict
@@ -95,7 +95,7 @@ def winning_region(
     """
     if chance not in ("random", "adversarial"):
         raise ValueError(f"chance={chance!r}; choose random or adversarial.")
-    game = as_game(game)
+    game = as_padded_game(game)
     game, objective = on_states(game, spec)
     if chance == "adversarial":
         game, origin = adversarial_chance(game)

@@ -20,6 +20,8 @@ from jaxltl.core.host.graph import HostGraph
 from jaxltl.core.host.row_graph import RowGraph
 from jaxltl.core.host.rows import rows_of, rows_of_matrix
 from jaxltl.core.models import kernels, operators
+from jaxltl.core.models.choices import choice_shape, choices
+from jaxltl.core.models.compiled import compiled_form
 from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
@@ -49,12 +51,12 @@ class TracedGraph:
 
     @property
     def available(self) -> jax.Array:
-        """``bool[S, A]``."""
-        return self.model.available
+        """``bool[S, A]``, of a sparse model ``bool[R]``."""
+        return choices(self.model).available
 
     def on_choices(self, states: jax.Array) -> jax.Array:
-        """What holds of states, of their actions: ``bool[S, 1]``."""
-        return states[..., None]
+        """What holds of states, of their actions: ``bool[S, 1]`` or ``bool[R]``."""
+        return choices(self.model).spread(states)
 
     def exists(self, region: jax.Array) -> jax.Array:
         """Whether some successor lies in a region: ``bool[S, A]``; False where unavailable."""
@@ -75,7 +77,7 @@ class TracedGraph:
 
     def first(self, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Whether a mask ``bool[S, A]`` holds for some action, and the first one (or 0)."""
-        return operators.first_action(mask)
+        return choices(self.model).first(mask)
 
     def attract(self, goal, allowed, rule, among, chance: str):
         """Region, action and rank of an attractor."""
@@ -86,11 +88,12 @@ class TracedGraph:
         shape, flat = self.state_shape, int(np.prod(self.state_shape))
         result = (
             jax.ShapeDtypeStruct(shape, jnp.int32),
-            jax.ShapeDtypeStruct((*shape, self.num_actions), jnp.bool_),
+            jax.ShapeDtypeStruct(choice_shape(self.model), jnp.bool_),
         )
 
         def host(model, core, allowed):
-            return host_graph(model).components(np.asarray(core), np.asarray(allowed), closed)
+            concrete = jax.tree.map(np.asarray, model)
+            return graph_of(concrete).components(np.asarray(core), np.asarray(allowed), closed)
 
         def callback():
             return jax.pure_callback(
@@ -142,8 +145,11 @@ def _sweeps(graph: TracedGraph, goal, allowed, rule, among, *, chance):
 
 def graph_of(model: Any, *arguments: Any) -> Graph:
     """The graph of a model: the host's, unless the model or an argument is traced."""
-    if isinstance(model, SparseMDP) and not is_traced((model, arguments)):
-        return RowGraph(model.host)
+    world = model.mdp if isinstance(model, Game) else model
+    if isinstance(world, SparseMDP):
+        if not is_traced((model, arguments)):
+            return RowGraph(world.host)
+        model = compiled_form(model)[0]
     if is_traced((model, arguments)) or not is_table(model):
         return TracedGraph(lax.stop_gradient(model))  # supports have no derivative
     return host_graph(model)

@@ -13,6 +13,7 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.models import operators
+from jaxltl.core.models.choices import choice_shape, choices
 from jaxltl.core.models.concrete import namespace, to_jax
 from jaxltl.core.models.mdp import support
 from jaxltl.core.models.padded import to_padded
@@ -141,15 +142,18 @@ def _owners(system: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def as_game(model: Any) -> Game:
-    """A game as solvers take it; any other model as the game in which the system always moves.
-
-    Sparse models are padded (:func:`~jaxltl.core.models.padded.to_padded`).
-    """
+    """A game as solvers take it; any other model as the game in which the system always moves."""
     if not isinstance(model, Game):
         model = Game(model, to_jax(np.ones(model.state_shape, bool)))
-    if isinstance(model.mdp, SparseMDP):
-        model = replace(model, mdp=to_padded(model.mdp))
     return model
+
+
+def as_padded_game(model: Any) -> Game:
+    """The same, where sparse models are padded (:func:`~jaxltl.core.models.padded.to_padded`)."""
+    game = as_game(model)
+    if isinstance(game.mdp, SparseMDP):
+        game = replace(game, mdp=to_padded(game.mdp))
+    return game
 
 
 def is_deterministic(model: Any) -> bool:
@@ -167,6 +171,16 @@ def swap_players(game: Game) -> Game:
 
 
 # --- the primitives: those of the model -----------------------------------------------------
+
+
+@choices.register
+def _(game: Game) -> Any:
+    return choices(game.mdp)
+
+
+@choice_shape.register
+def _(game: Game) -> tuple[int, ...]:
+    return choice_shape(game.mdp)
 
 
 @operators.expectation.register

@@ -8,6 +8,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.core.models.concrete import is_traced, to_jax
 
 # Transitions of a state up to which what is summed over them is written out, so that XLA fuses
 # it into one pass and with what reads single actions; beyond, programs would grow too large.
@@ -21,7 +24,7 @@ UNROLL = 16
 Term = Callable[[jax.Array, jax.Array], jax.Array]
 
 
-def gather(value: jax.Array, index: jax.Array) -> jax.Array:
+def gather(value: Any, index: Any) -> jax.Array:
     """Rows ``value[index]`` at places that are known to exist, without checks of bounds."""
     return jnp.asarray(value).at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
@@ -115,3 +118,23 @@ def largest(dtype: Any) -> Any:
     """The largest value of a dtype."""
     is_float = jnp.issubdtype(dtype, jnp.floating)
     return jnp.inf if is_float else jnp.iinfo(dtype).max
+
+
+# --- spans that stand one after another ------------------------------------------------------
+
+
+def owners(start: Any, total: int) -> jax.Array:
+    """Whose span each of a number of things lies in, ``int32[total]``, from the spans' starts."""
+    count = start.shape[-1] - 1
+    if not is_traced(start):
+        return to_jax(np.repeat(np.arange(count, dtype=np.int32), np.diff(np.asarray(start))))
+    # Spans are not empty, so each begins one.
+    begins = jnp.zeros(total, jnp.int32).at[start[1:-1]].add(
+        1, indices_are_sorted=True, mode="promise_in_bounds")
+    return jnp.cumsum(begins, dtype=jnp.int32)
+
+
+def segment(operation: Any, quantity: jax.Array, owner: jax.Array, count: int) -> jax.Array:
+    """A reduction such as ``jax.ops.segment_sum`` of what each of so many owners has."""
+    return operation(
+        quantity, owner, count, indices_are_sorted=True, mode="promise_in_bounds")

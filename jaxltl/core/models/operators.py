@@ -1,15 +1,18 @@
 """The primitives through which every algorithm sees a model.
 
-A model is an :class:`~jaxltl.core.models.mdp.MDP`, a :class:`~jaxltl.core.models.mdp.DenseMDP` or a
+A model is an :class:`~jaxltl.core.models.mdp.MDP`, a :class:`~jaxltl.core.models.mdp.DenseMDP`, a
+:class:`~jaxltl.core.models.sparse.SparseMDP` or a
 :class:`~jaxltl.core.models.product.Product`. Values have the shape of the model's states,
-``[S]`` or ``[S, Q]``, and quantities on actions have one more axis, A. The functions
-are open (``functools.singledispatch``): a representation of one's own needs
-``expectation``, ``exists_successor``, ``forall_successor`` and ``sample_successor``, and
-``least_successor`` where ranks are compared.
+``[S]`` or ``[S, Q]``, and quantities on actions have one more axis, A; of a sparse model they are
+``[R]``, and an action is a row. Reductions over a state's choices are those of
+:func:`~jaxltl.core.models.choices.choices`. The functions are open (``functools.singledispatch``):
+a representation of one's own needs ``expectation``, ``exists_successor``, ``forall_successor`` and
+``sample_successor``, and ``least_successor`` where ranks are compared.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import singledispatch
 from typing import Any, NamedTuple
@@ -21,8 +24,17 @@ import numpy as np
 from jax import lax
 
 from jaxltl.core.models import kernels
+from jaxltl.core.models.choices import action_argmax as action_argmax
+from jaxltl.core.models.choices import action_max as action_max
+from jaxltl.core.models.choices import action_mean as action_mean
+from jaxltl.core.models.choices import choice_shape, choices
+from jaxltl.core.models.choices import first_action as first_action
+from jaxltl.core.models.choices import is_deterministic as is_deterministic
+from jaxltl.core.models.concrete import is_traced
+from jaxltl.core.models.entries import entries
 from jaxltl.core.models.kernels import only_real
 from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import describe_row, row_tolerance
 
 
@@ -142,6 +154,13 @@ def transition_matrix(model: Any, policy: jax.Array) -> jax.Array:
     raise TypeError(_unknown(model))
 
 
+@singledispatch
+def following(model: Any, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
+    """``v -> P_pi v`` of a deterministic policy, ``float[N]`` from ``float[N]``, for sweeps."""
+    chain = induced_chain(model, policy)
+    return lambda value: expectation(chain, value)[:, 0]
+
+
 def pushforward(model: Any, mass: jax.Array) -> jax.Array:
     """Mass that flows into each state, ``(P' x)(t) = sum_{s, a} P(t | s, a) x(s, a)``.
 
@@ -166,10 +185,8 @@ def pushforward(model: Any, mass: jax.Array) -> jax.Array:
 
 
 def _unknown(model: Any) -> str:
-    advice = "pad it by to_padded(model)"
-    if type(model).__name__ != "SparseMDP":
-        advice = "pass an MDP, a DenseMDP, a Product or a Game"
-    return f"{type(model).__name__} is not a model with padded successors: {advice}."
+    return (f"{type(model).__name__} is not a model: pass an MDP, a DenseMDP, a SparseMDP, a "
+            "Product or a Game.")
 
 
 @expectation.register
@@ -279,80 +296,80 @@ def _sample(key: chex.PRNGKey, probability: jax.Array) -> jax.Array:
     return jax.random.categorical(key, jnp.log(probability))
 
 
-# --- what a policy does to quantities on actions -----------------------------------------
+@expectation.register
+def _(model: SparseMDP, value: jax.Array) -> jax.Array:
+    return entries(model).expectation(value)
 
 
-def action_mean(policy: jax.Array, quantity: jax.Array) -> jax.Array:
-    """Mean over a policy's actions, ``sum_a pi(s, a) x(s, a)``.
-
-    Args:
-      policy: ``float[S, A]``, or ``int32[S]`` for a deterministic policy.
-      quantity: ``[S, A]``, finite.
-
-    Returns:
-      ``[S]``.
-    """
-    if is_deterministic(policy):
-        return jnp.take_along_axis(quantity, policy[..., None], axis=-1)[..., 0]
-    return jnp.sum(policy * quantity, axis=-1)
+@exists_successor.register
+def _(model: SparseMDP, region: jax.Array) -> jax.Array:
+    of = entries(model)
+    inside = kernels.hits(of.probability, kernels.gather(region, of.successor))
+    return of.over_entries(jax.ops.segment_max, inside.astype(jnp.int32)) > 0
 
 
-def action_max(quantity: jax.Array, available: jax.Array) -> jax.Array:
-    """Maximum over available actions, ``[S]`` from ``[S, A]``; written out for few actions."""
-    quantity = jnp.where(available, quantity, -jnp.inf)
-    if quantity.shape[-1] > kernels.UNROLL:
-        return quantity.max(axis=-1)
-    best = quantity[..., 0]
-    for a in range(1, quantity.shape[-1]):
-        best = jnp.maximum(best, quantity[..., a])
-    return best
+@forall_successor.register
+def _(model: SparseMDP, region: jax.Array) -> jax.Array:
+    return ~exists_successor(model, ~jnp.asarray(region))
 
 
-def action_argmax(quantity: jax.Array, available: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Maximum over available actions and the first action that attains it, ``[S]`` each."""
-    quantity = jnp.where(available, quantity, -jnp.inf)
-    if quantity.shape[-1] > kernels.UNROLL:
-        return quantity.max(axis=-1), quantity.argmax(axis=-1).astype(jnp.int32)
-    best, action = quantity[..., 0], jnp.zeros(quantity.shape[:-1], jnp.int32)
-    for a in range(1, quantity.shape[-1]):
-        better = quantity[..., a] > best
-        best = jnp.where(better, quantity[..., a], best)
-        action = jnp.where(better, a, action)
-    return best, action
+@least_successor.register
+def _(model: SparseMDP, value: jax.Array) -> jax.Array:
+    of = entries(model)
+    reached = only_real(of.probability, kernels.gather(value, of.successor))
+    return of.over_entries(jax.ops.segment_min, reached)
 
 
-def first_action(condition: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Whether a condition ``bool[S, A]`` holds for some action, and the first one (or 0)."""
-    if condition.shape[-1] > kernels.UNROLL:
-        return condition.any(axis=-1), condition.argmax(axis=-1).astype(jnp.int32)
-    some = jnp.zeros(condition.shape[:-1], bool)
-    action = jnp.zeros(condition.shape[:-1], jnp.int32)
-    for a in reversed(range(condition.shape[-1])):
-        some |= condition[..., a]
-        action = jnp.where(condition[..., a], a, action)
-    return some, action
+@sample_successor.register
+def _(model: SparseMDP, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
+    del state  # a row is one state's
+    probability, start = jnp.asarray(model.probability), jnp.asarray(model.entry_start)
+    end = start[action + 1]
+
+    def step(carry: Any) -> Any:
+        entry, last, rest = carry
+        real = probability[entry] > 0
+        return entry + 1, jnp.where(real, entry, last), rest - probability[entry]
+
+    draw = jax.random.uniform(key, dtype=probability.dtype)
+    first = start[action]
+    # The first entry up to which there is more than was drawn; the last one but for rounding.
+    _, entry, _ = lax.while_loop(
+        lambda carry: (carry[0] < end) & (carry[2] >= 0), step, (first, first, draw))
+    return jnp.asarray(model.successor)[entry]
 
 
-def is_deterministic(policy: chex.Array) -> bool:
-    """Whether a policy is given as one action per state (integers) rather than a distribution."""
-    return jnp.issubdtype(jnp.result_type(policy), jnp.integer)
+@transition_matrix.register
+def _(model: SparseMDP, policy: jax.Array) -> jax.Array:
+    return entries(model).matrix(policy)
+
+
+@following.register
+def _(model: SparseMDP, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
+    of = entries(model)
+    return lambda value: kernels.gather(of.expectation(value), policy)
+
+
+# --- policies ------------------------------------------------------------------------------
 
 
 def policy_distribution(model: Any, policy: Any) -> jax.Array:
-    """Any policy as ``float[S, A]``, with its shape checked against the model.
+    """Any policy as ``float[S, A]``, of a sparse model ``float[R]``, its shape checked.
 
     Raises:
       ValueError: the policy has neither the shape of states nor of state-action pairs.
     """
-    states, actions = model.state_shape, model.num_actions
+    states, pairs = model.state_shape, choice_shape(model)
     if is_deterministic(policy):
         if jnp.shape(policy) != states:
             raise ValueError(f"policy has shape {jnp.shape(policy)}; a deterministic policy "
                              f"(integers) for this model has shape {states}.")
-        return jax.nn.one_hot(policy, actions, dtype=model.dtype)
-    if jnp.shape(policy) != (*states, actions):
+        if isinstance(model, SparseMDP):
+            return choices(model).one_hot(policy, model.dtype)
+        return jax.nn.one_hot(policy, pairs[-1], dtype=model.dtype)
+    if jnp.shape(policy) != pairs:
         raise ValueError(f"policy has shape {jnp.shape(policy)}; a stochastic policy for this "
-                         f"model has shape {(*states, actions)}.")
+                         f"model has shape {pairs}.")
     return policy
 
 
@@ -378,14 +395,15 @@ def valid_policy(model: Any, policy: jax.Array, where: jax.Array | bool = True) 
       policy: ``float[S, A]`` or ``int32[S]``; differentiable in the former.
       where: ``bool[S]``, the states whose rows count.
     """
-    policy = policy_distribution(model, policy)
-    available = model.available
+    policy, over = policy_distribution(model, policy), choices(model)
+    available = over.available
     given = jnp.where(available | (policy == 0), policy, jnp.nan)
-    total = jnp.sum(given, axis=-1)
-    row = (jnp.abs(total - 1) <= row_tolerance(policy.dtype)) & jnp.all(given >= 0, axis=-1)
+    total = over.sum(given)
+    row = (jnp.abs(total - 1) <= row_tolerance(policy.dtype)) & over.all(given >= 0)
     row |= ~jnp.asarray(where)
-    uniform = available / jnp.maximum(jnp.sum(available, axis=-1, keepdims=True), 1)
-    used = jnp.where(row[..., None], jnp.where(available, policy, 0), uniform.astype(policy.dtype))
+    uniform = available / over.spread(jnp.maximum(over.sum(available), 1))
+    used = jnp.where(
+        over.spread(row), jnp.where(available, policy, 0), uniform.astype(policy.dtype))
     return Policy(used, lax.stop_gradient(given), jnp.all(row))
 
 
@@ -395,8 +413,11 @@ def require_policy(model: Any, policy: Any, where: Any = True) -> None:
     Raises:
       ValueError: a row is no distribution over available actions, with its state; or a shape.
     """
-    tracer = jax.core.Tracer
-    if any(isinstance(x, tracer) for x in jax.tree.leaves((model, policy, where))):
+    if is_traced((model, policy, where)):
+        return
+    world = getattr(model, "mdp", model)
+    if isinstance(world, SparseMDP):
+        row_weights(world, policy, where)
         return
     shape = (*model.state_shape, model.num_actions)
     table, available = np.asarray(policy), np.asarray(model.available)
@@ -419,3 +440,48 @@ def require_policy(model: Any, policy: Any, where: Any = True) -> None:
     if not (good | ~np.asarray(where)).all():
         state = np.argwhere(~good & where)[0]
         raise ValueError(f"{describe_row(given[tuple(state)], tuple(state))}.")
+
+
+def row_weights(model: SparseMDP, policy: Any, where: Any = True) -> np.ndarray:
+    """A policy of a sparse model as weights of its rows, ``float64[R]``, on the host.
+
+    Args:
+      model: a concrete sparse model.
+      policy: rows ``int32[S]``, or their weights ``float[R]``.
+      where: ``bool[S]``, the states whose rows count.
+
+    Raises:
+      ValueError: a shape is wrong, or a state's row is not one of its own, or its weights are no
+        distribution.
+    """
+    host, policy = model.host, np.asarray(policy)
+    if is_deterministic(policy):
+        if policy.shape != (host.num_states,):
+            raise ValueError(f"policy has shape {policy.shape}; expected ({host.num_states},), a "
+                             f"row for each state, or ({host.num_rows},) weights of rows.")
+        wrong = ((policy < host.row_start[:-1]) | (policy >= host.row_start[1:])) & where
+        if wrong.any():
+            s = int(np.flatnonzero(wrong)[0])
+            raise ValueError(
+                f"the policy takes row {policy[s]} in state {s}, whose rows are "
+                f"{host.row_start[s]} to {host.row_start[s + 1] - 1}.")
+        weight = np.zeros(host.num_rows)
+        weight[policy[np.broadcast_to(where, policy.shape)]] = 1
+        return weight
+    if policy.shape != (host.num_rows,):
+        raise ValueError(f"policy has shape {policy.shape}; expected ({host.num_rows},), a weight "
+                         "for each choice.")
+    weight = policy.astype(np.float64)
+    require_weights(host, weight, row_tolerance(policy.dtype), where)
+    return weight
+
+
+def require_weights(host: Any, weight: np.ndarray, tolerance: float, where: Any = True) -> None:
+    """Raises a ValueError unless weights ``float[R]`` are a distribution in each state."""
+    total = host.over_choices(np.add, weight)
+    off = ~((np.abs(total - 1) <= tolerance) & (host.over_choices(np.minimum, weight) >= 0))
+    off &= where
+    if off.any():
+        s = int(np.flatnonzero(off)[0])
+        row = weight[host.row_start[s] : host.row_start[s + 1]]
+        raise ValueError(f"{describe_row(row, (s,))}.")

@@ -8,11 +8,15 @@ from functools import cached_property
 from typing import Any
 
 import chex
+import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
 from jaxltl.core.host.rows import LARGE
 from jaxltl.core.host.sparse import HostMDP
+from jaxltl.core.models.concrete import is_traced
+from jaxltl.core.models.kernels import gather, owners, segment
 from jaxltl.core.models.mdp import checked_initial, checked_label
 
 _PADDED = ("this takes models that are padded: give to_padded(model). Sparse models have choices "
@@ -137,13 +141,13 @@ def row_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = Non
     """The expected reward of each choice, ``r(s) + r(s, a) + sum_t P(t | s, a) r(s, a, t)``.
 
     Args:
-      model: a concrete sparse model.
+      model: the sparse model.
       reward: the name of one of its rewards, a structure, or an array on states ``[S]``, on
         choices ``[R]`` or on entries ``[T]``, taken for the first of these that fits. None is the
         only reward that the model has.
 
     Returns:
-      ``float64[R]``.
+      ``float64[R]``; where anything is traced, JAX's, in the model's precision.
 
     Raises:
       ValueError: there is no such reward, or its shape fits nothing.
@@ -158,7 +162,9 @@ def row_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = Non
                              f"{_listed(model.rewards)}.")
         reward = model.rewards[reward]
     if not isinstance(reward, Rewards):
-        reward = _shaped(model, np.asarray(reward, np.float64))
+        reward = _shaped(model, reward)
+    if is_traced((model, reward)):
+        return _traced_reward(model, reward)
     host = model.host
     total = np.zeros(host.num_rows)
     if reward.state is not None:
@@ -171,11 +177,25 @@ def row_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = Non
     return total
 
 
+def _traced_reward(model: SparseMDP, reward: Rewards) -> Any:
+    total = jnp.zeros(model.num_rows, jax.dtypes.canonicalize_dtype(model.dtype))
+    if reward.state is not None:
+        total += gather(reward.state, owners(model.row_start, model.num_rows))
+    if reward.choice is not None:
+        total += reward.choice
+    if reward.transition is not None:
+        row = owners(model.entry_start, model.num_transitions)
+        earned = model.probability * jnp.asarray(reward.transition)
+        total += segment(jax.ops.segment_sum, earned, row, model.num_rows)
+    return total
+
+
 def _listed(names: Mapping[str, Any]) -> str:
     return ", ".join(map(repr, names)) or "none"
 
 
-def _shaped(model: SparseMDP, reward: np.ndarray) -> Rewards:
+def _shaped(model: SparseMDP, reward: Any) -> Rewards:
+    reward = reward if isinstance(reward, jax.Array) else np.asarray(reward, np.float64)
     for size, name in ((model.num_states, "state"), (model.num_rows, "choice"),
                        (model.num_transitions, "transition")):
         if reward.shape == (size,):

@@ -9,7 +9,6 @@ runs a scatter on a CPU one entry at a time.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -18,9 +17,13 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.models import kernels, operators
+from jaxltl.core.models.choices import Columns
+from jaxltl.core.models.choices import action_columns as action_columns
+from jaxltl.core.models.entries import Entries, entries
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.sparse import SparseMDP
 
 _LARGEST = 2**22  # transitions up to which a product's are written down, one by one
 _WIDEST = 6  # predecessor lists are at most this many times wider than successor lists
@@ -41,6 +44,11 @@ class Successors(NamedTuple):
     successor: list[list[jax.Array]] | jax.Array
     probability: list[list[jax.Array]] | jax.Array
 
+    @property
+    def choices(self) -> Columns:
+        """How quantities on actions are laid out."""
+        return Columns()
+
     def expectation(self, value: jax.Array) -> list[jax.Array]:
         """Expected value of the next state, ``[N, ...]`` for each action, from ``[N, ...]``."""
         if not (isinstance(self.successor, list) or isinstance(self.probability, list)):
@@ -58,6 +66,11 @@ class Primitives:
     """
 
     model: Any
+
+    @property
+    def choices(self) -> Columns:
+        """As of :class:`Successors`."""
+        return Columns()
 
     def expectation(self, value: jax.Array) -> list[jax.Array]:
         """As :meth:`Successors.expectation`."""
@@ -88,8 +101,14 @@ class Predecessors(NamedTuple):
         return kernels.fold(list(self.pair), list(self.probability), mass)
 
 
-def table(model: Any) -> Successors | Primitives:
-    """What sweeps a model: its successors where they can be written down, else its primitives."""
+def table(model: Any) -> Successors | Primitives | Entries:
+    """What sweeps a model: its successors where they can be written down, else its primitives.
+
+    Of a sparse model, or a game on one, its entries.
+    """
+    world = model.mdp if isinstance(model, Game) else model
+    if isinstance(world, SparseMDP):
+        return entries(world)
     return successors(model) or Primitives(model)
 
 
@@ -127,20 +146,6 @@ def _columns(entries: jax.Array) -> list[list[jax.Array]] | jax.Array:
         return jnp.moveaxis(entries, 0, -1)
     _, num_actions, width = entries.shape
     return [[entries[:, a, k] for k in range(width)] for a in range(num_actions)]
-
-
-def action_columns(num_actions: int, quantity: jax.Array) -> list[jax.Array]:
-    """``[S, A]`` as A arrays ``[N]``, which lie side by side in memory."""
-    rows = quantity.reshape(-1, num_actions)
-    return [rows[:, a] for a in range(num_actions)]
-
-
-def mean(weight: Sequence[jax.Array], quantity: Sequence[jax.Array]) -> jax.Array:
-    """``sum_a w(s, a) x(s, a)``, of columns; weights may lack the lanes."""
-    terms = []
-    for w, x in zip(weight, quantity, strict=True):
-        terms.append(w.reshape(w.shape + (1,) * (x.ndim - w.ndim)) * x)
-    return reduce(jnp.add, terms)
 
 
 def predecessors(models: Sequence[Any]) -> Predecessors | None:

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxltl.core.models.operators import action_mean
-from jaxltl.core.models.tables import action_columns, mean, table
+from jaxltl.core.models.choices import choices
+from jaxltl.core.models.compiled import compiled_form, in_shape_of
+from jaxltl.core.models.tables import table
 from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values import newton
 from jaxltl.core.values.discounted import (
@@ -22,32 +23,38 @@ from jaxltl.core.values.discounted import (
     gains,
     optimal_value,
 )
-from jaxltl.core.values.evidence import rounding_unit
+from jaxltl.core.values.evidence import most_choices, rounding_unit
 from jaxltl.core.values.linear import System
 from jaxltl.core.values.soft import policy_logits, soft_maximum, with_softmax
 
 
-def boltzmann_expansion(num_actions: int) -> float:
+def boltzmann_expansion(num_actions: Any) -> Any:
     """Largest row sum of the Jacobian of ``sum_a softmax(q)_a q_a`` over all q.
 
     The Boltzmann operator contracts for discounts below its inverse. The supremum is
-    attained where one action stands above the rest, which are equal.
+    attained where one action stands above the rest, which are equal: by g, of which it is half,
+    the root of ``g tanh((g - log(n - 1)) / 2) = 2``.
+
+    Args:
+      num_actions: n, a number or traced.
 
     Example:
       >>> [round(boltzmann_expansion(n), 2) for n in (1, 2, 3, 4)]
       [1.0, 1.2, 1.33, 1.42]
     """
-    if num_actions == 1:
-        return 1.0
-    gap = np.linspace(0.0, 40.0, 400_001)
-    top = 1 / (1 + (num_actions - 1) * np.exp(-gap))
-    mean = top * gap
-    row_sum = np.abs(top * (1 + gap - mean)) + np.abs((1 - top) * (1 - mean))
-    # The grid misses the maximum by less than its spacing squared.
-    return float(row_sum.max() + 1e-7)
+    xp: Any = jnp if isinstance(num_actions, jax.Array) else np
+    n = xp.asarray(num_actions, float)
+    others = xp.log(xp.maximum(n - 1, 1))
+    low, high = others, others + 4  # between them the left side goes from 0 to more than 2
+    for _ in range(30):
+        middle = (low + high) / 2
+        above = middle * xp.tanh((middle - others) / 2) >= 2
+        low, high = xp.where(above, low, middle), xp.where(above, middle, high)
+    # Bisection, and rounding in what it looks at.
+    found = xp.where(n > 1, high / 2 * (1 + 64 * float(jnp.finfo(high.dtype).eps)) + 1e-7, 1.0)
+    return found if xp is jnp else float(found)
 
 
-@partial(jax.jit, static_argnames=("adjoint", "method"))
 def boltzmann_value(
     model: Any,
     reward: jax.Array,
@@ -69,7 +76,8 @@ def boltzmann_value(
 
     Args:
       model: the model.
-      reward: ``float[S, A]`` or ``float[S, A, K]``.
+      reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
+        :func:`~jaxltl.core.models.sparse.row_reward`.
       discount: scalar in [0, 1).
       initial: ``float[S]``, where to start; default zero.
       adjoint: ``"exact"``, or ``"approximate"`` for the sensitivity (2.7) that holds the
@@ -81,7 +89,7 @@ def boltzmann_value(
       max_steps: damped steps at most.
 
     Returns:
-      :class:`Solution`; `policy` is ``float[S, A]``, the softmax.
+      :class:`Solution`; `policy` is ``float[S, A]``, of a sparse model ``float[R]``, the softmax.
 
     Raises:
       ValueError: the reward has the wrong shape, or an unknown method or adjoint.
@@ -98,7 +106,17 @@ def boltzmann_value(
         raise ValueError(f"adjoint={adjoint!r}; choose exact or approximate.")
     if method not in ("damped", "newton"):
         raise ValueError(f"method={method!r}; choose damped or newton.")
-    reward = expected_reward(model, reward)
+    form, reward = compiled_form(model, reward)
+    return in_shape_of(model, _boltzmann_value(
+        form, reward, discount, initial, tolerance, max_steps, adjoint=adjoint, method=method))
+
+
+@partial(jax.jit, static_argnames=("adjoint", "method"))
+def _boltzmann_value(
+    model: Any, reward: Any, discount: Any, initial: Any, tolerance: Any, max_steps: Any, *,
+    adjoint: str, method: str,
+) -> Solution:
+    reward, over = expected_reward(model, reward), choices(model)
     discount = jnp.asarray(discount, model.dtype)
     given = _given(model, reward, discount, tolerance)
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
@@ -120,17 +138,17 @@ def boltzmann_value(
     ))
 
     def backup(v: jax.Array) -> jax.Array:
-        policy = jax.nn.softmax(policy_logits(model, reward, discount, v), axis=-1)
+        policy = over.softmax(policy_logits(model, reward, discount, v))
         if adjoint == "approximate":
             policy = lax.stop_gradient(policy)
-        return action_mean(policy, action_value(model, reward, discount, v))
+        return over.mean(policy, action_value(model, reward, discount, v))
 
     def system() -> System:
-        policy = jax.nn.softmax(policy_logits(model, reward, discount, solution.value), axis=-1)
+        policy = over.softmax(policy_logits(model, reward, discount, solution.value))
         if adjoint == "exact":
             q = action_value(model, reward, discount, solution.value)
-            policy *= 1 + q - action_mean(policy, q)[..., None]
-        return System(table(model), action_columns(model.num_actions, policy), discount)
+            policy *= 1 + q - over.spread(over.mean(policy, q))
+        return System(table(model), over.columns(policy), discount)
 
     solution = differentiable(solution, backup, system)
     return with_softmax(model, reward, discount, solution)
@@ -147,7 +165,7 @@ class _Given(NamedTuple):
 
 
 def _given(model: Any, reward: jax.Array, discount: jax.Array, tolerance: Any) -> _Given:
-    expansion = discount * boltzmann_expansion(model.num_actions)
+    expansion = discount * boltzmann_expansion(most_choices(model))
     contracts = expansion < 1
     gap = jnp.where(contracts, 1 - expansion, 1)
     size = jnp.max(jnp.abs(reward))
@@ -166,12 +184,13 @@ def _judge(value: jax.Array, image: jax.Array, given: _Given) -> tuple[jax.Array
     return (error <= given.enough) | ~jnp.isfinite(error), error
 
 
-def softmax_mean(q, given: Any) -> tuple[jax.Array, list[jax.Array]]:
+def softmax_mean(over: Any, q: Any, given: Any) -> tuple[jax.Array, Any]:
     """``sum_a softmax(q)_a q_a`` of columns, and its derivative."""
-    _, policy = soft_maximum(q, given)
-    finite = [jnp.where(jnp.isneginf(x), 0, x) for x in q]
-    value = mean(policy, finite)
-    return value, [p * (1 + x - value) for p, x in zip(policy, finite, strict=True)]
+    _, policy = soft_maximum(over, q, given)
+    finite = jax.tree.map(lambda x: jnp.where(jnp.isneginf(x), 0, x), q)
+    value = over.mean(policy, finite)
+    return value, jax.tree.map(
+        lambda p, x, v: p * (1 + x - v), policy, finite, over.spread(value, finite))
 
 
 def boltzmann_fixed_points(

@@ -2,8 +2,9 @@
 
 Every solver stops on a certified error, returns the enclosure that certifies it, and is
 differentiable by the implicit function theorem in the reward, the discount and the
-transition probabilities. A ``model`` is an MDP, a DenseMDP or a Product; shapes are
-written for an MDP, and a product's values have ``[S, Q]`` for ``[S]``.
+transition probabilities. A ``model`` is an MDP, a DenseMDP, a SparseMDP or a Product; shapes are
+written for an MDP, and a product's values have ``[S, Q]`` for ``[S]``. Of a sparse model quantities
+on actions are ``[R]``, and actions of policies are rows.
 """
 
 from __future__ import annotations
@@ -11,23 +12,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial, reduce
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxltl.core.models.operators import (
-    action_argmax,
-    action_max,
-    action_mean,
-    expectation,
-    induced_chain,
-    require_policy,
-    valid_policy,
-)
-from jaxltl.core.models.tables import action_columns, mean, table
+from jaxltl.core.models.choices import choices
+from jaxltl.core.models.compiled import compiled_form, flat_policy, in_shape_of
+from jaxltl.core.models.concrete import is_traced
+from jaxltl.core.models.operators import expectation, following, require_policy, valid_policy
+from jaxltl.core.models.sparse import SparseMDP, row_reward
+from jaxltl.core.models.tables import table
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values import newton
 from jaxltl.core.values.enclosed import discounted, is_sparse
@@ -46,7 +43,7 @@ def action_value(
 
     Args:
       model: the model.
-      reward: ``float[S, A]``.
+      reward: ``float[S, A]``, of a sparse model ``float[R]``, as below.
       discount: scalar.
       value: ``float[S]``.
 
@@ -54,17 +51,20 @@ def action_value(
       ``float[S, A]``.
     """
     q = reward + discount * expectation(model, value)
-    return jnp.where(model.available, q, 0)
+    return jnp.where(choices(model).available, q, 0)
 
 
 def expected_reward(model: Any, reward: jax.Array) -> jax.Array:
     """A reward on pairs ``[S, A]`` or transitions ``[S, A, K]`` as its expectation ``[S, A]``.
 
-    Zero at unavailable actions; what stands there and in padding is not read.
+    Zero at unavailable actions; what stands there and in padding is not read. Of a sparse model it
+    is that of :func:`~jaxltl.core.models.sparse.row_reward`.
 
     Raises:
       ValueError: the reward has another shape.
     """
+    if isinstance(getattr(model, "mdp", model), SparseMDP):
+        return jnp.asarray(row_reward(getattr(model, "mdp", model), reward), model.dtype)
     actions = (*model.state_shape, model.num_actions)
     transitions = (*actions, model.num_successors)
     reward = jnp.asarray(reward, model.dtype)
@@ -87,7 +87,7 @@ class Parameters(NamedTuple):
       size: the largest reward.
       unit: relative rounding of a backup.
       tolerance: certified error asked for, or None.
-      policy: columns of a policy's weights, or None.
+      policy: a policy's weights, in columns, or None.
     """
 
     discount: jax.Array
@@ -116,9 +116,10 @@ def parameters(model: Any, reward: jax.Array, discount: Any, tolerance: Any) -> 
         jnp.asarray(rounding_unit(model), model.dtype), goal)
 
 
-def gains(model: Any, reward: jax.Array) -> list[jax.Array]:
+def gains(model: Any, reward: jax.Array) -> Any:
     """The reward's columns, minus infinity at unavailable actions."""
-    return action_columns(model.num_actions, jnp.where(model.available, reward, -jnp.inf))
+    over = choices(model)
+    return over.columns(over.logits(reward))
 
 
 def solution_of(
@@ -207,10 +208,12 @@ def policy_value(
       >>> round(policy_value(mdp, jnp.array([0]), jnp.ones((1, 1)), 0.5).value.item(), 4)
       2.0
     """
-    if is_sparse(model):
+    if is_sparse(model) and not is_traced((model, policy, reward, discount, tolerance)):
         return discounted(model, reward, discount, policy=policy, tolerance=tolerance)
-    require_policy(model, policy)
-    return _policy_value(model, policy, reward, discount, tolerance, max_steps)
+    form, reward = compiled_form(model, reward)
+    policy = flat_policy(model, policy)
+    require_policy(form, policy)
+    return in_shape_of(model, _policy_value(form, policy, reward, discount, tolerance, max_steps))
 
 
 @jax.jit
@@ -218,21 +221,21 @@ def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solu
     reward = expected_reward(model, reward)
     given = parameters(model, reward, discount, tolerance)
     checked = valid_policy(model, policy)
-    weight = action_columns(model.num_actions, checked.distribution)
+    over, rows = choices(model), table(model)
+    weight = over.columns(checked.distribution)
     given = given._replace(policy=weight)
-    rows = table(model)
 
-    def combine(q, given: Parameters):
-        return mean(given.policy, q), given.policy
+    def combine(over: Any, q: Any, given: Parameters):
+        return over.mean(given.policy, q), given.policy
 
     value, image, n = newton.solve(
         rows, combine, judge, newton.Backup(
-            action_columns(model.num_actions, reward), given.discount,
+            over.columns(reward), given.discount,
             jnp.zeros_like(given.discount), given),
         jnp.zeros(model.num_states, model.dtype), max_steps=max_steps)
 
     def backup(v: jax.Array) -> jax.Array:
-        return action_mean(checked.distribution, action_value(model, reward, given.discount, v))
+        return over.mean(checked.distribution, action_value(model, reward, given.discount, v))
 
     solution = solution_of(model, given, value, image, checked.distribution, n)
     solution = differentiable(
@@ -287,11 +290,12 @@ def optimal_value(
       >>> [round(v, 4) for v in best.value.tolist()], best.policy.tolist()
       ([1.0, 2.0], [1, 0])
     """
-    if is_sparse(model):
+    if is_sparse(model) and not is_traced((model, reward, discount, tolerance)):
         return discounted(model, reward, discount, tolerance=tolerance)
-    return _optimal_value(
-        model, reward, discount, method=method, tolerance=tolerance, max_steps=max_steps,
-        evaluation_sweeps=evaluation_sweeps)
+    form, reward = compiled_form(model, reward)
+    return in_shape_of(model, _optimal_value(
+        form, reward, discount, method=method, tolerance=tolerance, max_steps=max_steps,
+        evaluation_sweeps=evaluation_sweeps))
 
 
 @partial(jax.jit, static_argnames=("method",))
@@ -310,7 +314,7 @@ def _optimal_value(
     if method == "auto":
         few = math.prod(model.state_shape) <= DENSE_LIMIT
         method = "policy_iteration" if few else "modified_policy_iteration"
-    reward = expected_reward(model, reward)
+    reward, over = expected_reward(model, reward), choices(model)
     given = parameters(model, reward, discount, tolerance)
     zero = jnp.zeros(model.num_states, model.dtype)
     if method == "modified_policy_iteration":
@@ -323,42 +327,38 @@ def _optimal_value(
                           jnp.zeros_like(given.discount), given),
             zero, newton=method == "policy_iteration", max_steps=max_steps)
     q = reward + given.discount * expectation(model, value.reshape(model.state_shape))
-    _, policy = action_argmax(q, model.available)
+    _, policy = over.argmax(q)
 
     def backup(v: jax.Array) -> jax.Array:
-        return action_max(reward + given.discount * expectation(model, v), model.available)
+        return over.max(reward + given.discount * expectation(model, v))
 
     def system() -> System:
-        chosen = jax.nn.one_hot(policy, model.num_actions, dtype=model.dtype)
-        return System(table(model), action_columns(model.num_actions, chosen), given.discount)
+        chosen = over.one_hot(policy, model.dtype)
+        return System(table(model), over.columns(chosen), given.discount)
 
     return differentiable(
         solution_of(model, given, value, image, policy, n), backup, system)
 
 
-def best_action(q, given: Any) -> tuple[jax.Array, list[jax.Array]]:
+def best_action(over: Any, q: Any, given: Any) -> tuple[jax.Array, Any]:
     """The largest action value, and weight one on the first action that attains it."""
-    best = reduce(jnp.maximum, q)
-    weight, free = [], jnp.ones(best.shape, bool)
-    for x in q:
-        here = free & (x >= best)
-        weight.append(here.astype(best.dtype))
-        free &= ~here
-    return best, weight
+    return over.best(q)
 
 
 def _modified_policy_iteration(model, reward, given: Parameters, max_steps, sweeps):
+    over = choices(model)
+
     def greedy(v: jax.Array) -> tuple[jax.Array, jax.Array]:
         q = reward + given.discount * expectation(model, v.reshape(model.state_shape))
-        image, policy = action_argmax(q, model.available)
+        image, policy = over.argmax(q)
         return image.ravel(), policy
 
     def step(_, carry, __):
         _, image, policy = carry
-        chain = induced_chain(model, policy)
-        gain = action_mean(policy, reward).ravel()
+        onward = following(model, policy)
+        gain = over.mean(policy, reward).ravel()
         value = lax.fori_loop(
-            0, sweeps, lambda _, v: gain + given.discount * expectation(chain, v)[:, 0], image)
+            0, sweeps, lambda _, v: gain + given.discount * onward(v), image)
         return value, *greedy(value)
 
     def finished(carry, _):

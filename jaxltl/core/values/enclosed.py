@@ -11,25 +11,20 @@ from jaxltl.core.host import optimal
 from jaxltl.core.host.discounted import discounted_value
 from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.host.transient import Enclosed
+from jaxltl.core.models.compiled import flat_policy
+from jaxltl.core.models.compiled import is_sparse as is_sparse
 from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.convert import to_sparse
-from jaxltl.core.models.operators import is_deterministic
-from jaxltl.core.models.product import Product
+from jaxltl.core.models.operators import is_deterministic, require_weights, row_weights
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import (
     Method,
     Solution,
     Status,
-    describe_row,
     require_shape,
     row_tolerance,
 )
 from jaxltl.core.values.bounded import finite_reward
-
-
-def is_sparse(model: Any) -> bool:
-    """Whether a model's choices are rows: a SparseMDP, or a product of one."""
-    return isinstance(model.mdp if isinstance(model, Product) else model, SparseMDP)
 
 
 def solution_of(
@@ -109,14 +104,12 @@ def chain_of(model: Any, sparse: SparseMDP, policy: Any) -> Chain:
       ValueError: a shape is wrong, or a state's row is no distribution over its choices.
     """
     host = sparse.host
-    weight = _weights(model, sparse, np.asarray(policy))
+    if is_sparse(model):
+        weight = row_weights(sparse, flat_policy(model, policy))
+    else:
+        weight = _weights(model, sparse, np.asarray(policy))
+        require_weights(host, weight, row_tolerance(np.float64))
     total = host.over_choices(np.add, weight)
-    off = (np.abs(total - 1) > row_tolerance(np.float64)) | (
-        host.over_choices(np.minimum, weight) < 0)
-    if off.any():
-        s = int(np.flatnonzero(off)[0])
-        row = weight[host.row_start[s] : host.row_start[s + 1]]
-        raise ValueError(f"{describe_row(row, (s,))}.")
     from scipy.sparse import csr_array
 
     taken = np.flatnonzero(weight > 0)
@@ -133,33 +126,15 @@ def chain_of(model: Any, sparse: SparseMDP, policy: Any) -> Chain:
 
 
 def _weights(model: Any, sparse: SparseMDP, policy: np.ndarray) -> np.ndarray:
-    host = sparse.host
-    if not is_sparse(model):
-        actions = (*model.state_shape, model.num_actions)
-        if is_deterministic(policy) and policy.shape == actions[:-1]:
-            policy = np.eye(model.num_actions)[policy]
-        if policy.shape != actions:
-            raise ValueError(f"policy has shape {policy.shape}; expected {actions[:-1]} of actions "
-                             f"or {actions} of their probabilities.")
-        flat = policy.reshape(host.num_states, -1)
-        return flat[host.state, np.asarray(sparse.action)].astype(np.float64)
-    if is_deterministic(policy):
-        if policy.shape != (host.num_states,):
-            raise ValueError(f"policy has shape {policy.shape}; expected ({host.num_states},), a "
-                             f"row for each state, or ({host.num_rows},) weights of rows.")
-        wrong = (policy < host.row_start[:-1]) | (policy >= host.row_start[1:])
-        if wrong.any():
-            s = int(np.flatnonzero(wrong)[0])
-            raise ValueError(
-                f"the policy takes row {policy[s]} in state {s}, whose rows are "
-                f"{host.row_start[s]} to {host.row_start[s + 1] - 1}.")
-        weight = np.zeros(host.num_rows)
-        weight[policy] = 1
-        return weight
-    if policy.shape != (host.num_rows,):
-        raise ValueError(f"policy has shape {policy.shape}; expected ({host.num_rows},), a weight "
-                         "for each choice.")
-    return policy.astype(np.float64)
+    """A padded model's policy as weights of its rows."""
+    actions = (*model.state_shape, model.num_actions)
+    if is_deterministic(policy) and policy.shape == actions[:-1]:
+        policy = np.eye(model.num_actions)[policy]
+    if policy.shape != actions:
+        raise ValueError(f"policy has shape {policy.shape}; expected {actions[:-1]} of actions "
+                         f"or {actions} of their probabilities.")
+    flat = policy.reshape(sparse.num_states, -1)
+    return flat[sparse.host.state, np.asarray(sparse.action)].astype(np.float64)
 
 
 def given_policy(solution: Solution, policy: Any) -> Solution:
@@ -205,9 +180,6 @@ def discounted(
     Rewards are named, or arrays on states, choices or transitions, see
     :func:`~jaxltl.core.models.sparse.row_reward`; they are finite.
     """
-    if is_traced((model, reward, discount, policy, tolerance)):
-        raise ValueError("a sparse model is read on the host: give concrete arrays, or pad it by "
-                         "to_padded(model) to solve it inside jit.")
     if not 0 <= float(discount) < 1:
         raise ValueError(f"discount={float(discount):.6g}; it must be at least 0 and below 1.")
     sparse = to_sparse(model)

@@ -9,17 +9,34 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, Status
 
 
-def rounding_unit(model: Any) -> float:
+def rounding_unit(model: Any) -> Any:
     """Rounding errors of one backup, relative to the magnitude of what it sums.
 
     A backup sums at most as many products as a state has successors, over which rows may
     also miss one by a rounding each, and takes a maximum or a mean over the actions.
     """
-    terms = model.num_successors + model.num_actions + 4
+    terms = widest_row(model) + most_choices(model) + 4
     return terms * float(jnp.finfo(model.dtype).eps)
+
+
+def most_choices(model: Any) -> Any:
+    """The most choices that a state has: static, but of a sparse model ``int32[]``."""
+    world = getattr(model, "mdp", model)
+    if isinstance(world, SparseMDP):
+        return jnp.max(jnp.diff(jnp.asarray(world.row_start)))
+    return model.num_actions
+
+
+def widest_row(model: Any) -> Any:
+    """The most successors that a choice has: static, but of a sparse model ``int32[]``."""
+    world = getattr(model, "mdp", model)
+    if isinstance(world, SparseMDP):
+        return jnp.max(jnp.diff(jnp.asarray(world.entry_start)))
+    return model.num_successors
 
 
 class Enclosure(NamedTuple):

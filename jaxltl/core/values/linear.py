@@ -7,7 +7,7 @@ Large ones are solved by BiCGSTAB.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxltl.core.models.entries import Entries
 from jaxltl.core.models.operators import transition_matrix
-from jaxltl.core.models.tables import Primitives, Successors, mean
+from jaxltl.core.models.tables import Primitives, Successors
 from jaxltl.core.values.iterate import in_turn, iterate
 
 Operator = Callable[[jax.Array], jax.Array]
@@ -33,21 +34,22 @@ class System(NamedTuple):
 
     Attributes:
       table: the model's successors, see :func:`~jaxltl.core.models.tables.table`.
-      weight: ``float[N]`` for each action, such as a policy's columns.
+      weight: ``float[N]`` for each action, such as a policy's columns; of a sparse model
+        ``float[R]``.
       scale: ``float[N]`` or a scalar, such as the discount; zero where a value is fixed.
     """
 
     table: Any
-    weight: Sequence[jax.Array]
+    weight: Any
     scale: jax.Array
 
     @property
     def num_states(self) -> int:
-        return self.weight[0].shape[0]
+        return self.table.choices.size(self.weight)
 
     def onward(self, x: jax.Array) -> jax.Array:
         """``scale * P_w x`` for ``[N, ...]``."""
-        return self.scale * mean(self.weight, self.table.expectation(x))
+        return self.scale * self.table.choices.mean(self.weight, self.table.expectation(x))
 
     def matvec(self, x: jax.Array) -> jax.Array:
         """The system applied to ``[N]``."""
@@ -62,14 +64,16 @@ class System(NamedTuple):
     def matrix(self) -> jax.Array:
         """``float[N, N]``, written out."""
         n = self.num_states
-        eye = jnp.eye(n, dtype=self.weight[0].dtype)
+        eye = jnp.eye(n, dtype=jax.tree.leaves(self.weight)[0].dtype)
         if not isinstance(self.table, Successors):
             if isinstance(self.table, Primitives):
                 model = self.table.model
                 policy = jnp.stack(self.weight, -1).reshape(*model.state_shape, -1)
                 found = transition_matrix(model, policy)
+            elif isinstance(self.table, Entries):
+                found = self.table.matrix(self.weight)
             else:
-                found = mean(self.weight, self.table.expectation(eye))
+                found = self.table.choices.mean(self.weight, self.table.expectation(eye))
             return eye - jnp.broadcast_to(self.scale, (n,))[:, None] * found
         rows = jnp.arange(n)
         target = jnp.asarray(self.table.successor)  # [A, K, N]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.models.concrete import is_traced
-from jaxltl.core.models.game import Game, as_game, is_deterministic
+from jaxltl.core.models.game import Game, as_padded_game, is_deterministic
 from jaxltl.core.models.operators import induced_chain
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted import expected_reward
@@ -55,7 +55,7 @@ def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> S
       >>> mean.value.tolist(), mean.policy.tolist()
       ([2.0, 2.0], [1, 0])
     """
-    game = as_game(game)
+    game = as_padded_game(game)
     reward = expected_reward(game, reward)
     if is_traced((game, reward)):
         raise ValueError("mean_payoff works on the host; call it outside jit and vmap.")

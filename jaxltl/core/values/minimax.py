@@ -2,7 +2,8 @@
 
 The system maximises and the environment minimises. Values come with a certified
 enclosure, and are differentiable by the implicit function theorem. Shapes are written for
-states ``[S]``; a game on a Product has ``[S, Q]``.
+states ``[S]``; a game on a Product has ``[S, Q]``. In a game on a sparse model quantities on
+actions are ``[R]``, and an action is a row.
 """
 
 from __future__ import annotations
@@ -19,17 +20,18 @@ from jax import lax
 
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
+from jaxltl.core.models.choices import choice_shape, choices
+from jaxltl.core.models.compiled import compiled_form, flat_policy, in_shape_of
 from jaxltl.core.models.concrete import namespace, to_jax
 from jaxltl.core.models.game import Game, as_game
 from jaxltl.core.models.operators import (
-    action_max,
-    action_mean,
     expectation,
     is_deterministic,
     require_policy,
     valid_policy,
 )
-from jaxltl.core.models.tables import action_columns, mean, table
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.models.tables import table
 from jaxltl.core.types import Solution, require_shape, status_code
 from jaxltl.core.values import newton
 from jaxltl.core.values.discounted import best_action, expected_reward
@@ -66,7 +68,8 @@ def minimax_value(
 
     Args:
       game: a Game; any other model is the game in which the system always moves.
-      reward: ``float[S, A]`` or ``float[S, A, K]``; what is paid at environment states counts.
+      reward: ``float[S, A]`` or ``float[S, A, K]``; what is paid at environment states counts. In
+        a game on a sparse model as of :func:`~jaxltl.core.models.sparse.row_reward`.
       discount: scalar in [0, 1).
       per: ``"move"`` or ``"system_move"``, which moves are discounted.
       method: ``"policy_iteration"``: linear solves for both players' greedy choices (Pollatschek
@@ -107,22 +110,23 @@ def minimax_value(
       ([4.0, 4.0], [1, 0])
     """
     _require("method", method, _METHODS)
-    game = as_game(game)
-    moves = game.available
+    given = as_game(game)
+    game, reward = compiled_form(given, reward)
     if allowed is not None:
-        require_shape("allowed", allowed, moves.shape)
+        require_shape("allowed", allowed, choice_shape(game))
     graph = graph_of(game, allowed)
     xp = graph.xp
-    system, moves = take(graph, (game.system, moves))
+    system, moves = take(graph, (game.system, graph.available))
     if allowed is not None:
         moves = moves & xp.asarray(allowed, bool)
     # Chance and the environment may lead to where play gets stuck.
-    lost = attract(graph, ~moves.any(axis=-1), moves, rule=~system).region
-    moves = moves & ~lost[..., None] & ~graph.exists(lost)
+    lost = attract(graph, ~graph.first(moves)[0], moves, rule=~system).region
+    moves = moves & ~graph.on_choices(lost) & ~graph.exists(lost)
     defined = _returns(graph, per, system | lost, moves, xp.zeros_like(lost))
     moves, live = to_jax((moves, ~lost))
-    return _solve(game, None, moves, live, defined, reward, discount, tolerance, max_steps,
-                  per=per, method=method)
+    return in_shape_of(given, _solve(
+        game, None, moves, live, defined, reward, discount, tolerance, max_steps,
+        per=per, method=method))
 
 
 def strategy_value(
@@ -177,15 +181,17 @@ def strategy_value(
       [1.6667, 1.3333]
     """
     _require("method", method, _METHODS)
-    game = as_game(game)
+    asked = as_game(game)
+    game, reward = compiled_form(asked, reward)
     if isinstance(environment, str):
         _require("environment", environment, ("adversarial",))
         environment = None
+    strategy, environment = (flat_policy(asked.mdp, x) for x in (strategy, environment))
     given = [("strategy", strategy, game.system)]
     if environment is not None:
         given.append(("environment", environment, ~game.system))
     for name, policy, states in given:
-        kind, shape = "stochastic", game.available.shape
+        kind, shape = "stochastic", choice_shape(game)
         if is_deterministic(policy):
             kind, shape = "of integers", game.state_shape
         require_shape(f"{name} ({kind})", policy, shape)
@@ -195,18 +201,21 @@ def strategy_value(
     system, used = take(graph, (game.system, checked.used))
     followed = graph.xp.ones_like(system)
     drawn = followed if environment is not None else system
-    moves = graph.available & graph.xp.where(drawn[..., None], used, True)
+    moves = graph.available & graph.xp.where(graph.on_choices(drawn), used, True)
     # Whoever plays, nobody keeps away from where play gets stuck.
-    lost = attract(graph, ~moves.any(axis=-1), moves, rule=followed).region
-    moves = moves & ~lost[..., None]
+    lost = attract(graph, ~graph.first(moves)[0], moves, rule=followed).region
+    moves = moves & ~graph.on_choices(lost)
     defined = _returns(graph, per, system | lost, moves, drawn)
     moves, drawn, live = to_jax((moves, drawn, ~lost))
-    return _solve(game, checked._replace(used=drawn), moves, live, defined, reward, discount,
-                  tolerance, max_steps, per=per, method=method)
+    return in_shape_of(asked, _solve(
+        game, checked._replace(used=drawn), moves, live, defined, reward, discount,
+        tolerance, max_steps, per=per, method=method))
 
 
 def _read(game: Game, states: Any) -> Any:
     """The states of a player whose rows of a policy are read: those that have moves at all."""
+    if isinstance(game.mdp, SparseMDP):  # whose every state has a choice
+        return states
     xp, states, available = namespace(states, game.available)
     return states & xp.any(available, axis=-1)
 
@@ -230,14 +239,14 @@ class _Drawn(NamedTuple):
 @jax.jit
 def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> _Drawn:
     """The policies of both players as one, zero where neither is read."""
-    read = _read(game, game.system)
+    read, over = _read(game, game.system), choices(game)
     weight, given, valid = valid_policy(game, jnp.asarray(strategy), read)
-    weight = jnp.where(read[..., None], weight, 0)  # nothing of what is not read
+    weight = jnp.where(over.spread(read), weight, 0)  # nothing of what is not read
     if environment is not None:
         read = _read(game, ~game.system)
         other = valid_policy(game, jnp.asarray(environment), read)
-        weight = jnp.where(read[..., None], other.distribution, weight)
-        given = jnp.where(read[..., None], other.given, given)
+        weight = jnp.where(over.spread(read), other.distribution, weight)
+        given = jnp.where(over.spread(read), other.given, given)
         valid &= other.valid
     return _Drawn(weight, given, valid, lax.stop_gradient(weight) > 0)
 
@@ -273,7 +282,7 @@ class _Play(NamedTuple):
     Attributes:
       system: ``bool[N]``.
       drawn: ``bool[N]``, where moves are drawn by `weight`; None where nobody's are.
-      weight: columns ``[N]``.
+      weight: in columns.
       horizon: the largest value of h, or infinite, or NaN where there is none.
       discount: a scalar.
       unit: relative rounding of a backup.
@@ -283,7 +292,7 @@ class _Play(NamedTuple):
 
     system: jax.Array
     drawn: jax.Array | None
-    weight: list[jax.Array] | None
+    weight: Any
     horizon: jax.Array
     discount: jax.Array
     unit: jax.Array
@@ -291,30 +300,31 @@ class _Play(NamedTuple):
     tolerance: jax.Array | None
 
 
-def _chosen(q: newton.Columns, play: _Play) -> tuple[jax.Array, list[jax.Array]]:
+def _chosen(over: Any, q: Any, play: _Play) -> tuple[jax.Array, Any]:
     """What both players' best moves are worth, and their weights."""
-    best, weight = best_action([jnp.where(play.system, x, -x) for x in q], play)
+    own = jax.tree.map(lambda s, x: jnp.where(s, x, -x), over.spread(play.system, q), q)
+    best, weight = best_action(over, own, play)
     best = jnp.where(play.system, best, -best)
     if play.drawn is None:
         return best, weight
-    pairs = zip(play.weight or [], weight, strict=True)
-    weight = [jnp.where(play.drawn, given, own) for given, own in pairs]
-    return jnp.where(play.drawn, _mean(weight, q), best), weight
+    weight = jax.tree.map(jnp.where, over.spread(play.drawn, q), play.weight, weight)
+    return jnp.where(play.drawn, _mean(over, weight, q), best), weight
 
 
-def _mean(weight: list[jax.Array], q: newton.Columns) -> jax.Array:
+def _mean(over: Any, weight: Any, q: Any) -> jax.Array:
     """The mean of columns that are infinite where moves are not allowed."""
-    return mean(weight, [jnp.where(jnp.isinf(x), 0, x) for x in q])
+    return over.mean(weight, jax.tree.map(lambda x: jnp.where(jnp.isinf(x), 0, x), q))
 
 
-def _gains(play: _Play, reward: jax.Array, moves: jax.Array, live: jax.Array) -> list[jax.Array]:
+def _gains(rows: Any, play: _Play, reward: Any, moves: Any, live: jax.Array) -> Any:
     """Columns of a reward, infinitely bad for who moves where it is not allowed; else zero."""
-    never = jnp.where(play.system, -jnp.inf, jnp.inf).astype(reward.dtype)
+    never = jnp.where(play.system, -jnp.inf, jnp.inf).astype(play.discount.dtype)
     if play.drawn is not None:
         never = jnp.where(play.drawn, 0, never)
-    num_actions = moves.shape[-1]
-    pairs = zip(*(action_columns(num_actions, x) for x in (reward, moves)), strict=True)
-    return [jnp.where(live, jnp.where(m, r, never), 0) for r, m in pairs]
+    spread = rows.choices.spread
+    return jax.tree.map(
+        lambda lives, m, r, none: jnp.where(lives, jnp.where(m, r, none), 0),
+        spread(live, reward), moves, reward, spread(never, reward))
 
 
 # --- bounds --------------------------------------------------------------------------------
@@ -337,10 +347,10 @@ def _horizon(rows: Any, play: _Play, moves, live, per: str, defined, max_steps) 
             # Below, from 1 + P tau <= tau + growth follows that tau / (1 - growth) is enough.
             return (growth <= 2.0**-7) | ~jnp.isfinite(growth) | ~given[1], jnp.abs(growth)
 
-        ones = jnp.ones(moves.shape, tau.dtype)
+        ones = jax.tree.map(lambda m: jnp.ones(m.shape, tau.dtype), moves)
         tau, after, _ = newton.solve(
-            rows, lambda q, given: _chosen(q, given[0]), judge,
-            newton.Backup(_gains(slow, ones, moves, free), free.astype(tau.dtype),
+            rows, lambda over, q, given: _chosen(over, q, given[0]), judge,
+            newton.Backup(_gains(rows, slow, ones, moves, free), free.astype(tau.dtype),
                           jnp.zeros_like(play.discount), (slow, defined)),
             tau, max_steps=max_steps)
         growth = jnp.max(after - tau)
@@ -407,30 +417,31 @@ def _solve(
     max_steps, *, per: str, method: str,
 ) -> Solution:
     discount = jnp.asarray(discount, game.dtype)
-    reward = jnp.where(moves, expected_reward(game, reward), 0)
+    reward, over = jnp.where(moves, expected_reward(game, reward), 0), choices(game)
     free = ~game.system if per == "system_move" else jnp.zeros_like(game.system)
     rate = jnp.where(live, jnp.where(free, 1, discount), 0)
-    sign = jnp.where(game.system, 1, -1).astype(game.dtype)[..., None]
+    sign = jnp.where(game.system, 1, -1).astype(game.dtype)
 
     def backup(value: jax.Array) -> jax.Array:
-        q = reward + rate[..., None] * expectation(game, value)
-        best = sign[..., 0] * action_max(sign * q, moves)
+        q = reward + over.spread(rate) * expectation(game, value)
+        best = sign * over.max(over.spread(sign) * q, moves)
         if drawn is not None:
-            best = jnp.where(drawn.used, action_mean(drawn.weight, q), best)
+            best = jnp.where(drawn.used, over.mean(drawn.weight, q), best)
         return jnp.where(live, best, 0)
 
     flat = live.ravel()
     play = _Play(
         game.system.ravel(), None if drawn is None else drawn.used.ravel(),
-        None if drawn is None else action_columns(game.num_actions, drawn.weight),
+        None if drawn is None else over.columns(drawn.weight),
         discount, discount, jnp.asarray(rounding_unit(game), game.dtype),
         jnp.max(jnp.abs(reward)),
         None if tolerance is None else jnp.asarray(tolerance, game.dtype))
-    rows = table(game)
-    horizon = _horizon(rows, play, moves, flat, per, defined, max_steps)
+    rows, columns = table(game), over.columns(moves)
+    horizon = _horizon(rows, play, columns, flat, per, defined, max_steps)
     play = play._replace(horizon=jnp.max(horizon))
     numbers = newton.Backup(
-        _gains(play, reward, moves, flat), rate.ravel(), jnp.zeros_like(discount), play)
+        _gains(rows, play, over.columns(reward), columns, flat), rate.ravel(),
+        jnp.zeros_like(discount), play)
     zero = jnp.zeros(flat.shape, game.dtype)
     if method == "strategy_iteration":
         value, image, num_steps = _strategy_iteration(rows, numbers, zero, max_steps)
@@ -440,9 +451,8 @@ def _solve(
             monotone=False, first_sweeps=_FIRST_SWEEPS if flat.size > DENSE_LIMIT else 0,
             max_steps=max_steps)
     rows, numbers, play, horizon = lax.stop_gradient((rows, numbers, play, horizon))
-    q = [g + numbers.scale * x
-         for g, x in zip(numbers.reward, rows.expectation(value), strict=True)]
-    weight = jnp.stack(_chosen(q, play)[1], axis=-1).reshape(moves.shape)
+    q = newton.action_values(rows.choices, numbers, rows.expectation(value))
+    weight = over.whole(_chosen(rows.choices, q, play)[1])
     verdict = _certify(play, value, image)
     evidence = _certify(play._replace(horizon=horizon), value, image)
     known = jnp.all(evidence.half < jnp.inf)
@@ -453,7 +463,7 @@ def _solve(
     middle = image + evidence.shift
     solution = Solution(
         value=middle.reshape(live.shape),
-        policy=jnp.argmax(weight, axis=-1).astype(jnp.int32) if drawn is None else weight,
+        policy=over.first(weight == 1)[1] if drawn is None else weight,
         lower=answer(jnp.where(known, middle - evidence.half, -jnp.inf)),
         upper=answer(jnp.where(known, middle + evidence.half, jnp.inf)),
         residual=jnp.max(jnp.abs(image - value)),
@@ -472,7 +482,7 @@ class _Strategies(NamedTuple):
     """Where strategy iteration is: z is to be looked at, the value of the choices `weight`."""
 
     z: jax.Array
-    weight: list[jax.Array]
+    weight: Any
     value: jax.Array
     image: jax.Array
     unchanged: jax.Array
@@ -483,30 +493,30 @@ def _strategy_iteration(rows: Any, numbers: newton.Backup, zero: jax.Array, max_
     """Solves for the value of both players' choices, then improves the environment's, or,
     where those are a best answer already, the system's (Hoffman and Karp 1966)."""
     def step(rows: Any, k: _Strategies, given: newton.Backup) -> _Strategies:
-        play = given.extra
-        q = [g + given.scale * x
-             for g, x in zip(given.reward, rows.expectation(k.z), strict=True)]
-        image, best = _chosen(q, play)
-        own = _mean(k.weight, q)
+        over, play = rows.choices, given.extra
+        q = newton.action_values(over, given, rows.expectation(k.z))
+        image, best = _chosen(over, q, play)
+        own = _mean(over, k.weight, q)
         margin = 2 * play.unit * (play.size + jnp.max(jnp.abs(k.z)))
         better = jnp.where(play.system, image - own, own - image) > margin
         if play.drawn is not None:
             better &= ~play.drawn
         answers = better & ~play.system
         change = jnp.where(answers.any(), answers, better)
-        weight = [jnp.where(change, new, old) for new, old in zip(best, k.weight, strict=True)]
+        weight = jax.tree.map(jnp.where, over.spread(change, q), best, k.weight)
         unchanged = jnp.where(change.any(), 0, k.unchanged + 1)
         done = _judge(k.z, image, play)[0] | (unchanged > _UNCHANGED)
 
         def solved() -> jax.Array:
             # Solving for the correction refines the value where the choices stay the same.
-            return k.z + solver(System(rows, weight, given.scale)).solve(_mean(weight, q) - k.z)
+            return k.z + solver(System(rows, weight, given.scale)).solve(
+                _mean(over, weight, q) - k.z)
 
         z = lax.cond(done, lambda: k.z, solved)
         return _Strategies(z, weight, k.z, image, unchanged, done)
 
     start = _Strategies(
-        zero, _chosen(numbers.reward, numbers.extra)[1], zero, zero, jnp.int32(-1),
+        zero, _chosen(rows.choices, numbers.reward, numbers.extra)[1], zero, zero, jnp.int32(-1),
         jnp.bool_(False))
     last, n = iterate(step, lambda k, _: k.done, rows, start, numbers, max_steps=max_steps)
     return last.value, last.image, n

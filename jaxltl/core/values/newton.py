@@ -8,7 +8,7 @@ and Brumelle 1979). One loop holds the sweeps, the linear solver and the judging
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxltl.core.models.tables import mean
 from jaxltl.core.values.iterate import iterate
 from jaxltl.core.values.linear import (
     DENSE_LIMIT,
@@ -27,9 +26,9 @@ from jaxltl.core.values.linear import (
     start_bicgstab,
 )
 
-Columns = Sequence[jax.Array]
-# From rewards, what is ahead, and parameters: the value and the weights of its derivative.
-Combine = Callable[[Columns, Any], tuple[jax.Array, list[jax.Array]]]
+Quantity = Any  # on choices: columns ``[N, ...]``, of a sparse model ``[R, ...]``
+# From the choices, their values, and parameters: the value and the weights of its derivative.
+Combine = Callable[[Any, Quantity, Any], tuple[jax.Array, Quantity]]
 # From value, image and parameters: whether it is good enough, and how good it is.
 Judge = Callable[[jax.Array, jax.Array, Any], tuple[jax.Array, jax.Array]]
 
@@ -41,13 +40,13 @@ class Backup(NamedTuple):
     """A backup at some numbers; lanes may differ in all of it.
 
     Attributes:
-      reward: ``float[N]`` for each action.
+      reward: ``float[N]`` for each action, of a sparse model ``float[R]``.
       scale: the discount, a scalar or ``float[N]``.
       damping: how much of the old value a sweep keeps.
       extra: what `combine` and `judge` read besides.
     """
 
-    reward: Columns
+    reward: Quantity
     scale: jax.Array
     damping: jax.Array
     extra: Any
@@ -60,7 +59,7 @@ class _Search(NamedTuple):
     z: jax.Array
     value: jax.Array  # the best so far, with its image and the weights of the derivative there
     image: jax.Array
-    weight: jax.Array  # [A, N]
+    weight: jax.Array  # [A, N], or [R]
     error: jax.Array
     done: jax.Array
     newton: jax.Array  # whether z is a step of Newton's, to be judged
@@ -96,8 +95,8 @@ def solve(
 
     Args:
       table: the model's, see :func:`~jaxltl.core.models.tables.table`.
-      combine: from the action values, columns ``[N, ...]``, and ``backup.extra``, the image
-        and the weights.
+      combine: from the table's choices, the action values, columns ``[N, ...]`` or
+        ``[R, ...]``, and ``backup.extra``, the image and the weights.
       judge: from value, image and ``backup.extra``, whether to end, and the error.
       backup: its numbers.
       value: ``float[N]``, where to start.
@@ -111,12 +110,13 @@ def solve(
     """
     # Elsewhere an exact step is no better than another.
     small = monotone and value.shape[0] <= DENSE_LIMIT
+    over = table.choices
 
     def step(table: Any, k: _Search, given: Backup) -> _Search:
-        ahead = table.expectation(k.z)
-        branches = [partial(_look, combine, judge, newton, monotone, given)]
+        over, ahead = table.choices, table.expectation(k.z)
+        branches = [partial(_look, over, combine, judge, newton, monotone, given)]
         if newton:
-            branches += [partial(_first, given), partial(_second, small, given)]
+            branches += [partial(_first, over, given), partial(_second, over, small, given)]
         if newton and small:
             branches += [partial(_direct, table, given)]
         if len(branches) == 1:
@@ -127,7 +127,7 @@ def solve(
     scalar, none, no = zero[0], jnp.int32(0), jnp.bool_(False)
     start = _Search(
         phase=jnp.int32(_LOOK), z=value, value=value, image=value,
-        weight=jnp.stack([zero] * len(backup.reward)),
+        weight=over.packed(over.spread(zero, backup.reward)),
         error=jnp.full_like(scalar, jnp.inf), done=no,
         newton=no, plain=jnp.int32(first_sweeps), pause=none, solved=no,
         krylov=start_bicgstab(zero, zero),
@@ -141,16 +141,15 @@ def solve(
 
 
 def _look(
-    combine, judge, newton: bool, monotone: bool, given: Backup, k: _Search, ahead: Columns
+    over, combine, judge, newton: bool, monotone: bool, given: Backup, k: _Search, ahead: Quantity
 ) -> _Search:
     """Judges z by its image, and says what follows."""
-    q = [g + given.scale * x for g, x in zip(given.reward, ahead, strict=True)]
-    image, weight = combine(q, given.extra)
+    image, weight = combine(over, action_values(over, given, ahead), given.extra)
     done, error = judge(k.z, image, given.extra)
     if not newton:
         sweep = k.z + (1 - given.damping) * (image - k.z)
         return k._replace(z=sweep, value=k.z, image=image, error=error, done=done)
-    weight = jnp.stack(weight)
+    weight = over.packed(weight)
     kept = ~k.newton | (error <= k.error / 2)  # false for NaN
     if monotone:
         kept |= k.solved & jnp.isfinite(error)
@@ -171,17 +170,23 @@ def _look(
     )
 
 
-def _applied(given: Backup, k: _Search, ahead: Columns) -> jax.Array:
-    return k.z - given.scale * mean(list(k.weight), ahead)
+def action_values(over: Any, given: Backup, ahead: Quantity) -> Quantity:
+    """``g + c x`` of a backup's numbers and what is ahead of each choice."""
+    return jax.tree.map(
+        lambda g, c, x: g + c * x, given.reward, over.spread(given.scale, ahead), ahead)
 
 
-def _first(given: Backup, k: _Search, ahead: Columns) -> _Search:
-    krylov = k.krylov.first(_applied(given, k, ahead))
+def _applied(over: Any, given: Backup, k: _Search, ahead: Quantity) -> jax.Array:
+    return k.z - given.scale * over.mean(over.unpacked(k.weight), ahead)
+
+
+def _first(over: Any, given: Backup, k: _Search, ahead: Quantity) -> _Search:
+    krylov = k.krylov.first(_applied(over, given, k, ahead))
     return k._replace(krylov=krylov, z=krylov.r, phase=jnp.full_like(k.phase, _SECOND))
 
 
-def _second(small: bool, given: Backup, k: _Search, ahead: Columns) -> _Search:
-    krylov = k.krylov.second(_applied(given, k, ahead))
+def _second(over: Any, small: bool, given: Backup, k: _Search, ahead: Quantity) -> _Search:
+    krylov = k.krylov.second(_applied(over, given, k, ahead))
     size, inner = krylov.size, k.inner + 2
     solved = size <= k.target
     failed = ~solved & ((inner >= _INNER) | ~jnp.isfinite(size))
@@ -192,8 +197,8 @@ def _second(small: bool, given: Backup, k: _Search, ahead: Columns) -> _Search:
     )
 
 
-def _direct(table: Any, given: Backup, k: _Search, ahead: Columns) -> _Search:
+def _direct(table: Any, given: Backup, k: _Search, ahead: Quantity) -> _Search:
     del ahead
-    matrix = System(table, list(k.weight), given.scale).matrix()
+    matrix = System(table, table.choices.unpacked(k.weight), given.scale).matrix()
     z = k.value + inverse(matrix) @ (k.image - k.value)
     return k._replace(phase=jnp.full_like(k.phase, _LOOK), z=z, solved=jnp.ones_like(k.solved))

@@ -8,10 +8,12 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxltl.core.models.choices import choices
+from jaxltl.core.models.compiled import compiled_form, flat_policy
 from jaxltl.core.models.operators import pushforward, require_policy, valid_policy
-from jaxltl.core.models.tables import action_columns, table
+from jaxltl.core.models.tables import table
 from jaxltl.core.types import Solution, status_code
-from jaxltl.core.values.evidence import refuse
+from jaxltl.core.values.evidence import most_choices, refuse, widest_row
 from jaxltl.core.values.fixed_point import implicit
 from jaxltl.core.values.iterate import in_turn
 from jaxltl.core.values.linear import System, solver
@@ -32,13 +34,14 @@ def occupancy_measure(
 
     Args:
       model: the model.
-      policy: ``float[S, A]`` or ``int32[S]``.
+      policy: ``float[S, A]`` or ``int32[S]``; of a sparse model ``float[R]``, or rows ``int32[S]``.
       discount: scalar in [0, 1).
       initial: ``float[S]``, mass to start from; default the model's distribution.
       tolerance: certified absolute error asked for; default: what the dtype allows.
 
     Returns:
-      :class:`Solution` whose `value`, `lower` and `upper` are ``float[S, A]``.
+      :class:`Solution` whose `value`, `lower` and `upper` are ``float[S, A]``, of a sparse model
+      ``float[R]``.
 
     Raises:
       ValueError: policy has the wrong shape, or is none (under ``jit`` the status is INVALID).
@@ -52,22 +55,25 @@ def occupancy_measure(
       >>> [round(v, 4) for v in x[:, 0].tolist()]
       [1.0, 1.0]
     """
-    require_policy(model, policy)
-    start = model.initial if initial is None else jnp.asarray(initial, model.dtype)
-    return _occupancy(model, policy, discount, start, tolerance)
+    (form, _), policy = compiled_form(model), flat_policy(model, policy)
+    require_policy(form, policy)
+    start = model.initial if initial is None else initial
+    return _occupancy(form, policy, discount, start, tolerance)
 
 
 @jax.jit
 def _occupancy(model, policy, discount, start, tolerance) -> Solution:
-    checked = valid_policy(model, policy)
+    checked, over = valid_policy(model, policy), choices(model)
     policy = checked.distribution
     discount = jnp.asarray(discount, model.dtype)
-    start = jnp.broadcast_to(start, model.state_shape)
+    start = jnp.asarray(start, model.dtype)
+    start = jnp.broadcast_to(start, model.state_shape) if start.ndim < 2 else start.reshape(
+        model.state_shape)
 
     def flow(d: jax.Array) -> jax.Array:
-        return start + discount * pushforward(model, d[..., None] * policy)
+        return start + discount * pushforward(model, over.spread(d) * policy)
 
-    system = System(table(model), action_columns(model.num_actions, policy), discount)
+    system = System(table(model), over.columns(policy), discount)
     linear = solver(system)
     visits, n = in_turn(_visits, model, policy, discount, start, linear)
     residual = jnp.sum(jnp.abs(flow(visits) - visits))
@@ -75,7 +81,7 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
     # The operator is a contraction in the sum norm, and each state's inflow may sum up
     # contributions of all pairs.
     rounding = (
-        (model.num_actions * model.num_successors + 4)
+        (most_choices(model) * widest_row(model) + 4)
         * jnp.finfo(model.dtype).eps * jnp.sum(jnp.abs(visits)) / gap
     )
     bound = residual / gap + rounding
@@ -84,7 +90,7 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
     goal = 4 * rounding if tolerance is None else tolerance
     visits = implicit(
         flow, visits, solve=linear.transpose_solve, transpose_solve=linear.solve)
-    value = visits[..., None] * policy
+    value = over.spread(visits) * policy
     frozen = lax.stop_gradient(value)
     solution = Solution(
         value=value,
@@ -101,7 +107,7 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
 
 def _visits(model, policy, discount, start, linear) -> tuple[jax.Array, jax.Array]:
     visits, n = linear.transpose_counted(start)
-    flow = start + discount * pushforward(model, visits[..., None] * policy)
+    flow = start + discount * pushforward(model, choices(model).spread(visits) * policy)
     # One step more brings down what elimination has left.
     more, m = linear.transpose_counted(flow - visits)
     return visits + more, n + m + 1

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial, reduce
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.scipy.special import logsumexp
 
+from jaxltl.core.models.choices import choices
+from jaxltl.core.models.compiled import compiled_form, in_shape_of
 from jaxltl.core.models.operators import expectation, pushforward
-from jaxltl.core.models.tables import Predecessors, action_columns, table
+from jaxltl.core.models.tables import Predecessors, table
 from jaxltl.core.types import Solution
 from jaxltl.core.values import newton
 from jaxltl.core.values.discounted import (
@@ -32,7 +33,6 @@ _LEAST = 0.95  # of the logarithm of the least normal number, to which probabili
 _SWEEPS_BETWEEN = 4  # sweeps between two looks at what is left
 
 
-@partial(jax.jit, static_argnames=("method",))
 def soft_value(
     model: Any,
     reward: jax.Array,
@@ -47,7 +47,8 @@ def soft_value(
 
     Args:
       model: the model.
-      reward: ``float[S, A]`` or ``float[S, A, K]``.
+      reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
+        :func:`~jaxltl.core.models.sparse.row_reward`.
       discount: scalar in [0, 1).
       initial: ``float[S]``, where to start; default zero. It changes the number of steps only.
       method: ``"newton"`` (soft policy iteration, few linear solves, for any discount)
@@ -56,7 +57,8 @@ def soft_value(
       max_steps: steps of the method at most.
 
     Returns:
-      :class:`Solution`; `policy` is ``float[S, A]``, ``exp(Q - V)``.
+      :class:`Solution`; `policy` is ``float[S, A]``, ``exp(Q - V)``, of a sparse model
+      ``float[R]``.
 
     Raises:
       ValueError: the reward has the wrong shape, or an unknown method.
@@ -73,7 +75,17 @@ def soft_value(
     """
     if method not in ("newton", "value_iteration"):
         raise ValueError(f"method={method!r}; choose newton or value_iteration.")
-    reward = expected_reward(model, reward)
+    form, reward = compiled_form(model, reward)
+    return in_shape_of(model, _soft_value(
+        form, reward, discount, initial, tolerance, max_steps, method=method))
+
+
+@partial(jax.jit, static_argnames=("method",))
+def _soft_value(
+    model: Any, reward: Any, discount: Any, initial: Any, tolerance: Any, max_steps: Any, *,
+    method: str,
+) -> Solution:
+    reward, over = expected_reward(model, reward), choices(model)
     given = parameters(model, reward, discount, tolerance)
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
     value, image, n = newton.solve(
@@ -83,24 +95,23 @@ def soft_value(
     solution = solution_of(model, given, value, image, value, n)
 
     def backup(v: jax.Array) -> jax.Array:
-        return logsumexp(policy_logits(model, reward, given.discount, v), axis=-1)
+        return over.logsumexp(policy_logits(model, reward, given.discount, v))
 
     def system() -> System:
         logits = policy_logits(model, reward, given.discount, solution.value)
-        policy = jax.nn.softmax(logits, axis=-1)
-        return System(table(model), action_columns(model.num_actions, policy), given.discount)
+        return System(table(model), over.columns(over.softmax(logits)), given.discount)
 
     solution = differentiable(solution, backup, system)
     return with_softmax(model, reward, given.discount, solution)
 
 
-def soft_maximum(q, given: Parameters) -> tuple[jax.Array, list[jax.Array]]:
+def soft_maximum(over: Any, q: Any, given: Parameters) -> tuple[jax.Array, Any]:
     """``log sum_a exp q_a`` of columns, and its derivative, the softmax."""
     # Elementwise over columns: reductions over a short last axis take several times as long.
-    top = reduce(jnp.maximum, q)
-    raised = [jnp.exp(x - top) for x in q]
-    total = reduce(jnp.add, raised)
-    return top + jnp.log(total), [x / total for x in raised]
+    top = over.max(q)
+    raised = jax.tree.map(lambda x, t: jnp.exp(x - t), q, over.spread(top, q))
+    total = over.sum(raised)
+    return top + jnp.log(total), jax.tree.map(jnp.divide, raised, over.spread(total, q))
 
 
 def policy_logits(
@@ -108,7 +119,7 @@ def policy_logits(
 ) -> jax.Array:
     """Action values with minus infinity at unavailable actions, whose softmax is the policy."""
     q = reward + discount * expectation(model, value)
-    return jnp.where(model.available, q, -jnp.inf)
+    return choices(model).logits(q)
 
 
 def with_softmax(
@@ -121,18 +132,18 @@ def with_softmax(
 def softmax_policy(
     model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
 ) -> jax.Array:
-    """The softmax of the action values of a value, ``float[S, A]``.
+    """The softmax of the action values of a value, ``float[S, A]`` or ``float[R]``.
 
     Every available action has a positive probability, also where its exponential is too small for
     the dtype: what a policy surely does depends on it.
     """
-    q = policy_logits(model, reward, discount, value)
+    q, over = policy_logits(model, reward, discount, value), choices(model)
     # As a constant: where the compiler rounds q otherwise elsewhere, no entry equals the maximum,
     # and its derivative is 0 / 0.
-    best = lax.stop_gradient(jnp.max(q, axis=-1, keepdims=True))
+    best = over.spread(lax.stop_gradient(over.top(q)))
     least = best + _LEAST * math.log(jnp.finfo(q.dtype).tiny)
-    q = jnp.where(model.available, jnp.maximum(q, least), q)
-    return jax.nn.softmax(q, axis=-1)
+    q = jnp.where(over.available, jnp.maximum(q, least), q)
+    return over.softmax(q)
 
 
 def soft_policy_adjoint(
@@ -153,38 +164,38 @@ def soft_policy_adjoint(
 
     Args:
       model: the model.
-      policy: ``float[S, A]``, of :func:`soft_value`.
+      policy: ``float[S, A]`` or ``float[R]``, of :func:`soft_value`.
       discount: scalar in [0, 1).
-      cotangent: ``float[S, A]``, the weights c; zero at unavailable actions.
+      cotangent: ``float[S, A]`` or ``float[R]``, the weights c; zero at unavailable actions.
       predecessors: of the model (without their leading axis), which make it faster.
       max_steps: sweeps at most.
 
     Returns:
-      ``float[S, A]``.
+      As `cotangent`.
     """
-    shape = policy.shape[:-1]
-    columns = partial(action_columns, model.num_actions)
-    g = cotangent - policy * jnp.sum(cotangent, axis=-1, keepdims=True)
-    weight, discount = columns(policy), jnp.asarray(discount, policy.dtype)
+    over = choices(model)
+    g = cotangent - policy * over.spread(over.sum(cotangent))
+    weight, discount = over.columns(policy), jnp.asarray(discount, policy.dtype)
 
     def push(before, discount, mass):
         """The discounted flow ``[N]`` of masses ``[N]`` of the actions."""
         if before is not None:
             return discount * before.pushforward(jnp.concatenate(mass))
-        return discount * pushforward(model, jnp.stack(mass, -1).reshape(policy.shape)).ravel()
+        return discount * pushforward(model, over.whole(mass)).ravel()
 
     def step(before, carry, given):
         (x, r), (weight, discount, _) = carry, given
-        return x + r, push(before, discount, [w * r for w in weight])
+        return x + r, push(
+            before, discount, jax.tree.map(jnp.multiply, weight, over.layout.spread(r, weight)))
 
     def finished(carry, given):
         return jnp.sum(jnp.abs(carry[1]), 0) <= given[2]
 
-    b = push(predecessors, discount, columns(g))
+    b = push(predecessors, discount, over.columns(g))
     target = float(jnp.finfo(b.dtype).eps) ** 0.8 * jnp.sum(jnp.abs(b), 0)
     start = lax.stop_gradient((jnp.zeros_like(b), b))
     (x, r), _ = iterate(
         step, finished, predecessors, start, lax.stop_gradient((weight, discount, target)),
         max_steps=max_steps, every=_SWEEPS_BETWEEN,
         lanes="mapped" if predecessors is None else "side by side")
-    return g + policy * (x + r).reshape(shape)[..., None]
+    return g + policy * over.spread((x + r).reshape(model.state_shape))
