@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import Rewards, SparseMDP
 from jaxltl.io._init_label import labels_with_init
+from jaxltl.io._intervals import exact_part, value_texts
 from jaxltl.io._tokens import joined_lines
 
 _STEP = 2**17  # lines that are held at a time
@@ -33,17 +35,24 @@ class Written:
     lines: Callable[[], Iterator[bytes]]
 
 
-def written_sections(model: SparseMDP, dialect: str) -> list[Written]:
+def written_sections(given: SparseMDP | IntervalMDP, dialect: str) -> list[Written]:
     """The sections of a model's files, in order.
 
     Raises:
       ValueError: the format cannot hold the model.
     """
-    storm = dialect == "storm"
+    storm, model = dialect == "storm", exact_part(given)
+    chances = value_texts(given, ",")
+    if storm and model is not given:
+        raise ValueError(
+            "Storm reads no intervals in explicit files; write PRISM's (dialect='prism'), or UMB "
+            "or DRN."
+        )
     labels, holds = _labels(model, storm)
-    kind = b"# Transitions (%s)\n" % (b"DTMC" if model.is_chain else b"MDP")
+    title = ("" if model is given else "I") + ("DTMC" if model.is_chain else "MDP")
+    kind = f"# Transitions ({title})\n".encode()
     action = None if storm and model.is_chain else _action_texts(model)  # Storm reads none there
-    sections = [Written("tra", "", [kind], lambda: _transitions(model, action, storm))]
+    sections = [Written("tra", "", [kind], lambda: _transitions(model, chances, action, storm))]
     if model.valuation and not storm:
         values = [_value_texts(name, x) for name, x in model.valuation.items()]
         names = _plain(model.valuation, "variable", ' "(),')
@@ -68,7 +77,10 @@ def _plain(names: Any, what: str, refused: str) -> list[str]:
 
 
 def _transitions(
-    model: SparseMDP, action: Callable[[int], str] | None, storm: bool
+    model: SparseMDP,
+    chances: Callable[[slice], list[str]],
+    action: Callable[[int], str] | None,
+    storm: bool,
 ) -> Iterator[bytes]:
     host = model.host
     if storm:
@@ -86,11 +98,11 @@ def _transitions(
             host.state[row].tolist(),
             choice[row].tolist(),
             host.successor[part].tolist(),
-            host.probability[part].tolist(),
+            chances(part),
         ]
-        form = "%d %d %d %r"
+        form = "%d %d %d %s"
         if model.is_chain:
-            form, columns = "%d %d %r", [columns[0], *columns[2:]]
+            form, columns = "%d %d %s", [columns[0], *columns[2:]]
         if action is not None and numbers is not None:
             form += "%s"
             columns.append(list(map(action, numbers[row].tolist())))

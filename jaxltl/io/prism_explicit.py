@@ -7,13 +7,20 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.io._files import read_bytes, write_bytes
+from jaxltl.io._intervals import (
+    first_without_distribution,
+    has_bracket,
+    intervals,
+    with_whole_brackets,
+)
 from jaxltl.io._prism_parts import Section, read_labels, read_rewards, read_valuation
 from jaxltl.io._prism_text import written_sections
 from jaxltl.io._tokens import Floats, Integers, Text, decoded, numbered, refuse
@@ -25,10 +32,11 @@ _SECTION = re.compile(
     rb"^#[ \t]*(Transitions|States|Observations|Labels|Reward structure)\b.*$", re.MULTILINE
 )
 _KIND = re.compile(rb"^#[ \t]*Transitions[ \t]*\(([^)\n]*)\)", re.MULTILINE)
+_KINDS = (b"DTMC", b"MDP", b"IDTMC", b"IMDP")
 _NUMBERED = re.compile(rb"_(0|[1-9]\d{0,8}|1\d{9})")  # how actions without names are written
 
 
-def read_prism(path: str | os.PathLike[str]) -> SparseMDP:
+def read_prism(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
     """The Markov chain or decision process in explicit files of PRISM, or of Storm's older dialect.
 
     Beside ``name.tra`` are looked for ``name.lab`` (labels), ``name.sta`` (values of variables),
@@ -41,14 +49,15 @@ def read_prism(path: str | os.PathLike[str]) -> SparseMDP:
     is state 0. A state without transitions (a deadlock) gets a loop, as in PRISM. Numbers are the
     nearest doubles to the decimals and fractions (``1/3``) in the files. A reward of transitions
     that is the same for all successors of every choice is one of choices. A reward without a name
-    is called "", and several ones by their numbers.
+    is called "", and several ones by their numbers. Probabilities of which some are written as
+    ``[l,u]`` make it an interval model.
 
     Args:
       path: of the ``.tra`` or ``.pexp`` file.
 
     Raises:
-      ValueError: naming file and line, and what was expected; for models whose probabilities are
-        intervals, with observations, or in continuous time.
+      ValueError: naming file and line, and what was expected; for models with observations, or in
+        continuous time.
 
     Example:
       >>> import tempfile
@@ -71,7 +80,10 @@ def read_prism(path: str | os.PathLike[str]) -> SparseMDP:
 
 
 def write_prism(
-    path: str | os.PathLike[str], model: SparseMDP, *, dialect: Literal["prism", "storm"] = "prism"
+    path: str | os.PathLike[str],
+    model: SparseMDP | IntervalMDP,
+    *,
+    dialect: Literal["prism", "storm"] = "prism",
 ) -> None:
     """Writes a model as explicit files, such as :func:`read_prism` reads.
 
@@ -84,7 +96,7 @@ def write_prism(
         ``.gz`` or ``.xz`` to compress them.
       model: a concrete model. Initial states must be equally likely.
       dialect: PRISM's files, or those that Storm reads. The latter have no variables, no names of
-        rewards, and in chains no actions.
+        rewards, no intervals, and in chains no actions.
 
     Raises:
       ValueError: the format cannot hold the model, naming what it cannot; the place cannot be
@@ -198,7 +210,7 @@ class _Rows:
       num_states: S.
       is_chain: whether choices have no numbers.
       state, choice, target, action: ``int32[T]``; action -1 stands for none.
-      probability: ``float64[T]``.
+      probability: ``float64[T]``, or ``float64[T, 2]`` where some are intervals.
       line: ``int32[T]``, 0 where there is no line.
       names: of the actions.
     """
@@ -217,10 +229,11 @@ class _Rows:
 def _sizes(text: Text) -> tuple[bool, list[int], Text]:
     """Whether it is a chain, the sizes that the first line gives (none in Storm's), the rest."""
     kind = _KIND.search(text.data, text.begin, min(text.stop, text.begin + 2000))
-    if kind and kind[1] not in (b"DTMC", b"MDP"):
+    if kind and kind[1] not in _KINDS:
         raise text.error(
             text.line,
-            f"a model of type {kind[1].decode(errors='replace')} is not read; DTMC and MDP are.",
+            f"a model of type {kind[1].decode(errors='replace')} is not read; "
+            f"{', '.join(x.decode() for x in _KINDS)} are.",
         )
     first, line, rest = text.first_line(b"#")
     if first.lower() in (b"dtmc", b"mdp"):
@@ -240,7 +253,7 @@ def _sizes(text: Text) -> tuple[bool, list[int], Text]:
             "or Storm's 'dtmc' or 'mdp'.",
         )
     numbers = [int(x) for x in sizes]
-    if kind and (kind[1] == b"DTMC") != (len(sizes) == 2):
+    if kind and kind[1].endswith(b"DTMC") != (len(sizes) == 2):
         raise text.error(line, f"{len(sizes)} sizes; a {kind[1].decode()} has {5 - len(sizes)}.")
     if not 0 < numbers[0] < 2**31 - 1:
         raise text.error(line, f"{numbers[0]} states; expected 1 to {2**31 - 2}.")
@@ -257,8 +270,12 @@ def _read_rows(text: Text) -> _Rows:
     below = sizes[0] if sizes else 2**31 - 2
     names: dict[bytes, int] = {}
     parts: list[list[NDArray]] = [[] for _ in range(6)]
+    given = _KIND.search(text.data, text.begin, min(text.stop, text.begin + 2000))
+    is_interval = given is not None and given[1].startswith(b"I")
     for block in rest.blocks(b"#"):
+        block = with_whole_brackets(block, width - 1)
         at = block.columns(width, 1, f"{form}, and an action or none")
+        is_interval |= has_bracket(block, at + width - 1)
         action = np.full(at.size, -1, np.int32)
         named = block.count > width
         action[named] = numbered(block.texts(at[named] + width), names)
@@ -271,7 +288,9 @@ def _read_rows(text: Text) -> _Rows:
             block.integers(at, "a state", below),
             choice,
             block.integers(at + width - 2, "a state", below),
-            block.probabilities(at + width - 1),
+            np.stack(intervals(block, at + width - 1), 1)
+            if is_interval
+            else block.probabilities(at + width - 1),
             action,
             block.line.astype(np.int32),
         )
@@ -279,6 +298,8 @@ def _read_rows(text: Text) -> _Rows:
             part.append(column)
     if not parts[0]:
         raise text.error(rest.line, f"the file ends without a transition; expected {form}.")
+    if is_interval:  # what was read before the first interval was numbers
+        parts[3] = [x if x.ndim > 1 else np.stack([x, x], 1) for x in parts[3]]
     columns = tuple(np.concatenate(x) for x in parts)
     del parts
     state, choice, target, probability, action, lines = columns
@@ -335,7 +356,7 @@ def _with_loops(rows: _Rows) -> _Rows:
     place = np.searchsorted(rows.state, missing)
 
     def put(column: NDArray, value: NDArray | float) -> NDArray:
-        return np.insert(column, place, value)
+        return np.insert(column, place, value, axis=0)
 
     return replace(
         rows,
@@ -348,38 +369,39 @@ def _with_loops(rows: _Rows) -> _Rows:
     )
 
 
-def _model(text: Text, sections: list[Section]) -> SparseMDP:
+def _model(text: Text, sections: list[Section]) -> SparseMDP | IntervalMDP:
     rows = _with_loops(_read_rows(text))
     new = np.ones(rows.state.size, bool)
     new[1:] = (rows.state[1:] != rows.state[:-1]) | (rows.choice[1:] != rows.choice[:-1])
     start = np.flatnonzero(new)
     total = np.add.reduceat(rows.probability, start)
-    wrong = np.abs(total - 1) > 1e-6
-    if wrong.any():
-        row = int(wrong.argmax())
+    if (bad := first_without_distribution(total)) is not None:
+        row, what, how = bad
         raise text.error(
             int(rows.line[start[row]]),
-            f"the probabilities of state {rows.state[start[row]]}, "
-            f"choice {rows.choice[start[row]]} sum to {total[row]:.9g}; expected 1.",
+            f"{what} of state {rows.state[start[row]]}, choice {rows.choice[start[row]]} {how}.",
         )
     count = np.bincount(rows.state[start], minlength=rows.num_states)
     action, action_names = _actions(text, rows, start)
     label, propositions, initial = read_labels(sections, rows.num_states)
-    model = make_sparse(
-        np.concatenate([[0], count.cumsum()]),
-        np.append(start, rows.state.size),
-        rows.target,
-        rows.probability,
-        initial=initial,
-        label=label,
-        propositions=propositions,
-        action=action,
-        action_names=action_names,
-        valuation=read_valuation(sections, rows.num_states),
-    )
-    is_chain = rows.is_chain
-    del rows, new, start, total  # rewards take memory too
-    return replace(model, rewards=read_rewards(sections, model, is_chain))
+    options: Any = {
+        "initial": initial,
+        "label": label,
+        "propositions": propositions,
+        "action": action,
+        "action_names": action_names,
+        "valuation": read_valuation(sections, rows.num_states),
+    }
+    starts = np.concatenate([[0], count.cumsum()]), np.append(start, rows.state.size)
+    is_chain, found, probability = rows.is_chain, None, rows.probability
+    if probability.ndim > 1:
+        found = interval_rows(*starts, rows.target, *probability.T, **options)
+        model = found.nominal
+    else:
+        model = make_sparse(*starts, rows.target, probability, **options)
+    del rows, new, start, total, probability, starts  # rewards take memory too
+    model = replace(model, rewards=read_rewards(sections, model, is_chain))
+    return model if found is None else replace(found, nominal=model)
 
 
 def _actions(text: Text, rows: _Rows, start: Integers) -> tuple[Integers | None, tuple[str, ...]]:
