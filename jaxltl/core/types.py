@@ -84,6 +84,9 @@ class Solution:
       num_steps: applications of the operator that were spent.
       status: an array of :class:`Status` codes.
       method: how it was found, where there were several ways; static.
+      nature: of interval models, ``float[T]``: the distribution that nature picks for each choice,
+        so that someone else can check. Where it is against the policy, no policy does better than
+        the value if nature keeps to it; where it is for it, both attain the value together.
     """
 
     value: jax.Array
@@ -94,6 +97,7 @@ class Solution:
     num_steps: jax.Array
     status: jax.Array
     method: Method = struct.field(pytree_node=False, default=Method())
+    nature: jax.Array | None = None
 
 
 def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:

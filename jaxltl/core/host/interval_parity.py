@@ -45,7 +45,7 @@ def parity_against_nature(
     rounds = 0
     while True:
         rounds += 1
-        answer, chance = _answered(model, row, priority, tolerance)
+        answer = _answered(model, row, priority, tolerance)
         value = 1 - answer.value
         gain, p = gains(model, value, zero, up=False)
         best = mdp.over_choices(np.maximum, gain)
@@ -78,14 +78,12 @@ def parity_against_nature(
 
 def _answered(
     model: HostInterval, row: Integers, priority: Integers, tolerance: float
-) -> tuple[Robust, Floats]:
-    """What nature makes of a policy: the probability that it does not win, and how."""
+) -> Robust:
+    """What nature makes of a policy: the probability that it does not win."""
     part, _ = model.chain(row)
     lost = joint_accepting(part, priority[part.mdp.state[part.mdp.row]] + 1)
-    found = interval_values.reachability(
+    return interval_values.reachability(
         part, lost.region, maximize=True, helpful=True, tolerance=tolerance / 2)
-    inside = lost.region[part.mdp.state[part.mdp.row]]
-    return found, np.where(inside, lost.probability, found.probability)
 
 
 class _Game(NamedTuple):

@@ -241,8 +241,8 @@ def _scaled(
         what = (f"the lower ends sum to {low[r]:.9g}, which is above 1" if low[r] > 1 else
                 f"the upper ends sum to {high[r]:.9g}, which is below 1")
         raise ValueError(f"{_place(row_start, r)}: {what}; no distribution lies between them.")
-    lower = np.where((low > 1 + rounding)[row], lower / low[row], lower)
-    upper = np.where((high < 1 - rounding)[row], upper / high[row], upper)
+    lower = np.where((low > 1 + rounding)[row], lower / np.maximum(low, 1)[row], lower)
+    upper = np.where((high < 1 - rounding)[row], upper / np.minimum(high, 1)[row], upper)
     return lower, np.clip(np.maximum(upper, lower), 0, 1)
 
 

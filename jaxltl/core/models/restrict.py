@@ -12,6 +12,7 @@ import numpy as np
 from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.game import Game
+from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, make_mdp, support
 from jaxltl.core.models.part import part_of, reachable
 from jaxltl.core.models.product import Product, flat_successor
@@ -22,7 +23,7 @@ def with_allowed(model: Any, allowed: chex.Array) -> Any:
     """The same model in which only some of the actions are left.
 
     Args:
-      model: an MDP, a DenseMDP, a SparseMDP, a Product or a Game.
+      model: an MDP, a DenseMDP, a SparseMDP, an IntervalMDP, a Product or a Game.
       allowed: ``bool[S, A]``, in a product ``bool[S, Q, A]``, of a sparse model ``bool[R]``,
         such as the actions that lose nothing or a permissive strategy's mask.
 
@@ -39,6 +40,8 @@ def with_allowed(model: Any, allowed: chex.Array) -> Any:
       >>> with_allowed(mdp, np.array([[False, True]])).available.tolist()
       [[False, True]]
     """
+    if isinstance(model, IntervalMDP):
+        return model.changed(lambda nominal: _with_rows(nominal, allowed))
     if isinstance(model, SparseMDP):
         return _with_rows(model, allowed)
     shape = (*model.state_shape, model.num_actions)
@@ -90,7 +93,7 @@ def restrict(
     """The states that are reachable from initial ones by allowed actions, on the host.
 
     Args:
-      model: an MDP, a SparseMDP, a Product over one, or a Game on either.
+      model: an MDP, a SparseMDP, a Product over one, a Game on either, or an IntervalMDP.
       initial: ``float[S]`` or ``[S, Q]``, a distribution to start from; default the model's.
       allowed: ``bool[S, A]`` or ``[S, Q, A]``, the actions to keep, such as a permissive
         strategy's mask; default the available ones. Of a sparse model ``bool[R]``.
@@ -102,6 +105,10 @@ def restrict(
     Raises:
       ValueError: the world has no successor lists, or a reachable state keeps no action.
     """
+    if isinstance(model, IntervalMDP):
+        found = restrict(model.nominal, initial, allowed=allowed)
+        part = model.changed(lambda x: restrict(x, initial, allowed=allowed).model)
+        return found._replace(model=part)
     lazy = model.mdp if isinstance(model, Game) else model
     world = lazy.mdp if isinstance(lazy, Product) else lazy
     if isinstance(world, SparseMDP):

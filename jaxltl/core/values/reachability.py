@@ -24,6 +24,7 @@ from jaxltl.core.host import reach as host
 from jaxltl.core.host.quickest import quickest
 from jaxltl.core.models.concrete import is_traced, namespace, to_jax
 from jaxltl.core.models.game import Game
+from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import DenseMDP, support
 from jaxltl.core.models.operators import (
     action_argmax,
@@ -42,6 +43,7 @@ from jaxltl.core.values.evidence import m_matrix_error, refuse, rounding_unit
 from jaxltl.core.values.fixed_point import implicit
 from jaxltl.core.values.iterate import in_turn, iterate
 from jaxltl.core.values.linear import Inverse, System, solver
+from jaxltl.core.values.robust import refuse_nature, robust_reachability
 
 _POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
 _FINER = 8  # how much nearer a guess is, once the bounds are near
@@ -66,6 +68,7 @@ def reachability_probability(
     stay: jax.Array | None = None,
     policy: jax.Array | None = None,
     objective: str = "max",
+    nature: str | None = None,
     method: str = "auto",
     tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int = 1_000_000,
@@ -86,6 +89,8 @@ def reachability_probability(
       policy: ``float[S, A]`` or ``int32[S]``: evaluate this policy. Default: optimise. Of a sparse
         model ``float[R]``, or rows ``int32[S]``.
       objective: ``"max"`` or ``"min"``; ignored when a policy is given.
+      nature: of interval models only, see
+        :func:`~jaxltl.core.values.robust.robust_reachability`, which answers then.
       method: for a given policy: ``"direct"`` (elimination, however slowly the policy
         makes progress), ``"iterative"`` (Krylov), or ``"auto"``, direct for small models.
       tolerance: half the width of the enclosure asked for. Default: the square root of the
@@ -116,6 +121,11 @@ def reachability_probability(
         raise ValueError(f"method={method!r}; choose auto, direct or iterative.")
     if objective not in ("max", "min"):
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    if isinstance(model, IntervalMDP):
+        return robust_reachability(
+            model, target, policy=policy, objective=objective, nature=nature, stay=stay,
+            tolerance=tolerance)
+    refuse_nature(nature)
     require_shape("target", target, model.state_shape)
     if is_sparse(model) or stay is not None:
         return reachability(

@@ -5,44 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from flax import struct
 
 from jaxltl.core.host import interval_values
 from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.interval_values import Robust
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import row_reward
-from jaxltl.core.types import Method, Status, require_shape
+from jaxltl.core.types import Method, Solution, Status, require_shape
 from jaxltl.core.values.bounded import structure
 
 TOLERANCE = 1e-6
 
 
-@struct.dataclass
-class RobustSolution:
-    """A solver's answer about an interval model, with its evidence.
-
-    Attributes:
-      value, lower, upper: ``float64[S]``, a certified enclosure of the optimum.
-      policy: ``int32[S]``, the row of each state.
-      nature: ``float64[T]``, nature's distribution of each row, so that someone else can check:
-        where nature is against the policy, no policy does better than the value if nature keeps
-        to it; where it is for it, policy and nature attain the value.
-      residual: how far the value is from satisfying its equation.
-      num_steps: systems that were solved.
-      status: of :class:`~jaxltl.core.types.Status`.
-      method: how it was found, in words; static.
-    """
-
-    value: Any
-    policy: Any
-    nature: Any
-    lower: Any
-    upper: Any
-    residual: Any
-    num_steps: Any
-    status: Any
-    method: Method = struct.field(pytree_node=False, default=Method())
+RobustSolution = Solution
 
 
 def require_direction(nature: str | None, objective: str) -> str:
@@ -61,10 +36,17 @@ def require_direction(nature: str | None, objective: str) -> str:
     return nature
 
 
+def refuse_nature(nature: str | None) -> None:
+    """Raises ValueError if a direction of nature is given where it has nothing to choose."""
+    if nature is not None:
+        raise ValueError(f"nature={nature!r} is for models with intervals (make_interval); the "
+                         "probabilities of this one are given. Leave it out.")
+
+
 def robust_reachability(
     model: IntervalMDP, target: Any, *, policy: Any = None, objective: str = "max",
-    nature: str | None = None, stay: Any = None, tolerance: float | None = None,
-) -> RobustSolution:
+    nature: str | None = None, stay: Any = None, tolerance: Any = None,
+) -> Solution:
     """Probability of reaching a target when probabilities lie in intervals.
 
     ``x(s) = opt_a opt_p sum_t p_t x(t)`` outside of the target, p among the distributions of row a
@@ -81,7 +63,7 @@ def robust_reachability(
       tolerance: the width of the enclosure asked for, 1e-6.
 
     Returns:
-      :class:`RobustSolution`.
+      :class:`Solution`, with `nature`.
 
     Raises:
       ValueError: shapes, or a direction.
@@ -107,8 +89,8 @@ def robust_reachability(
 
 def robust_total_reward(
     model: IntervalMDP, reward: Any, target: Any, *, policy: Any = None, objective: str = "max",
-    nature: str | None = None, tolerance: float | None = None,
-) -> RobustSolution:
+    nature: str | None = None, tolerance: Any = None,
+) -> Solution:
     """Expected reward until a target is reached when probabilities lie in intervals.
 
     ``x(s) = opt_a opt_p (r(s, a) + sum_t p_t x(t))`` outside of the target, infinite where the
@@ -124,7 +106,7 @@ def robust_total_reward(
       tolerance: the width of the enclosure asked for, as a share of the value, 1e-6.
 
     Returns:
-      :class:`RobustSolution`.
+      :class:`Solution`, with `nature`.
 
     Raises:
       ValueError: shapes, a direction, or a reward that is negative or depends on nature.
@@ -173,7 +155,7 @@ def interval_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
 def robust_solution(
     model: IntervalMDP, found: Robust, tolerance: float, *, relative: bool, policy: Any = None,
     entry: Any = None,
-) -> RobustSolution:
+) -> Solution:
     """What the host found, with its status."""
     finite = np.isfinite(found.upper)
     width = np.where(finite, found.upper, 0) - np.where(finite, found.lower, 0)
@@ -185,10 +167,11 @@ def robust_solution(
         chance = np.asarray(model.nominal.probability).copy()
         chance[entry] = found.probability
         row = np.asarray(policy)
-    return RobustSolution(
-        value=found.value, policy=row.astype(np.int32), nature=chance, lower=found.lower,
-        upper=found.upper, residual=np.float64(found.residual),
-        num_steps=np.int32(found.rounds), status=np.int32(status), method=Method(found.method))
+    parts: dict[str, Any] = {
+        "value": found.value, "policy": row.astype(np.int32), "nature": chance,
+        "lower": found.lower, "upper": found.upper, "residual": np.float64(found.residual),
+        "num_steps": np.int32(found.rounds), "status": np.int32(status)}
+    return Solution(**parts, method=Method(found.method))
 
 
 def _under(model: IntervalMDP, policy: Any) -> tuple[HostInterval, Any]:

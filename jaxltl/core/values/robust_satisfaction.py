@@ -17,8 +17,9 @@ from jaxltl.core.host.product import HostProduct, host_product
 from jaxltl.core.host.rows import Booleans, Integers
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.types import Method, Status
-from jaxltl.core.values.robust import TOLERANCE, RobustSolution, require_direction
+from jaxltl.core.models.product import Product
+from jaxltl.core.types import Method, Solution, Status
+from jaxltl.core.values.robust import TOLERANCE, require_direction
 from jaxltl.core.values.sparse_satisfaction import automaton_of
 
 
@@ -34,7 +35,7 @@ class RobustSatisfaction(NamedTuple):
       product: what is reached of the model beside the automaton, N states.
     """
 
-    solution: RobustSolution
+    solution: Solution
     automaton: Automaton
     letter: np.ndarray
     product: HostProduct
@@ -78,7 +79,9 @@ def robust_satisfaction(
     states = np.flatnonzero(np.asarray(model.initial) > 0) if states is None else states
     states = np.asarray(states, np.int64)
     yes, no = universal_states(automaton), ~live_states(automaton)
-    product, host = _product(model, automaton, letter, states, yes | no)
+    initial = np.broadcast_to(automaton.initial, states.shape)
+    product, host = _pairs(
+        model, np.asarray(automaton.delta), letter, states, initial, yes | no, False)
     maximize, helpful = objective == "max", nature == "max"
     priority = None
     if automaton.acceptance in ("buchi", "parity"):
@@ -87,37 +90,91 @@ def robust_satisfaction(
     found = _solved(
         host, yes[product.memory], no[product.memory], priority, maximize, helpful,
         automaton.acceptance == "safety", asked)
-    solution = RobustSolution(
-        value=found.value[product.start], policy=product.base_row[found.row].astype(np.int32),
-        nature=found.probability, lower=found.lower[product.start],
-        upper=found.upper[product.start], residual=np.float64(found.residual),
-        num_steps=np.int32(found.rounds), status=np.int32(_status(found, asked)),
-        method=Method(found.method))
+    solution = _solution(
+        found, asked, product.start.shape, product.start,
+        policy=product.base_row[found.row].astype(np.int32))
     return RobustSatisfaction(solution, automaton, letter, product)
 
 
-def _status(found: Robust, tolerance: float) -> Status:
-    narrow = (found.upper - found.lower <= tolerance).all()
-    return Status.CONVERGED if narrow else Status.PRECISION
+def _solution(
+    found: Robust, tolerance: float, shape: tuple[int, ...], states: Integers, policy: Any
+) -> Solution:
+    """What was found, of some states of the product."""
+    low, high = (x[states].reshape(shape) for x in (found.lower, found.upper))
+    status = Status.CONVERGED if (high - low <= tolerance).all() else Status.PRECISION
+    parts: dict[str, Any] = {
+        "value": found.value[states].reshape(shape), "policy": policy, "lower": low,
+        "upper": high, "nature": found.probability, "residual": np.float64(found.residual),
+        "num_steps": np.int32(found.rounds), "status": np.int32(status)}
+    return Solution(**parts, method=Method(found.method))
 
 
-def _product(
-    model: IntervalMDP, automaton: Automaton, letter: np.ndarray, states: np.ndarray,
-    still: Booleans,
+def robust_product_satisfaction(
+    model: Product, *, objective: str = "max", nature: str | None = None, tolerance: Any = None
+) -> Solution:
+    """The same from every pair of a state and a memory of a product of an interval model.
+
+    Args:
+      model: a product of an :class:`~jaxltl.core.models.interval.IntervalMDP`.
+      objective, nature, tolerance: as of :func:`robust_satisfaction`.
+
+    Returns:
+      :class:`Solution`; `value` is ``float64[S, Q]``, `policy` rows of the world, ``int32[S, Q]``.
+      Its `nature` has a distribution for each choice in each pair, pairs in order ``s * Q + q``;
+      for Buchi and parity acceptance read on entry it is left out.
+
+    Raises:
+      ValueError: the product's actions are restricted.
+    """
+    nature = require_direction(nature, objective)
+    if model.allowed is not None:
+        raise ValueError("a product of an interval model takes no mask of actions; restrict the "
+                         "world by with_allowed(world, rows).")
+    asked = TOLERANCE if tolerance is None else float(tolerance)
+    world: Any = model.mdp
+    task, letter, shape = model.automaton, np.asarray(model.letter), model.state_shape
+    delta, priority = np.asarray(task.delta), np.asarray(task.priority)
+    yes, no = universal_states(task), ~live_states(task)
+    state, memory = (x.ravel() for x in np.indices(shape))
+    live = task.acceptance in ("buchi", "parity")
+    delayed = live and model.label_on == "entry"
+    count = 1
+    if delayed:
+        # A memory holds the priority that was read last, too, so that states read priorities.
+        count = int(priority.max()) + 1
+        q = np.repeat(np.arange(len(delta)), count)
+        delta = delta[q] * count + priority[q]
+        memory, yes, no = memory * count, yes[q], no[q]
+    product, host = _pairs(
+        world, delta, letter, state, memory, yes & False, model.label_on == "entry")
+    level = None
+    if live:
+        level = product.memory % count if delayed else priority[
+            product.memory, letter[product.base_state]]
+    found = _solved(
+        host, yes[product.memory], no[product.memory], level, objective == "max",
+        nature == "max", task.acceptance == "safety", asked)
+    policy = product.base_row[found.row[product.start]].astype(np.int32).reshape(shape)
+    solution = _solution(found, asked, shape, product.start, policy)
+    return solution.replace(nature=None) if delayed else solution  # type: ignore[attr-defined]
+
+
+def _pairs(
+    model: IntervalMDP, delta: np.ndarray, letter: np.ndarray, state: Integers, memory: Integers,
+    still: Booleans, on_entry: bool,
 ) -> tuple[HostProduct, HostInterval]:
     """What is reached of the product, with its intervals."""
     mdp = model.nominal.host
     # Entries travel by number, from 1; a loop of what stands still has 1 too.
     numbered = HostMDP(mdp.row_start, mdp.entry_start, mdp.successor,
                        np.arange(1.0, mdp.num_transitions + 1))
-    initial = np.broadcast_to(automaton.initial, states.shape)
     found = host_product(
-        numbered, automaton.delta, letter, states, initial, on_entry=False, still=still)
+        numbered, delta, letter, state, memory, on_entry=on_entry, still=still)
     entry = found.host.probability.astype(np.int64) - 1
     loop = found.still[found.host.state[found.host.row]]
     chance, lower, upper = (
-        np.where(loop, 1.0, x[entry]) for x in (mdp.probability, model.host.lower,
-                                                model.host.upper))
+        np.where(loop, 1.0, x[entry])
+        for x in (mdp.probability, model.host.lower, model.host.upper))
     host = HostMDP(
         found.host.row_start, found.host.entry_start, found.host.successor, chance)
     return found._replace(host=host), HostInterval(host, lower, upper)

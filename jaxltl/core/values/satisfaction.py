@@ -17,6 +17,7 @@ from jaxltl.core.graphs.acceptance import (
 )
 from jaxltl.core.host.quickest import quickest, until_read
 from jaxltl.core.models.concrete import is_traced, namespace, to_jax
+from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.operators import is_deterministic, require_policy
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Solution
@@ -27,6 +28,8 @@ from jaxltl.core.values.reachability import (
     complement,
     reachability_probability,
 )
+from jaxltl.core.values.robust import refuse_nature
+from jaxltl.core.values.robust_satisfaction import robust_product_satisfaction
 from jaxltl.core.values.sparse_satisfaction import product_satisfaction
 
 
@@ -77,6 +80,7 @@ def optimal_satisfaction(
     model: Product,
     *,
     objective: str = "max",
+    nature: str | None = None,
     tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int = 1_000_000,
 ) -> Solution:
@@ -107,6 +111,8 @@ def optimal_satisfaction(
     Args:
       model: the product.
       objective: ``"max"`` or ``"min"``.
+      nature: of products of interval models only, see
+        :func:`~jaxltl.core.values.robust_satisfaction.robust_satisfaction`.
       tolerance: half the width of the enclosure asked for; default as in
         :func:`reachability_probability`, as closely as the dtype allows.
       max_steps: sweeps at most.
@@ -119,6 +125,10 @@ def optimal_satisfaction(
     Raises:
       ValueError: the objective is unknown.
     """
+    if isinstance(model.mdp, IntervalMDP):
+        return robust_product_satisfaction(
+            model, objective=objective, nature=nature, tolerance=tolerance)
+    refuse_nature(nature)
     if objective in ("max", "min") and is_sparse(model):
         return product_satisfaction(model, objective=objective, tolerance=tolerance)
     problem = as_reachability(model, objective)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxltl.core.host import optimal
 from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.convert import to_sparse
+from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import Rewards, SparseMDP, row_reward
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values.enclosed import (
@@ -19,6 +20,7 @@ from jaxltl.core.values.enclosed import (
     is_sparse,
     solution_of,
 )
+from jaxltl.core.values.robust import refuse_nature, robust_total_reward
 
 
 def total_reward(
@@ -28,6 +30,7 @@ def total_reward(
     *,
     policy: chex.Array | None = None,
     objective: str = "max",
+    nature: str | None = None,
     tolerance: float | None = None,
 ) -> Solution:
     """Expected reward until a target is reached; without a target, for ever.
@@ -39,13 +42,15 @@ def total_reward(
     for ever. That is decided on the graph; where going round earns nothing, states are one.
 
     Args:
-      model: a concrete MDP, DenseMDP, SparseMDP or product of one.
+      model: a concrete MDP, DenseMDP, SparseMDP or product of one, or an IntervalMDP.
       reward: at least 0. For a sparse model as of
         :func:`~jaxltl.core.models.sparse.row_reward`: a name, a structure, or an array on states,
         choices or transitions; else ``float[S]`` or ``float[S, A]``, what a step earns.
       target: ``bool[S]``.
       policy: evaluate this policy; default: optimise.
       objective: ``"max"`` or ``"min"``; ignored when a policy is given.
+      nature: of interval models only, see
+        :func:`~jaxltl.core.values.robust.robust_total_reward`, which answers then.
       tolerance: the width of the enclosure asked for, as a share of the value; default 1e-6 in
         double precision, 1e-3 in single.
 
@@ -66,6 +71,13 @@ def total_reward(
     """
     if objective not in ("max", "min"):
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    if isinstance(model, IntervalMDP):
+        if target is None:
+            raise ValueError("total rewards of interval models need a target; give one.")
+        return robust_total_reward(
+            model, reward, target, policy=policy, objective=objective, nature=nature,
+            tolerance=tolerance)
+    refuse_nature(nature)
     if is_traced((model, reward, target, policy)):
         raise ValueError("total_reward reads its model, so it works on concrete arrays only; "
                          "inside jit use prepare(model, target).")
