@@ -31,8 +31,29 @@ def compelled(
       every: whether all rows must, else some.
       rows: ``bool[R]``, the rows that may be taken; default all.
     """
+    return _compelled(model, goal, every, rows)[0]
+
+
+def attracting(
+    model: HostInterval, goal: Booleans, rows: Booleans | None = None
+) -> Integers:
+    """Rows by which states must come nearer to a goal against nature: ``int[S]``.
+
+    Any row at the goal, and where it cannot be forced.
+
+    Args:
+      model, goal, rows: as of :func:`compelled`.
+    """
+    return _compelled(model, goal, False, rows)[1]
+
+
+def _compelled(
+    model: HostInterval, goal: Booleans, every: bool, rows: Booleans | None
+) -> tuple[Booleans, Integers]:
+    """The states of :func:`compelled`, and rows that make it so."""
     mdp = model.mdp
     region = goal.copy()
+    found: Integers = mdp.row_start[:-1].astype(np.int64)
     waiting = np.ones(mdp.num_rows, bool) if rows is None else rows.copy()
     left = np.bincount(mdp.state[waiting], minlength=mdp.num_states)
     start, before = mdp.predecessors
@@ -46,9 +67,12 @@ def compelled(
         if every:
             count_down(left, state)
             state = state[left[state] == 0]
+        else:
+            new = ~region[state]
+            found[state[new]] = row[new]
         frontier = distinct(state[~region[state]], mdp.num_states)
         region[frontier] = True
-    return region
+    return region, found
 
 
 class Decided(NamedTuple):

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxltl.core.host import optimal
 from jaxltl.core.host.interval import HostInterval
-from jaxltl.core.host.interval_graph import decided, joint_components, surely
+from jaxltl.core.host.interval_graph import attracting, decided, joint_components, surely
 from jaxltl.core.host.interval_optimum import Joint, joint_bound
 from jaxltl.core.host.rows import Booleans, Integers
 from jaxltl.core.host.sparse import Floats, HostMDP
@@ -145,7 +145,7 @@ def total_reward(
         found = _led_by_nature(
             part, part.within(np.ones(part.mdp.num_transitions, bool)), solve, -1)
     else:
-        first = _attracting(part, ends)
+        first = attracting(part, ends)
         found = _led_by_policy(part, first, solve, -1)
     value, lower, upper = (
         np.where(finite, x, np.inf) for x in (found.value, found.lower, found.upper))
@@ -367,21 +367,6 @@ def _greedy_start(model: HostInterval, target: Booleans) -> Integers:
         if not better.any() or (new - value).max() <= 1e-3:
             break
         value = np.maximum(new, value)
-    return row
-
-
-def _attracting(model: HostInterval, goal: Booleans) -> Integers:
-    """Rows by which each state must come nearer to a goal that can be forced."""
-    mdp = model.mdp
-    row = mdp.row_start[:-1].astype(np.int64)
-    region = goal.copy()
-    while not region.all():
-        some, first = mdp.first_choice(
-            ~model.may_stay(~region) & ~region[mdp.state])
-        if not some.any():
-            break
-        row = np.where(some, first, row)
-        region |= some
     return row
 
 
