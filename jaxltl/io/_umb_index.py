@@ -39,6 +39,13 @@ class Type:
     name: str
     size: int
 
+    @property
+    def end(self) -> Type | None:
+        """The type of each end of an interval; None for what is none."""
+        if not self.name.endswith("-interval"):
+            return None
+        return Type(self.name.removesuffix("-interval"), self.size // 2)
+
 
 @dataclass(frozen=True)
 class Annotation:
@@ -252,14 +259,10 @@ def _annotation(group: str, key: str, value: Any, place: str) -> Annotation:
     if "probability-type" in value:
         raise ValueError(f"{place}{what}: its values are drawn at random; expected numbers.")
     kind = _type(_get(value, "type", f"{place}{what}: "), what, place)
-    wanted = {"rewards": ("double", "rational", "int", "uint"), INITIAL: ("double",)}.get(
-        group, ("bool",)
-    )
-    if kind.name.endswith("-interval"):
-        raise ValueError(
-            f"{place}{what}: its values are intervals ({kind.name}); single numbers are read."
-        )
-    if kind.name not in wanted or (kind.name != "rational" and kind.size != _SIZES[kind.name]):
+    numbers = ("double", "rational", "int", "uint", "double-interval", "rational-interval")
+    wanted = {"rewards": numbers, INITIAL: ("double",)}.get(group, ("bool",))
+    longer = kind.name.startswith("rational")  # than usual, it may be
+    if kind.name not in wanted or (not longer and kind.size != _SIZES[kind.name]):
         raise ValueError(
             f"{place}{what}: its type is {kind.name} of {kind.size} bits; expected "
             f"{' or '.join(wanted)} of the usual size."
@@ -344,7 +347,9 @@ def _type(data: Any, what: str, place: str) -> Type:
             f"{place}{what}: the type is {_shown(name)}; expected one of {', '.join(_SIZES)}."
         )
     size = _count(data, "size", f"{place}{what}: ") if "size" in data else _SIZES[name]
-    if not 0 < size < 2**32 or (name in ("double", "string") and size != _SIZES[name]):
+    if not 0 < size < 2**32 or (
+        name in ("double", "double-interval", "string") and size != _SIZES[name]
+    ):
         raise ValueError(f"{place}{what}: a {name} of {size} bits; expected {_SIZES[name]}.")
     if name == "rational" and size % 2:
         raise ValueError(f"{place}{what}: a rational of {size} bits; expected an even number.")
@@ -352,16 +357,12 @@ def _type(data: Any, what: str, place: str) -> Type:
 
 
 def _check_number(kind: Type, what: str, place: str) -> None:
-    """Raises a ValueError unless a type is of single numbers in whole words."""
-    if kind.name.endswith("-interval"):
+    """Raises a ValueError unless a type is of numbers or intervals in whole words."""
+    known = ("double", "rational", "double-interval", "rational-interval")
+    if kind.name not in known or kind.size % _SIZES[kind.name]:
         raise ValueError(
-            f"{place}{what} is {kind.name}: the probabilities are intervals; models "
-            "with single numbers are read."
-        )
-    if kind.name not in ("double", "rational") or kind.size % _SIZES[kind.name]:
-        raise ValueError(
-            f"{place}{what} is {kind.name} of {kind.size} bits; expected double of 64 "
-            "or rational of a multiple of 128."
+            f"{place}{what} is {kind.name} of {kind.size} bits; expected double of 64, rational of "
+            "a multiple of 128, double-interval of 128 or rational-interval of a multiple of 256."
         )
 
 

@@ -62,6 +62,37 @@ def read_numbers(content: Bytes, kind: Type, place: str) -> NDArray[np.float64]:
     return content.view(code).astype(np.float64, copy=False)
 
 
+def read_ends(content: Bytes, kind: Type, place: str) -> NDArray[np.float64]:
+    """Lower and upper ends of intervals, ``float64[n, 2]``; of numbers twice the same.
+
+    Raises:
+      ValueError: as of :func:`read_numbers`.
+    """
+    if kind.end is None:
+        found = read_numbers(content, kind, place)
+        return np.stack([found, found], 1)
+    return read_numbers(content, kind.end, place).reshape(-1, 2)
+
+
+def read_points(content: Bytes, kind: Type, place: str) -> NDArray[np.float64]:
+    """Numbers, which may be written as intervals of one point.
+
+    Raises:
+      ValueError: an interval is no point, or as of :func:`read_numbers`.
+    """
+    if kind.end is None:
+        return read_numbers(content, kind, place)
+    ends = read_ends(content, kind, place)
+    wrong = ~(ends[:, 0] == ends[:, 1])
+    if wrong.any():
+        i = int(wrong.argmax())
+        raise ValueError(
+            f"{place}number {i} is the interval [{ends[i, 0]:.9g}, {ends[i, 1]:.9g}]; single "
+            "numbers, or intervals of one point, are read."
+        )
+    return ends[:, 0].copy()
+
+
 def _read_rationals(content: Bytes, place: str) -> NDArray[np.float64]:
     """Numerators and denominators, half of each record, as doubles."""
     half = content.shape[1] // 2

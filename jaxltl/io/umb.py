@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.mdp import checked_initial
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.io._files import Compression, compression_by_name, pieces, raw_bytes, write_bytes
@@ -35,7 +36,9 @@ from jaxltl.io._umb_tar import Stream, members, tar_pieces, write_gzip
 from jaxltl.io._umb_values import (
     Bytes,
     read_bits,
+    read_ends,
     read_numbers,
+    read_points,
     read_starts,
     read_texts,
     read_variables,
@@ -46,16 +49,19 @@ from jaxltl.io._umb_values import (
 
 _LARGEST_INDEX = 2**26  # bytes
 _PLAYERS = ("system", "environment")
+_BOOL, _DOUBLE = {"type": "bool", "size": 1}, {"type": "double", "size": 64}
+_INTERVAL = {"type": "double-interval", "size": 128}
 
 
-def read_umb(path: str | os.PathLike[str]) -> SparseMDP | Game:
+def read_umb(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
     """The Markov chain, decision process or turn-based game in a UMB file.
 
     Read are plain archives and those compressed by gzip or xz: labels, rewards on states, choices
     and branches, names of actions, and variables of states. Probabilities and rewards that are
     rational become the nearest doubles. Branches of a choice with the same target become one.
-    Player 0 of a game is the system. Where no state is initial, the initial distribution is
-    uniform over all.
+    Player 0 of a game is the system. Probabilities that are intervals make it an interval model,
+    whose rewards may be written as intervals of one point. Where no state is initial, the initial
+    distribution is uniform over all.
 
     Left out, as nothing follows from them: who made the file, the players' names, actions of
     branches, annotations other than labels and rewards, variables of choices and branches, and
@@ -66,12 +72,13 @@ def read_umb(path: str | os.PathLike[str]) -> SparseMDP | Game:
       path: the file.
 
     Returns:
-      A :class:`~jaxltl.core.models.sparse.SparseMDP`, or a game
-      (:class:`~jaxltl.core.models.game.Game`) over one.
+      A :class:`~jaxltl.core.models.sparse.SparseMDP`, an
+      :class:`~jaxltl.core.models.interval.IntervalMDP`, or a game
+      (:class:`~jaxltl.core.models.game.Game`) over a SparseMDP.
 
     Raises:
       ValueError: the file cannot be read, is damaged or no UMB file, its parts do not fit one
-        another, or it holds what is not read: interval probabilities, rates, observations, more
+        another, or it holds what is not read: games with intervals, rates, observations, more
         than two players who have a choice, choices whose branches have no probabilities. The
         message names the file, the member, what was found and what was expected.
     """
@@ -135,7 +142,7 @@ def _check_memory(size: int, place: str) -> None:
         )
 
 
-def _model(found: dict[str, Bytes], index: Index, place: str) -> SparseMDP | Game:
+def _model(found: dict[str, Bytes], index: Index, place: str) -> SparseMDP | IntervalMDP | Game:
     row_start = _starts(found, "state-to-choices.bin", index.states, index.choices, place)
     entry_start = _starts(found, "choice-to-branches.bin", index.choices, index.branches, place)
     target = _needed(found, "branch-to-target.bin", place).view("<u8")
@@ -150,22 +157,22 @@ def _model(found: dict[str, Bytes], index: Index, place: str) -> SparseMDP | Gam
     probability = _probability(found, index, entry_start, place)
     initial = _initial(found, index)
     owner = _owners(found, index, row_start, place)
+    rows = row_start, entry_start, target
+    options |= {"label": labels, "propositions": names, "initial": initial}
+    interval = None
     try:
-        model = make_sparse(
-            row_start,
-            entry_start,
-            target,
-            probability,
-            label=labels,
-            propositions=names,
-            initial=initial,
-            **options,
-        )
+        if probability.ndim > 1:
+            interval = interval_rows(*rows, *probability.T, **options)
+            model = interval.nominal
+        else:
+            model = make_sparse(*rows, probability, **options)
     except ValueError as error:
         raise ValueError(f"{place}{error}") from None
     exact = found.get(f"annotations/{INITIAL}/probability/states/values.bin")
     if exact is not None:  # what was checked may have been scaled
         model = replace(model, initial=exact.view("<f8").astype(np.float64, copy=False))
+    if interval is not None:
+        return replace(interval, nominal=model)
     return model if owner is None else make_game(model, owner)
 
 
@@ -221,7 +228,7 @@ def _rewards(found: dict[str, Bytes], index: Index, place: str) -> dict[str, Rew
     for one in index.annotations:
         if one.group == "rewards":
             parts = {
-                PARTS[part]: read_numbers(
+                PARTS[part]: read_points(
                     found.pop(one.member(part)), one.type, f"{place}{one.member(part)}: "
                 )
                 for part in one.applies_to
@@ -270,9 +277,16 @@ def _valuation(found: dict[str, Bytes], index: Index, place: str) -> dict[str, N
 def _probability(
     found: dict[str, Bytes], index: Index, entry_start: NDArray[np.int64], place: str
 ) -> NDArray[np.float64]:
-    member = "branch-to-probability.bin"
-    if index.probability is not None and member in found:
-        return read_numbers(found.pop(member), index.probability, f"{place}{member}: ")
+    """The probability of each branch, or lower and upper ends ``[T, 2]``."""
+    member, kind = "branch-to-probability.bin", index.probability
+    if kind is not None and kind.end is not None and index.players > 1:
+        raise ValueError(
+            f"{place}the probabilities of this game are intervals; chains and decision processes "
+            "are read with them."
+        )
+    if kind is not None and member in found:
+        read = read_numbers if kind.end is None else read_ends
+        return read(found.pop(member), kind, f"{place}{member}: ")
     several = np.flatnonzero(np.diff(entry_start) > 1)
     if several.size:
         count = int(np.diff(entry_start)[several[0]])
@@ -280,7 +294,7 @@ def _probability(
             f"{place}{member} is missing, and choice {several[0]} has {count} "
             "branches; without probabilities each choice may have one."
         )
-    return np.ones(index.branches)
+    return np.ones(index.branches if kind is None or kind.end is None else (index.branches, 2))
 
 
 def _initial(found: dict[str, Bytes], index: Index) -> NDArray[np.float64] | None:
@@ -345,7 +359,8 @@ def write_umb(
 
     Args:
       path: the file.
-      model: a model that :func:`~jaxltl.core.models.convert.to_sparse` takes, or a game over one.
+      model: a model that :func:`~jaxltl.core.models.convert.to_sparse` takes, an interval model,
+        whose rewards are written as intervals of one point, or a game over a model.
       compression: "gzip", "xz", None for none, or by the end of the name: xz for ``.xz``, else
         gzip.
 
@@ -371,9 +386,11 @@ def write_umb(
 
 def _contents(model: Any, place: str) -> list[tuple[str, Any]]:
     """The members of a model's file, the index first."""
-    system = None
+    system, interval = None, None
     if isinstance(model, Game):
         model, system = model.mdp, np.asarray(model.system, bool).ravel()
+    if isinstance(model, IntervalMDP):
+        interval, model = model.host, model.nominal
     sparse = to_sparse(model)
     host, initial = sparse.host, np.asarray(sparse.initial, np.float64)
     players = 2 if system is not None else 0 if host.is_chain else 1
@@ -387,7 +404,7 @@ def _contents(model: Any, place: str) -> list[tuple[str, Any]]:
         "#branches": host.num_transitions,
         "#branch-actions": 0,
         "#observations": 0,
-        "branch-probability-type": {"type": "double", "size": 64},
+        "branch-probability-type": _DOUBLE if interval is None else _INTERVAL,
     }
     contents: list[tuple[str, Any]] = [("state-is-initial.bin", write_bits(initial > 0))]
     if not host.is_chain:
@@ -395,7 +412,12 @@ def _contents(model: Any, place: str) -> list[tuple[str, Any]]:
     contents += [
         ("choice-to-branches.bin", _packed(host.entry_start, "<u8")),
         ("branch-to-target.bin", _packed(host.successor, "<u8")),
-        ("branch-to-probability.bin", _packed(host.probability, "<f8")),
+        (
+            "branch-to-probability.bin",
+            _packed(host.probability, "<f8")
+            if interval is None
+            else _pairs(interval.lower, interval.upper),
+        ),
     ]
     if system is not None:
         counts["player-names"] = list(_PLAYERS)
@@ -406,7 +428,7 @@ def _contents(model: Any, place: str) -> list[tuple[str, Any]]:
         counts["#choice-actions"] = len(names) or int(action.max()) + 1
         contents.append((f"{ACTIONS}/values.bin", _packed(action, "<u4")))
         contents += _written_texts(names, ACTIONS, place)
-    annotations, more = _annotations(sparse, initial)
+    annotations, more = _annotations(sparse, initial, interval is not None)
     index: dict[str, Any] = {
         "format-version": 1,
         "format-revision": 0,
@@ -440,18 +462,28 @@ def _written_texts(texts: Sequence[str], folder: str, place: str) -> list[tuple[
     return [(f"{folder}/string-mapping.bin", start), (f"{folder}/strings.bin", content)]
 
 
+def _pairs(lower: Any, upper: Any) -> Bytes:
+    """Intervals as bytes."""
+    return _packed(np.stack([lower, upper], 1).ravel(), "<f8")
+
+
 def _annotations(
-    model: SparseMDP, initial: NDArray[np.float64]
+    model: SparseMDP, initial: NDArray[np.float64], points: bool
 ) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
-    """The labels, the rewards and the initial distribution if need be: described, and members."""
+    """The labels, the rewards and the initial distribution if need be: described, and members.
+
+    Args:
+      model, initial: the model.
+      points: whether rewards are written as intervals, as Storm has them in interval models.
+    """
     described: dict[str, Any] = {"aps": {}, "rewards": {}}
     contents: list[tuple[str, Any]] = []
 
-    def add(group: str, key: str, name: str, kind: str, parts: dict[str, Bytes]) -> None:
+    def add(group: str, key: str, name: str, kind: dict[str, Any], parts: dict[str, Bytes]) -> None:
         described.setdefault(group, {})[key] = {
             "alias": name,
             "applies-to": list(parts),
-            "type": {"type": kind, "size": 1 if kind == "bool" else 64},
+            "type": kind,
         }
         contents.extend(
             (f"annotations/{group}/{key}/{part}/values.bin", content)
@@ -464,28 +496,20 @@ def _annotations(
     ):
         # Storm and PRISM have a label init of their own, the initial states.
         group, key = (OTHER_LABELS, str(i)) if name == "init" else ("aps", key)
-        add(group, key, name, "bool", {"states": write_bits(label[:, i])})
+        add(group, key, name, _BOOL, {"states": write_bits(label[:, i])})
     names = list(model.rewards)
     for name, key in zip(names, ids_for(names, "r"), strict=True):
-        reward = model.rewards[name]
-        parts = {
-            part: _packed(getattr(reward, ours), "<f8")
-            for part, ours in PARTS.items()
-            if getattr(reward, ours) is not None
-        }
-        add(
-            "rewards",
-            key,
-            name,
-            "double",
-            parts or {"states": _packed(np.zeros(model.num_states), "<f8")},
-        )
+        given = {part: getattr(model.rewards[name], ours) for part, ours in PARTS.items()}
+        parts = {part: x for part, x in given.items() if x is not None}
+        parts = parts or {"states": np.zeros(model.num_states)}
+        packed = {k: _pairs(x, x) if points else _packed(x, "<f8") for k, x in parts.items()}
+        add("rewards", key, name, _INTERVAL if points else _DOUBLE, packed)
     if not np.array_equal(initial, checked_initial(_uniform(initial > 0), initial.size)):
         add(
             INITIAL,
             "probability",
             "initial distribution",
-            "double",
+            _DOUBLE,
             {"states": _packed(initial, "<f8")},
         )
     return described, contents

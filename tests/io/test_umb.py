@@ -418,7 +418,10 @@ INTERVAL = {"type": "double-interval", "size": 128}
             r"time is 'stochastic'; models in discrete time are read",
         ),
         (system_edit("#observations", 3), r"the model has 3 observations; .* no POMDPs"),
-        (system_edit("branch-probability-type", INTERVAL), r"the probabilities are intervals"),
+        (
+            system_edit("branch-probability-type", INTERVAL),
+            r"branch-to-probability\.bin has 64 bytes; expected 128",
+        ),
         (
             system_edit("branch-probability-type", {"type": "int"}),
             r"is int of 64 bits; expected doub",
@@ -522,7 +525,7 @@ INTERVAL = {"type": "double-interval", "size": 128}
         ),
         (
             annotation_edit("type", {"type": "double-interval"}),
-            r"rewards/r: its values are intervals",
+            r"rewards/r/choices/values\.bin has 40 bytes; expected 80",
         ),
         (
             annotation_edit("type", {"type": "string"}),
