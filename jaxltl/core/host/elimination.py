@@ -1,8 +1,9 @@
 """Systems ``(I - P) x = b`` of policies that leave, solved by sparse elimination where it pays.
 
-Unknowns are ordered by strongly connected component, so that elimination fills at most these, and
-in each by Cuthill and McKee (1969). Where even that would fill (graphs that mix well), Krylov steps
-and sweeps converge.
+Unknowns are ordered by strongly connected component, and in each by Cuthill and McKee (1969), so
+that elimination fills these, and what leads from one to another. Where that would be much, large
+components are eliminated one after the other, and nothing between them fills. Where a component
+itself would (graphs that mix well), Krylov steps and sweeps converge. What fills is counted before.
 """
 
 from __future__ import annotations
@@ -16,10 +17,32 @@ from jaxltl.core.host.sparse import Floats
 
 _SMALL = 3000  # states of a component up to which it may be filled
 _SPREAD = 8  # how many times its mean bandwidth a larger one must have states
+_MOST = 2**28  # entries that may be filled, 12 bytes each
+_MOST_BETWEEN = 10**7  # of these, between components that are eliminated together
+_APART = 500  # states from which a component is eliminated alone, if they are not
+_SAMPLED = 64  # rows in which what fills is counted where its bound is too large
 _FILL = 4  # growth of the fill after which the order is sought anew
 _KRYLOV = 500  # steps of a Krylov method where elimination would fill
 _SWEEPS = 20_000  # and sweeps after it
 _LEFT = 1e-14  # largest residual of what they find, as a share of the right side
+
+
+class _Block(NamedTuple):
+    """Some components, which lead to no block behind.
+
+    Attributes:
+      order: ``int[B]``, the states in the order of elimination; ascending where they are swept.
+      inner: ``float64[B, B]``, the policy's matrix on these.
+      outer: ``float64[B, M]``, on the blocks before; None where there are none.
+      factor: of SuperLU; None where it is swept.
+      fill: entries of the first factors in this order.
+    """
+
+    order: Integers
+    inner: Any
+    outer: Any
+    factor: Any
+    fill: int
 
 
 class Factors(NamedTuple):
@@ -28,40 +51,50 @@ class Factors(NamedTuple):
     Attributes:
       rows: ``float64[R, M]``, all rows, SciPy's.
       label: ``int[M]``, components in order.
-      order: ``int[M]``, or None where it is swept.
-      matrix: ``float64[M, M]``, the policy's, in that order if there is one.
-      factor: of SuperLU, or None.
-      fill: of the first factors in this order.
+      blocks: in the order of solution.
     """
 
     rows: Any
     label: Integers
-    order: Integers | None
-    matrix: Any
-    factor: Any
-    fill: int
+    blocks: tuple[_Block, ...]
 
     @property
     def method(self) -> str:
         """How it is solved, in words."""
-        return "policy iteration by " + ("sweeps" if self.order is None else "elimination")
+        swept = {x.factor is None for x in self.blocks}
+        how = {True: "sweeps", False: "elimination"}
+        return "policy iteration by " + " and ".join(how[x] for x in sorted(swept))
+
+    @property
+    def fill(self) -> int:
+        """How many entries the factors had at first."""
+        return sum(x.fill for x in self.blocks)
 
     def solve(self, b: Floats) -> Floats:
         """The solution; NaN where it could not be found."""
-        if self.order is None:
-            return _swept(self.matrix, b)
-        x = np.empty(b.size)
-        x[self.order] = self.factor.solve(b[self.order], trans="T")
+        x = np.zeros(b.size)
+        for block in self.blocks:
+            right = b[block.order]
+            if block.outer is not None:
+                right = right + block.outer @ x
+            if not np.isfinite(right).all():
+                return np.full(b.size, np.nan)
+            x[block.order] = (_swept(block.inner, right) if block.factor is None
+                              else block.factor.solve(right, trans="T"))
         return x
 
     def other(self, chosen: Integers) -> Factors | None:
         """The same for another policy."""
-        if self.order is None:
-            return self._replace(matrix=self.rows[chosen])
-        found = _factored(self.rows, self.label, self.order, chosen)
-        if found is not None and found.fill > _FILL * self.fill:
-            return factors(self.rows, self.label, chosen)
-        return None if found is None else found._replace(fill=self.fill)
+        found = []
+        for block in self.blocks:
+            swept = block.factor is None
+            new = _block(self.rows, self.label, block.order, chosen, swept=swept)
+            if new is None:
+                return None
+            if not swept and (new.factor is None or new.fill > _FILL * block.fill):
+                return factors(self.rows, self.label, chosen)
+            found.append(new._replace(fill=block.fill))
+        return self._replace(blocks=tuple(found))
 
 
 def factors(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
@@ -75,11 +108,41 @@ def factors(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
     Returns:
       Its factors; None where it is singular.
     """
-    matrix = rows[chosen]
-    order = order_of(matrix, label)
-    if order is None:
-        return Factors(rows, label, None, matrix, None, 0)
-    return _factored(rows, label, order, chosen)
+    matrix, size = rows[chosen], np.bincount(label)
+    if min(_between(matrix, label, size)) <= _MOST_BETWEEN:
+        order = order_of(matrix, label)
+        one = None if order is None else _block(rows, label, order, chosen)
+        if order is not None and one is None:
+            return None
+        if one is not None and one.factor is not None:
+            return Factors(rows, label, (one,))
+    found = []
+    for nodes in _parts(label, size):
+        order = order_of(matrix[nodes][:, nodes], label[nodes])
+        kept = nodes if order is None else nodes[order]
+        block = _block(rows, label, kept, chosen, swept=order is None)
+        if block is None:
+            return None
+        found.append(block)
+    return Factors(rows, label, tuple(found))
+
+
+def _parts(label: Integers, size: Integers) -> list[Integers]:
+    """The states of each large component, and of what stands between two of them."""
+    large = size > _APART
+    begins = large.copy()
+    begins[1:] |= large[:-1]
+    begins[:1] = False
+    part = begins.cumsum()[label]
+    return np.split(np.argsort(part, kind="stable"), np.bincount(part).cumsum()[:-1])
+
+
+def _between(matrix: Any, label: Integers, size: Integers) -> tuple[int, int]:
+    """What may fill between components: if the earlier ones stand first, and if the later ones."""
+    source = np.repeat(label, np.diff(matrix.indptr))
+    target = label[matrix.indices]
+    between = source != target
+    return int(size[target[between]].sum()), int(size[source[between]].sum())
 
 
 def order_of(matrix: Any, label: Integers) -> Integers | None:
@@ -90,10 +153,9 @@ def order_of(matrix: Any, label: Integers) -> Integers | None:
     if size.max(initial=0) <= 1:
         return np.argsort(label, kind="stable")
     source = np.repeat(np.arange(label.size), np.diff(matrix.indptr))
-    between = label[source] != label[matrix.indices]
-    into, out_of = (int(size[label[x[between]]].sum()) for x in (matrix.indices, source))
+    into, out_of = _between(matrix, label, size)
     within = matrix.copy()
-    within.data[between] = 0
+    within.data[label[source] != label[matrix.indices]] = 0
     within.eliminate_zeros()
     both = (within + within.T).tocsr()
     order = csgraph.reverse_cuthill_mckee(both, symmetric_mode=True)
@@ -105,28 +167,102 @@ def order_of(matrix: Any, label: Integers) -> Integers | None:
         source = np.repeat(np.arange(label.size), np.diff(both.indptr))
         furthest = np.zeros(label.size, np.int64)
         np.maximum.at(furthest, source, place[source] - place[both.indices])
-        largest = label == size.argmax()
-        if furthest[largest].mean() * _SPREAD > np.count_nonzero(largest):
+        mean = np.bincount(label, furthest) / np.maximum(size, 1)
+        if ((size > _SMALL) & (mean * _SPREAD > size)).any():
             return None
     # What leads from one component to another fills, of the two, the one that stands first.
     return order[::-1] if out_of < into else order
 
 
-def _factored(rows: Any, label: Integers, order: Integers, chosen: Integers) -> Factors | None:
+def _block(
+    rows: Any, label: Integers, order: Integers, chosen: Integers, *, swept: bool = False
+) -> _Block | None:
+    """Some states of a policy, factored unless that would fill too much; None if singular."""
     from scipy.sparse import linalg
 
-    place = np.empty(order.size, np.int32)
+    whole = order.size == label.size
+    place = np.full(label.size, -1, np.int32)
     place[order] = np.arange(order.size, dtype=np.int32)
-    matrix = rows[chosen[order]]
-    matrix.indices = place[matrix.indices]
-    matrix.has_sorted_indices = False
+    inner, outer = rows[chosen[order]], None
+    if whole:
+        inner.indices = place[inner.indices]
+        inner.has_sorted_indices = False
+    else:
+        outer = inner.copy()
+        outer.data[place[outer.indices] >= 0] = 0
+        outer.eliminate_zeros()
+        inner = inner[:, order]
+    if swept or _too_much(inner, label[order]):
+        return _Block(order, inner, outer, None, 0)
     try:
         factor = linalg.splu(
-            _minus(matrix).T, permc_spec="NATURAL", diag_pivot_thresh=0,
+            _minus(inner).T, permc_spec="NATURAL", diag_pivot_thresh=0,
             options={"SymmetricMode": True})
     except (RuntimeError, MemoryError):
         return None
-    return Factors(rows, label, order, matrix, factor, int(factor.nnz))
+    return _Block(order, inner, outer, factor, int(factor.nnz))
+
+
+def _too_much(matrix: Any, label: Integers) -> bool:
+    """Whether elimination in the order of the states would fill more than there may be.
+
+    Factors fill nothing before the first entry of a row and of a column (George and Liu 1981). In
+    components where that allows too much, rows are counted along the elimination tree.
+
+    Args:
+      matrix: ``float64[B, B]``.
+      label: ``int[B]``, the components, which stand together.
+    """
+    size = label.size
+    if size * (size + 1) <= _MOST:
+        return False
+    source = np.repeat(np.arange(size), np.diff(matrix.indptr))
+    target = matrix.indices
+    between = label[source] != label[target]
+    last = np.zeros(int(label.max(initial=0)) + 1, np.int64)
+    last[label] = np.arange(1, size + 1)
+    first = np.minimum(source[between], target[between])
+    allowed = _MOST - size - int((last[label[first]] - first).sum())
+    source, target = source[~between], target[~between]
+    left, top = np.arange(size), np.arange(size)
+    np.minimum.at(left, source, target)
+    np.minimum.at(top, target, source)
+    if int((2 * np.arange(size) - left - top).sum()) <= allowed:
+        return False
+    return allowed <= 0 or 2 * _counted(source, target, size) > allowed
+
+
+def _counted(source: Integers, target: Integers, size: int) -> float:
+    """About how many entries one factor of a symmetric pattern has, by some of its rows.
+
+    Row i is filled where the elimination tree leads from its entries towards i (Liu 1990).
+    """
+    from scipy import sparse
+
+    low, high = np.minimum(source, target), np.maximum(source, target)
+    kept = low < high
+    pattern = sparse.coo_array(
+        (np.ones(np.count_nonzero(kept), bool), (high[kept], low[kept])),
+        shape=(size, size)).tocsr()
+    starts, entries = pattern.indptr.tolist(), pattern.indices.tolist()
+    parent, beyond = [-1] * size, [-1] * size
+    for i in range(size):
+        for k in entries[starts[i] : starts[i + 1]]:
+            while k != -1 and k < i:
+                after, beyond[k] = beyond[k], i
+                if after == -1:
+                    parent[k] = i
+                k = after
+    sampled = np.linspace(0, size - 1, min(_SAMPLED, size)).astype(int).tolist()
+    total = 0
+    for i in sampled:
+        seen = {i}
+        for k in entries[starts[i] : starts[i + 1]]:
+            while k not in seen:
+                seen.add(k)
+                k = parent[k]
+        total += len(seen) - 1
+    return total * size / len(sampled)
 
 
 def _minus(matrix: Any) -> Any:

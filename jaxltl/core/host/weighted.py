@@ -226,6 +226,7 @@ def _signed(
     Every step earns a little more than it does, so that the value is one that no step exceeds.
     """
     from jaxltl.core.host.elimination import factors
+    from jaxltl.core.host.levels import Edges, components_in_order
 
     inner = np.flatnonzero(~end)
     rows = np.flatnonzero(~end[mdp.state])
@@ -234,7 +235,8 @@ def _signed(
     starts = mdp.row_start[:-1][inner]
     unit = (2 * int(np.diff(mdp.entry_start).max()) + 8) * _EPS
     chosen, policy = first[inner], first
-    solver = factors(matrix, np.zeros(inner.size, np.int64), chosen)
+    begins = matrix.indptr[np.append(starts, rows.size)]
+    solver = factors(matrix, components_in_order(Edges(begins, matrix.indices)), chosen)
     extra = 0.0
     for _ in range(_ROUNDS):
         if solver is None:
