@@ -24,11 +24,11 @@ from jaxltl.core.models.state_formulas import states_satisfying
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values import bounded
 from jaxltl.core.values.average_reward import average_reward
+from jaxltl.core.values.opposite import opposite_event
 from jaxltl.core.values.reachability import reachability_probability
 from jaxltl.core.values.sparse_satisfaction import (
     Satisfaction,
     at_states,
-    opposite_event,
     sparse_satisfaction,
 )
 from jaxltl.core.values.total_reward import total_reward

@@ -21,10 +21,10 @@ from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.evidence import rounding_unit
+from jaxltl.core.values.opposite import opposite_event
 from jaxltl.core.values.reachability import (
     action_matrices,
     attaining_actions,
-    complement,
     max_sets,
     min_sets,
 )
@@ -122,7 +122,7 @@ def optimal_actions(
     sure = attaining_actions(problem.model, problem.target, objective=problem.objective)
     if sure is not None:
         keeps, bounds = sure
-        bounds = complement(bounds) if problem.opposite else bounds
+        bounds = opposite_event(bounds) if problem.opposite else bounds
         narrower = _bounded(problem, keeps, bounds, objective, goal)
         if int(narrower.status) == Status.CONVERGED:
             return narrower

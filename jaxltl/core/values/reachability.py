@@ -22,7 +22,7 @@ from jaxltl.core.graphs.end_components import EndComponents, components_within
 from jaxltl.core.graphs.graph import Graph, TracedGraph, graph_of, is_table, take
 from jaxltl.core.host import reach as host
 from jaxltl.core.host.quickest import quickest
-from jaxltl.core.models.concrete import is_traced, namespace, to_jax
+from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import DenseMDP, support
@@ -170,21 +170,6 @@ def _decided(model: Any, target: Any, *, objective: str) -> tuple[Sets, EndCompo
         return min_sets(graph, target), None
     sets = max_sets(graph, target)
     return sets, components_within(graph, ~(sets.one | sets.zero))
-
-
-def complement(reach: Solution) -> Solution:
-    """Of the opposite event, whose probability is one minus this one; bounds rounded outwards."""
-    bounds = lax.stop_gradient((reach.upper, reach.lower))
-    xp, value, (far, near) = namespace(reach.value, bounds)
-    one = xp.ones((), value.dtype)
-
-    def outwards(bound: Any, end: int) -> Any:
-        rounded = one - bound
-        beyond = xp.clip(xp.nextafter(rounded, end * one), 0, 1)
-        return xp.where((bound == 0) | (bound == 1), rounded, beyond)
-
-    found = to_jax((one - value, outwards(far, -1), outwards(near, 2)))
-    return replace(reach, value=found[0], lower=found[1], upper=found[2])
 
 
 # --- what the graph decides ----------------------------------------------------------------

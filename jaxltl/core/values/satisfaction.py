@@ -22,10 +22,10 @@ from jaxltl.core.models.operators import is_deterministic, require_policy
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Solution
 from jaxltl.core.values.enclosed import is_sparse
+from jaxltl.core.values.opposite import opposite_event
 from jaxltl.core.values.reachability import (
     QUICK_LIMIT,
     action_matrices,
-    complement,
     reachability_probability,
 )
 from jaxltl.core.values.robust import refuse_nature
@@ -73,7 +73,7 @@ def satisfaction_probability(
     reach = reachability_probability(
         model, target, policy=policy, method=method, tolerance=tolerance
     )
-    return complement(reach) if kind == "safety" else reach
+    return opposite_event(reach) if kind == "safety" else reach
 
 
 def optimal_satisfaction(
@@ -139,7 +139,7 @@ def optimal_satisfaction(
         xp, region, action, chosen = namespace(
             problem.accepting.region, _visiting(problem, found), found.policy)
         found = replace(found, policy=to_jax(xp.where(region, action, chosen).astype(xp.int32)))
-    return complement(found) if problem.opposite else found
+    return opposite_event(found) if problem.opposite else found
 
 
 class Reaching(NamedTuple):

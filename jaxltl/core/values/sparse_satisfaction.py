@@ -20,6 +20,7 @@ from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.models.state_formulas import letters_of
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values.enclosed import Chain, chain_of, default_tolerance, solution_of
+from jaxltl.core.values.opposite import opposite_event
 
 
 class Satisfaction(NamedTuple):
@@ -231,18 +232,3 @@ def at_states(solution: Solution, states: np.ndarray) -> Solution:
         name: np.asarray(getattr(solution, name), np.float64)[states]
         for name in ("value", "lower", "upper")}
     return replace(solution, **taken)
-
-
-def opposite_event(solution: Solution) -> Solution:
-    """Of the opposite event, in double precision, with bounds rounded outwards."""
-    value, lower, upper = (
-        np.asarray(x, np.float64) for x in (solution.value, solution.lower, solution.upper))
-    turned: dict[str, Any] = {
-        "value": 1 - value, "lower": _one_minus(upper, 0.0), "upper": _one_minus(lower, 1.0)}
-    return replace(solution, **turned)
-
-
-def _one_minus(bound: np.ndarray, end: float) -> np.ndarray:
-    found = 1 - bound
-    exact = (bound == 0) | (bound == 1)
-    return np.where(exact, found, np.clip(np.nextafter(found, 3 * end - 1), 0, 1))

@@ -9,7 +9,6 @@ from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.core.values.satisfaction import optimal_satisfaction
 from jaxltl.core.values.sparse_satisfaction import (
     Satisfaction,
-    opposite_event,
     sparse_satisfaction,
 )
 
@@ -80,17 +79,6 @@ def test_strategies_attain_what_they_are_said_to(formula):
             attained = sparse_satisfaction(
                 chain, formula, states=found.product.start).solution
             np.testing.assert_allclose(attained.value, found.solution.value, atol=1e-6)
-
-
-def test_opposite_events_keep_what_is_exact():
-    found = sparse_satisfaction(random_sparse(0), "G F a | F G !a").solution
-    assert (found.lower == 1).all() and (found.upper == 1).all()
-    turned = opposite_event(found)
-    assert (turned.lower == 0).all() and (turned.upper == 0).all()
-    some = sparse_satisfaction(random_sparse(1), "F (a & b & c & X a)").solution
-    turned = opposite_event(some)
-    assert (turned.lower <= 1 - some.value).all() and (1 - some.value <= turned.upper).all()
-    np.testing.assert_allclose(turned.upper - turned.lower, some.upper - some.lower, atol=1e-12)
 
 
 def test_bad_arguments_are_named():
