@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxltl.core.host import interval_values
 from jaxltl.core.host.interval import HostInterval
+from jaxltl.core.host.interval_discounted import discounted
+from jaxltl.core.host.interval_game import Spread, spread
 from jaxltl.core.host.interval_values import Robust
-from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.sparse import row_reward
-from jaxltl.core.types import Method, Solution, Status, require_shape
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.interval import IntervalMDP, make_interval
+from jaxltl.core.models.operators import is_deterministic, require_weights, row_weights
+from jaxltl.core.models.sparse import SparseMDP, row_reward
+from jaxltl.core.types import Method, Solution, Status, require_shape, row_tolerance
 from jaxltl.core.values.bounded import structure
 
 TOLERANCE = 1e-6
@@ -53,10 +57,12 @@ def robust_reachability(
     (Nilim and El Ghaoui 2005, Iyengar 2005); the least solution.
 
     Args:
-      model: the model.
+      model: the model, or a :class:`~jaxltl.core.models.game.Game` on one (or on a sparse model),
+        whose environment wants the opposite of its system.
       target: ``bool[S]``, or the name of a label.
-      policy: ``int32[S]``, rows to be evaluated; default: optimise.
-      objective: ``"max"`` or ``"min"``, what the policy makes of the probability.
+      policy: ``int32[S]``, rows, or ``float[R]``, their weights, to be evaluated; default:
+        optimise.
+      objective: ``"max"`` or ``"min"``, what the policy (the system) makes of the probability.
       nature: ``"min"`` or ``"max"``, what nature makes of it; default: the opposite of
         `objective` (for a given policy: ``"min"``).
       stay: ``bool[S]``, the states that may be passed; default all.
@@ -76,15 +82,16 @@ def robust_reachability(
       >>> robust_reachability(model, [False, True, False]).value.tolist()
       [0.4, 1.0, 0.0]
     """
-    nature = require_direction(nature, objective)
-    target = _states(model, target, "target")
-    stay = None if stay is None else _states(model, stay, "stay")
     asked = TOLERANCE if tolerance is None else float(tolerance)
-    part, entry = _under(model, policy)
+    sides = sides_of(model, policy, objective, nature)
+    model = sides.model
+    target = sides.states(states_of(model, target, "target"))
+    if stay is not None:
+        stay = sides.states(states_of(model, stay, "stay")) | sides.added
     found = interval_values.reachability(
-        part, target, maximize=objective == "max", helpful=nature == "max", stay=stay,
+        sides.host, target, maximize=sides.maximize, helpful=sides.helpful, stay=stay,
         tolerance=asked)
-    return robust_solution(model, found, asked, relative=False, policy=policy, entry=entry)
+    return robust_solution(sides, found, asked, relative=False)
 
 
 def robust_total_reward(
@@ -111,33 +118,95 @@ def robust_total_reward(
     Raises:
       ValueError: shapes, a direction, or a reward that is negative or depends on nature.
     """
-    nature = require_direction(nature, objective)
-    target = _states(model, target, "target")
-    earned = interval_reward(model, reward)
     asked = TOLERANCE if tolerance is None else float(tolerance)
-    part, entry = _under(model, policy)
-    if policy is not None:
-        earned = earned[np.asarray(policy)]
+    sides = sides_of(model, policy, objective, nature)
+    model = sides.model
+    target = sides.states(states_of(model, target, "target"))
+    earned = sides.rows(interval_reward(model, reward))
     found = interval_values.total_reward(
-        part, earned, target, maximize=objective == "max", large=nature == "max",
+        sides.host, earned, target, maximize=sides.maximize, large=sides.helpful,
         tolerance=asked)
-    return robust_solution(model, found, asked, relative=True, policy=policy, entry=entry)
+    return robust_solution(sides, found, asked, relative=True)
 
 
-def interval_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
+def robust_discounted_value(
+    model: IntervalMDP, reward: Any, discount: float, *, policy: Any = None,
+    objective: str = "max", nature: str | None = None, tolerance: float | None = None,
+) -> Solution:
+    """Discounted value when probabilities lie in intervals.
+
+    ``V(s) = opt_a opt_p (r(s, a) + discount sum_t p_t V(t))`` (Iyengar 2005), by policy iteration;
+    the bounds are ``V +- |Phi V - V| / (1 - discount)``, with rounding.
+
+    Args:
+      model: the model, or a game on one.
+      reward: of any sign, as of :func:`robust_total_reward`.
+      discount: in ``[0, 1)``.
+      policy, objective, nature: as of :func:`robust_reachability`.
+      tolerance: the width of the enclosure asked for; default 1e-8 of the largest possible value.
+
+    Returns:
+      :class:`Solution`, with `nature`.
+
+    Raises:
+      ValueError: shapes, a direction, the discount, or a reward that depends on nature.
+    """
+    if not 0 <= float(discount) < 1:
+        raise ValueError(f"discount={float(discount):.6g}; it must be at least 0 and below 1.")
+    sides = sides_of(model, policy, objective, nature)
+    earned = sides.rows(interval_reward(sides.model, reward, signed=True))
+    largest = float(np.abs(earned).max(initial=0)) / (1 - float(discount))
+    asked = 1e-8 * max(largest, 1e-300) if tolerance is None else float(tolerance)
+    found = discounted(
+        sides.host, earned, np.where(sides.choosing, 1.0, float(discount)),
+        maximize=sides.maximize, large=sides.helpful, tolerance=asked)
+    return robust_solution(sides, found, asked, relative=False)
+
+
+def robust_expectation(
+    model: IntervalMDP, value: Any, *, nature: str = "min"
+) -> tuple[np.ndarray, np.ndarray]:
+    """The expected value of the next state of each choice, as nature makes it.
+
+    ``min_p sum_t p_t value(t)``, or the maximum, over the distributions of each row: mass goes
+    first to the least (largest) values.
+
+    Args:
+      model: the model.
+      value: ``float[S]``, finite.
+      nature: ``"min"`` or ``"max"``.
+
+    Returns:
+      ``float64[R]``, and nature's distributions, ``float64[T]``.
+
+    Example:
+      >>> from jaxltl.core.models.interval import interval_rows
+      >>> model = interval_rows(None, [0, 2, 3], [0, 1, 1], [.25, .5, 1], [.5, .75, 1])
+      >>> robust_expectation(model, [0.0, 4.0])[0].tolist()
+      [2.0, 4.0]
+    """
+    require_direction(nature, "max")
+    require_shape("value", value, model.state_shape)
+    ahead = np.asarray(value, np.float64)[model.host.mdp.successor]
+    p = model.host.nature(ahead, maximize=nature == "max")
+    return model.host.total(p * ahead), p
+
+
+def interval_reward(model: IntervalMDP, reward: Any, *, signed: bool = False) -> np.ndarray:
     """The reward of each choice, ``float64[R]``.
 
     Raises:
-      ValueError: it is negative or not finite, or depends on the successor that nature picks.
+      ValueError: it is not finite, negative (unless it may be `signed`), or depends on the
+        successor that nature picks.
     """
     earned = row_reward(model.nominal, reward)
-    bad = ~((earned >= 0) & np.isfinite(earned))
+    bad = ~(((earned >= 0) | signed) & np.isfinite(earned))
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
         state = int(model.nominal.host.state[row])
         raise ValueError(f"the reward of state {state}, choice "
                          f"{row - int(model.nominal.row_start[state])} is {earned[row]}; it must "
-                         "be finite and at least 0.")
+                         f"be finite{'' if signed else ' and at least 0'}.")
     of = structure(model.nominal, reward).transition
     if of is not None:
         each = np.asarray(of)
@@ -153,44 +222,134 @@ def interval_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
 
 
 def robust_solution(
-    model: IntervalMDP, found: Robust, tolerance: float, *, relative: bool, policy: Any = None,
-    entry: Any = None,
+    sides: Sides, found: Robust, tolerance: float, *, relative: bool
 ) -> Solution:
     """What the host found, with its status."""
-    finite = np.isfinite(found.upper)
-    width = np.where(finite, found.upper, 0) - np.where(finite, found.lower, 0)
-    scale = np.where(finite, found.upper, 1) if relative else 1.0
-    narrow = (width <= tolerance * scale) & (finite | (found.lower == found.upper))
+    size = sides.model.num_states
+    value, lower, upper = (x[:size] for x in (found.value, found.lower, found.upper))
+    finite = np.isfinite(upper)
+    width = np.where(finite, upper, 0) - np.where(finite, lower, 0)
+    scale = np.where(finite, upper, 1) if relative else 1.0
+    narrow = (width <= tolerance * scale) & (finite | (lower == upper))
     status = Status.CONVERGED if narrow.all() else Status.PRECISION
     row, chance = found.row, found.probability
-    if policy is not None:
-        chance = np.asarray(model.nominal.probability).copy()
-        chance[entry] = found.probability
-        row = np.asarray(policy)
+    if sides.spread is not None:
+        row = sides.spread.policy(row, chance)
+        chance = sides.spread.nature(chance, np.asarray(sides.model.nominal.probability))
+    policy = np.asarray(row.astype(np.int32) if sides.policy is None else sides.policy)
     parts: dict[str, Any] = {
-        "value": found.value, "policy": row.astype(np.int32), "nature": chance,
-        "lower": found.lower, "upper": found.upper, "residual": np.float64(found.residual),
-        "num_steps": np.int32(found.rounds), "status": np.int32(status)}
+        "value": value, "policy": policy, "nature": chance, "lower": lower, "upper": upper,
+        "residual": np.float64(found.residual), "num_steps": np.int32(found.rounds),
+        "status": np.int32(status)}
     return Solution(**parts, method=Method(found.method))
 
 
-def _under(model: IntervalMDP, policy: Any) -> tuple[HostInterval, Any]:
-    """The model under a policy, and which entries are left."""
+class Sides(NamedTuple):
+    """A question with the wishes of all who choose.
+
+    Attributes:
+      model: the model that was asked about.
+      host: the one that is solved, in which a policy and nature choose.
+      maximize, helpful: whether the policy, and nature, make a value large.
+      spread: how the one became the other, where they differ.
+      policy: the policy that was given.
+    """
+
+    model: Any
+    host: HostInterval
+    maximize: bool
+    helpful: bool
+    spread: Spread | None
+    policy: Any
+
+    @property
+    def choosing(self) -> np.ndarray:
+        """``bool[R']``, the rows by which nature chooses among rows, in no time."""
+        if self.spread is None:
+            return np.zeros(self.host.mdp.num_rows, bool)
+        return self.spread.row < 0
+
+    @property
+    def added(self) -> np.ndarray:
+        """``bool[S']``, the states that were not there."""
+        return np.arange(self.host.mdp.num_states) >= self.model.num_states
+
+    def states(self, quantity: np.ndarray) -> np.ndarray:
+        """``bool[S']``, nothing of what is new."""
+        return np.append(quantity, np.zeros(np.count_nonzero(self.added), bool))
+
+    def rows(self, quantity: np.ndarray) -> np.ndarray:
+        """``float64[R']``, nothing where nature chooses."""
+        if self.spread is None:
+            return quantity
+        return np.where(self.choosing, 0, quantity[self.spread.row])
+
+
+def sides_of(
+    model: Any, policy: Any, objective: str, nature: str | None
+) -> Sides:
+    """Who chooses what, and what for.
+
+    Args:
+      model: an IntervalMDP, or a game on one or on a sparse model.
+      policy: rows ``int[S]``, or weights ``float[R]``, or None.
+      objective, nature: directions; of a game, the system's and nature's.
+    """
+    world, system = world_of(model)
     if policy is None:
-        return model.host, None
-    policy = np.asarray(policy)
-    require_shape("policy", policy, model.state_shape)
-    start = model.nominal.host.row_start
-    wrong = (policy < start[:-1]) | (policy >= start[1:])
-    if wrong.any():
-        s = int(np.flatnonzero(wrong)[0])
-        raise ValueError(f"the policy takes row {policy[s]} in state {s}, whose rows are "
-                         f"{start[s]} to {start[s + 1] - 1}.")
-    chain, entry = model.host.chain(policy)
-    return chain, entry
+        return host_sides(world.host, system, objective, nature)._replace(model=world)
+    if system is not None:
+        raise ValueError("a game takes no policy; restrict the system's rows by with_allowed.")
+    helpful = require_direction(nature, objective) == "max"
+    parted = _under(world, np.asarray(policy))
+    return Sides(world, parted.model, helpful, helpful, parted, policy)
 
 
-def _states(model: IntervalMDP, states: Any, name: str) -> np.ndarray:
+def world_of(model: Any) -> tuple[IntervalMDP, np.ndarray | None]:
+    """The interval model, and of a game the states where the system moves.
+
+    Raises:
+      ValueError: the model, or what a game is on, is none.
+    """
+    world = model.mdp if isinstance(model, Game) else model
+    if isinstance(world, SparseMDP) and isinstance(model, Game):
+        world = make_interval(world, world.probability, world.probability)
+    if not isinstance(world, IntervalMDP):
+        raise ValueError(f"{type(world).__name__} has no intervals; give an IntervalMDP, or a game "
+                         "on one or on a SparseMDP.")
+    return world, np.asarray(model.system, bool) if isinstance(model, Game) else None
+
+
+def host_sides(
+    host: HostInterval, system: np.ndarray | None, objective: str, nature: str | None
+) -> Sides:
+    """:func:`sides_of` on the host, without a policy."""
+    helpful = require_direction(nature, objective) == "max"
+    maximize = objective == "max"
+    if system is None:
+        return Sides(None, host, maximize, helpful, None, None)
+    # Who wants what nature wants becomes nature, and the other one is the policy.
+    rows = np.ones(host.mdp.num_rows)
+    parted = spread(host, system if maximize == helpful else ~system, 0 * rows, rows)
+    return Sides(None, parted.model, not helpful, helpful, parted, None)
+
+
+def _under(model: IntervalMDP, policy: np.ndarray) -> Spread:
+    """The model in which there is nothing to choose but for nature."""
+    host = model.host
+    weight = row_weights(model.nominal, policy)
+    require_weights(host.mdp, weight, row_tolerance(np.float64))
+    if not is_deterministic(policy):
+        weight = weight / host.mdp.over_choices(np.add, weight)[host.mdp.state]
+        return spread(host, np.ones(model.num_states, bool), weight, weight)
+    chain, entry = host.chain(policy)
+    return Spread(
+        chain, np.arange(model.num_states), policy.astype(np.int64), entry,
+        np.full(entry.size, -1))
+
+
+def states_of(model: IntervalMDP, states: Any, name: str) -> np.ndarray:
+    """``bool[S]`` from an array or the name of a label."""
     if isinstance(states, str):
         return np.asarray(model.states_where(states), bool)
     require_shape(name, states, model.state_shape)

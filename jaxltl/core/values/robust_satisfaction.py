@@ -19,7 +19,7 @@ from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Method, Solution, Status
-from jaxltl.core.values.robust import TOLERANCE, require_direction
+from jaxltl.core.values.robust import TOLERANCE, host_sides, world_of
 from jaxltl.core.values.sparse_satisfaction import automaton_of
 
 
@@ -42,7 +42,7 @@ class RobustSatisfaction(NamedTuple):
 
 
 def robust_satisfaction(
-    model: IntervalMDP, task: Task, *, objective: str = "max", nature: str | None = None,
+    model: Any, task: Task, *, objective: str = "max", nature: str | None = None,
     states: Any = None, tolerance: float | None = None,
 ) -> RobustSatisfaction:
     """Largest or smallest probability of a formula that nature, for or against it, leaves.
@@ -53,9 +53,9 @@ def robust_satisfaction(
     ends of 0 nature may cut edges, so that neither the graph nor its end components are fixed.
 
     Args:
-      model: the model.
+      model: an IntervalMDP, or a game on one (or on a sparse model).
       task: a formula, its text, or an automaton over the letters that occur in the model.
-      objective: ``"max"`` or ``"min"``, what the policy makes of the probability.
+      objective: ``"max"`` or ``"min"``, what the policy (the system) makes of the probability.
       nature: ``"min"`` or ``"max"``; default: the opposite of `objective`.
       states: ``int[I]``, where runs start; default the initial states.
       tolerance: the width of the enclosure asked for, 1e-6.
@@ -73,7 +73,7 @@ def robust_satisfaction(
       >>> robust_satisfaction(model, "F G a").solution.value.tolist()
       [0.4]
     """
-    nature = require_direction(nature, objective)
+    model, system = world_of(model)
     asked = TOLERANCE if tolerance is None else float(tolerance)
     automaton, letter = automaton_of(model.nominal, task)
     states = np.flatnonzero(np.asarray(model.initial) > 0) if states is None else states
@@ -82,13 +82,13 @@ def robust_satisfaction(
     initial = np.broadcast_to(automaton.initial, states.shape)
     product, host = _pairs(
         model, np.asarray(automaton.delta), letter, states, initial, yes | no, False)
-    maximize, helpful = objective == "max", nature == "max"
     priority = None
     if automaton.acceptance in ("buchi", "parity"):
         source = product.memory, letter[product.base_state]
         priority = np.asarray(automaton.priority)[source]
+    moves = None if system is None else system[product.base_state]
     found = _solved(
-        host, yes[product.memory], no[product.memory], priority, maximize, helpful,
+        host, yes[product.memory], no[product.memory], priority, moves, objective, nature,
         automaton.acceptance == "safety", asked)
     solution = _solution(
         found, asked, product.start.shape, product.start,
@@ -126,7 +126,6 @@ def robust_product_satisfaction(
     Raises:
       ValueError: the product's actions are restricted.
     """
-    nature = require_direction(nature, objective)
     if model.allowed is not None:
         raise ValueError("a product of an interval model takes no mask of actions; restrict the "
                          "world by with_allowed(world, rows).")
@@ -152,8 +151,8 @@ def robust_product_satisfaction(
         level = product.memory % count if delayed else priority[
             product.memory, letter[product.base_state]]
     found = _solved(
-        host, yes[product.memory], no[product.memory], level, objective == "max",
-        nature == "max", task.acceptance == "safety", asked)
+        host, yes[product.memory], no[product.memory], level, None, objective, nature,
+        task.acceptance == "safety", asked)
     policy = product.base_row[found.row[product.start]].astype(np.int32).reshape(shape)
     solution = _solution(found, asked, shape, product.start, policy)
     return solution.replace(nature=None) if delayed else solution  # type: ignore[attr-defined]
@@ -181,10 +180,30 @@ def _pairs(
 
 
 def _solved(
+    host: HostInterval, yes: Booleans, no: Booleans, priority: Integers | None,
+    system: Booleans | None, objective: str, nature: str | None, safety: bool, tolerance: float,
+) -> Robust:
+    """The probability from all states of a product; of a game where `system` says who moves."""
+    sides = host_sides(host, system, objective, nature)
+    maximize, helpful = sides.maximize, sides.helpful
+    if sides.spread is None:
+        return _of_sides(host, yes, no, priority, maximize, helpful, safety, tolerance)
+    source = sides.spread.source
+    found = _of_sides(
+        sides.host, yes[source], no[source], None if priority is None else priority[source],
+        maximize, helpful, safety, tolerance)
+    size = host.mdp.num_states
+    return found._replace(
+        value=found.value[:size], lower=found.lower[:size], upper=found.upper[:size],
+        row=sides.spread.policy(found.row, found.probability),
+        probability=sides.spread.nature(found.probability, host.mdp.probability))
+
+
+def _of_sides(
     host: HostInterval, yes: Booleans, no: Booleans, priority: Integers | None, maximize: bool,
     helpful: bool, safety: bool, tolerance: float,
 ) -> Robust:
-    """The probability from all states of a product."""
+    """The same where a policy and nature choose."""
     if priority is None:
         goal = no if safety else yes
         if safety:

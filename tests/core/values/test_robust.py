@@ -1,20 +1,28 @@
 """Interval models of a formula, a reward or a discount: laws, known values and messages."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
+from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows, make_interval
 from jaxltl.core.models.product import product
 from jaxltl.core.models.restrict import restrict, with_allowed
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
 from jaxltl.core.values.reachability import reachability_probability
-from jaxltl.core.values.robust import robust_reachability, robust_total_reward
-from jaxltl.core.values.robust_satisfaction import robust_satisfaction
+from jaxltl.core.values.robust import (
+    robust_discounted_value,
+    robust_expectation,
+    robust_reachability,
+    robust_total_reward,
+)
+from jaxltl.core.values.robust_satisfaction import _solved, robust_satisfaction
 from jaxltl.core.values.satisfaction import optimal_satisfaction
 from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
 from jaxltl.core.values.total_reward import total_reward
-from tests.reference_intervals import random_model
+from tests.reference_intervals import chains, parity, random_model, reach, reward
 
 DIRECTIONS = [("max", "max"), ("max", "min"), ("min", "max"), ("min", "min")]
 TASKS = ["F a", "G !b", "!b U a", "G F a", "F G a", "G F a & F G !b", "G (a -> F b)",
@@ -136,6 +144,121 @@ def test_one_function_takes_both_kinds():
                 model, np.ones(4), target, objective=objective, nature=nature).value)
     with pytest.raises(ValueError, match=r"nature='max'.*intervals"):
         reachability_probability(model.nominal, target, nature="max")
+
+
+def test_mixed_policies():
+    """A policy that mixes rows is as good as the one that its coin makes of them."""
+    rng = np.random.default_rng(9)
+    for _ in range(10):
+        model = labelled(rng)
+        host = model.nominal.host
+        weight = rng.random(host.num_rows)
+        weight /= np.add.reduceat(weight, host.row_start[:-1])[host.state]
+        target = model.states_where("a")
+        points = make_interval(model.nominal, *[model.nominal.probability] * 2)
+        alone = reachability_probability(model.nominal, target, policy=weight)
+        np.testing.assert_allclose(
+            robust_reachability(points, target, policy=weight).value, alone.value, atol=1e-6)
+        low, high = (robust_reachability(model, target, policy=weight, nature=nature)
+                     for nature in ("min", "max"))
+        assert (low.lower <= alone.upper).all()
+        assert (high.upper >= alone.lower).all()
+        p = np.asarray(high.nature)
+        assert ((model.lower - 1e-15 <= p) & (p <= model.upper + 1e-15)).all()
+        again = reachability_probability(
+            model.nominal.replace(probability=p), target, policy=weight)
+        np.testing.assert_allclose(again.value, high.value, atol=1e-6)
+
+
+def test_games():
+    """Against all choices of both players and all vertices of nature's."""
+    rng = np.random.default_rng(10)
+    for _ in range(25):
+        host = random_model(rng)
+        model = labelled(rng, host)
+        system = rng.random(4) < 0.5
+        goal = np.arange(4) == rng.integers(4)
+        priority = rng.integers(0, 3, 4)
+        game = Game(model, system)
+        cost = rng.integers(0, 3, model.num_rows).astype(float)
+        worth = partial(_reach, goal), partial(_reward, goal, cost), partial(_parity, priority)
+        for nature in ("min", "max"):
+            for objective in ("max", "min"):
+                of = {"objective": objective, "nature": nature}
+                held(robust_reachability(game, goal, **of),
+                     played(host, goal, system, worth[0], **of))
+                held(robust_total_reward(game, cost, goal, **of),
+                     played(host, goal, system, worth[1], **of))
+            yes = np.zeros(4, bool)
+            found = _solved(host, yes, yes, priority, system, "max", nature, False, 1e-6)
+            held(found, played(host, yes, system, worth[2], objective="max", nature=nature))
+
+
+def _reach(goal, rows, p):
+    return reach(p, goal)
+
+
+def _reward(goal, cost, rows, p):
+    return reward(p, goal, cost[list(rows)])
+
+
+def _parity(priority, rows, p):
+    return parity(p, priority)
+
+
+def played(host, goal, system, worth, objective, nature):
+    """The value of a game by trying everything."""
+    of = {rows: getattr(np, nature)(worth(rows, p), 0) for rows, p in chains(host, goal)}
+    ours, theirs = (max, min) if objective == "max" else (min, max)
+    ours, theirs = (getattr(np, x.__name__) for x in (ours, theirs))
+    by: dict = {}
+    for rows, value in of.items():
+        mine = tuple(r for r, s in zip(rows, system, strict=True) if s)
+        by.setdefault(mine, []).append(value)
+    return ours([theirs(x, 0) for x in by.values()], 0)
+
+
+def held(found, value):
+    finite = np.isfinite(value)
+    assert (np.isfinite(found.upper) == finite).all()
+    low, high, value = (np.where(finite, x, 0) for x in (found.lower, found.upper, value))
+    size = np.maximum(1, value)
+    assert ((low <= value + 1e-11 * size) & (value <= high + 1e-11 * size)).all()
+    assert (high - low <= 1e-6 * size).all()
+
+
+def test_exact_games_have_values():
+    """A game on a sparse model: the environment takes the worse of two coins."""
+    coins = make_sparse([0, 2, 3, 4], [0, 2, 4, 5, 6], [1, 2, 1, 2, 1, 2],
+                        [0.25, 0.75, 0.5, 0.5, 1, 1], label=[[0], [1], [0]], propositions=["a"])
+    for system, best in ((True, 0.5), (False, 0.25)):
+        game = Game(coins, np.array([system] * 3))
+        assert robust_reachability(game, "a").value[0] == pytest.approx(best)
+        found = robust_satisfaction(game, "F G a", states=[0]).solution
+        assert found.value[0] == pytest.approx(best)
+
+
+def test_discounted_values():
+    """Against sweeps of the operator, alone and in games; points are exact models."""
+    rng = np.random.default_rng(11)
+    for _ in range(10):
+        model = labelled(rng)
+        host = model.nominal.host
+        earned = rng.normal(size=model.num_rows)
+        for objective, nature in DIRECTIONS:
+            value = np.zeros(4)
+            for _ in range(600):
+                image = earned + 0.9 * robust_expectation(model, value, nature=nature)[0]
+                value = getattr(np, objective + "imum").reduceat(image, host.row_start[:-1])
+            found = robust_discounted_value(
+                model, earned, 0.9, objective=objective, nature=nature)
+            assert int(found.status) == Status.CONVERGED
+            np.testing.assert_allclose(found.value, value, atol=1e-8)
+            assert (found.lower <= value + 1e-12).all()
+            assert (value <= found.upper + 1e-12).all()
+            game = Game(model, np.ones(4, bool))
+            np.testing.assert_allclose(robust_discounted_value(
+                game, earned, 0.9, objective=objective, nature=nature).value, value, atol=1e-7)
 
 
 COIN = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
