@@ -14,7 +14,6 @@ that nothing was found says nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -38,6 +37,7 @@ from jaxltl.core.values.prepared import Prepared, prepare, solve_prepared
 from jaxltl.core.values.prepared_chain import evaluate_prepared, is_direct
 
 _UNIT = float(np.finfo(np.float64).eps)
+_FINEST = 1e-12  # the width asked for where the one that was asked for does not tell
 
 
 @struct.dataclass
@@ -192,7 +192,7 @@ def make_problem(
         bound,
     )
     if reward is not None:
-        value = _certified(found, here, 1e-3)[1]
+        value = _bounds(found, here, 1e-3)[1]
         if np.isinf(value):
             raise ValueError(
                 "the expected reward is infinite at every point: from some initial state the "
@@ -268,6 +268,11 @@ def evaluate(parameters: jax.Array, problem: Problem, hparams: Hparams) -> Any:
 
 def _is_chain(prepared: Prepared) -> bool:
     return prepared.num_rows == prepared.num_states
+
+
+def _takes_turns(prepared: Prepared) -> bool:
+    """Whether how much work a solve is depends on the numbers."""
+    return not is_direct(prepared) if _is_chain(prepared) else prepared.cyclic
 
 
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
@@ -402,7 +407,6 @@ def feasible(
     hparams: Hparams | None = None,
     num_steps: int = 200,
     tolerance: float = 1e-6,
-    report: Callable[[int, int], None] | None = None,
 ) -> Feasible:
     """Parameters for which a value is past a threshold, from many starts, proven.
 
@@ -419,7 +423,6 @@ def feasible(
       hparams: how to search.
       num_steps: steps at most of each.
       tolerance: the width of the certified bounds, of rewards as a share.
-      report: called with how many are certified and how many there are to certify.
 
     Returns:
       :class:`Feasible`; `feasible` only where the certified bound meets the threshold.
@@ -447,7 +450,9 @@ def feasible(
         raise ValueError(f"threshold={threshold}; give a finite number.")
     hparams = Hparams() if hparams is None else hparams
     key = jax.random.key(0) if key is None else key
-    goal = np.asarray(threshold, problem.low.dtype)
+    # A little further, so that rounding does not decide.
+    beyond = 1e3 * float(jnp.finfo(problem.low.dtype).eps) * abs(threshold)
+    goal = np.asarray(threshold + problem.sign * beyond, problem.low.dtype)
     most = np.int32(_positive("num_steps", num_steps))
     points = None
     if np.ndim(starts) == 0:
@@ -472,7 +477,7 @@ def feasible(
         ),
     )
     found = _search(keys, points, lean, hparams, goal, most)
-    return _proven(problem, float(threshold), found, tolerance, report)
+    return _proven(problem, float(threshold), found, tolerance)
 
 
 @jax.jit
@@ -493,8 +498,7 @@ def _search(
             num_steps=most,
         )
 
-    prepared = problem.prepared
-    if not (is_direct(prepared) and (_is_chain(prepared) or not prepared.cyclic)):
+    if _takes_turns(problem.prepared):
         return lax.map(lambda given: one(*given), (keys, points))
     return jax.vmap(one)(keys, points)
 
@@ -504,7 +508,7 @@ def _met(goal: Any, sign: Any, before: Any, after: Any, metrics: Any) -> jax.Arr
 
 
 def _proven(
-    problem: Problem, threshold: float, found: learner.Learned, tolerance: float, report: Any
+    problem: Problem, threshold: float, found: learner.Learned, tolerance: float
 ) -> Feasible:
     """Certified bounds of what was claimed."""
     state = found.state
@@ -515,27 +519,55 @@ def _proven(
     )
     points, value = points.astype(np.float64), value.astype(np.float64)
     slack = max(1e-6, 1e4 * float(jnp.finfo(dtype).eps))
+    if problem.reward is None:
+        value = np.clip(value, 0, 1)
     off = problem.sign * (threshold - value)
     claimed = np.flatnonzero(off <= slack * max(abs(threshold), slack))
     lower = np.zeros(value.size)
     upper = np.full(value.size, 1.0 if problem.reward is None else np.inf)
-    for count, i in enumerate(claimed):
-        lower[i], upper[i] = _certified(problem, problem.model.at(points[i]), tolerance)
-        if report is not None:
-            report(count + 1, claimed.size)
-    certain = np.zeros(value.size, bool)
-    side = lower[claimed] >= threshold if problem.sign > 0 else upper[claimed] <= threshold
-    certain[claimed] = side
-    open_ = (lower < threshold) & (threshold < upper)
     status = np.full(value.size, Status.MAX_STEPS, np.int32)
-    status[claimed] = np.where(open_[claimed], Status.PRECISION, Status.MAX_STEPS)
     status = np.where(np.isnan(value), np.maximum(last, Status.NONFINITE), status)
+    for i in claimed:
+        try:
+            bounds = certify(problem, points[i], tolerance=tolerance)
+            if bounds[0] < threshold < bounds[1]:
+                bounds = certify(problem, points[i], tolerance=_FINEST)
+        except ValueError:  # not what it seemed in the precision of the search
+            status[i] = Status.INVALID
+            continue
+        lower[i], upper[i] = bounds
+        if bounds[0] < threshold < bounds[1]:
+            status[i] = Status.PRECISION
+    certain = lower >= threshold if problem.sign > 0 else upper <= threshold
+    certain &= np.isin(np.arange(value.size), claimed) & (status != Status.INVALID)
     status = np.where(certain, Status.CONVERGED, status).astype(np.int32)
     return Feasible(points, value, lower, upper, certain, steps, status, problem.model.parameters)
 
 
-def _certified(problem: Problem, model: Any, tolerance: float) -> tuple[float, float]:
-    """Bounds of the value of a model, rounding of its numbers included."""
+def certify(
+    problem: Problem, parameters: chex.Array, *, tolerance: float = 1e-6
+) -> tuple[float, float]:
+    """Bounds of the value at a point of the box, proven by the host engine, rounding included.
+
+    Of a model that is read from a file they hold for its functions at exactly this point; of one
+    whose numbers a JAX function computes, for the model with these numbers.
+
+    Args:
+      problem: the question.
+      parameters: ``float[D]``, or a number for each name.
+      tolerance: the width asked for, of rewards as a share of the value.
+
+    Returns:
+      The lower and the upper bound.
+
+    Raises:
+      ValueError: the point is not in the box, or the functions are no model there.
+    """
+    return _bounds(problem, problem.model.at(parameters), tolerance)
+
+
+def _bounds(problem: Problem, model: Any, tolerance: float) -> tuple[float, float]:
+    """Bounds of the mean over the initial distribution of a model."""
     given: dict[str, Any] = {
         "maximize": problem.objective == "max",
         "tolerance": tolerance,

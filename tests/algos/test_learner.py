@@ -24,6 +24,7 @@ from jaxltl.algos import (
     behavioral_cloning,
     cce,
     checkpoint,
+    feasible,
     learner,
     maximin_q,
     mlirl,
@@ -34,6 +35,7 @@ from jaxltl.algos import (
 from jaxltl.algos.exponential_family import diagonal_gaussian
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.parametric import make_parametric
 from jaxltl.core.types import Status
 from tests.support import counted_traces, lane
 
@@ -210,6 +212,20 @@ def cloning():
         behavioral_cloning, problem, setting(), setting(learning_rate=0.1, l2=0.1, patience=3))
 
 
+def two_throws(x):
+    p, q = x
+    return jnp.array([p, 1 - p, 1 - q, q, 1, 1])
+
+
+def parameters():
+    """A head, then a tail, of two coins."""
+    chain = jl.make_sparse(
+        None, [0, 2, 4, 5, 6], [1, 3, 2, 3, 2, 3], [0.5] * 4 + [1, 1], initial=[1, 0, 0, 0])
+    model = make_parametric(chain, two_throws, [0.1, 0.2], [0.9, 0.8])
+    problem = feasible.make_problem(model, np.arange(4) == 2, bound=">=")
+    return Case(feasible, problem, feasible.Hparams(), feasible.Hparams(learning_rate=0.01))
+
+
 LEARNERS = {
     "toy": lambda: Case(TOY, jnp.arange(3.0), 0.1, 0.2),
     "mlirl-world": mlirl_world,
@@ -222,6 +238,7 @@ LEARNERS = {
     "cpo": partial(trust, "cpo", hidden=(3,)),
     "cce": cross_entropy,
     "cloning": cloning,
+    "feasible": parameters,
 }
 
 by_learner = pytest.mark.parametrize("name", LEARNERS)

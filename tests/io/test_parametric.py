@@ -4,13 +4,17 @@ import re
 from dataclasses import replace
 from fractions import Fraction
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxltl.core.models.sparse import row_reward
 from jaxltl.io.drn import read_drn, write_drn
 from jaxltl.io.parametric import read_parametric
 from tests.io.mutate import mutated
 from tests.io.same import assert_same, full_model
+from tests.support import counted_traces
 
 CHAIN = """\
 @type: DTMC
@@ -151,3 +155,60 @@ def test_mutated_files_are_read_or_refused(tmp_path):
             read_parametric(path)
         except ValueError as error:
             assert str(tmp_path) in str(error)
+
+
+# --- as functions of arrays -------------------------------------------------------------------
+
+BOX = {"p": (0.2, 0.6), "q": (0.1, 0.5)}
+LOW, HIGH = ({name: ends[i] for name, ends in BOX.items()} for i in range(2))
+
+# Two entries lead from state 1 to state 0; state 2 does not lead to state 1, whatever p is.
+PARALLEL = CHAIN.replace("\t\t0 : (2-p-q)/2", "\t\t0 : 1/4\n\t\t0 : 3/4-(p+q)/2").replace(
+    "\t\t2 : 1\n", "\t\t2 : 1\n\t\t1 : p-p\n"
+)
+
+
+@pytest.mark.parametrize("text", [CHAIN, PARALLEL])
+def test_functions_of_arrays_are_those_of_the_file(tmp_path, text):
+    found = read(tmp_path, text)
+    over = found.over(LOW, HIGH)
+    evaluate = jax.jit(lambda numbers, x: numbers(x))
+    for x in ([0.25, 0.5], [0.6, 0.1], over.inside):
+        exact = found.at(dict(zip("pq", x, strict=True)))
+        probability, rewards = evaluate(over.numbers, jnp.array(x))
+        np.testing.assert_allclose(probability, exact.probability, rtol=1e-14)
+        np.testing.assert_allclose(rewards["cost"], row_reward(exact), rtol=1e-13, atol=1e-15)
+        assert_same(over.at(x), exact)
+    assert_same(over.model, over.at(over.inside))
+    assert over.parameters == ("p", "q") and over.low.tolist() == [0.2, 0.1]
+
+
+def test_a_file_that_is_read_again_compiles_nothing(tmp_path):
+    evaluate = jax.jit(lambda model, x: model.numbers(x))
+    one, other = (read(tmp_path, CHAIN).over(LOW, HIGH) for _ in range(2))
+    evaluate(one, one.inside)
+    with counted_traces() as traced:
+        evaluate(other, one.inside)
+        evaluate(other.within(LOW, 0.5), one.inside)
+    assert not traced
+    assert read(tmp_path, CHAIN.replace("p^2", "p^3")).over(LOW, HIGH).exact != one.exact
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "message"),
+    [
+        ({"p": 0.2}, 0.5, "low: q is missing"),
+        (0.5, 0.2, "interval of p is .0.5, 0.2.; low must be below high"),
+        (-0.9, -0.1, "no model at any of 64 points of the box; at .* probability -"),
+        (2.5, 3.5, "no model at any of 64 points"),
+    ],
+)
+def test_boxes_without_a_model_are_refused(tmp_path, low, high, message):
+    with pytest.raises(ValueError, match=message):
+        read(tmp_path, CHAIN).over(low, high)
+
+
+def test_where_transitions_are_gone_there_is_no_such_model(tmp_path):
+    over = read(tmp_path, CHAIN).over(0.0, 1.0)
+    with pytest.raises(ValueError, match="some transitions are gone"):
+        over.at({"p": 0.0, "q": 0.5})
