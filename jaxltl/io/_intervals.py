@@ -41,9 +41,10 @@ def with_whole_brackets(block: Block, column: int, lines: NDArray[np.bool_] | No
       column: of the token in its line, from 0.
       lines: ``bool[L]``, those that are looked at; default all.
     """
-    long_enough = block.count > column
-    lines = np.flatnonzero(long_enough if lines is None else long_enough & lines)
-    at = block.first[:-1][lines] + column
+    looked_at = block.count > column
+    if lines is not None:
+        looked_at &= lines
+    at = block.first[:-1][looked_at] + column
     at = at[block.data[block.start[at]] == ord("[")]
     closing = np.flatnonzero(block.data[block.end - 1] == ord("]"))
     if not at.size or not closing.size:
@@ -71,46 +72,51 @@ def intervals(block: Block, token: Integers) -> tuple[Floats, Floats]:
     Raises:
       ValueError: one is neither, or the ends are crossed or no probabilities, naming its line.
     """
-    # A line for each token, whose blanks may be inside of it.
-    length = block.end[token] - block.start[token] + 1
-    joined = block.joined(token)
-    joined[length.cumsum() - 1] = ord("\n")
-    sign = joined[_SIGN[joined]].tobytes()
-    begins = np.concatenate([[0], length.cumsum()[:-1]])
-    opened = joined[begins] == ord("[")
-    fits = (
-        _SHAPE.fullmatch(sign) is not None
-        and opened.sum() == sign.count(b"[")
-        and ((joined[begins + length - 2] == ord("]")) == opened).all()
-    )
-    data = np.frombuffer(joined.tobytes().translate(_TO_BLANKS), np.uint8)
-    blank = np.ones(data.size + 1, bool)
-    np.less_equal(data, 32, out=blank[1:])
-    edge = np.flatnonzero(blank[1:] != blank[:-1])
-    start, end = edge[::2], edge[1::2]
-    count = np.diff(np.searchsorted(start, np.append(begins, data.size)))
-    if not fits or (count != 1 + opened).any():
-        raise block.error(_first_wrong(block, token), EXPECTED)
-    first = np.concatenate([[0], count.cumsum()])
-    line = block.line[np.searchsorted(block.first, token, "right") - 1]
-    numbers = Block(block.text, data, start, end, first, line)
-    lower = numbers.floats(first[:-1], EXPECTED)
-    upper = numbers.floats(first[1:] - 1, EXPECTED) if opened.any() else lower
+    numbers = _numbers(block, token)
+    if numbers is None:
+        low, high = 0, token.size  # the first wrong one is among these
+        while high - low > 1:
+            middle = (low + high) // 2
+            fits = _numbers(block, token[low:middle]) is not None
+            low, high = (middle, high) if fits else (low, middle)
+        raise block.error(int(token[low]), EXPECTED)
+    lower = numbers.floats(numbers.first[:-1], EXPECTED)
+    upper = lower
+    if (numbers.count > 1).any():
+        upper = numbers.floats(numbers.first[1:] - 1, EXPECTED)
     bad = ~((lower >= 0) & (lower <= upper) & (upper <= 1 + NEAR))
     if bad.any():
         raise block.error(int(token[int(bad.argmax())]), EXPECTED)
     return lower, upper
 
 
-def _first_wrong(block: Block, token: Integers) -> int:
-    """The first token that has not the form of a number or of an interval."""
-    for one in token.tolist():
-        text = block.data[block.start[one] : block.end[one]].tobytes()
-        inner = text[1:-1].split(b",") if text[:1] == b"[" else [text]
-        closed = text[:1] != b"[" or (text[-1:] == b"]" and len(inner) == 2)
-        if not closed or any(len(x.split()) != 1 or _SIGN[list(x)].any() for x in inner):
-            return one
-    raise AssertionError(token)
+def _numbers(block: Block, token: Integers) -> Block | None:
+    """A line for each token, with its number or the two of its interval; None if one is neither."""
+    length = block.end[token] - block.start[token] + 1
+    joined = block.joined(token)
+    joined[length.cumsum() - 1] = ord("\n")
+    begin = length.cumsum() - length
+    opened = joined[begin] == ord("[")
+    if (
+        _SHAPE.fullmatch(joined[_SIGN[joined]].tobytes()) is None
+        or opened.sum() != (joined == ord("[")).sum()
+        or ((joined[begin + length - 2] == ord("]")) != opened).any()
+    ):
+        return None
+    comma = joined == ord(",")
+    data = np.frombuffer(joined.tobytes().translate(_TO_BLANKS), np.uint8)
+    blank = np.ones(data.size + 1, bool)
+    np.less_equal(data, 32, out=blank[1:])
+    edge = np.flatnonzero(blank[1:] != blank[:-1])
+    start, end = edge[::2], edge[1::2]
+    count = np.diff(np.searchsorted(start, np.append(begin, data.size)))
+    # One number on either side of each comma.
+    of = np.searchsorted(start, np.flatnonzero(comma))
+    first = np.concatenate([[0], count.cumsum()])
+    if (count != 1 + opened).any() or (of != first[1:][opened] - 1).any():
+        return None
+    line = block.line[np.searchsorted(block.first, token, "right") - 1]
+    return Block(block.text, data, start, end, first, line)
 
 
 def point_rewards(text: Text) -> Text:

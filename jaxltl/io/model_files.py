@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.game import Game
+from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.io._files import pieces, raw_bytes, write_bytes
 from jaxltl.io.drn import read_drn, write_drn
@@ -26,7 +27,7 @@ class Format(NamedTuple):
 
     name: str
     suffixes: tuple[str, ...]
-    read: Callable[[Any], SparseMDP | Game]
+    read: Callable[[Any], SparseMDP | IntervalMDP | Game]
     write: Callable[[Any, Any], None]
     of: str  # what it holds: "models", "all" for games too, or "games"
 
@@ -59,7 +60,7 @@ FORMATS = (
 )
 
 
-def read_model(path: str | os.PathLike[str]) -> SparseMDP | Game:
+def read_model(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
     """The model of a file, by the end of its name or, where that says nothing, by how it begins.
 
     Known are UMB (``.umb``), PRISM's explicit files (``.tra`` with what stands beside it,
@@ -71,8 +72,9 @@ def read_model(path: str | os.PathLike[str]) -> SparseMDP | Game:
       path: the file.
 
     Returns:
-      A :class:`~jaxltl.core.models.sparse.SparseMDP`, or a game over one. The objective of a parity
-      game is what :func:`~jaxltl.io.pgsolver.objective_of` says of it.
+      A :class:`~jaxltl.core.models.sparse.SparseMDP`, a game over one, or an
+      :class:`~jaxltl.core.models.interval.IntervalMDP`. The objective of a parity game is what
+      :func:`~jaxltl.io.pgsolver.objective_of` says of it.
 
     Raises:
       ValueError: the format is not known, or the file is missing or malformed. The message names
@@ -86,8 +88,9 @@ def write_model(path: str | os.PathLike[str], model: Any) -> None:
 
     Args:
       path: the file.
-      model: a model that :func:`~jaxltl.core.models.convert.to_sparse` takes, or a
-        :class:`~jaxltl.core.models.game.Game` over one.
+      model: a model that :func:`~jaxltl.core.models.convert.to_sparse` takes, a
+        :class:`~jaxltl.core.models.game.Game` over one, or an
+        :class:`~jaxltl.core.models.interval.IntervalMDP`.
 
     Raises:
       ValueError: the format is not known or cannot hold the model, naming what of it, or the place
@@ -117,7 +120,7 @@ def write_model(path: str | os.PathLike[str], model: Any) -> None:
             f"{str(path)!r}: {form.name} holds games only, and this is no Game; write "
             f"{_listed(x for x in FORMATS if x.of != 'games')}."
         )
-    form.write(path, model if is_game else to_sparse(model))
+    form.write(path, model if isinstance(model, Game | IntervalMDP) else to_sparse(model))
 
 
 def _by_name(path: str | os.PathLike[str]) -> Format | None:

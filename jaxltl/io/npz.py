@@ -14,12 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.algos.checkpoint import atomic_write, read_arrays
+from jaxltl.core.host.rows import starts_of
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp
 from jaxltl.core.models.padded import to_padded
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.io._files import ALWAYS_ALLOWED, MAX_RATIO, raw_bytes
+from jaxltl.io._intervals import exact_part
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -37,8 +40,9 @@ _SHARED = {
     "actions": _TEXTS,
     "system": _TRUTH,
 }
-_PADDED = {"transition": _NUMBERS, "available": _TRUTH, **_SHARED}
-_SPARSE = {"row_start": _WHOLE, "entry_start": _WHOLE, "action": _WHOLE, **_SHARED}
+_ENDS = {"lower": _NUMBERS, "upper": _NUMBERS}  # of interval models
+_PADDED = {"transition": _NUMBERS, "available": _TRUTH, **_SHARED, **_ENDS}
+_SPARSE = {"row_start": _WHOLE, "entry_start": _WHOLE, "action": _WHOLE, **_SHARED, **_ENDS}
 _VALUES = ("biufUS", "truth values, numbers and texts")
 _REWARD, _VARIABLE = "reward:", "variable:"
 _PARTS = ("state", "choice", "transition")
@@ -101,8 +105,10 @@ def model_of(arrays: Arrays, name: str) -> tuple[MDP, tuple[str, ...] | None]:
       ValueError: an array is missing or wrong.
     """
     with _errors_in(name):
+        if set(arrays) & set(_ENDS):
+            raise ValueError("its probabilities are intervals; a padded model has single numbers.")
         if _is_sparse(arrays):
-            return to_padded(sparse_model(arrays)), None
+            return to_padded(exact_part(sparse_model(arrays))), None
         mdp, _ = _padded_model(arrays)
         return mdp, _action_names(arrays, mdp.num_actions)
 
@@ -125,8 +131,7 @@ def _padded_model(arrays: Arrays) -> tuple[MDP, SparseMDP]:
     options: dict[str, Any] = {
         k: arrays[k] for k in ("available", "initial", "label") if k in arrays
     }
-    names = arrays.get("propositions", np.zeros(0, str))
-    options["propositions"] = [str(x) for x in names.ravel()]
+    options["propositions"] = _propositions(arrays)
     exact: Any
     given: Mapping[str, Any] = arrays
     if "transition" in arrays:
@@ -155,13 +160,58 @@ def _action_names(arrays: Arrays, count: int) -> tuple[str, ...] | None:
     return actions
 
 
-def sparse_model(arrays: Arrays) -> SparseMDP:
+def _padded_interval(arrays: Arrays) -> tuple[IntervalMDP, int]:
+    """The model of successor, lower and upper, ``[S, A, K]``, and A; probability is passed over."""
+    missing = {"successor", *_ENDS} - set(arrays)
+    if missing:
+        raise ValueError(
+            f"it needs the array {min(missing)}; an interval model has successor, lower and upper."
+        )
+    successor, lower, upper = (arrays[k] for k in ("successor", *_ENDS))
+    if (
+        successor.ndim != 3
+        or not successor.shape == lower.shape == upper.shape
+        or not (successor.size)
+    ):
+        raise ValueError(
+            f"successor has shape {successor.shape}, lower {lower.shape} and upper "
+            f"{upper.shape}; all must be [states, actions, successors]."
+        )
+    used = ~((lower == 0) & (upper == 0))
+    available = np.asarray(arrays.get("available", used.any(-1)), bool)
+    if available.shape != used.shape[:2]:
+        raise ValueError(f"available has shape {available.shape}; expected {used.shape[:2]}.")
+    used &= available[..., None]
+    state, action = np.nonzero(available)
+    options: dict[str, Any] = {k: arrays[k] for k in ("initial", "label") if k in arrays}
+    found = interval_rows(
+        starts_of(available.sum(-1)),
+        starts_of(used.sum(-1)[state, action]),
+        successor[used],
+        lower[used].astype(np.float64),
+        upper[used].astype(np.float64),
+        action=action,
+        propositions=_propositions(arrays),
+        **options,
+    )
+    return found, used.shape[1]
+
+
+def _propositions(arrays: Arrays) -> list[str]:
+    return [str(x) for x in arrays.get("propositions", np.zeros(0, str)).ravel()]
+
+
+def sparse_model(arrays: Arrays) -> SparseMDP | IntervalMDP:
     """The model of the arrays row_start, entry_start, successor and probability.
+
+    With the arrays lower and upper it is an interval model, whose probability is passed over.
 
     Raises:
       ValueError: an array is missing or wrong.
     """
-    missing = {"row_start", "entry_start", "successor", "probability"} - set(arrays)
+    is_interval = bool(set(arrays) & set(_ENDS))
+    chances = tuple(_ENDS) if is_interval else ("probability",)
+    missing = {"row_start", "entry_start", "successor", *chances} - set(arrays)
     if missing:
         raise ValueError(f"it needs the array {min(missing)}.")
     rewards: dict[str, dict[str, NDArray[Any]]] = {}
@@ -175,33 +225,35 @@ def sparse_model(arrays: Arrays) -> SparseMDP:
                 )
             rewards.setdefault(reward, {})[part] = array
     options: dict[str, Any] = {k: arrays[k] for k in ("initial", "label", "action") if k in arrays}
-    for key, ours in (("propositions", "propositions"), ("actions", "action_names")):
-        if key in arrays:
-            options[ours] = [str(x) for x in arrays[key].ravel()]
-    model = make_sparse(
-        arrays["row_start"],
-        arrays["entry_start"],
-        arrays["successor"],
-        arrays["probability"],
-        rewards={k: Rewards(**v) for k, v in rewards.items()},
-        valuation={
-            key.removeprefix(_VARIABLE): array
-            for key, array in arrays.items()
-            if key.startswith(_VARIABLE)
-        },
-        **options,
-    )
-    if "initial" in arrays:  # what was checked may have been scaled
-        model = replace(model, initial=np.asarray(arrays["initial"], np.float64))
-    return model
+    options["propositions"] = _propositions(arrays)
+    if "actions" in arrays:
+        options["action_names"] = [str(x) for x in arrays["actions"].ravel()]
+    options["rewards"] = {k: Rewards(**v) for k, v in rewards.items()}
+    options["valuation"] = {
+        key.removeprefix(_VARIABLE): array
+        for key, array in arrays.items()
+        if key.startswith(_VARIABLE)
+    }
+    rows = (arrays[k] for k in ("row_start", "entry_start", "successor", *chances))
+    found = interval_rows(*rows, **options) if is_interval else make_sparse(*rows, **options)
+    return _with_initial(found, arrays)
 
 
-def read_npz(path: str | os.PathLike[str]) -> SparseMDP | Game:
+def _with_initial(model: Any, arrays: Arrays) -> Any:
+    """The model with the initial distribution as it stands; what was checked may be scaled."""
+    if "initial" not in arrays:
+        return model
+    exact = replace(exact_part(model), initial=np.asarray(arrays["initial"], np.float64))
+    return replace(model, nominal=exact) if isinstance(model, IntervalMDP) else exact
+
+
+def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
     """The model of an ``.npz`` file, in double precision.
 
     A padded file has the array ``transition``, ``[S, A, S]``, or ``successor`` and ``probability``,
     ``[S, A, K]``; a sparse one, such as :func:`write_npz` writes, the fields of
-    :class:`~jaxltl.core.models.sparse.SparseMDP`. With an array ``system`` it is a game.
+    :class:`~jaxltl.core.models.sparse.SparseMDP`. With an array ``system`` it is a game, with
+    ``lower`` and ``upper`` in place of ``probability`` an interval model.
 
     Raises:
       ValueError: naming the file and the array that is unknown, missing or wrong.
@@ -210,8 +262,20 @@ def read_npz(path: str | os.PathLike[str]) -> SparseMDP | Game:
     try:
         arrays = parse_arrays(raw_bytes(path), name, ("system",))
         with _errors_in(name):
+            if set(arrays) & set(_ENDS) and "system" in arrays:
+                raise ValueError(
+                    "the probabilities of this game are intervals; chains and "
+                    "decision processes are read with them."
+                )
+            model: Any
             if _is_sparse(arrays):
                 model = sparse_model(arrays)
+            elif set(arrays) & set(_ENDS):
+                model, num_actions = _padded_interval(arrays)
+                named = replace(
+                    model.nominal, action_names=_action_names(arrays, num_actions) or ()
+                )
+                model = _with_initial(replace(model, nominal=named), arrays)
             else:
                 mdp, model = _padded_model(arrays)
                 names = _action_names(arrays, mdp.num_actions)
@@ -228,7 +292,8 @@ def write_npz(path: str | os.PathLike[str], model: Any) -> None:
 
     Args:
       path: the file.
-      model: a model that :func:`~jaxltl.core.models.convert.to_sparse` takes, or a game over one.
+      model: a model that :func:`~jaxltl.core.models.convert.to_sparse` takes, a game over one, or
+        an interval model.
 
     Raises:
       ValueError: a variable holds other things, or the place cannot be written to.
@@ -236,8 +301,12 @@ def write_npz(path: str | os.PathLike[str], model: Any) -> None:
     arrays: dict[str, Any] = {}
     if isinstance(model, Game):
         model, arrays["system"] = model.mdp, np.asarray(model.system, bool).ravel()
-    sparse = to_sparse(model)
-    for key in ("row_start", "entry_start", "successor", "probability", "initial", "label"):
+    keys = ["row_start", "entry_start", "successor", "probability", "initial", "label"]
+    if isinstance(model, IntervalMDP):
+        keys.remove("probability")
+        arrays |= {k: np.asarray(getattr(model, k), np.float64) for k in _ENDS}
+    sparse = to_sparse(exact_part(model))
+    for key in keys:
         arrays[key] = np.asarray(getattr(sparse, key))
     if sparse.action is not None:
         arrays["action"] = np.asarray(sparse.action)

@@ -13,11 +13,13 @@ from typing import Any
 
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.game import Game
+from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.io._intervals import exact_part
 from jaxltl.io.umb import read_umb, write_umb
 
 
-def from_stormpy(model: Any) -> SparseMDP | Game:
+def from_stormpy(model: Any) -> SparseMDP | IntervalMDP | Game:
     """A sparse model of Storm's as one of the library's, bit for bit.
 
     States and choices keep their order. Kept are labels (without Storm's own ``"init"``, which is
@@ -27,10 +29,11 @@ def from_stormpy(model: Any) -> SparseMDP | Game:
 
     Args:
       model: a sparse Markov chain, decision process or stochastic game (`SparseDtmc`, `SparseMdp`,
-        `SparseSmg`).
+        `SparseSmg`), or one of the first two with intervals.
 
     Returns:
-      A :class:`~jaxltl.core.models.sparse.SparseMDP`, or a Game over one.
+      A :class:`~jaxltl.core.models.sparse.SparseMDP`, a Game over one, or an
+      :class:`~jaxltl.core.models.interval.IntervalMDP`.
 
     Raises:
       ValueError: stormpy (version 2 or later) is not installed, or the model is none of these.
@@ -60,25 +63,27 @@ def to_stormpy(model: Any) -> Any:
     Of an initial distribution Storm has the states where it is positive.
 
     Args:
-      model: a model that :func:`~jaxltl.core.models.convert.to_sparse` takes, or a Game over one.
+      model: a model that :func:`~jaxltl.core.models.convert.to_sparse` takes, a Game over one, or
+        an :class:`~jaxltl.core.models.interval.IntervalMDP`.
 
     Returns:
-      A `SparseDtmc` where every state has one choice, a `SparseMdp`, or a `SparseSmg`.
+      A `SparseDtmc` where every state has one choice, a `SparseMdp`, or a `SparseSmg`; of an
+      interval model one with intervals.
 
     Raises:
       ValueError: stormpy (version 2 or later) is not installed.
     """
     storm = _stormpy()
-    sparse = to_sparse(model.mdp if isinstance(model, Game) else model)
+    sparse = to_sparse(exact_part(model.mdp if isinstance(model, Game) else model))
     options = storm.io.UmbImportOptions()
     options.build_state_valuations = bool(sparse.valuation)  # else Storm warns that there are none
     options.build_choice_labeling = sparse.action is not None
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.umb"
+        if isinstance(model, Game):
+            model = replace(model, mdp=sparse)
         write_umb(
-            path,
-            replace(model, mdp=sparse) if isinstance(model, Game) else sparse,
-            compression=None,
+            path, model if isinstance(model, Game | IntervalMDP) else sparse, compression=None
         )
         return storm.build_model_from_umb(str(path), options=options)
 

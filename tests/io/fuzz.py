@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.models.game import make_game
-from jaxltl.core.models.sparse import SparseMDP, make_sparse
+from jaxltl.core.models.sparse import make_sparse
 from jaxltl.io.drn import read_drn, write_drn
 from jaxltl.io.hoa_game import read_hoa_game
 from jaxltl.io.npz import read_npz, write_npz
@@ -28,7 +28,7 @@ from jaxltl.io.reward_machine import read_reward_machine
 from jaxltl.io.umb import read_umb, write_umb
 from tests.io.archives import classes_example, example, members_of, tar, umb
 from tests.io.mutate import mutated
-from tests.io.same import full_model
+from tests.io.same import full_interval, full_model
 
 MOST_SECONDS = 5.0  # of processor time, for one small file
 MOST_MEMORY = 2**30  # bytes that trying them may add
@@ -117,6 +117,7 @@ _VALUES = (
     "bool",
     "string",
     "double-interval",
+    "rational-interval",
     "\ud800",
     [],
     {},
@@ -249,13 +250,15 @@ def umb_samples(folder: Path) -> list[bytes]:
     for model in models:
         write_umb(path, model, compression=None)
         samples.append(path.read_bytes())
+    write_umb(path, full_interval(rng), compression=None)
+    samples.append(path.read_bytes())
     return [*samples, umb(*example()), umb(*classes_example(), folders=True)]
 
 
 # --- texts, and arrays ----------------------------------------------------------------------
 
 
-def _written(write: Callable[[Path, SparseMDP], None], name: str) -> Callable[[Path], list[bytes]]:
+def _written(write: Callable[[Path, Any], None], name: str) -> Callable[[Path], list[bytes]]:
     """Samples of a writer for models."""
 
     def samples(folder: Path) -> list[bytes]:
@@ -264,6 +267,7 @@ def _written(write: Callable[[Path, SparseMDP], None], name: str) -> Callable[[P
             full_model(rng, 5, chain=True, transition_rewards=False),
             full_model(rng, transition_rewards=False),
             make_sparse(None, [0, 1], [0], [1.0]),
+            full_interval(rng, transition_rewards=False),
         ):
             write(path, model)
             found.append(path.read_bytes())
@@ -310,7 +314,9 @@ def damaged_arrays(rng: np.random.Generator, data: bytes) -> bytes:
                     "reward:x:state",
                     "variable:x",
                     "unknown",
-                )[rng.integers(7)]
+                    "lower",
+                    "upper",
+                )[rng.integers(9)]
             ] = array
         elif kind == 2:
             arrays[name] = arrays.get(other, array)
@@ -355,6 +361,9 @@ def npz_samples(folder: Path) -> list[bytes]:
     found.append(file.getvalue())
     file = io.BytesIO()
     np.savez(file, transition=np.array([[[0.5, 0.5]], [[0, 1]]]))
+    found.append(file.getvalue())
+    file = io.BytesIO()
+    np.savez(file, successor=successor, lower=probability / 2, upper=probability)
     return [*found, file.getvalue()]
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.sparse import Rewards, SparseMDP
 from tests.sparse_models import random_sparse
 
@@ -48,6 +49,25 @@ def full_model(rng, num_states=9, *, chain=False, transition_rewards=True, names
             "y": rng.random(num_states),
         },
     )
+
+
+def full_interval(rng, num_states=9, **options):
+    """The same with intervals: points, lower ends of 0, whole rows that are open."""
+    model = full_model(rng, num_states, **options)
+    p = model.probability
+    lower, upper = p * rng.random(p.size), p + (1 - p) * rng.random(p.size)
+    kind = rng.integers(4, size=p.size)
+    lower = np.where(kind == 0, 0, np.where(kind == 1, p, lower))
+    upper = np.where(kind == 1, p, np.where(rng.random(p.size) < 0.1, 1, upper))
+    return make_interval(model, lower, upper)
+
+
+def assert_same_interval(found: IntervalMDP, model: IntervalMDP, **options):
+    """The same ends bit for bit, and the same model."""
+    assert isinstance(found, IntervalMDP)
+    assert found.lower.tobytes() == model.lower.tobytes()
+    assert found.upper.tobytes() == model.upper.tobytes()
+    assert_same(found.nominal, model.nominal, **options)
 
 
 def assert_same(found: SparseMDP, model: SparseMDP, *, valuation=True):

@@ -12,6 +12,7 @@ import numpy as np
 from jaxltl.app.files import tables
 from jaxltl.core.games.objective import Parity
 from jaxltl.core.models.game import Game
+from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.padded import to_padded
 from jaxltl.core.models.sparse import SparseMDP
@@ -68,6 +69,11 @@ def read_padded(path: Path, more: Sequence[str] = ()) -> ReadModel:
     model: Any = read_model(path)
     found: dict[str, np.ndarray] = {}
     objective = None
+    if isinstance(model, IntervalMDP):
+        raise ValueError(
+            f"{name!r} holds a model whose probabilities are intervals; jaxltl solve answers "
+            "questions about it, and learners need single numbers."
+        )
     if isinstance(model, Game):
         if "system" not in more:
             raise ValueError(
