@@ -47,8 +47,7 @@ class HoaGame(NamedTuple):
     """A game, what the system is to achieve, and who chooses which propositions.
 
     Attributes:
-      game: a Game over a :class:`~jaxltl.core.models.sparse.SparseMDP`; its game solvers, such as
-        ``winning_region``, pad it.
+      game: a Game over a :class:`~jaxltl.core.models.sparse.SparseMDP`.
       objective: the parity objective.
       inputs: the propositions that the environment chooses.
       outputs: those that the system chooses.

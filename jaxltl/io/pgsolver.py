@@ -29,8 +29,7 @@ class ParityGame(NamedTuple):
     """A game and what the system is to achieve in it.
 
     Attributes:
-      game: a Game over a :class:`~jaxltl.core.models.sparse.SparseMDP`; its game solvers, such as
-        ``winning_region``, pad it.
+      game: a Game over a :class:`~jaxltl.core.models.sparse.SparseMDP`.
       objective: the parity objective, min-even, of the fewest priorities that say the same.
     """
 

@@ -100,12 +100,12 @@ def _keep(arena: _Arena, moves: Any, inside: Any, counters: Any) -> tuple[Any, A
 
 def _within(arena: _Arena, moves: Any, inside: Any) -> Any:
     """The system's moves that surely stay inside, and all of the environment's."""
-    return moves & (arena.graph.forall(inside) | ~arena.system[..., None])
+    return moves & (arena.graph.forall(inside) | ~arena.graph.on_choices(arena.system))
 
 
 def _near(arena: _Arena, found: Any) -> Any:
     """The environment's moves that may lead to a set: ``bool[S, A]``. They help the system."""
-    return arena.graph.exists(found) & ~arena.system[..., None]
+    return arena.graph.exists(found) & ~arena.graph.on_choices(arena.system)
 
 
 def _pursue(arena: _Arena, j: int, inside: Any, allowed: Any) -> tuple[Any, Any]:

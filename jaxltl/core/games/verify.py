@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from jaxltl.core.games.objective import GR1, Parity
 from jaxltl.core.host.components import reached, strong_components
-from jaxltl.core.models.game import as_padded_game
+from jaxltl.core.models.compiled import compiled_form
+from jaxltl.core.models.game import as_game
 from jaxltl.core.models.mdp import DenseMDP, support
+from jaxltl.core.models.sparse import SparseMDP
 
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.integer[Any]]
@@ -88,10 +90,25 @@ def verify(winning: Any) -> Verification:
     return Verification(not system, not environment, reason)
 
 
+class _Moves(NamedTuple):
+    """The moves of a game over flat states, in order of states and actions.
+
+    Attributes:
+      state, action: of each move.
+      move, successor: of each edge, which are in order of moves.
+    """
+
+    state: Integers
+    action: Integers
+    move: Integers
+    successor: Integers
+
+
 class _Claim(NamedTuple):
     """A ``Winning`` with flat states: ``[S]``, actions ``[S, memories]``, sets ``[n, S]``."""
 
-    game: Any
+    shape: tuple[int, ...]  # of the game's states
+    moves: _Moves
     system: Booleans
     region: Booleans
     won: Booleans
@@ -104,7 +121,7 @@ class _Claim(NamedTuple):
 
 
 def _claim(winning: Any) -> _Claim:
-    game, objective = as_padded_game(winning.game), winning.objective
+    game, objective = as_game(winning.game), winning.objective
     shape = game.state_shape
     if isinstance(objective, GR1):
         sets = tuple(
@@ -129,8 +146,8 @@ def _claim(winning: Any) -> _Claim:
         return value.reshape(-1, max(width, 1))
 
     return _Claim(
-        game, np.asarray(game.system).ravel(), flat("region", 0)[:, 0].astype(bool),
-        won.ravel(), np.asarray(objective.lost).ravel(),
+        shape, _moves(compiled_form(game)[0]), np.asarray(game.system).ravel(),
+        flat("region", 0)[:, 0].astype(bool), won.ravel(), np.asarray(objective.lost).ravel(),
         flat("action", len(sets[1])), flat("counter_action", len(sets[0])), priority, *sets,
     )
 
@@ -151,7 +168,8 @@ def _refute_system(claim: _Claim) -> str:
         node_in[play.source] & ~np.repeat(claim.region, memories)[play.target]
     )
     if edge.size:
-        node, action = divmod(int(play.pair[edge[0]]), play.actions)
+        pair = int(play.pair[edge[0]])
+        node, action = int(play.owner[pair]), int(claim.moves.action[pair // memories])
         who = "strategy's" if claim.system[node // memories] else "environment's"
         return f"from {_where(claim, play, node)} the {who} action {action} leaves the region"
     for avoid, meet, what in _failures(claim):
@@ -218,7 +236,7 @@ def _least_priorities(priority: Integers, parity: int):
 
 
 def _name(claim: _Claim, state: int) -> str:
-    where = tuple(int(i) for i in np.unravel_index(state, claim.game.state_shape))
+    where = tuple(int(i) for i in np.unravel_index(state, claim.shape))
     return str(where[0]) if len(where) == 1 else str(where)
 
 
@@ -230,9 +248,13 @@ def _where(claim: _Claim, play: _Play, node: int) -> str:
 
 def _unavailable(claim: _Claim, action: Integers, where: Booleans) -> str:
     """The first action of a strategy that cannot be taken."""
-    available = np.asarray(claim.game.available).reshape(action.shape[0], -1)
-    known = (action >= 0) & (action < available.shape[1])
-    valid = known & np.take_along_axis(available, np.where(known, action, 0), axis=1)
+    moves = claim.moves
+    base = int(moves.action.max()) + 1
+    known = (action >= 0) & (action < base)
+    asked = np.arange(action.shape[0])[:, None] * base + np.where(known, action, 0)
+    number = moves.state * base + moves.action
+    place = np.minimum(np.searchsorted(number, asked), number.size - 1)
+    valid = known & (number[place] == asked)
     wrong = np.argwhere(where[:, None] & ~valid)
     if not wrong.size:
         return ""
@@ -247,7 +269,7 @@ def _unavailable(claim: _Claim, action: Integers, where: Booleans) -> str:
 class _Play(NamedTuple):
     """What one player faces: edges from nodes ``state * memories + memory`` by numbered pairs.
 
-    The pair ``node * actions + action`` is a choice; all its edges are possible at once.
+    The pair ``move * memories + memory`` is a choice; all its edges are possible at once.
     """
 
     source: Integers
@@ -255,40 +277,60 @@ class _Play(NamedTuple):
     target: Integers
     into: Integers  # the pairs with an edge into node n are into[start[n]:start[n + 1]]
     start: Integers
+    owner: Integers  # the node of each pair
     nodes: int
     memories: int
-    actions: int
 
 
 def _fix(claim: _Claim, owner: Booleans, action: Integers, goals: Booleans) -> _Play:
     """The game with one player's actions fixed; the memory advances past a goal that is met."""
-    state, taken, successor = _edges(claim.game)
+    moves = claim.moves
     memories = len(goals)
     memory = np.arange(memories)
     after = np.where(goals.T, (memory + 1) % memories, memory)  # [S, memories]
-    kept = ~owner[state, None] | (action[state] == taken[:, None])
-    nodes, actions = owner.size * memories, claim.game.num_actions
+    kept = ~owner[moves.state, None] | (action[moves.state] == moves.action[:, None])
+    kept = kept[moves.move]
+    state = moves.state[moves.move]
     source = (state[:, None] * memories + memory)[kept]
-    pair = source * actions + np.broadcast_to(taken[:, None], kept.shape)[kept]
-    target = (successor[:, None] * memories + after[state])[kept]
+    pair = (moves.move[:, None] * memories + memory)[kept]
+    target = (moves.successor[:, None] * memories + after[state])[kept]
+    nodes = owner.size * memories
     order = np.argsort(target, kind="stable")
     start = np.searchsorted(target[order], np.arange(nodes + 1))
-    return _Play(source, pair, target, pair[order], start, nodes, memories, actions)
+    of_pair = (moves.state[:, None] * memories + memory).ravel()
+    return _Play(source, pair, target, pair[order], start, of_pair, nodes, memories)
 
 
-def _edges(game: Any) -> tuple[Integers, Integers, Integers]:
-    """The state, action and successor of every possible move, states numbered flat."""
+def _moves(game: Any) -> _Moves:
+    """Every possible move of a game whose products are lazy only if they are padded."""
     model = game.mdp
+    if isinstance(model, SparseMDP):
+        host = model.host
+        row = np.arange(host.num_rows)
+        return _Moves(*(x.astype(int) for x in (host.state, row, host.row, host.successor)))
     world = getattr(model, "mdp", model)
     s, a, k = support(world).nonzero()
     t = k if isinstance(world, DenseMDP) else np.asarray(world.successor)[s, a, k].astype(int)
+    new = np.ones(s.size, bool)
+    new[1:] = (s[1:] != s[:-1]) | (a[1:] != a[:-1])
+    move, first = new.cumsum() - 1, np.flatnonzero(new)
     if world is model:
-        return s, a, t
+        return _Moves(s[first], a[first], move, t)
     step = np.asarray(model.next_memory)
     memories = step.shape[1]
+    memory = np.arange(memories)
     after = step[t if model.label_on == "entry" else s]
-    source = s[:, None] * memories + np.arange(memories)
-    return source.ravel(), np.repeat(a, memories), (t[:, None] * memories + after).ravel()
+    # Moves of (s, q) are numbered by s, q and action.
+    count = np.bincount(s[first], minlength=step.shape[0])
+    begin = count.cumsum() - count
+    rank = np.arange(first.size) - begin[s[first]]
+    number = (begin * memories)[s[first], None] + memory * count[s[first], None] + rank[:, None]
+    state, action = np.empty(number.size, int), np.empty(number.size, int)
+    state[number] = s[first, None] * memories + memory
+    action[number] = a[first, None]
+    moves, target = number[move].ravel(), (t[:, None] * memories + after).ravel()
+    order = np.argsort(moves, kind="stable")
+    return _Moves(state, action, moves[order], target[order])
 
 
 def _component(play: _Play, inside: Booleans, meet: Booleans) -> int | None:
@@ -331,8 +373,8 @@ def _almost_surely(play: _Play, goal: Booleans, inside: Booleans) -> Booleans:
 
 
 def _staying(play: _Play, sources: Booleans, targets: Booleans) -> Booleans:
-    """Pairs of some nodes that surely lead to some nodes: ``bool[nodes * actions]``."""
-    alive = np.zeros(play.nodes * play.actions, bool)
+    """Pairs of some nodes that surely lead to some nodes, ``bool[pairs]``."""
+    alive = np.zeros(play.owner.size, bool)
     alive[play.pair] = True
     alive[play.pair[~sources[play.source] | ~targets[play.target]]] = False
     return alive
@@ -340,14 +382,14 @@ def _staying(play: _Play, sources: Booleans, targets: Booleans) -> Booleans:
 
 def _trim(play: _Play, alive: Booleans, inside: Booleans) -> None:
     """Drops the pairs that lead to an inside node without a pair, again and again, in place."""
-    remaining = alive.reshape(play.nodes, play.actions).sum(1)
+    remaining = np.bincount(play.owner[alive], minlength=play.nodes)
     stuck = np.flatnonzero(inside & (remaining == 0)).tolist()
     while stuck:
         node = stuck.pop()
         for pair in play.into[play.start[node] : play.start[node + 1]].tolist():
             if alive[pair]:
                 alive[pair] = False
-                source = pair // play.actions
+                source = play.owner[pair]
                 remaining[source] -= 1
                 if not remaining[source]:
                     stuck.append(source)

@@ -20,8 +20,9 @@ from jaxltl.core.games.objective import GR1, Parity, States, buchi
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models.compiled import compiled_form
 from jaxltl.core.models.concrete import namespace, to_jax
-from jaxltl.core.models.game import Game, as_padded_game
+from jaxltl.core.models.game import Game, as_game, as_padded_game
 from jaxltl.core.models.mdp import make_mdp, support
 from jaxltl.core.models.product import product
 from jaxltl.core.models.restrict import restrict
@@ -70,12 +71,14 @@ def winning_region(
     of few attractors.
 
     Args:
-      game: a Game; an MDP or a Product is the game in which the system always moves.
+      game: a Game; any other model is the game in which the system always moves. Actions in one
+        on a sparse model are rows, in its product with a task those of
+        :func:`~jaxltl.core.models.convert.to_sparse`.
       spec: an objective on the game's states (see :mod:`jaxltl.core.games.objective`), or a
         formula or an automaton, which is put beside the game (``label_on="exit"``).
       chance: ``"random"``: by the model's probabilities; ``"adversarial"``: the environment
         decides where a random move leads, so that winning is sure. States from S on are
-        then the moves that it decides (on the host only).
+        then the moves that it decides (on the host only; sparse models are padded).
 
     Returns:
       :class:`Winning`. :func:`~jaxltl.core.games.verify.verify` checks it independently.
@@ -95,7 +98,7 @@ def winning_region(
     """
     if chance not in ("random", "adversarial"):
         raise ValueError(f"chance={chance!r}; choose random or adversarial.")
-    game = as_padded_game(game)
+    game = as_game(game) if chance == "random" else as_padded_game(game)
     game, objective = on_states(game, spec)
     if chance == "adversarial":
         game, origin = adversarial_chance(game)
@@ -109,16 +112,29 @@ def solve(game: Game, objective: Parity | GR1, moves: jax.Array | None = None) -
     Args:
       game: the game.
       objective: what the system is to achieve.
-      moves: ``bool[S, A]``; default the available ones. A state without any is won for the
-        player who need not move there.
+      moves: ``bool[S, A]``, on a sparse model ``bool[R]``; default the available ones. A state
+        without any is won for the player who need not move there.
     """
-    graph = graph_of(game, objective, moves)
-    owner, goal, moves = take(graph, (game.system, objective, moves))
+    form, _ = compiled_form(game)
+    graph = graph_of(form, objective, moves)
+    owner, goal, moves = take(graph, (form.system, _flat(form, objective), moves))
     if isinstance(objective, GR1):
-        found = solve_gr1(graph, owner, goal, moves)
-        return Winning(game, objective, *to_jax(found))
-    region, action = to_jax(solve_parity(graph, owner, goal, moves))
-    return Winning(game, objective, region, action, action)
+        found: Any = solve_gr1(graph, owner, goal, moves)
+    else:
+        region, action = solve_parity(graph, owner, goal, moves)
+        found = region, action, action
+    if form.state_shape != game.state_shape:
+        found = [x.reshape(*game.state_shape, *x.shape[1:]) for x in found]
+    return Winning(game, objective, *to_jax(tuple(found)))
+
+
+def _flat(form: Game, objective: Parity | GR1) -> Any:
+    """The objective with the states of a compiled form, which may number those of a product."""
+    more = objective.lost.ndim - len(form.state_shape)
+    if not more:
+        return objective
+    return jax.tree.map(
+        lambda x: x.reshape(*x.shape[: x.ndim - 1 - more], *form.state_shape), objective)
 
 
 def almost_sure_buchi(game: Any, accepting: States) -> Winning:
@@ -303,7 +319,7 @@ def _odd(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Found
     xp = graph.xp
     here = open_ & (objective.priority == p)
     # The system makes no move that may leave what an even priority above has it remain in.
-    allowed = allowed & (graph.forall(won.region | open_) | ~system[..., None])
+    allowed = allowed & (graph.forall(won.region | open_) | ~graph.on_choices(system))
 
     def body(carry):
         found, _ = carry
@@ -312,7 +328,7 @@ def _odd(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Found
         near = _Found(drawn.region, xp.where(new, drawn.action, found.action))
         remain = open_ & ~here & ~near.region
         # The environment's other moves help the system.
-        closer = graph.exists(near.region) & ~system[..., None]
+        closer = graph.exists(near.region) & ~graph.on_choices(system)
         deeper = _level(arena, p + 1, near, remain, allowed & ~closer)
         return deeper, xp.any(deeper.region != near.region)
 

@@ -10,6 +10,14 @@ from jaxltl.core.models.sparse import SparseMDP
 _LARGEST = 8 * 2**30  # bytes of the largest model that is padded
 
 
+def action_of(model: SparseMDP) -> np.ndarray:
+    """The action that each row of a sparse model becomes when it is padded, ``int[R]``."""
+    host = model.host
+    if model.action is not None and not model.action_names:
+        return np.asarray(model.action)
+    return np.arange(host.num_rows) - host.row_start[host.state]
+
+
 def to_padded(model: SparseMDP) -> MDP:
     """The same process with padded successor lists, for batches and the compiled solvers.
 
@@ -27,9 +35,7 @@ def to_padded(model: SparseMDP) -> MDP:
         one number.
     """
     host = model.host
-    column = np.arange(host.num_rows) - host.row_start[host.state]
-    if model.action is not None and not model.action_names:
-        column = np.asarray(model.action)
+    column = action_of(model)
     width = int(np.diff(host.entry_start).max())
     num_actions = int(column.max()) + 1
     shape = (host.num_states, num_actions, width)
@@ -54,3 +60,11 @@ def to_padded(model: SparseMDP) -> MDP:
         label=np.asarray(model.label),
         propositions=model.propositions,
     )
+
+
+def padded_rows(model: SparseMDP, quantity: np.ndarray) -> np.ndarray:
+    """A quantity on rows ``[R]`` as one of the padded model, ``[S, A]``; zero where unavailable."""
+    action = action_of(model)
+    found = np.zeros((model.num_states, int(action.max()) + 1), quantity.dtype)
+    found[model.host.state, action] = quantity
+    return found

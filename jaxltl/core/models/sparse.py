@@ -20,9 +20,8 @@ from jaxltl.core.models.kernels import gather, owners, segment
 from jaxltl.core.models.mdp import checked_initial, checked_label
 
 _PADDED = ("this takes models that are padded: give to_padded(model). Sparse models have choices "
-           "in rows, and are taken by the functions of graphs, reachability_probability, "
-           "total_reward, optimal_value, policy_value, optimal_satisfaction, average_reward and "
-           "prepare.")
+           "in rows, and are taken by the primitives, the functions of graphs and games, the "
+           "solvers of values, and prepare; not by permissive strategies, learners and rollouts.")
 Array = Any  # NumPy's in double precision as it is read, or JAX's
 
 
@@ -47,8 +46,8 @@ class SparseMDP:
 
     The choices of state s are the rows ``row_start[s]`` to ``row_start[s + 1] - 1``, and row r
     leads to ``successor[e]`` with ``probability[e]`` for the entries e from ``entry_start[r]`` to
-    ``entry_start[r + 1] - 1``. Quantities on actions have a number for each row, ``[R]``. A Markov
-    chain has one row in each state. Build one with :func:`make_sparse`, which checks it; its
+    ``entry_start[r + 1] - 1``. Quantities on actions have a number for each row, ``[R]``, and an
+    action of a policy is a row. A Markov chain has one row in each state. Build one with :func:`make_sparse`, which checks it; its
     arrays are NumPy's, in double precision, whatever JAX's default.
 
     Attributes:

@@ -6,6 +6,7 @@ written for states ``[S]``; a game on a Product has ``[S, Q]``.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any, NamedTuple
 
@@ -15,9 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.models.compiled import compiled_form, in_shape_of
 from jaxltl.core.models.concrete import is_traced
-from jaxltl.core.models.game import Game, as_padded_game, is_deterministic
+from jaxltl.core.models.game import Game, as_game, as_padded_game, is_deterministic
 from jaxltl.core.models.operators import induced_chain
+from jaxltl.core.models.padded import padded_rows
+from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted import expected_reward
 
@@ -34,11 +38,14 @@ def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> S
 
     Args:
       game: a deterministic Game; any other model is the game in which the system always moves.
-      reward: ``float[S, A]`` or ``float[S, A, K]``, finite; moves of both players count.
+      reward: ``float[S, A]`` or ``float[S, A, K]``, finite; moves of both players count. In a game
+        on a sparse model, which is padded for it, as of
+        :func:`~jaxltl.core.models.sparse.row_reward`.
       max_steps: pairs of strategies to look at at most.
 
     Returns:
-      :class:`Solution`; `policy` is ``int32[S]``, optimal for both players. `lower` and `upper`
+      :class:`Solution`; `policy` is ``int32[S]``, optimal for both players; rows in a game on a
+      sparse model. `lower` and `upper`
       are `value`, or its neighbours among the floats where the mean is not a float. Where
       max_steps did not suffice they are infinite.
 
@@ -55,10 +62,18 @@ def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> S
       >>> mean.value.tolist(), mean.policy.tolist()
       ([2.0, 2.0], [1, 0])
     """
-    game = as_padded_game(game)
-    reward = expected_reward(game, reward)
-    if is_traced((game, reward)):
+    asked = as_game(game)
+    if is_traced((asked, reward)):
         raise ValueError("mean_payoff works on the host; call it outside jit and vmap.")
+    form, reward = compiled_form(asked, reward)
+    if isinstance(form.mdp, SparseMDP):
+        host = form.mdp.host
+        game = as_padded_game(form)
+        found = mean_payoff(game, padded_rows(form.mdp, reward), max_steps=max_steps)
+        row = padded_rows(form.mdp, np.arange(host.num_rows))
+        policy = row[np.arange(host.num_states), np.asarray(found.policy)]
+        return in_shape_of(asked, replace(found, policy=jnp.asarray(policy, jnp.int32)))
+    game, reward = form, expected_reward(form, reward)
     if not is_deterministic(game):
         raise ValueError(
             "mean_payoff is for deterministic games, and some move of this one has several "
