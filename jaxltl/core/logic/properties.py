@@ -84,6 +84,8 @@ class Property:
         operator: `"P"` (a probability), `"R"` (an expected reward), `"T"` (expected steps),
             `"LRA"` (the part of the time that a state formula holds in the long run), `"multi"`.
         objective: `"max"`, `"min"`, or None where it is not said.
+        nature: The second of two directions, `"max"` in `Pminmax`: what nature makes of the number
+            within intervals; None where only one is said, or none.
         relation, threshold: The comparison, None for `=?`.
         reward: For `"R"`, the name, or None for the only one that the model has.
         path: For `"P"` a formula or a bounded one, for `"T"` and `"R"` `F` of a state formula or
@@ -101,6 +103,7 @@ class Property:
     path: Formula | Bounded | Earned = TRUE
     parts: tuple[Property, ...] = ()
     name: str | None = None
+    nature: Literal["max", "min"] | None = None
 
     @property
     def direction(self) -> Literal["max", "min"] | None:
@@ -122,6 +125,8 @@ def parse_properties(text: str) -> tuple[Property, ...]:
     or, outermost, on a reward (`F{"time"}<=5 "goal"`). Of a reward: `R{"name"}max=? [ F "goal" ]`,
     `[ C ]`, `[ C<=10 ]`, `[ I=5 ]`, `[ S ]` or `[ LRA ]`. Expected steps: `Tmin=? [ F "goal" ]`.
     Time in the long run: `LRAmax=? [ "up" ]`. Several at once: `multi(P, P, ...)`.
+    Where probabilities are intervals, what the policy makes of them comes first and what nature
+    does second: `Pmaxmin=?`, `R{"time"}minmax=?`.
 
     From tightest to loosest: `!`, `&`, `|`, `<=>`, `=>`, the prefixes `X F G`, then `U W R`, then
     `&&` and `||`. So temporal operators reach as far as they can, as in PRISM and Storm:
@@ -176,7 +181,8 @@ _TOKEN = re.compile(r"""
   | (?P<word>[A-Za-z_][A-Za-z0-9_]*)
   | (?P<sign><=>|=>|<=|>=|!=|&&|\|\||[-<>=&|!()\[\]{},;:?/+*])
 """, re.VERBOSE)
-_OPERATOR = re.compile(r"(P|R|T|LRA|S)(max|min)?")
+_OPERATOR = re.compile(r"(P|R|T|LRA|S)(max|min)?(max|min)?")
+_DIRECTIONS = ("max", "min", "maxmax", "maxmin", "minmax", "minmin")
 _MAX_DIGITS = 400  # of a number and of its exponent's value, as none means more
 
 
@@ -264,12 +270,14 @@ class _Parser:
             raise self.error("a property: P, Pmax, Pmin, R, Rmax, Rmin, T, LRA or multi(...)")
         self.take()
         operator, objective = ("LRA" if match[1] == "S" else match[1]), match[2]
+        nature = match[3]
         reward = None
         if operator == "R" and self.accept("{"):
             reward = self.quoted()
             self.expect("}")
         if objective is None:  # R{"name"}max, and max apart from its operator
-            objective = self.accept("max", "min")
+            both = self.accept(*_DIRECTIONS) or ""
+            objective, nature = both[:3] or None, both[3:] or None
         relation, threshold = self.comparison(operator)
         self.expect("[")
         path = _CONTENT[operator](self)
@@ -277,7 +285,7 @@ class _Parser:
         text = self.text[start.start : self.tokens[self.place - 1].end]
         return Property(
             text, operator, objective, relation, threshold, reward, path,  # type: ignore[arg-type]
-            name=name)
+            name=name, nature=nature)  # type: ignore[arg-type]
 
     def multi(self, start: _Token, name: str | None) -> Property:
         self.expect("(")
@@ -287,6 +295,9 @@ class _Parser:
             parts.append(self.property_())
             if parts[-1].operator == "multi":
                 raise self.error("a property with P or R; multi stands outermost", first)
+            if parts[-1].nature is not None:
+                raise self.error("one direction, max or min: several objectives are solved for "
+                                 "without intervals", first)
             if not self.accept(","):
                 break
         self.expect(")", " or ','")

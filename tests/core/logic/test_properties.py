@@ -50,6 +50,25 @@ READ_AS = {
 }
 
 
+@pytest.mark.parametrize("policy", ["max", "min"])
+@pytest.mark.parametrize("nature", ["max", "min"])
+def test_two_directions_are_of_the_policy_and_of_nature(policy, nature):
+    for operator, rest in (
+        ("P", 'F "a"'), ("R", 'F "a"'), ('R{"x"}', 'F "a"'), ('R {"x"} ', "C"), ("T", 'F "a"'),
+        ("LRA", '"a"'), ("P ", 'G F "a"'),
+    ):
+        found = parse_property(f"{operator}{policy}{nature}=? [ {rest} ]")
+        assert (found.objective, found.nature) == (policy, nature)
+        assert found.operator == operator[: 3 if operator == "LRA" else 1]
+    found = parse_property(f'P{policy}{nature}>=1/3 [ X "a" ]')
+    assert (found.nature, found.relation, found.threshold) == (nature, ">=", Fraction(1, 3))
+    assert parse_property(f'P{policy}=? [ X "a" ]').nature is None
+    with pytest.raises(ValueError, match="one direction"):
+        parse_property(f'multi(P{policy}{nature}=? [ X "a" ])')
+    with pytest.raises(ValueError, match=f"found 'P{policy}{nature}max', expected a property"):
+        parse_property(f'P{policy}{nature}max=? [ X "a" ]')
+
+
 @pytest.mark.parametrize("text", READ_AS)
 def test_temporal_operators_reach_as_far_as_they_can(text):
     assert path(text) == parse_ltl(READ_AS[text])
