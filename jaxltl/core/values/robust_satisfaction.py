@@ -33,12 +33,14 @@ class RobustSatisfaction(NamedTuple):
       automaton: the task, over the letters that occur; letters are read as a state is left.
       letter: ``int[S]``, the letter that each state shows.
       product: what is reached of the model beside the automaton, N states.
+      value: ``float64[N]``, in each of them.
     """
 
     solution: Solution
     automaton: Automaton
     letter: np.ndarray
     product: HostProduct
+    value: np.ndarray
 
 
 def robust_satisfaction(
@@ -93,7 +95,7 @@ def robust_satisfaction(
     solution = _solution(
         found, asked, product.start.shape, product.start,
         policy=product.base_row[found.row].astype(np.int32))
-    return RobustSatisfaction(solution, automaton, letter, product)
+    return RobustSatisfaction(solution, automaton, letter, product, found.value)
 
 
 def _solution(

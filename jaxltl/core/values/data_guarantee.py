@@ -1,0 +1,193 @@
+"""From counted transitions to a policy and what is guaranteed of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.automata.translate import Task
+from jaxltl.core.host.confidence import ConfidenceSets, Method, intervals_from_counts
+from jaxltl.core.models.convert import to_sparse
+from jaxltl.core.models.counts import TransitionCounts, counts_on
+from jaxltl.core.models.interval import IntervalMDP, make_interval
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.values.robust_satisfaction import RobustSatisfaction, robust_satisfaction
+
+
+@dataclass(frozen=True)
+class DataGuarantee:
+    """What data guarantee of a task.
+
+    Attributes:
+      bound: of the initial distribution; with the confidence that was asked for, the task has at
+        least this probability under the policy (at most, where it was to be made small).
+      confidence: the chance that data are drawn of which all this is true.
+      optimistic: what no policy exceeds, with the same confidence, of the same data: how much more
+        data can gain at most.
+      satisfaction: the policy, the automaton that is its memory, and nature's worst case.
+      model: the model with its intervals.
+      sets: the sets from which these come.
+      gain: ``float64[R]``, where more samples help: by how much the bound would rise, to first
+        order, if a choice were known to be what its frequencies say.
+    """
+
+    bound: float
+    confidence: float
+    optimistic: float
+    satisfaction: RobustSatisfaction
+    model: IntervalMDP
+    sets: ConfidenceSets
+    gain: np.ndarray
+
+
+def learn_guarantee(
+    model: Any, counts: TransitionCounts | np.ndarray, task: Task, confidence: float, *,
+    method: Method = "anytime", objective: str = "max", rows: Any = None,
+    num_claims: int | None = None, tolerance: float | None = None,
+) -> DataGuarantee:
+    """A policy for a formula, and the probability that it has with a confidence.
+
+    Sets that hold all probabilities at once with the confidence
+    (:func:`~jaxltl.core.host.confidence.intervals_from_counts`) make an interval model; its worst
+    case over nature is at most (for ``"min"`` at least) the truth for every policy, so it may be
+    optimised over the same data. Of a ball the smallest intervals around it count.
+
+    Args:
+      model: its graph, labels and initial distribution count; its probabilities do not. See
+        :func:`~jaxltl.core.models.counts.counted_model` for one that is made of a log.
+      counts: of its transitions, matched by name; or ``int[T]``, beside its entries.
+      task: a formula, its text or an automaton.
+      confidence: in (0, 1), of everything that is returned at once.
+      method: ``"anytime"`` holds however data were gathered, ``"clopper-pearson"``,
+        ``"hoeffding"`` and ``"weissman"`` where the number of samples of each choice does not
+        depend on what they were.
+      objective: ``"max"`` or ``"min"``.
+      rows, num_claims: as of :func:`~jaxltl.core.host.confidence.intervals_from_counts`.
+      tolerance: of :func:`~jaxltl.core.values.robust_satisfaction.robust_satisfaction`.
+
+    Returns:
+      :class:`DataGuarantee`.
+
+    Raises:
+      ValueError: the counts do not fit the model, the confidence, a label or a direction.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [.5, .5, 1, 1], initial=[1, 0, 0],
+      ...                    label=[[0], [1], [0]], propositions=["a"])
+      >>> found = learn_guarantee(coin, np.array([900, 100, 0, 0]), "F a", 0.95,
+      ...                         method="clopper-pearson")
+      >>> round(found.bound, 3), round(found.optimistic, 3)
+      (0.88, 0.918)
+    """
+    sparse = to_sparse(model)
+    count = counts_on(sparse, counts) if isinstance(counts, TransitionCounts) else counts
+    sets = intervals_from_counts(
+        count, confidence, method=method, entry_start=sparse.entry_start, rows=rows,
+        num_claims=num_claims)
+    interval, kept = _with_sets(sparse, sets)
+    against, along = ("min", "max") if objective == "max" else ("max", "min")
+    found = robust_satisfaction(
+        interval, task, objective=objective, nature=against, tolerance=tolerance)
+    best = robust_satisfaction(
+        interval, task, objective=objective, nature=along, tolerance=tolerance)
+    share = np.asarray(interval.initial)
+    share = share[share > 0]
+    sure, most = ("lower", "upper") if objective == "max" else ("upper", "lower")
+    center = np.asarray(sets.center, np.float64)[kept]
+    sign = 1 if objective == "max" else -1
+    return DataGuarantee(
+        bound=_mean(share, getattr(found.solution, sure)), confidence=float(confidence),
+        optimistic=_mean(share, getattr(best.solution, most)), satisfaction=found,
+        model=interval, sets=sets, gain=sign * _gain(interval, found, center, share))
+
+
+def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.ndarray]:
+    """The model with intervals; all entries are kept, which are those that it had."""
+    found = make_interval(model, sets.lower, sets.upper)
+    if found.num_transitions == model.num_transitions:
+        return found, np.ones(model.num_transitions, bool)
+    code = [np.asarray(x.host.row, np.int64) * model.num_states + x.successor
+            for x in (model, found.nominal)]
+    return found, np.isin(*code)
+
+
+def _mean(share: np.ndarray, value: Any) -> float:
+    return float(np.clip(share @ np.asarray(value) / share.sum(), 0, 1))
+
+
+def _gain(
+    model: IntervalMDP, found: RobustSatisfaction, center: np.ndarray, share: np.ndarray
+) -> np.ndarray:
+    """Expected visits of each choice, times what nature takes there: ``float64[R]``."""
+    from scipy.sparse import csr_array, eye_array
+    from scipy.sparse.linalg import spsolve
+
+    product, value = found.product, found.value
+    host = product.host
+    policy = np.asarray(found.solution.policy)
+    taken = product.base_row == policy[host.state]
+    entry = taken[host.row]
+    nature = np.asarray(found.solution.nature)
+    open_ = (value > 0) & (value < 1)
+    # Inside what is open every state is left almost surely, with nature as it is.
+    inner = entry & open_[host.state[host.row]] & open_[host.successor] & (nature > 0)
+    size = host.num_states
+    step = csr_array(
+        (nature[inner], (host.successor[inner], host.state[host.row][inner])), shape=(size, size))
+    first = np.zeros(size)
+    np.add.at(first, product.start, share)
+    visits = spsolve((eye_array(size) - step).tocsc(), np.where(open_, first, 0))
+    world = model.nominal.host
+    width = np.diff(host.entry_start)
+    whole = width == np.diff(world.entry_start)[product.base_row]
+    begin = world.entry_start[product.base_row]
+    rank = np.arange(host.num_transitions) - np.repeat(host.entry_start[:-1], width)
+    known = np.where(whole[host.row], center[(np.repeat(begin, width) + rank)], nature)
+    better = np.add.reduceat((known - nature) * value[host.successor], host.entry_start[:-1])
+    gain = np.zeros(world.num_rows)
+    use = taken & open_[host.state] & whole
+    np.add.at(gain, product.base_row[use], (visits[host.state] * better)[use])
+    return gain
+
+
+def guarantee_curve(
+    model: Any, counts: TransitionCounts | np.ndarray, task: Task, confidence: float,
+    sizes: Sequence[int], *, seed: int = 0, method: Method = "anytime", objective: str = "max",
+) -> np.ndarray:
+    """The bound over the number of samples, of random parts of the data.
+
+    Each part is drawn from the one before without replacement, so the curve is that of one order
+    in which the data might have come.
+
+    Args:
+      model, counts, task, confidence, method, objective: as of :func:`learn_guarantee`; each point
+        has the confidence by itself.
+      sizes: how many transitions to take, each at most as many as there are.
+      seed: of the order.
+
+    Returns:
+      ``float64[len(sizes)]``, in the order of `sizes`.
+
+    Raises:
+      ValueError: a size is negative or larger than the data; and as there.
+    """
+    sparse = to_sparse(model)
+    whole = counts_on(sparse, counts) if isinstance(counts, TransitionCounts) else counts
+    whole = np.asarray(whole, np.int64)
+    wanted = np.asarray(sizes)
+    total = int(whole.sum())
+    wrong = (wanted < 0) | (wanted > total)
+    if wrong.any():
+        raise ValueError(f"sizes[{int(np.argmax(wrong))}] is {wanted[wrong][0]}; there are {total} "
+                         "transitions.")
+    rng = np.random.default_rng(seed)
+    bound = np.empty(wanted.size)
+    for i in np.argsort(-wanted, kind="stable"):
+        whole = rng.multivariate_hypergeometric(whole, int(wanted[i]), method="marginals")
+        bound[i] = learn_guarantee(
+            sparse, whole, task, confidence, method=method, objective=objective).bound
+    return bound
