@@ -52,11 +52,10 @@ def raw_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
                 parts.append(part)
                 size += len(part)
         data = parts[0] if len(parts) == 1 else b"".join(parts)
-    except (OSError, ValueError, MemoryError) as error:  # ValueError: a null byte in the name
-        reason = getattr(error, "strerror", None) or str(error) or "too large for the memory"
-        raise ValueError(f"cannot read {name!r}: {reason}.") from None
+    except (OSError, ValueError, MemoryError) as error:
+        raise _unreadable(name, error) from None
     if size > limit:
-        raise ValueError(f"{name!r} has more than {limit} bytes, the most that are read.")
+        raise _too_large(name, limit)
     return data
 
 
@@ -77,6 +76,44 @@ def pieces(data: bytes, name: str, limit: int = MAX_BYTES) -> Iterator[bytes]:
         raise ValueError(
             f"{name!r} begins as {kind} does and is damaged: {error or 'out of memory'}."
         ) from None
+
+
+def streamed(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> Iterator[bytes]:
+    """The bytes of a file piece by piece, as of :func:`read_bytes`, never all of them at once.
+
+    Of a compressed file, what it holds compressed is in memory.
+
+    Raises:
+      ValueError: as :func:`read_bytes`.
+    """
+    packed: list[bytes] = []
+    name, size = str(path), 0
+    try:
+        with open(path, "rb") as file:
+            while part := file.read(_STEP):
+                size += len(part)
+                if size > limit:
+                    break
+                if packed or (size == len(part) and compression_of(part)):
+                    packed.append(part)
+                else:
+                    yield part
+    except (OSError, ValueError, MemoryError) as error:
+        raise _unreadable(name, error) from None
+    if size > limit:
+        raise _too_large(name, limit)
+    if packed:
+        yield from pieces(b"".join(packed), name, limit)
+
+
+def _unreadable(name: str, error: Exception) -> ValueError:
+    # A null byte in the name makes a ValueError.
+    reason = getattr(error, "strerror", None) or str(error) or "too large for the memory"
+    return ValueError(f"cannot read {name!r}: {reason}.")
+
+
+def _too_large(name: str, limit: int) -> ValueError:
+    return ValueError(f"{name!r} has more than {limit} bytes, the most that are read.")
 
 
 def read_text(path: str | os.PathLike[str], expected: str) -> str:

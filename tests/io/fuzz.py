@@ -21,6 +21,7 @@ from jaxltl.core.models.game import make_game
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.io.drn import read_drn, write_drn
 from jaxltl.io.hoa_game import read_hoa_game
+from jaxltl.io.log import read_log
 from jaxltl.io.npz import read_npz, write_npz
 from jaxltl.io.pgsolver import read_pgsolver
 from jaxltl.io.prism_explicit import read_prism, write_prism
@@ -386,6 +387,12 @@ _MACHINE = b"""0 # where it starts
 (1,2,"!(g | False)",ConstantRewardFunction(1))
 """
 
+_LOG = b"""time,state,action,next,count
+1,hall,left,"kitchen, lower",3
+2,"kitchen, lower", right ,hall,1
+3,0,left,hall,0
+"""
+
 READERS = {
     "umb": Reader(read_umb, ".umb", umb_samples, damaged_archive),
     "npz": Reader(read_npz, ".npz", npz_samples, damaged_arrays),
@@ -393,5 +400,6 @@ READERS = {
     "pexp": Reader(read_prism, ".pexp", _written(write_prism, "sample.pexp")),
     "hoa_game": Reader(read_hoa_game, ".hoa", lambda folder: [_ARBITER]),
     "reward_machine": Reader(read_reward_machine, ".txt", lambda folder: [_MACHINE]),
+    "log": Reader(read_log, ".csv", lambda folder: [_LOG, gzip.compress(_LOG)]),
     "pgsolver": Reader(read_pgsolver, ".pg", lambda folder: list(_PARITY)),
 }

@@ -90,13 +90,29 @@ def make_counts(
     most |= {"action": arrays["action"].max() + 1}
     state_names = _checked_names("states", states, int(most["state"]))
     action_names = _checked_names("actions", actions, int(most["action"]))
-    order = np.lexsort((arrays["successor"], arrays["action"], arrays["state"]))
-    key = np.stack([arrays[name][order].astype(np.int32) for name in list(columns)[:3]])
-    new = np.append(True, (key[:, 1:] != key[:, :-1]).any(0))
-    number = arrays.get("count", np.ones(size, np.int64)).astype(np.int64)[order]
-    merged = np.add.reduceat(number, np.flatnonzero(new))
-    s, a, t = key[:, new]
-    return TransitionCounts(s, a, t, merged, state_names, action_names)
+    count = arrays.get("count", np.ones(size, np.int64))
+    rows = [arrays[name] for name in ("state", "action", "successor")]
+    s, a, t, number = merged(np.stack([x.astype(np.int64) for x in (*rows, count)]))
+    return TransitionCounts(
+        s.astype(np.int32),
+        a.astype(np.int32),
+        t.astype(np.int32),
+        number,
+        state_names,
+        action_names,
+    )
+
+
+def merged(table: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Columns of state, action, successor and count, in order, with those alike as one.
+
+    >>> merged(np.array([[1, 0, 1], [0, 0, 0], [2, 1, 2], [5, 6, 7]])).tolist()
+    [[0, 1], [0, 0], [1, 2], [6, 12]]
+    """
+    table = table[:, np.lexsort(table[2::-1])]
+    new = np.append(True, (table[:3, 1:] != table[:3, :-1]).any(0))
+    table[3, new] = np.add.reduceat(table[3], np.flatnonzero(new))
+    return table[:, new]
 
 
 def _checked_names(what: str, names: Sequence[str] | None, least: int) -> tuple[str, ...]:

@@ -1,0 +1,218 @@
+"""Logs of transitions, and of which labels states have: tables of comma-separated values."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.models.counts import (
+    Places,
+    TransitionCounts,
+    in_order,
+    listed,
+    make_counts,
+    merged,
+    place_of,
+    places,
+)
+from jaxltl.io._columns import Lines, read_columns
+
+_COUNT = re.compile(r"[0-9]{1,16}")
+_MOST = 2**53  # transitions
+_HELD = 2**16  # distinct lines that are kept before those alike are put together
+
+
+def read_log(
+    path: str | os.PathLike[str],
+    model: Any = None,
+    *,
+    columns: tuple[str, str, str] = ("state", "action", "next"),
+    count: str = "count",
+    states: Sequence[str] | None = None,
+    actions: Sequence[str] | None = None,
+) -> TransitionCounts:
+    """How often each transition stands in a log.
+
+    A log is a text in UTF-8, compressed by gzip or xz or not, of lines with fields separated by
+    commas (RFC 4180)::
+
+        state,action,next
+        hall,left,kitchen
+        hall,left,hall
+
+    Its first line names the columns, which may stand in any order and among others. States and
+    actions may have any names. A column `count` says how often a transition came that stands in one
+    line; 0 for one that is possible and never came. The file is read line by line: what is kept are
+    the names and the distinct transitions.
+
+    Args:
+      path: the file.
+      model: an :class:`~jaxltl.core.models.mdp.MDP` or
+        :class:`~jaxltl.core.models.sparse.SparseMDP` that every transition has to fit, with its
+        names: its variable `state` or the numbers of states, and the names or numbers of actions.
+      columns: the names of the columns of the state, the action and the next state.
+      count: that of the counts.
+      states, actions: all names that there are, in the order of their numbers. Default: those of
+        the log, by number if all are integers, else by alphabet.
+
+    Returns:
+      :class:`~jaxltl.core.models.counts.TransitionCounts`.
+      :func:`~jaxltl.core.models.counts.counts_on` puts it beside the probabilities of a model, and
+      :func:`~jaxltl.core.models.counts.counted_model` makes a model of it.
+
+    Raises:
+      ValueError: naming the file and the line: the file cannot be read, is no such table, has an
+        empty field, a line with too few or too many, a second header, a count that is no integer
+        from 0, or a name or transition that is not among those given.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "log.csv"
+      >>> _ = path.write_text("state,action,next\\nhall,left,kitchen\\nhall,left,hall\\n" * 1)
+      >>> counts = read_log(path)
+      >>> counts.states, counts.successor.tolist(), counts.count.tolist()
+      (('hall', 'kitchen'), [0, 1], [1, 1])
+    """
+    known = None
+    if model is not None:
+        if states is not None or actions is not None:
+            raise ValueError("model and names are both given; a model has names of its own.")
+        known = places(model)
+        states, actions = known.states, known.actions
+    numbers = _names(states), _names(actions)
+    name, total, size = str(path), 0, 0
+    held = [np.zeros((4, 0), np.int64)]
+    for lines in read_columns(path, columns, (count,)):
+        part = _numbered(lines, *numbers, known)
+        total += sum(part[3].tolist())
+        if total > _MOST:
+            raise ValueError(
+                f"{name!r}, line {lines.first + len(lines.fields) - 1}: counts add up to more than "
+                "2^53 up to here."
+            )
+        held.append(part)
+        size += part.shape[1]
+        if size > _HELD + 2 * held[0].shape[1]:
+            held = [merged(np.concatenate(held, 1))]
+            size = held[0].shape[1]
+    every = np.concatenate(held, 1)
+    if not every.size:
+        raise ValueError(f"{name!r}, line 2: there is no transition after the header.")
+    return _by_name(every, *numbers)
+
+
+def read_labels(
+    path: str | os.PathLike[str],
+    states: Sequence[str] | None = None,
+    *,
+    columns: tuple[str, str] = ("state", "label"),
+) -> dict[str, tuple[str, ...]]:
+    """Which states have which labels, from a table with the columns state and label.
+
+    A state stands in as many lines as it has labels, and in none if it has none.
+
+    Args:
+      path: the file, as of :func:`read_log`.
+      states: all states that there are. Default: any.
+      columns: the names of the columns.
+
+    Returns:
+      The states of each label, in the order of the file, as
+      :func:`~jaxltl.core.models.counts.counted_model` takes them.
+
+    Raises:
+      ValueError: naming the file and the line, as :func:`read_log`.
+    """
+    known = set(states or ())
+    found: dict[str, dict[str, bool]] = {}
+    for lines in read_columns(path, columns):
+        for fields in lines.times:
+            state, label = fields
+            if states is not None and state not in known:
+                raise lines.error(fields, _unknown("state", state, list(states)))
+            found.setdefault(label, {})[state] = True
+    if not found:
+        raise ValueError(f"{str(path)!r}, line 2: there is no label after the header.")
+    return {label: tuple(some) for label, some in found.items()}
+
+
+@dataclass
+class _Names:
+    """Names by number; new ones are added if they are not all known."""
+
+    number: dict[str, int]
+    complete: bool
+
+
+def _names(given: Sequence[str] | None) -> _Names:
+    return _Names({str(x): i for i, x in enumerate(given or ())}, given is not None)
+
+
+def _unknown(what: str, name: str, names: Sequence[str]) -> str:
+    return f"there is no {what} {name!r}; there are {listed(names)}."
+
+
+def _numbered(
+    lines: Lines, states: _Names, actions: _Names, known: Places | None
+) -> NDArray[np.int64]:
+    """The distinct lines as numbers of states, actions and next states, and counts: ``[4, N]``."""
+    distinct = list(lines.times)
+    texts, times = list(zip(*distinct, strict=True)), list(lines.times.values())
+    if len(texts) > 3:
+        times = [n * _count(lines, fields) for n, fields in zip(times, distinct, strict=True)]
+    table = np.array([*_numbers(lines, distinct, texts, states, actions), times], np.int64)
+    if known is not None:
+        _, wrong = place_of(known, *table[:3])
+        if wrong:
+            message = f"the model does not have it: {wrong[1]}."
+            raise lines.error(distinct[wrong[0]], message)
+    return table
+
+
+def _numbers(
+    lines: Lines,
+    distinct: list[tuple[str, ...]],
+    texts: list[tuple[str, ...]],
+    states: _Names,
+    actions: _Names,
+) -> list[list[int]]:
+    found = []
+    for what, names, column in zip(
+        ("state", "action", "state"), (states, actions, states), texts, strict=False
+    ):
+        new = set(column).difference(names.number)
+        if new and names.complete:
+            i = next(i for i, text in enumerate(column) if text in new)
+            raise lines.error(distinct[i], _unknown(what, column[i], list(names.number)))
+        for text in new:  # in any order; names are put in theirs at the end
+            names.number[text] = len(names.number)
+        found.append([names.number[text] for text in column])
+    return found
+
+
+def _count(lines: Lines, fields: tuple[str, ...]) -> int:
+    """How often a line says that a transition came."""
+    if _COUNT.fullmatch(fields[3]) and (count := int(fields[3])) <= _MOST:
+        return count
+    raise lines.error(
+        fields, f"the count is {fields[3][:60]!r}; expected an integer from 0 to 2^53."
+    )
+
+
+def _by_name(table: NDArray[np.int64], states: _Names, actions: _Names) -> TransitionCounts:
+    """Counts whose numbers follow the order of names."""
+    orders = []
+    for names in (states, actions):
+        order = tuple(names.number) if names.complete else in_order(names.number)
+        place = {name: i for i, name in enumerate(order)}
+        orders.append((order, np.array([place[name] for name in names.number], np.int64)))
+    (state_names, s), (action_names, a) = orders
+    return make_counts(
+        s[table[0]], a[table[1]], s[table[2]], table[3], states=state_names, actions=action_names
+    )
