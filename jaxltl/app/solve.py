@@ -7,13 +7,16 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.logic.properties import Property, parse_properties
 from jaxltl.core.models.game import Game
+from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import NotConverged, Status
 from jaxltl.core.values.answer import Answer, Strategy, answer
@@ -102,8 +105,8 @@ def _text_of(path: Path) -> str:
         raise ValueError(f"cannot read {str(path)!r}: {error.strerror}.") from None
 
 
-def load(path: Path) -> SparseMDP:
-    """A chain or decision process from a model file.
+def load(path: Path) -> SparseMDP | IntervalMDP:
+    """A chain or decision process from a model file, with intervals or without.
 
     Raises:
       ValueError: it is none.
@@ -114,13 +117,15 @@ def load(path: Path) -> SparseMDP:
     if isinstance(model, Game):
         raise ValueError(f"{str(path)!r} is a game; properties of chains and decision processes "
                          "are solved, games by `jaxltl synthesize`.")
-    if not isinstance(model, SparseMDP):
+    if not isinstance(model, SparseMDP | IntervalMDP):
         raise ValueError(f"{str(path)!r} holds a {type(model).__name__}; properties of chains and "
                          "decision processes are solved.")
     return model
 
 
-def solve(model: SparseMDP, asked: Sequence[Asked], tolerance: float) -> Iterator[Result]:
+def solve(
+    model: SparseMDP | IntervalMDP, asked: Sequence[Asked], tolerance: float
+) -> Iterator[Result]:
     """The result of each property, as soon as it is there."""
     from scipy.sparse import csgraph, linalg  # noqa: F401 - their time is no property's
 
@@ -131,6 +136,10 @@ def solve(model: SparseMDP, asked: Sequence[Asked], tolerance: float) -> Iterato
         if one.parsed is not None:
             try:
                 if one.parsed.operator == "multi":
+                    if isinstance(model, IntervalMDP):
+                        raise ValueError(
+                            f"{one.text}: several objectives are not solved for where "
+                            "probabilities are intervals; ask for one at a time.")
                     found = answer_several(model, one.parsed, tolerance=tolerance)
                 else:
                     found = answer(model, one.parsed, tolerance=tolerance)
@@ -147,9 +156,10 @@ def solve(model: SparseMDP, asked: Sequence[Asked], tolerance: float) -> Iterato
 # --- what is shown ----------------------------------------------------------------------------
 
 
-def model_entry(model: SparseMDP, seconds: float) -> dict[str, Any]:
+def model_entry(model: SparseMDP | IntervalMDP, seconds: float) -> dict[str, Any]:
     """The model's part of the JSON object."""
-    return {"kind": "chain" if model.is_chain else "mdp", "states": model.num_states,
+    kinds = ("idtmc", "imdp") if isinstance(model, IntervalMDP) else ("chain", "mdp")
+    return {"kind": kinds[not model.is_chain], "states": model.num_states,
             "choices": model.num_rows, "transitions": model.num_transitions, "seconds": seconds}
 
 
@@ -260,17 +270,20 @@ def _value_text(found: Answer, i: int) -> str:
 # --- strategies -------------------------------------------------------------------------------
 
 
-def strategies(model: SparseMDP, results: Sequence[Result], source: Path) -> bytes:
+def strategies(
+    model: SparseMDP | IntervalMDP, results: Sequence[Result], source: Path
+) -> bytes:
     """A file of the strategies that attain the answers, as JSON; see docs/solve.md."""
     found = [
         {"property": r.asked.text, **_strategy(model, r.answer.strategy)}
         for r in results if isinstance(r.answer, Answer) and r.answer.strategy is not None
-        and not model.is_chain]
+        and (isinstance(model, IntervalMDP) or not model.is_chain)]
     table = {"model": source.name, "states": model.num_states, "strategies": found}
     return (json.dumps(table, allow_nan=False) + "\n").encode()
 
 
-def _strategy(model: SparseMDP, strategy: Strategy) -> dict[str, Any]:
+def _strategy(given: SparseMDP | IntervalMDP, strategy: Strategy) -> dict[str, Any]:
+    model = given.nominal if isinstance(given, IntervalMDP) else given
     host = model.host
     row = np.asarray(strategy.row)
     choice = (row - host.row_start[host.state[row]]).tolist()
@@ -280,21 +293,47 @@ def _strategy(model: SparseMDP, strategy: Strategy) -> dict[str, Any]:
         entry["kind"] = f"first choice, then by the {strategy.by} left"
     if names is not None:
         entry["action"] = names(row)
-    if strategy.memory is None:
-        return entry
     found = strategy.memory
-    start = found.product.start
+    if found is None:
+        if strategy.nature is not None:
+            entry["nature"] = _nature(host, host.successor, strategy.nature)
+        return entry
+    product, start = found.product, found.product.start
+    if strategy.nature is not None:
+        entry["letter_of"] = "the state that is left"
+        entry["nature"] = _nature(
+            product.host, product.base_state[product.host.successor], strategy.nature,
+            product.still)
     return {
         "kind": "memory",
-        "initial": np.stack([found.product.base_state[start], found.product.memory[start]],
-                            1).tolist(),
+        "initial": np.stack([product.base_state[start], product.memory[start]], 1).tolist(),
         "letters": [sorted(p for p, holds in zip(found.automaton.propositions, letter, strict=True)
                            if holds) for letter in found.automaton.letters],
         "letter": found.letter.tolist(),
         "update": found.automaton.delta.tolist(),
-        "state": found.product.base_state.tolist(), "memory": found.product.memory.tolist(),
+        "state": product.base_state.tolist(), "memory": product.memory.tolist(),
         **{k: v for k, v in entry.items() if k != "kind"},
     }
+
+
+def _nature(
+    host: HostMDP, successor: np.ndarray, probability: np.ndarray, still: np.ndarray | None = None
+) -> list[list[dict[str, float]]]:
+    """Nature's distribution of each choice of each state, by the numbers of successors.
+
+    Args:
+      host: the rows.
+      successor: ``int[T]``, what to call each entry's successor.
+      probability: ``float64[T]``.
+      still: ``bool[N]``, the states of which nothing is told.
+    """
+    names, mass = list(map(str, successor.tolist())), probability.tolist()
+    starts = host.entry_start.tolist()
+    rows = [{names[t]: mass[t] for t in range(a, b) if mass[t]}
+            for a, b in pairwise(starts)]
+    found = [rows[a:b] for a, b in pairwise(host.row_start.tolist())]
+    return found if still is None else [
+        [] if stands else x for x, stands in zip(found, still.tolist(), strict=True)]
 
 
 def _names(model: SparseMDP) -> Callable[[np.ndarray], list[str]] | None:

@@ -1,4 +1,4 @@
-"""Answers to properties of sparse models: each goes to the solver that it is a question for."""
+"""Answers to properties of models: each goes to the solver that it is a question for."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from jaxltl.core.logic.properties import (
     parse_property,
     unfolded,
 )
+from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.models.state_formulas import states_satisfying
 from jaxltl.core.types import Solution, Status
@@ -26,6 +27,8 @@ from jaxltl.core.values import bounded
 from jaxltl.core.values.average_reward import average_reward
 from jaxltl.core.values.opposite import opposite_event
 from jaxltl.core.values.reachability import reachability_probability
+from jaxltl.core.values.robust_bounded import robust_bounded_reachability, robust_next_probability
+from jaxltl.core.values.robust_satisfaction import RobustSatisfaction, robust_satisfaction
 from jaxltl.core.values.sparse_satisfaction import (
     Satisfaction,
     at_states,
@@ -37,6 +40,11 @@ TOLERANCE = 1e-6
 FINER = (1.0, 1e-3, 1e-6)  # parts of the tolerance by which a threshold is tried
 TINY = 1e-12  # width of an interval of rewards that is narrow enough whatever they are
 _OTHER = {"max": "min", "min": "max"}
+_EARNED = {
+    "total": "rewards for ever (C)", "cumulative": "rewards of so many steps (C<=k)",
+    "instantaneous": "rewards after so many steps (I=k)",
+    "average": "averages in the long run",
+}
 
 
 class Strategy(NamedTuple):
@@ -48,11 +56,14 @@ class Strategy(NamedTuple):
       by: how many steps (``"steps"``) or how much reward (``"reward"``) is left, if the row is the
         first choice of a strategy that depends on that; else empty.
       memory: the automaton and the product that a memory is from, or None.
+      nature: of an interval model nature's distributions, ``float64[T]``; with a memory of the
+        product's entries. Else None.
     """
 
     row: np.ndarray
     by: str = ""
-    memory: Satisfaction | None = None
+    memory: Satisfaction | RobustSatisfaction | None = None
+    nature: np.ndarray | None = None
 
 
 class Answer(NamedTuple):
@@ -85,13 +96,31 @@ class _Found(NamedTuple):
     strategy: Strategy | None
 
 
+class _Aim(NamedTuple):
+    """What a policy makes of a number, ``"max"`` or ``"min"``, and nature within intervals."""
+
+    policy: str
+    nature: str | None = None
+
+    @property
+    def opposite(self) -> _Aim:
+        return _Aim(_OTHER[self.policy], None if self.nature is None else _OTHER[self.nature])
+
+    @property
+    def directions(self) -> dict[str, Any]:
+        """As solvers take it."""
+        return {"objective": self.policy, "nature": self.nature}
+
+
 def answer(
-    model: SparseMDP, prop: Property | str, *, states: Any = None, tolerance: float = TOLERANCE
+    model: SparseMDP | IntervalMDP, prop: Property | str, *, states: Any = None,
+    tolerance: float = TOLERANCE,
 ) -> Answer:
     """The value of a property, or whether its threshold is met, with certified bounds.
 
     Args:
-      model: the model.
+      model: the model; with intervals, the policy's direction and nature's are both named, as in
+        ``Pmaxmin=?``, in chains nature's alone.
       prop: a property or its text, see :func:`~jaxltl.core.logic.properties.parse_properties`.
       states: ``int[I]``; default the initial states.
       tolerance: the width of the bounds, absolute for probabilities and relative for the rest.
@@ -101,8 +130,8 @@ def answer(
       those do not tell either, `holds` is None and the status is not CONVERGED.
 
     Raises:
-      ValueError: an unknown label or reward; no objective though the model has choices; a question
-        that the solvers do not take, with the reason.
+      ValueError: an unknown label or reward; no direction though the model has choices, or
+        intervals; a question that the solvers do not take, with the reason.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
@@ -119,8 +148,7 @@ def answer(
     if states is None:
         states = np.flatnonzero(np.asarray(model.initial) > 0)
     states = np.asarray(states, np.int64)
-    objective = _objective(model, prop)
-    solve = _solver(model, prop, objective, states)
+    solve = _solver(model, prop, _aim(model, prop), states)
     found = solve(tolerance)
     if prop.relation is None:
         return _answer(prop, states, found, None, tolerance)
@@ -193,45 +221,72 @@ def meets(relation: str, threshold: Fraction, lower: float, upper: float) -> boo
     return True if lower > threshold else False if upper <= threshold else None
 
 
-def _objective(model: SparseMDP, prop: Property) -> str:
+def _aim(model: SparseMDP | IntervalMDP, prop: Property) -> _Aim:
+    sign = prop.operator + (f'{{"{prop.reward}"}}' if prop.reward else "")
+    if isinstance(model, IntervalMDP):
+        return _robust_aim(model, prop, sign)
+    if prop.nature is not None:
+        raise ValueError(
+            f"{prop.text}: the model has no intervals from which nature could pick; ask for "
+            f"{sign}{prop.objective}=?.")
     if prop.direction is not None:
-        return prop.direction
+        return _Aim(prop.direction)
     if not model.is_chain:
-        sign = prop.operator + (f'{{"{prop.reward}"}}' if prop.reward else "")
         raise ValueError(
             f"{prop.text}: the model has states with several choices, so the value depends on a "
             f"strategy; ask for {sign}max=? or {sign}min=?.")
-    return "max"
+    return _Aim("max")
+
+
+def _robust_aim(model: IntervalMDP, prop: Property, sign: str) -> _Aim:
+    """Both directions; a threshold without any is for all strategies and all that nature picks."""
+    if prop.nature is not None:
+        assert prop.objective is not None
+        return _Aim(prop.objective, prop.nature)
+    if prop.direction is not None and (model.is_chain or prop.objective is None):
+        return _Aim(prop.direction, prop.direction)
+    if model.is_chain:
+        raise ValueError(
+            f"{prop.text}: the probabilities of this chain are intervals, so the value depends on "
+            f"what nature picks from them; ask for {sign}min=? or {sign}max=?.")
+    firsts = ("max", "min") if prop.objective is None else (prop.objective,)
+    listed = [f"{sign}{first}{second}=?" for first in firsts for second in ("min", "max")]
+    raise ValueError(
+        f"{prop.text}: probabilities are intervals, so the value depends on a strategy and on what "
+        f"nature picks; ask for {', '.join(listed[:-1])} or {listed[-1]}, the strategy's direction "
+        "first and nature's second.")
 
 
 # --- which solver -----------------------------------------------------------------------------
 
 
 def _solver(
-    model: SparseMDP, prop: Property, objective: str, states: np.ndarray
+    model: SparseMDP | IntervalMDP, prop: Property, aim: _Aim, states: np.ndarray
 ) -> Callable[[float], _Found]:
     """What solves a property at a tolerance."""
+    path, graph = prop.path, _graph(model)
     if prop.operator == "P":
-        assert not isinstance(prop.path, Earned)
-        return _Probability(model, states, prop.text).of(prop.path, objective)
+        assert not isinstance(path, Earned)
+        return _Probability(model, states, prop.text).of(path, aim)
     if prop.operator == "LRA":
-        assert isinstance(prop.path, Formula)
-        share = states_satisfying(model, prop.path, prop.text).astype(np.float64)
+        assert isinstance(path, Formula)
+        known = _without_intervals(model, prop, "averages in the long run")
+        share = states_satisfying(graph, path, prop.text).astype(np.float64)
         return lambda tolerance: _plain(states, average_reward(
-            model, share, objective=objective, tolerance=tolerance))
+            known, share, objective=aim.policy, tolerance=tolerance))
     reward: Any = np.ones(model.num_rows) if prop.operator == "T" else prop.reward
-    return _reward_solver(model, prop, reward, objective, states)
-
-
-def _reward_solver(
-    model: SparseMDP, prop: Property, reward: Any, objective: str, states: np.ndarray
-) -> Callable[[float], _Found]:
-    path = prop.path
     if isinstance(path, Formula):
-        target = states_satisfying(model, path.operands[0], prop.text)
+        target: Any = states_satisfying(graph, path.operands[0], prop.text)
         return lambda tolerance: _plain(states, total_reward(
-            model, reward, target, objective=objective, tolerance=tolerance))
+            model, reward, target, tolerance=tolerance, **aim.directions))
     assert isinstance(path, Earned)
+    return _earned_solver(_without_intervals(model, prop, _EARNED[path.kind]), path, reward,
+                          aim.policy, states)
+
+
+def _earned_solver(
+    model: SparseMDP, path: Earned, reward: Any, objective: str, states: np.ndarray
+) -> Callable[[float], _Found]:
     if path.kind == "average":
         return lambda tolerance: _plain(states, average_reward(
             model, reward, objective=objective, tolerance=tolerance))
@@ -245,50 +300,66 @@ def _reward_solver(
         states, solve(model, reward, steps, objective=objective), by="steps")
 
 
+def _graph(model: SparseMDP | IntervalMDP) -> SparseMDP:
+    """All of a model but its intervals."""
+    return model.nominal if isinstance(model, IntervalMDP) else model
+
+
+def _without_intervals(
+    model: SparseMDP | IntervalMDP, prop: Property | str, what: str
+) -> SparseMDP:
+    """The model, for those who know nothing of intervals."""
+    if not isinstance(model, IntervalMDP):
+        return model
+    raise ValueError(
+        f"{prop}: {what} are not solved for where probabilities are intervals; solved for are "
+        "probabilities of formulas, and expected rewards or steps until a state is reached (F).")
+
+
 def _plain(states: np.ndarray, solution: Solution, by: str = "") -> _Found:
     method = str(solution.method) or {
         "steps": "step by step", "reward": "level by level of the reward"}.get(by, "")
-    return _Found(
-        at_states(solution, states), method, Strategy(np.asarray(solution.policy), by))
+    nature = None if solution.nature is None else np.asarray(solution.nature)
+    return _Found(at_states(solution, states), method,
+                  Strategy(np.asarray(solution.policy), by, nature=nature))
 
 
 class _Probability(NamedTuple):
     """Probabilities of paths of one model, at some states."""
 
-    model: SparseMDP
+    model: SparseMDP | IntervalMDP
     states: np.ndarray
     text: str
 
-    def of(self, path: Formula | Bounded, objective: str) -> Callable[[float], _Found]:
+    def of(self, path: Formula | Bounded, aim: _Aim) -> Callable[[float], _Found]:
         """What solves a path at a tolerance; simple ones without an automaton."""
         if isinstance(path, Bounded):
-            return self.within(path, objective)
+            return self.within(path, aim)
         if path.operator == "!" and not is_boolean(path):
-            return self.opposite(path.operands[0], objective)
+            return self.opposite(path.operands[0], aim)
         if is_boolean(path):
             return lambda tolerance: self.at_once(path)
         if not all(is_boolean(f) for f in path.operands):
-            return self.automaton(path, objective)
+            return self.automaton(path, aim)
         left, right = path.operands[0], path.operands[-1]
         match path.operator:
             case "X":
                 target = self.where(right)
-                return lambda tolerance: _plain(self.states, bounded.next_probability(
-                    self.model, target, objective=objective))
+                return lambda tolerance: self.next(target, aim)
             case "F":
-                return self.until(TRUE, right, objective)
+                return self.until(TRUE, right, aim)
             case "U":
-                return self.until(left, right, objective)
+                return self.until(left, right, aim)
             case "G":
-                return self.opposite(Formula("F", (~right,)), objective)
+                return self.opposite(Formula("F", (~right,)), aim)
             case "W":
-                return self.opposite(Formula("U", (~right, ~left & ~right)), objective)
+                return self.opposite(Formula("U", (~right, ~left & ~right)), aim)
             case "R":
-                return self.opposite(Formula("U", (~left, ~right)), objective)
+                return self.opposite(Formula("U", (~left, ~right)), aim)
         raise AssertionError(path.operator)
 
     def where(self, condition: Formula) -> np.ndarray:
-        return states_satisfying(self.model, condition, self.text)
+        return states_satisfying(_graph(self.model), condition, self.text)
 
     def at_once(self, path: Formula) -> _Found:
         holds: Any = self.where(path).astype(np.float64)[self.states]
@@ -298,8 +369,8 @@ class _Probability(NamedTuple):
             value=holds, policy=nobody, lower=holds, upper=holds, residual=zero, num_steps=zero,
             status=zero), "the label", None)
 
-    def opposite(self, path: Formula | Bounded, objective: str) -> Callable[[float], _Found]:
-        solve = self.of(path, _OTHER[objective])
+    def opposite(self, path: Formula | Bounded, aim: _Aim) -> Callable[[float], _Found]:
+        solve = self.of(path, aim.opposite)
 
         def found(tolerance: float) -> _Found:
             result = solve(tolerance)
@@ -307,46 +378,67 @@ class _Probability(NamedTuple):
 
         return found
 
-    def until(self, left: Formula, right: Formula, objective: str) -> Callable[[float], _Found]:
+    def until(self, left: Formula, right: Formula, aim: _Aim) -> Callable[[float], _Found]:
         target: Any = self.where(right)
         stay: Any = None if left == TRUE else self.where(left)
         return lambda tolerance: _plain(self.states, reachability_probability(
-            self.model, target, stay=stay, objective=objective, tolerance=tolerance))
+            self.model, target, stay=stay, tolerance=tolerance, **aim.directions))
 
-    def automaton(self, path: Formula, objective: str) -> Callable[[float], _Found]:
+    def next(self, target: np.ndarray, aim: _Aim) -> _Found:
+        if isinstance(self.model, IntervalMDP):
+            return _plain(self.states, robust_next_probability(
+                self.model, target, **aim.directions))
+        return _plain(self.states, bounded.next_probability(
+            self.model, target, objective=aim.policy))
+
+    def automaton(self, path: Formula, aim: _Aim) -> Callable[[float], _Found]:
         def found(tolerance: float) -> _Found:
-            result = sparse_satisfaction(
-                self.model, path, objective=objective, states=self.states, tolerance=tolerance)
+            result: Satisfaction | RobustSatisfaction
+            nature = None
+            if isinstance(self.model, IntervalMDP):
+                result = robust_satisfaction(
+                    self.model, path, states=self.states, tolerance=tolerance, **aim.directions)
+                row, nature = (np.asarray(x) for x in (
+                    result.solution.policy, result.solution.nature))
+            else:
+                result = sparse_satisfaction(
+                    self.model, path, objective=aim.policy, states=self.states,
+                    tolerance=tolerance)
+                row = result.row
             method = str(result.solution.method)
             size = f"product of {result.product.host.num_states} states"
             return _Found(result.solution, f"{size}, {method}" if method else size,
-                          Strategy(result.row, memory=result))
+                          Strategy(row, memory=result, nature=nature))
 
         return found
 
-    def within(self, path: Bounded, objective: str) -> Callable[[float], _Found]:
+    def within(self, path: Bounded, aim: _Aim) -> Callable[[float], _Found]:
         if path.operator == "R":
             negated = TRUE if path.left.operator == "false" else ~path.left
             return self.opposite(
-                replace(path, operator="U", left=negated, right=~path.right), objective)
+                replace(path, operator="U", left=negated, right=~path.right), aim)
         if path.reward is not None:
-            return self.within_reward(path, objective)
+            return self.within_reward(path, aim)
         if path.lower or path.upper is None:
             if max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
                 raise ValueError(
                     f"{self.text}: a lower bound on steps is solved for up to "
                     f"{MAX_UNFOLDED_STEPS} steps; drop it or make it smaller.")
-            return self.of(unfolded(path), objective)
+            return self.of(unfolded(path), aim)
         target, stay = self.where(path.right), self.where(path.left)
-        steps = path.upper
+        steps, model = path.upper, self.model
+        if isinstance(model, IntervalMDP):
+            return lambda tolerance: _plain(self.states, robust_bounded_reachability(
+                model, target, steps, stay=stay, **aim.directions), by="steps")
         return lambda tolerance: _plain(self.states, bounded.bounded_reachability(
-            self.model, target, steps, stay=stay, objective=objective), by="steps")
+            model, target, steps, stay=stay, objective=aim.policy), by="steps")
 
-    def within_reward(self, path: Bounded, objective: str) -> Callable[[float], _Found]:
+    def within_reward(self, path: Bounded, aim: _Aim) -> Callable[[float], _Found]:
         assert path.limit is not None
         target, stay = self.where(path.right), self.where(path.left)
         # Rewards are counted in units of more than 1e-9, so this is just below the limit.
         limit = path.limit - Fraction(1, 10**9) * path.strict
         reward = path.reward or None
+        model = _without_intervals(self.model, self.text, "bounds on rewards")
         return lambda tolerance: _plain(self.states, bounded.reward_bounded_reachability(
-            self.model, target, reward, float(limit), stay=stay, objective=objective), by="reward")
+            model, target, reward, float(limit), stay=stay, objective=aim.policy), by="reward")
