@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import cached_property
 from hashlib import sha256
 from typing import Any
 
@@ -16,6 +17,8 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.models.parametric import Ends, ParametricMDP, box_of, point_inside
+from jaxltl.core.models.ranges import Ends as Ranges
+from jaxltl.core.models.ranges import ranges
 from jaxltl.core.models.rational import Rationals, make_rationals
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.io._drn_body import names_of, read_body, read_header, rewards_of
@@ -31,6 +34,7 @@ _MOST_TERMS, _MOST_DEPTH, _MOST_POWER, _MOST_BITS = 10_000, 50, 1_000, 20_000
 
 # The coefficient of each monomial, which is the power of each parameter: 3 p q^2 is {(1, 2): 3}.
 Polynomial = dict[tuple[int, ...], Fraction]
+Term = tuple[Fraction, list[tuple[int, int]]]  # a coefficient, and parameters with their powers
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,17 @@ class RationalFunction:
 
     def at(self, point: tuple[Fraction, ...]) -> Fraction:
         """Its exact value; ZeroDivisionError at a pole."""
-        return _value(self.numerator, point) / _value(self.denominator, point)
+        above, below = (_value(factors, point) for factors in self._factors)
+        return above / below
+
+    @cached_property
+    def _factors(self) -> tuple[list[Term], list[Term]]:
+        """The terms of both, with the parameters that they have alone."""
+        above, below = (
+            [(c, [(d, k) for d, k in enumerate(powers) if k]) for powers, c in of.items()]
+            for of in (self.numerator, self.denominator)
+        )
+        return above, below
 
 
 @dataclass(frozen=True)
@@ -196,6 +210,23 @@ class _Numbers:
         }
         return probability, rewards
 
+    def ranges(self, low: np.ndarray, high: np.ndarray) -> tuple[Ranges, dict[str, Ranges]]:
+        """What they can be over a box of parameters of at least 0, on the host."""
+        value = ranges(self.functions, low, high)
+        lower, upper = (x[self.function] for x in value)
+        if self.entry is not None:
+            count = np.bincount(self.entry, minlength=self.num_transitions)
+            slack = 1 + count * np.finfo(np.float64).eps
+            lower, upper = (
+                np.bincount(self.entry, x, self.num_transitions) for x in (lower, upper)
+            )
+            lower, upper = lower / slack, upper * slack
+        rewards = {
+            name: Ranges(*(x[of_state] + x[of_choice] for x in value))
+            for name, (of_state, of_choice) in self.rewards.items()
+        }
+        return Ranges(np.clip(lower, 0, 1), np.clip(upper, 0, 1)), rewards
+
 
 class _Exact:
     """Exact instantiation; equal for equal models, so that reading a file again compiles nothing.
@@ -310,11 +341,19 @@ def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
             _starts(row, body.num_rows),
             np.concatenate(body.successor),
             np.concatenate(body.value),
-            {key: (of_state, of_choice) for key, of_state, of_choice in rewards_of(header, body)},
+            {
+                key: (_everywhere(of_state, body.num_states), _everywhere(of_choice, body.num_rows))
+                for key, of_state, of_choice in rewards_of(header, body)
+            },
             names_of(header, body),
         )
     except MemoryError:
         refuse(name, "it is too large for the memory.")
+
+
+def _everywhere(function: Integers, size: int) -> Integers:
+    """Functions of a reward on each state or choice; the first one, zero, where none is given."""
+    return function if function.size else np.zeros(size, np.int32)
 
 
 def _starts(owner: Integers, size: int) -> Integers:
@@ -332,12 +371,11 @@ def _constant(parameters: tuple[str, ...], value: Fraction | int) -> Polynomial:
     return {(0,) * len(parameters): Fraction(value)} if value else {}
 
 
-def _value(polynomial: Polynomial, point: tuple[Fraction, ...]) -> Fraction:
+def _value(terms: list[Term], point: tuple[Fraction, ...]) -> Fraction:
     total = Fraction(0)
-    for powers, coefficient in polynomial.items():
-        for x, power in zip(point, powers, strict=True):
-            if power:
-                coefficient *= x**power
+    for coefficient, factors in terms:
+        for d, power in factors:
+            coefficient *= point[d] ** power
         total += coefficient
     return total
 

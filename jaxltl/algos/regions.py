@@ -1,0 +1,205 @@
+"""Boxes of parameters in which a model has a property, or does not: proven, not sampled.
+
+Over a box every probability has a range. The interval model of these ranges, in which nature picks
+anew at each step, contains the model at every point of the box (parameter lifting, Quatmann,
+Dehnert, Jansen, Junges and Katoen 2016), so that its certified values enclose all of theirs. Where
+they do not decide, the box is split.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jaxltl.algos.feasible import Problem
+from jaxltl.core.host import interval_values
+from jaxltl.core.models.interval import IntervalMDP, make_interval
+from jaxltl.core.models.parametric import box_of
+
+ACCEPTED, REJECTED, OPEN = 1, -1, 0
+
+
+@dataclass(frozen=True)
+class Regions:
+    """Boxes that cover a box.
+
+    Attributes:
+      low, high: ``float64[N, D]``.
+      lower, upper: ``float64[N]``, what encloses the value in each of them.
+      verdict: ``int8[N]``: 1 where it is past the threshold at every point, -1 where it is at none,
+        0 where nothing was decided.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    verdict: np.ndarray
+
+    def share(self, verdict: int) -> float:
+        """The share of the whole volume that boxes of a verdict take."""
+        volume = np.prod(self.high - self.low, axis=1)
+        return float(volume[self.verdict == verdict].sum() / volume.sum())
+
+
+def enclose(problem: Problem, low: Any = None, high: Any = None) -> tuple[float, float]:
+    """Bounds of the value at every point of a box.
+
+    Args:
+      problem: made by :func:`~jaxltl.algos.feasible.make_problem`, of a model that was read by
+        :func:`~jaxltl.io.parametric.read_parametric`.
+      low, high: a number for all parameters, one for each name, or ``float[D]``; default the
+        problem's box.
+
+    Returns:
+      No point of the box has a value below the first or above the second number.
+
+    Raises:
+      ValueError: the box is none, or reaches out of the problem's or below 0; the model is of
+        functions whose ranges are not known.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> from jaxltl.algos.feasible import make_problem
+      >>> from jaxltl.io.parametric import read_parametric
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
+      >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n3\\n@model\\n"
+      ...     "state 0 init\\n\\taction 0\\n\\t\\t1 : p\\n\\t\\t2 : 1-p\\n"
+      ...     "state 1 goal\\n\\taction 0\\n\\t\\t1 : 1\\nstate 2\\n\\taction 0\\n\\t\\t2 : 1\\n")
+      >>> coin = make_problem(read_parametric(path).over(0.01, 0.99), "goal", bound=">=")
+      >>> [round(x, 6) for x in enclose(coin, 0.25, 0.75)]
+      [0.25, 0.75]
+    """
+    model = problem.model
+    low, high = _box(problem, low, high)
+    if not hasattr(model.numbers, "ranges"):
+        raise ValueError("the ranges of this model's functions over a box are not known; regions "
+                         "are proven for models that read_parametric reads.")
+    ends, rewards = model.numbers.ranges(low, high)
+    interval = make_interval(model.model, ends.lower, ends.upper)
+    reward = None if problem.reward is None else rewards[problem.reward]
+    least, most = (_value(problem, interval, reward, large) for large in (False, True))
+    return least[0], most[1]
+
+
+def _box(problem: Problem, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
+    model = problem.model
+    low, high = (whole if x is None else x for x, whole in ((low, model.low), (high, model.high)))
+    low, high = box_of(low, high, model.parameters)
+    out = (low < model.low) | (high > model.high)
+    if out.any():
+        d = int(np.flatnonzero(out)[0])
+        raise ValueError(
+            f"the box [{low[d]:.6g}, {high[d]:.6g}] of {model.parameters[d]} reaches out of the "
+            f"problem's, [{model.low[d]:.6g}, {model.high[d]:.6g}].")
+    return low, high
+
+
+def _value(
+    problem: Problem, model: IntervalMDP, reward: Any, large: bool
+) -> tuple[float, float]:
+    """Bounds of the mean over the initial distribution, with nature making it large or small."""
+    maximize = problem.objective == "max"
+    depth = problem.model.roundings
+    if problem.reward is None:
+        found = interval_values.reachability(
+            model.host, problem.target, maximize=maximize, helpful=large, stay=problem.stay,
+            depth=depth)
+    else:
+        earned = reward.upper if large else np.maximum(reward.lower, 0)
+        found = interval_values.total_reward(
+            model.host, earned, problem.target, maximize=maximize, large=large, depth=depth)
+    share = np.asarray(model.initial, np.float64)
+    start = np.flatnonzero(share)
+    share = share[start] / share[start].sum()
+    slack = 0.0 if start.size == 1 else (start.size + 2) * float(np.finfo(np.float64).eps)
+    low, high = (float(share @ x[start]) for x in (found.lower, found.upper))
+    return low * (1 - slack), high * (1 + slack)
+
+
+def verdict_of(problem: Problem, threshold: float, lower: float, upper: float) -> int:
+    """Whether all values between bounds are past a threshold (1), or none (-1), or neither (0)."""
+    if problem.bound == ">=":
+        return ACCEPTED if lower >= threshold else REJECTED if upper < threshold else OPEN
+    return ACCEPTED if upper <= threshold else REJECTED if lower > threshold else OPEN
+
+
+def prove_regions(
+    problem: Problem, threshold: float, *, low: Any = None, high: Any = None,
+    max_boxes: int = 1000,
+) -> Regions:
+    """A box split into boxes that are accepted, rejected, or left open.
+
+    The largest open box is split next, across its side that is the longest as a share of the whole.
+
+    Args:
+      problem, low, high: as of :func:`enclose`.
+      threshold: the value shall be past it, on the side that the problem says.
+      max_boxes: how many boxes to look at.
+
+    Returns:
+      :class:`Regions`.
+
+    Raises:
+      ValueError: as :func:`enclose`; the threshold is NaN, or `max_boxes` below 1.
+    """
+    if np.isnan(threshold):
+        raise ValueError("the threshold is NaN; give a number.")
+    if max_boxes < 1:
+        raise ValueError(f"max_boxes={max_boxes}; it must be at least 1.")
+    low, high = _box(problem, low, high)
+    size = np.where(high > low, high - low, 1.0)
+    todo, done, looked = deque([(low, high)]), [], 0
+    while todo and looked < max_boxes:
+        box = todo.popleft()
+        looked += 1
+        bounds = enclose(problem, *box)
+        verdict = verdict_of(problem, threshold, *bounds)
+        widths = (box[1] - box[0]) / size
+        if verdict != OPEN or looked + len(todo) + 2 > max_boxes or not widths.any():
+            done.append((*box, *bounds, verdict))
+            continue
+        d = int(widths.argmax())
+        middle = (box[0][d] + box[1][d]) / 2
+        for side in (0, 1):
+            half = [x.copy() for x in box]
+            half[1 - side][d] = middle
+            todo.append((half[0], half[1]))
+    lows, highs, lower, upper, verdicts = (np.array(x) for x in zip(*done, strict=True))
+    return Regions(lows, highs, lower, upper, verdicts.astype(np.int8))
+
+
+def prove_around(
+    problem: Problem, threshold: float, point: Any, *, num_halvings: int = 12
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """A box around a point, as large as bisection finds, that is accepted as a whole.
+
+    Its sides are the same share of the problem's box, as far as that reaches.
+
+    Args:
+      problem, threshold: as of :func:`prove_regions`.
+      point: ``float[D]`` in the problem's box, such as a feasible one.
+      num_halvings: of the share.
+
+    Returns:
+      Its ends, ``float64[D]`` both; None if not even the smallest one that was tried is accepted.
+    """
+    model = problem.model
+    point = np.asarray(point, np.float64)
+    sides = model.high - model.low
+    found, share, move = None, 1.0, 0.5
+    for _ in range(num_halvings):
+        low = np.maximum(point - share * sides, model.low)
+        high = np.minimum(point + share * sides, model.high)
+        if verdict_of(problem, threshold, *enclose(problem, low, high)) == ACCEPTED:
+            found = low, high
+            if share == 1.0:
+                break
+            share += move
+        else:
+            share -= move
+        move /= 2
+    return found
