@@ -6,18 +6,17 @@ enclosed in advance: each product and sum adds less than a unit of rounding to t
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxltl.core.host.choices import Choices, choices_of
 from jaxltl.core.host.rows import Booleans, Integers, spans
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import reaching
 
 UNDERFLOW = 1e-300  # more than all that is lost where numbers are too small
 _HUGE = 1e150
-_FEW = 16  # choices up to which they are gone through one by one
 
 
 class Steps(NamedTuple):
@@ -54,52 +53,26 @@ class Backup(NamedTuple):
     Attributes:
       matrix: ``P``, SciPy's sparse ``float64[R', N]``.
       taken: the same with the columns of all states, ``float64[R', S]``.
-      row: ``int[R']``, the model's rows: all first choices, then all second ones, and so on; by
-        state where some state has many.
-      starts: where the first, second, ... choices begin among these, and R'; or where the rows of
-        each state begin.
-      places: ``int[N]``, the states, those with the most choices first; or ascending.
-      operation: ``np.maximum``, ``np.minimum``, or None where no state has a choice.
-      by_choice: which of these orders it is. A reduction over short spans takes ten times what
-        going through few choices does.
+      choices: the order of the states and of their choices.
+      row: ``int[R']``, the model's rows, in that order.
+      places: ``int[N]``, the states.
+      operation: ``np.maximum`` or ``np.minimum``.
     """
 
     matrix: Any
     taken: Any
+    choices: Choices
     row: Integers
-    starts: Integers
     places: Integers
     operation: Any
-    by_choice: bool
 
     def best(self, quantity: Floats) -> Floats:
         """The optimum over each state's choices: ``[N]`` of a number a row."""
-        if self.operation is None or not quantity.size:
-            return quantity
-        if not self.by_choice:
-            return self.operation.reduceat(quantity, self.starts)
-        ends = self.starts.tolist()
-        found = quantity[: ends[1]].copy()
-        for a, b in pairwise(ends[1:]):
-            self.operation(found[: b - a], quantity[a:b], out=found[: b - a])
-        return found
+        return self.choices.best(quantity, self.operation)
 
     def first(self, quantity: Floats, best: Floats) -> Integers:
         """The model's row of each state's first best choice: ``int32[N]``."""
-        if self.operation is None:
-            return self.row.astype(np.int32)
-        found = np.empty(self.places.size, np.int32)
-        if self.by_choice:
-            ends = self.starts.tolist()
-            for a, b in reversed(list(pairwise(ends))):
-                hit = quantity[a:b] == best[: b - a]
-                found[: b - a][hit] = self.row[a:b][hit]
-            return found
-        count = np.diff(self.starts, append=self.row.size)
-        hit = np.flatnonzero(quantity == np.repeat(best, count))
-        state = np.repeat(np.arange(self.places.size), count)[hit]
-        found[state[::-1]] = self.row[hit[::-1]]  # the first one is written last
-        return found
+        return self.row[self.choices.first(quantity, best)].astype(np.int32)
 
     def sweeps(
         self, cost: Floats, value: Floats, num_steps: int, every: list[Integers] | None = None
@@ -135,21 +108,13 @@ class Backup(NamedTuple):
 def backup_on(mdp: HostMDP, places: Integers, operation: Any) -> Backup:
     """The :class:`Backup` of some states, ascending."""
     count = np.diff(mdp.row_start)[places]
-    most, whole = int(count.max(initial=1)), places.size == mdp.num_states
-    if most == 1 or most > _FEW:
-        row = spans(mdp.row_start[places], count)
-        taken = mdp.matrix if whole else mdp.matrix[row]
-        matrix = taken if whole else taken[:, places]
-        chain = row.size == places.size
-        return Backup(matrix, taken, row, count.cumsum() - count, places,
-                      None if chain else operation, False)
-    order = np.argsort(-count, kind="stable")
-    places, count = places[order], count[order]
-    sizes = [int(np.count_nonzero(count > k)) for k in range(most)]
-    row = np.concatenate([mdp.row_start[places[:n]] + k for k, n in enumerate(sizes)])
-    taken = mdp.matrix[row]
-    starts = np.concatenate([[0], np.cumsum(sizes)])
-    return Backup(taken[:, places], taken, row, starts, places, operation, True)
+    choices = choices_of(count)
+    row = spans(mdp.row_start[places], count)[choices.order]
+    whole = places.size == mdp.num_states and choices.is_chain
+    taken = mdp.matrix if whole else mdp.matrix[row]
+    places = places[choices.states]
+    matrix = taken if whole else taken[:, places]
+    return Backup(matrix, taken, choices, row, places, operation)
 
 
 def _policy(mdp: HostMDP, backup: Backup, row: Integers) -> Integers:

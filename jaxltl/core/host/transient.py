@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxltl.core.host.choices import Choices, choices_of
 from jaxltl.core.host.elimination import Factors, factors, order_of
 from jaxltl.core.host.exact import LARGEST, System, exact_optimum
 from jaxltl.core.host.levels import Edges, Levels, components_in_order, peel
@@ -321,10 +322,7 @@ class _Core(NamedTuple):
 
 
 class _Circles(NamedTuple):
-    """The core as matrices. Its nodes stand by their number of rows, those with most first.
-
-    Rows stand by rank: the first ones of all nodes, in order, then the second ones of the nodes
-    that have a second, and so on. So an optimum over rows is one over slices.
+    """The core as matrices.
 
     Attributes:
       matrix: ``float64[R, M]``, SciPy's.
@@ -332,7 +330,7 @@ class _Circles(NamedTuple):
       leaving: ``float64[R]``, how likely a row leaves the core.
       owner: ``int[R]``, the node of a row.
       row: ``int[R]``, the row of the system that it is.
-      starts: where the rows of each rank start, and R.
+      choices: the order of the nodes and of their rows.
       sign: 1 to maximise.
     """
 
@@ -341,35 +339,27 @@ class _Circles(NamedTuple):
     leaving: Floats
     owner: Integers
     row: Integers
-    starts: list[int]
+    choices: Choices
     sign: int
 
     @property
     def num_nodes(self) -> int:
-        return self.starts[1]
+        return self.choices.states.size
 
     @property
     def is_chain(self) -> bool:
-        return len(self.starts) == 2
+        return self.choices.is_chain
 
     def backup(self, value: Floats) -> Floats:
         return self.known + self.matrix @ value
 
     def best(self, image: Floats) -> Floats:
         """The optimum over the rows of each node."""
-        found = image[: self.starts[1]].copy()
-        better = np.maximum if self.sign > 0 else np.minimum
-        for a, b in zip(self.starts[1:-1], self.starts[2:], strict=True):
-            better(found[: b - a], image[a:b], out=found[: b - a])
-        return found
+        return self.choices.best(image, np.maximum if self.sign > 0 else np.minimum)
 
     def argbest(self, image: Floats, best: Floats) -> Integers:
         """The first row that attains the best of each node."""
-        found = np.arange(self.num_nodes)
-        for a, b in reversed(list(zip(self.starts[:-1], self.starts[1:], strict=True))):
-            hit = image[a:b] == best[: b - a]
-            found[: b - a] = np.where(hit, np.arange(a, b), found[: b - a])
-        return found
+        return self.choices.first(image, best)
 
 
 def _circles(
@@ -379,14 +369,9 @@ def _circles(
     from scipy import sparse
 
     count = np.diff(system.row_start)[core]
-    order = np.argsort(-count, kind="stable")
-    core, count = core[order], count[order]
-    rank = np.arange(int(count.sum())) - np.repeat(count.cumsum() - count, count)
-    owner = np.repeat(np.arange(core.size, dtype=np.int32), count)
-    place = np.argsort(rank, kind="stable")
-    owner = owner[place]
-    row = system.row_start[core][owner] + rank[place]
-    starts = [0, *np.bincount(rank).cumsum().tolist()]
+    choices = choices_of(count)
+    row, owner = spans(system.row_start[core], count)[choices.order], choices.owner
+    core = core[choices.states]
     width = np.diff(system.entry_start)[row]
     entry = spans(system.entry_start[row], width)
     number: Any = np.full(system.num_nodes + 1, -1, np.int32)
@@ -407,7 +392,7 @@ def _circles(
     source = np.repeat(owner, np.diff(matrix.indptr))
     edges = sparse.coo_array((np.ones(source.size, bool), (source, matrix.indices)),
                              shape=(core.size, core.size)).tocsr()
-    circles = _Circles(matrix, known, leaving, owner, row, starts, sign)
+    circles = _Circles(matrix, known, leaving, owner, row, choices, sign)
     return circles, core, Edges(edges.indptr, edges.indices)
 
 
