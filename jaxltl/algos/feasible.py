@@ -103,7 +103,7 @@ class State:
     """A search on its way.
 
     Attributes:
-      key, step: the root key and the number of steps made.
+      key, step: the root key, and the steps made.
       parameters: ``float[D]``, where the next step looks.
       inside: ``float[D]``, the newest point at which the functions were a model.
       best: of all points seen.
@@ -177,20 +177,9 @@ def make_problem(
     if reward is not None:
         row_reward(here, reward)  # refuses an unknown name
     prepared = prepare(here, target, stay=stay, reward=reward, objective=objective)
-    weight = np.asarray(here.initial, np.float64)
-    found = Problem(
-        model,
-        prepared,
-        weight,
-        model.low,
-        model.high,
-        model.inside,
-        target,
-        stay,
-        reward,
-        objective,
-        bound,
-    )
+    stay = None if stay is None else np.asarray(stay, bool)
+    weight, box = np.asarray(here.initial, np.float64), (model.low, model.high, model.inside)
+    found = Problem(model, prepared, weight, *box, target, stay, reward, objective, bound)
     if reward is not None:
         value = _bounds(found, here, 1e-3)[1]
         if np.isinf(value):
@@ -371,8 +360,9 @@ class Feasible:
         the threshold is claimed to be met; else what is known of any value, 0 and 1 or infinity.
       feasible: ``bool[N]``, whether these bounds prove it.
       num_steps: ``int32[N]``, of the searches.
-      status: ``int32[N]``: CONVERGED if it is proven; PRECISION if it seems met and the bounds do
-        not tell; MAX_STEPS if the search was stopped; INVALID or NONFINITE if nothing was found.
+      status: ``int32[N]``: CONVERGED if it is proven; UNCERTIFIED if it seems met and enough others
+        were proven; PRECISION if it seems met and the bounds do not tell; MAX_STEPS if the search
+        was stopped; INVALID or NONFINITE if nothing was found.
       names: of the parameters, static.
     """
 
@@ -386,7 +376,7 @@ class Feasible:
     names: tuple[str, ...] = struct.field(pytree_node=False)
 
     def valuation(self, i: int | None = None) -> dict[str, float]:
-        """The parameters of one by name; default the first that is feasible.
+        """The parameters of one start by name; default the first that is feasible.
 
         Raises:
           ValueError: none is.
@@ -407,6 +397,7 @@ def feasible(
     hparams: Hparams | None = None,
     num_steps: int = 200,
     tolerance: float = 1e-6,
+    enough: int | None = None,
 ) -> Feasible:
     """Parameters for which a value is past a threshold, from many starts, proven.
 
@@ -423,6 +414,7 @@ def feasible(
       hparams: how to search.
       num_steps: steps at most of each.
       tolerance: the width of the certified bounds, of rewards as a share.
+      enough: how many to prove, those first whose values are the best; default all.
 
     Returns:
       :class:`Feasible`; `feasible` only where the certified bound meets the threshold.
@@ -454,6 +446,7 @@ def feasible(
     beyond = 1e3 * float(jnp.finfo(problem.low.dtype).eps) * abs(threshold)
     goal = np.asarray(threshold + problem.sign * beyond, problem.low.dtype)
     most = np.int32(_positive("num_steps", num_steps))
+    enough = None if enough is None else _positive("enough", enough)
     points = None
     if np.ndim(starts) == 0:
         keys = jax.random.split(key, _positive("starts", int(starts)))
@@ -461,23 +454,10 @@ def feasible(
         points = _checked_starts(problem, np.asarray(starts))
         keys = jax.random.split(key, len(points))
     # Which model is proven is of no concern to the search.
-    lean = replace(
-        problem,
-        target=None,
-        stay=None,
-        model=replace(
-            problem.model,
-            model=None,
-            low=None,
-            high=None,
-            inside=None,
-            exact=None,
-            roundings=0,
-            parameters=(),
-        ),
-    )
+    numbers = ParametricMDP(None, problem.model.numbers, None, None, None, ())
+    lean = replace(problem, target=None, stay=None, model=numbers)
     found = _search(keys, points, lean, hparams, goal, most)
-    return _proven(problem, float(threshold), found, tolerance)
+    return _proven(problem, float(threshold), found, tolerance, enough)
 
 
 @jax.jit
@@ -486,17 +466,13 @@ def _search(
 ) -> learner.Learned:
     """All starts: side by side, or in turn where the amount of work depends on the start."""
 
+    until = Partial(_met, problem.sign * goal, problem.sign)
+
     def one(key: Any, point: Any) -> learner.Learned:
-        state = (
-            init(key, problem, hparams) if point is None else start_at(point, key, problem, hparams)
-        )
-        return run_until(
-            state,
-            problem,
-            hparams,
-            until=Partial(_met, problem.sign * goal, problem.sign),
-            num_steps=most,
-        )
+        state = init(key, problem, hparams)
+        if point is not None:
+            state = start_at(point, key, problem, hparams)
+        return run_until(state, problem, hparams, until=until, num_steps=most)
 
     if _takes_turns(problem.prepared):
         return lax.map(lambda given: one(*given), (keys, points))
@@ -508,7 +484,11 @@ def _met(goal: Any, sign: Any, before: Any, after: Any, metrics: Any) -> jax.Arr
 
 
 def _proven(
-    problem: Problem, threshold: float, found: learner.Learned, tolerance: float
+    problem: Problem,
+    threshold: float,
+    found: learner.Learned,
+    tolerance: float,
+    enough: int | None = None,
 ) -> Feasible:
     """Certified bounds of what was claimed."""
     state = found.state
@@ -523,11 +503,16 @@ def _proven(
         value = np.clip(value, 0, 1)
     off = problem.sign * (threshold - value)
     claimed = np.flatnonzero(off <= slack * max(abs(threshold), slack))
+    claimed = claimed[np.argsort(off[claimed], kind="stable")]
     lower = np.zeros(value.size)
     upper = np.full(value.size, 1.0 if problem.reward is None else np.inf)
     status = np.full(value.size, Status.MAX_STEPS, np.int32)
     status = np.where(np.isnan(value), np.maximum(last, Status.NONFINITE), status)
+    status[claimed] = Status.UNCERTIFIED
+    certain = np.zeros(value.size, bool)
     for i in claimed:
+        if enough is not None and certain.sum() >= enough:
+            break
         try:
             bounds = certify(problem, points[i], tolerance=tolerance)
             if bounds[0] < threshold < bounds[1]:
@@ -536,10 +521,9 @@ def _proven(
             status[i] = Status.INVALID
             continue
         lower[i], upper[i] = bounds
-        if bounds[0] < threshold < bounds[1]:
-            status[i] = Status.PRECISION
-    certain = lower >= threshold if problem.sign > 0 else upper <= threshold
-    certain &= np.isin(np.arange(value.size), claimed) & (status != Status.INVALID)
+        certain[i] = bounds[0] >= threshold if problem.sign > 0 else bounds[1] <= threshold
+        between = bounds[0] < threshold < bounds[1]
+        status[i] = Status.PRECISION if between else Status.MAX_STEPS
     status = np.where(certain, Status.CONVERGED, status).astype(np.int32)
     return Feasible(points, value, lower, upper, certain, steps, status, problem.model.parameters)
 

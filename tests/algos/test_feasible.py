@@ -112,6 +112,19 @@ def test_walks_with_circles():
     assert not feasible(longest, 9.001, starts=20).feasible.any()
 
 
+def test_what_may_be_passed_before(tmp_path):
+    """Not through state 1, so by the other way: of probability (1 - p) p, not 1 - p^2."""
+    model = drn(tmp_path, "p", [
+        ("0", "init", {1: "p", 3: "1-p"}), ("0", "", {2: "1-p", 4: "p"}), ("0", "goal", {2: "1"}),
+        ("0", "", {2: "p", 4: "1-p"}), ("0", "", {4: "1"})]).over(0.01, 0.99)
+    stay = [True, False, True, True, True]
+    problem = make_problem(model, "goal", bound=">=", stay=stay)
+    lower, upper = certify(problem, [0.25])
+    assert lower <= 0.1875 <= upper and upper - lower < 1e-6
+    assert feasible(problem, 0.2499, starts=4).feasible.all()
+    assert not feasible(problem, 0.2501, starts=4).feasible.any()
+
+
 def test_steps_are_measured_by_the_odds():
     """These are (p / (1 - p)) ** 3, whether the probability is 1e-6 or 1 - 1e-6."""
     problem = make_problem(ruin(), "won", bound=">=")
@@ -293,6 +306,18 @@ def test_a_search_that_is_wrong_claims_nothing(tmp_path):
     assert found.status.tolist() == [Status.PRECISION] and not found.feasible.any()
 
 
+def test_as_many_are_proven_as_are_enough():
+    problem = make_problem(ruin(), "won", bound=">=")
+    every = feasible(problem, 0.9, starts=20)
+    some = feasible(problem, 0.9, starts=20, enough=3)
+    best = np.argsort(-every.value, kind="stable")[:3]
+    assert set(np.flatnonzero(some.feasible)) == set(best)
+    np.testing.assert_array_equal(some.parameters, every.parameters)
+    assert (some.status[~some.feasible] == Status.UNCERTIFIED).all()
+    assert (some.upper[~some.feasible] == 1).all() and (some.lower[~some.feasible] == 0).all()
+    assert some.valuation()["p"] == every.parameters[min(best), 0]
+
+
 def test_points_that_are_no_model_after_all_are_told(tmp_path, monkeypatch):
     problem = make_problem(coins(tmp_path).over(1e-3, 1 - 1e-3), "goal", bound=">=")
 
@@ -344,6 +369,7 @@ def test_questions_that_are_none(tmp_path, changed, message):
     (np.inf, {}, "threshold=inf"),
     (0.2, {"starts": 0}, "starts=0; it must be at least 1"),
     (0.2, {"num_steps": 0}, "num_steps=0; it must be"),
+    (0.2, {"enough": 0}, "enough=0; it must be"),
     (0.2, {"starts": np.array([0.5])}, r"starts has shape \(1,\); expected \(N, 1\)"),
     (0.2, {"starts": np.array([[0.5], [0.95]])}, r"start 1 has p = 0.95; its interval is \[0.1"),
     (0.2, {"starts": np.array([[np.nan]])}, "start 0 has p = nan"),
