@@ -17,6 +17,8 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.models.parametric import Ends, ParametricMDP, box_of, point_inside
+from jaxltl.core.models.ranges import Ends as Ranges
+from jaxltl.core.models.ranges import ranges
 from jaxltl.core.models.rational import Rationals, make_rationals
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.io._drn_body import names_of, read_body, read_header, rewards_of
@@ -208,6 +210,23 @@ class _Numbers:
         }
         return probability, rewards
 
+    def ranges(self, low: np.ndarray, high: np.ndarray) -> tuple[Ranges, dict[str, Ranges]]:
+        """What they can be over a box of parameters of at least 0, on the host."""
+        value = ranges(self.functions, low, high)
+        lower, upper = (x[self.function] for x in value)
+        if self.entry is not None:
+            count = np.bincount(self.entry, minlength=self.num_transitions)
+            slack = 1 + count * np.finfo(np.float64).eps
+            lower, upper = (
+                np.bincount(self.entry, x, self.num_transitions) for x in (lower, upper)
+            )
+            lower, upper = lower / slack, upper * slack
+        rewards = {
+            name: Ranges(*(x[of_state] + x[of_choice] for x in value))
+            for name, (of_state, of_choice) in self.rewards.items()
+        }
+        return Ranges(np.clip(lower, 0, 1), np.clip(upper, 0, 1)), rewards
+
 
 class _Exact:
     """Exact instantiation; equal for equal models, so that reading a file again compiles nothing.
@@ -322,11 +341,19 @@ def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
             _starts(row, body.num_rows),
             np.concatenate(body.successor),
             np.concatenate(body.value),
-            {key: (of_state, of_choice) for key, of_state, of_choice in rewards_of(header, body)},
+            {
+                key: (_everywhere(of_state, body.num_states), _everywhere(of_choice, body.num_rows))
+                for key, of_state, of_choice in rewards_of(header, body)
+            },
             names_of(header, body),
         )
     except MemoryError:
         refuse(name, "it is too large for the memory.")
+
+
+def _everywhere(function: Integers, size: int) -> Integers:
+    """Functions of a reward on each state or choice; the first one, zero, where none is given."""
+    return function if function.size else np.zeros(size, np.int32)
 
 
 def _starts(owner: Integers, size: int) -> Integers:
