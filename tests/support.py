@@ -27,6 +27,14 @@ def as_mdp(model: reference.Model, **labels: Any) -> MDP:
     )
 
 
+def replaced(text: str, *replacements: tuple[str, str]) -> str:
+    """A text with parts replaced, each of which stands in it."""
+    for old, new in replacements:
+        assert old in text
+        text = text.replace(old, new)
+    return text
+
+
 def stack(trees: Sequence[Any]) -> Any:
     """Trees of one shape as a batch."""
     return jax.tree.map(lambda *x: jnp.asarray(np.stack([np.asarray(y) for y in x])), *trees)

@@ -234,9 +234,8 @@ def test_the_written_policy_runs_alone(learned):
     assert abs(done / 300 - start) < 4 * np.sqrt(start * (1 - start) / 300) + 0.02
 
 
-def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch):
-    place, _ = learned
-    task, out = place / "task.toml", place / "again"
+def interrupt_soon(monkeypatch):
+    """A run is interrupted as it reports for the second time."""
     reports = []
 
     def interrupt(self, *_, **__):
@@ -245,6 +244,12 @@ def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch):
             raise KeyboardInterrupt
 
     monkeypatch.setattr("tqdm.tqdm.set_postfix", interrupt)
+
+
+def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch):
+    place, _ = learned
+    task, out = place / "task.toml", place / "again"
+    interrupt_soon(monkeypatch)
     result = run("learn", task, "--out", out, "--seeds", 2)
     assert result.exit_code == 130 and "goes on from the last checkpoint" in result.stderr
     assert len(list(out.glob("checkpoint-*.npz"))) == 1

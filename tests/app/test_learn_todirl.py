@@ -16,7 +16,8 @@ from jaxltl.core.models.mdp import from_dense
 from jaxltl.envs import temporal_gridworld
 from jaxltl.io.colored_world import save_world, write_world
 from jaxltl.io.learned_reward import load_reward, plan_in
-from tests.test_cli import failure, run
+from tests.support import replaced
+from tests.test_cli import failure, interrupt_soon, run
 
 TASK = """
 [world]
@@ -100,10 +101,7 @@ def write(tmp_path):
     """Writes a task, after replacing parts of it, and its world."""
 
     def write(*replacements, text=TASK):
-        for old, new in replacements:
-            assert old in text
-            text = text.replace(old, new)
-        (tmp_path / "task.toml").write_text(text)
+        (tmp_path / "task.toml").write_text(replaced(text, *replacements))
         write_files(tmp_path)
         return tmp_path / "task.toml"
 
@@ -302,14 +300,7 @@ def test_a_file_that_is_no_network(tmp_path, learned):
 
 def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch):
     place, _, _ = learned
-    reports = []
-
-    def interrupt(self, *_, **__):
-        reports.append(self)
-        if len(reports) == 2:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr("tqdm.tqdm.set_postfix", interrupt)
+    interrupt_soon(monkeypatch)
     command = ("learn", place / "task.toml", "--out", place / "again")
     result = run(*command)
     assert result.exit_code == 130 and "goes on from the last checkpoint" in result.stderr

@@ -11,6 +11,7 @@ from jaxltl.app import synthesize as synthesis
 from jaxltl.app.files.game import load_game, read_game
 from jaxltl.app.reports import synthesize as report
 from jaxltl.app.reports.synthesize_page import play_explorer
+from tests.support import replaced
 from tests.test_cli import failure, run
 
 SQUARE = """
@@ -47,10 +48,7 @@ def write(tmp_path):
     """Writes a game file after replacing parts of it."""
 
     def write(*replacements, text=SQUARE):
-        for old, new in replacements:
-            assert old in text
-            text = text.replace(old, new)
-        (tmp_path / "game.toml").write_text(text)
+        (tmp_path / "game.toml").write_text(replaced(text, *replacements))
         return tmp_path / "game.toml"
 
     return write

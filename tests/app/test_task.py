@@ -16,6 +16,7 @@ from jaxltl.app.files.task import (
 )
 from jaxltl.core.models.product import product
 from jaxltl.core.values.satisfaction import optimal_satisfaction
+from tests.support import replaced
 
 TASK = """
 [world]
@@ -44,11 +45,7 @@ def write(tmp_path):
     """Writes a task, after replacing parts of it, and its demonstrations."""
 
     def write(*replacements, shown=SHOWN):
-        text = TASK
-        for old, new in replacements:
-            assert old in text
-            text = text.replace(old, new)
-        (tmp_path / "task.toml").write_text(text)
+        (tmp_path / "task.toml").write_text(replaced(TASK, *replacements))
         if shown is not None:
             text = shown if isinstance(shown, str) else json.dumps(shown)
             (tmp_path / "shown.json").write_text(text)

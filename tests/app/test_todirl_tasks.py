@@ -18,6 +18,7 @@ from jaxltl.core.values.mixture import WINDOW, at_starts
 from jaxltl.core.values.performance import infeasible_starts
 from jaxltl.io.learned_reward import load_reward, plan_in, save_reward
 from tests.algos.test_guaranteed import evaluate
+from tests.support import replaced
 from tests.test_cli import run
 
 TASK = '''
@@ -63,10 +64,7 @@ def write(tmp_path):
     """Writes a task, after replacing parts of it."""
 
     def write(*replacements, text=TASK):
-        for old, new in replacements:
-            assert old in text
-            text = text.replace(old, new)
-        (tmp_path / "task.toml").write_text(text)
+        (tmp_path / "task.toml").write_text(replaced(text, *replacements))
         return tmp_path / "task.toml"
 
     return write

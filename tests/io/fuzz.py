@@ -23,6 +23,7 @@ from jaxltl.io.drn import read_drn, write_drn
 from jaxltl.io.hoa_game import read_hoa_game
 from jaxltl.io.log import read_log
 from jaxltl.io.npz import read_npz, write_npz
+from jaxltl.io.parametric import read_parametric
 from jaxltl.io.pgsolver import read_pgsolver
 from jaxltl.io.prism_explicit import read_prism, write_prism
 from jaxltl.io.reward_machine import read_reward_machine
@@ -30,6 +31,11 @@ from jaxltl.io.umb import read_umb, write_umb
 from tests.io.archives import classes_example, example, members_of, tar, umb
 from tests.io.mutate import mutated
 from tests.io.same import full_interval, full_model
+from tests.io.test_drn import MDP as DRN
+from tests.io.test_hoa_game import ARBITER
+from tests.io.test_parametric import CHAIN as PARAMETRIC
+from tests.io.test_pgsolver import EXAMPLE
+from tests.io.test_reward_machine import OFFICE
 
 MOST_SECONDS = 5.0  # of processor time, for one small file
 MOST_MEMORY = 2**30  # bytes that trying them may add
@@ -368,38 +374,28 @@ def npz_samples(folder: Path) -> list[bytes]:
     return [*found, file.getvalue()]
 
 
-_PARITY = (
-    b'parity 4;\nstart 1;\n0 3 0 1,2 "a";\n1 2 1 0,1;\n2 4 1 2 "b c";\n',
-    b"0 1 0 1;\n1 0 1 0,1;\n",
-)
-
-_ARBITER = b"""HOA: v1 States: 2 Start: 0 AP: 3 "r" "g" "s" controllable-AP: 1
-acc-name: parity max even 3 Acceptance: 3 Inf(2) | (Fin(1) & Inf(0))
---BODY-- State: 0 [!0] 0 {2} [0 & 1] 0 {2} [0 & !1] 1 {1}
-State: 1 [1 & !2] 0 {2} [!1 | 2] 1 {1} --END--
-"""
-
-_MACHINE = b"""0 # where it starts
-[2]
-(0,0,'!f&!n',ConstantRewardFunction(0))
-(0,2,'n',ConstantRewardFunction(-0.5))
-(0,1,'f&!n',ConstantRewardFunction(2.5e-1))
-(1,2,"!(g | False)",ConstantRewardFunction(1))
-"""
-
 _LOG = b"""time,state,action,next,count
 1,hall,left,"kitchen, lower",3
 2,"kitchen, lower", right ,hall,1
 3,0,left,hall,0
 """
 
+
+def _texts(*samples: str) -> Callable[[Path], list[bytes]]:
+    """Samples by hand."""
+    return lambda folder: [text.encode() for text in samples]
+
+
+_drn = _written(write_drn, "sample.drn")
+
 READERS = {
     "umb": Reader(read_umb, ".umb", umb_samples, damaged_archive),
     "npz": Reader(read_npz, ".npz", npz_samples, damaged_arrays),
-    "drn": Reader(read_drn, ".drn", _written(write_drn, "sample.drn")),
+    "drn": Reader(read_drn, ".drn", lambda folder: [DRN.encode(), *_drn(folder)]),
+    "parametric": Reader(read_parametric, ".drn", _texts(PARAMETRIC)),
     "pexp": Reader(read_prism, ".pexp", _written(write_prism, "sample.pexp")),
-    "hoa_game": Reader(read_hoa_game, ".hoa", lambda folder: [_ARBITER]),
-    "reward_machine": Reader(read_reward_machine, ".txt", lambda folder: [_MACHINE]),
+    "hoa_game": Reader(read_hoa_game, ".hoa", _texts(ARBITER)),
+    "reward_machine": Reader(read_reward_machine, ".txt", _texts(OFFICE)),
     "log": Reader(read_log, ".csv", lambda folder: [_LOG, gzip.compress(_LOG)]),
-    "pgsolver": Reader(read_pgsolver, ".pg", lambda folder: list(_PARITY)),
+    "pgsolver": Reader(read_pgsolver, ".pg", _texts(EXAMPLE, "0 1 0 1;\n1 0 1 0,1;\n")),
 }

@@ -36,6 +36,7 @@ WORDS = [
     b"mdp",
     b"\r\n",
     b"",
+    *b"' & | ! ; { } {9} [t] F G 1e5 parity State: --END-- controllable-AP: \x80 \xc3\xa9".split(),
 ]
 
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.sparse import Rewards, SparseMDP
@@ -99,3 +100,24 @@ def actions(model: SparseMDP) -> list:
     if model.action is None:
         return []
     return [model.action_names[i] if model.action_names else int(i) for i in model.action]
+
+
+def refuses(write, path, model, more):
+    """A writer of an explicit format refuses a model of nine states with each of these parts.
+
+    Args:
+      write: the writer.
+      path: of the file, alone in its folder.
+      model: what can be written.
+      more: other parts that cannot, by what is said of them.
+    """
+    wrong = {
+        "not equally likely": {"initial": np.r_[0.25, 0.75, np.zeros(7)]},
+        "the action 'a b' cannot": {"action_names": ("a b", "b", "c")},
+        "the label 'a\"b' cannot": {"propositions": ('a"b', *model.propositions[1:])},
+        "another of this name": {"propositions": ("init", *model.propositions[1:])},
+    }
+    for message, parts in (wrong | more).items():
+        with pytest.raises(ValueError, match=message):
+            write(path, replace(model, **parts))
+    assert not list(path.parent.iterdir())

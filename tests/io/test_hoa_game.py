@@ -305,21 +305,3 @@ def test_games_that_cannot_be_written_are_refused():
     game = make_game(make_mdp([[[0]], [[1]]], [[[1.0]], [[1.0]]]), [True, True])
     with pytest.raises(ValueError, match="2 initial states, expected one"):
         write_hoa_game(game, reach(game, np.array([False, True])))
-
-
-def test_mutations_raise_nothing_but_value_errors():
-    rng = np.random.default_rng(3)
-    pieces = ["", "0", "1", "&", "|", "!", "(", "]", "{9}", "[t]", "\n", "State: 1", "--END--", "é",
-              "controllable-AP: 0", "99999999999"]  # fmt: skip
-    refused = 0
-    for _ in range(300):
-        text = ARBITER
-        for _ in range(rng.integers(1, 4)):
-            at = int(rng.integers(len(text)))
-            text = text[:at] + rng.choice(pieces) + text[at + int(rng.integers(4)) :]
-        try:
-            read_hoa_game("HOA: v1\n" + text[8:])
-        except ValueError as error:
-            refused += 1
-            assert str(error).startswith("read_hoa_game: ")
-    assert 150 < refused < 300

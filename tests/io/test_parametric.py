@@ -12,7 +12,6 @@ import pytest
 from jaxltl.core.models.sparse import row_reward
 from jaxltl.io.drn import read_drn, write_drn
 from jaxltl.io.parametric import read_parametric
-from tests.io.mutate import mutated
 from tests.io.same import assert_same, full_model
 from tests.support import counted_traces
 
@@ -145,16 +144,6 @@ def test_points_that_are_none_are_named(tmp_path):
     }.items():
         with pytest.raises(ValueError, match=message):
             found.at(dict(values))
-
-
-def test_mutated_files_are_read_or_refused(tmp_path):
-    rng, path = np.random.default_rng(0), tmp_path / "m.drn"
-    for _ in range(300):
-        path.write_bytes(mutated(rng, CHAIN.encode()))
-        try:
-            read_parametric(path)
-        except ValueError as error:
-            assert str(tmp_path) in str(error)
 
 
 # --- as functions of arrays -------------------------------------------------------------------
