@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from jaxltl.core.host.mixing import optimum
 from jaxltl.core.host.sparse import Floats, HostMDP
-from jaxltl.core.host.transient import Enclosed, Transient, optimum
+from jaxltl.core.host.transient import Enclosed, Transient
 
 _EPS = float(np.finfo(np.float64).eps)
 

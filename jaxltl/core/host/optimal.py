@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.host.contract import Contraction, merged, without_chains
+from jaxltl.core.host.mixing import optimum
 from jaxltl.core.host.rows import Booleans, Integers
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import (
@@ -22,7 +23,7 @@ from jaxltl.core.host.sparse_graph import (
     surely_reaching,
     towards,
 )
-from jaxltl.core.host.transient import Enclosed, Transient, optimum
+from jaxltl.core.host.transient import Enclosed, Transient
 
 _EPS = float(np.finfo(np.float64).eps)
 

@@ -1,0 +1,102 @@
+"""Optimal sums by the method that a model asks for: sweeps where it mixes, or elimination."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.host import transient
+from jaxltl.core.host.relaxation import Relaxed, Sums, cut, relaxed
+from jaxltl.core.host.rows import Booleans, spans
+from jaxltl.core.host.sparse import Floats, HostMDP
+from jaxltl.core.host.transient import Enclosed, Transient
+
+_EPS = float(np.finfo(np.float64).eps)
+_TINY = 1e-290
+_LARGE = 20_000  # open states from which sweeps are tried
+_MET = 4096  # states that are met
+_STEPS = 10  # within so many steps from one, where a model may mix
+
+
+def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: bool) -> Enclosed:
+    """:func:`jaxltl.core.host.transient.optimum`, by sweeps where a large model mixes well."""
+    if np.count_nonzero(problem.open) >= _LARGE and _spreads(problem.mdp, problem.open):
+        found = by_sweeps(problem, maximize=maximize, tolerance=tolerance, relative=relative)
+        if found is not None:
+            return found
+    return transient.optimum(problem, maximize=maximize, tolerance=tolerance, relative=relative)
+
+
+def by_sweeps(
+    problem: Transient, *, maximize: bool, tolerance: float, relative: bool
+) -> Enclosed | None:
+    """The same by sweeps; None where these take too long."""
+    mdp, sign = problem.mdp, 1 if maximize else -1
+    weight, rows = _without_loops(problem)
+    widest = int(np.diff(mdp.entry_start).max())
+    unit = (4 * widest + problem.depth + 16) * _EPS
+    cost: Any = problem.cost if rows is None else np.where(rows, problem.cost, 0)
+    if not cost.any():
+        cost = None
+    sums = Sums(
+        cut(mdp.row_start, mdp.entry_start, mdp.successor, weight, mdp.num_states),
+        problem.open, problem.open, problem.known, problem.known, cost, rows)
+    found = relaxed(sums, sign=sign, tolerance=tolerance, relative=relative, unit=unit)
+    return None if found is None else _enclosed(problem, found, sign)
+
+
+def _enclosed(problem: Transient, found: Relaxed, sign: int) -> Enclosed:
+    low, high = (found.near, found.far) if sign > 0 else (found.far, found.near)
+
+    def everywhere(x: Floats) -> Floats:
+        return np.where(problem.open, x, problem.known)
+
+    # Products too small for a float to hold are lost; relative errors do not count them.
+    low, high = everywhere(np.maximum(low - _TINY, 0)), everywhere(high + _TINY)
+    value = low + (high - low) / 2
+    row = np.where(problem.open, found.row, problem.mdp.row_start[:-1])
+    # The operator carries the bounds towards each other, so the value by half of what is between.
+    left = (high - value) / np.maximum(value, 1)
+    return Enclosed(
+        value, low, high, row, found.sweeps, float(left[problem.open].max(initial=0)),
+        "sweeps in place")
+
+
+def _without_loops(problem: Transient) -> tuple[Floats, Booleans | None]:
+    """Weights by which rows sum to one where they loop, and the rows that lead elsewhere."""
+    mdp = problem.mdp
+    loop = np.flatnonzero(mdp.successor == mdp.state[mdp.row])
+    if not loop.size:
+        return mdp.probability, problem.rows
+    weight = mdp.probability.copy()
+    weight[loop] = 0
+    of = mdp.row[loop]
+    first = loop[np.diff(of, prepend=-1) > 0]  # a row may repeat its successors
+    row = mdp.row[first]
+    width = np.diff(mdp.entry_start)[row]
+    entry = spans(mdp.entry_start[row], width)
+    rest = np.add.reduceat(weight[entry], width.cumsum() - width)
+    weight[first] = np.maximum(1 - rest, 0)
+    rows = np.ones(mdp.num_rows, bool) if problem.rows is None else problem.rows.copy()
+    rows[row[rest == 0]] = False
+    return weight, rows
+
+
+def _spreads(mdp: HostMDP, open_: Booleans) -> bool:
+    """Whether few steps from a state lead to many, as they do where elimination fills."""
+    seen: Any = np.zeros(mdp.num_states, bool)
+    node = np.flatnonzero(open_)
+    frontier, met = node[node.size // 2 : node.size // 2 + 1], 1
+    seen[frontier] = True
+    first = mdp.entry_start[mdp.row_start]
+    for _ in range(_STEPS):
+        after = mdp.successor[spans(first[frontier], first[frontier + 1] - first[frontier])]
+        frontier = np.unique(after[open_[after] & ~seen[after]])
+        seen[frontier] = True
+        met += frontier.size
+        if met >= _MET:
+            return True
+        if not frontier.size:
+            return False
+    return False
