@@ -67,6 +67,11 @@ from jaxltl.core.values.occupancy import feature_expectation, occupancy_measure
 from jaxltl.core.values.optimal_actions import OptimalActions, optimal_actions
 from jaxltl.core.values.performance import task_performance, task_performances
 from jaxltl.core.values.prepared import Prepared, prepare, solve_prepared
+from jaxltl.core.values.prepared_interval import (
+    PreparedInterval,
+    prepare_interval,
+    solve_interval,
+)
 from jaxltl.core.values.reachability import reachability_probability
 from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
 from jaxltl.core.values.soft import soft_value
@@ -104,6 +109,7 @@ __all__ = [
     "Parity",
     "Permissive",
     "Prepared",
+    "PreparedInterval",
     "Product",
     "Rewards",
     "Solution",
@@ -171,6 +177,7 @@ __all__ = [
     "permissive_strategy",
     "policy_value",
     "prepare",
+    "prepare_interval",
     "product",
     "project_policy",
     "project_trajectories",
@@ -189,6 +196,7 @@ __all__ = [
     "satisfaction_probability",
     "shield",
     "soft_value",
+    "solve_interval",
     "solve_prepared",
     "sparse_satisfaction",
     "stack_products",
