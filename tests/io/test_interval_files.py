@@ -137,34 +137,27 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "message"), WRONG)
-def test_what_is_wrong_in_drn_is_named(old, new, message, tmp_path):
-    assert old in DRN
-    path = tmp_path / "m.drn"
-    path.write_text(DRN.replace(old, new, 1))
-    with pytest.raises(ValueError, match=message) as caught:
-        read_model(path)
-    assert str(path) in str(caught.value)
+WRONG_EXPLICIT = [
+    ("[0.1,0.7]", "[0.7,0.1]", "line 3: '.0.7,0.1.' stands where .* interval .l, u. with 0 <="),
+    ("[0.1,0.7]", "[0.7]", "line 3: '.0.7.' stands where"),
+    ("[0.1,0.7]", "[0.1,0.7", "line 3: '.0.1,0.7' stands where"),
+    ("[0.1,0.7]", "[0.1,nan]", "line 3: 'nan' stands where"),
+    ("[0.1,0.7]", "[-1e-9,0.7]", "line 3: '.-1e-9,0.7.' stands where"),
+    ("[0.4,0.8]", "[0.95,1]", "line 3: the lower ends of state 0, choice 0 sum to 1.05"),
+    ("[0.4,0.8]", "[0,0.2]", "line 3: the upper ends of state 0, choice 0 sum to 0.9"),
+    ("(IMDP)", "(IPOMDP)", "line 1: a model of type IPOMDP is not read"),
+    ("(IMDP)", "(IDTMC)", "line 2: 3 sizes; a IDTMC has 2"),
+]
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("[0.1,0.7]", "[0.7,0.1]", "line 3: '.0.7,0.1.' stands where .* interval .l, u. with 0 <="),
-        ("[0.1,0.7]", "[0.7]", "line 3: '.0.7.' stands where"),
-        ("[0.1,0.7]", "[0.1,0.7", "line 3: '.0.1,0.7' stands where"),
-        ("[0.1,0.7]", "[0.1,nan]", "line 3: 'nan' stands where"),
-        ("[0.1,0.7]", "[-1e-9,0.7]", "line 3: '.-1e-9,0.7.' stands where"),
-        ("[0.4,0.8]", "[0.95,1]", "line 3: the lower ends of state 0, choice 0 sum to 1.05"),
-        ("[0.4,0.8]", "[0,0.2]", "line 3: the upper ends of state 0, choice 0 sum to 0.9"),
-        ("(IMDP)", "(IPOMDP)", "line 1: a model of type IPOMDP is not read"),
-        ("(IMDP)", "(IDTMC)", "line 2: 3 sizes; a IDTMC has 2"),
-    ],
+    ("text", "name", "old", "new", "message"),
+    [(DRN, "m.drn", *x) for x in WRONG] + [(TRA, "m.tra", *x) for x in WRONG_EXPLICIT],
 )
-def test_what_is_wrong_in_explicit_files_is_named(old, new, message, tmp_path):
-    assert old in TRA
-    path = tmp_path / "m.tra"
-    path.write_text(TRA.replace(old, new, 1))
+def test_what_is_wrong_is_named(text, name, old, new, message, tmp_path):
+    assert old in text
+    path = tmp_path / name
+    path.write_text(text.replace(old, new, 1))
     with pytest.raises(ValueError, match=message) as caught:
         read_model(path)
     assert str(path) in str(caught.value)

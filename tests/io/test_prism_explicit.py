@@ -236,25 +236,21 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("name", "old", "new", "message"), WRONG)
-def test_what_is_wrong_is_named(tmp_path, name, old, new, message):
-    assert old in FILES[name]
-    changed = FILES[name].replace(old, new, 1).encode(errors="surrogateescape")
-    path = put(tmp_path, FILES | {name: changed})
-    with pytest.raises(ValueError, match=message):
-        read_prism(path)
+WRONG_OF_STORM = [
+    ("m.lab", "#END", "", "the labels after '#DECLARATION' do not end"),
+    ("m.lab", "3 goal", "3 gaol", "line 6: 'gaol' stands where a label that is declared"),
+    ("m.lab", "goal\nunused", "goal\ngoal", "declared twice"),
+]
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("#END", "", "the labels after '#DECLARATION' do not end"),
-        ("3 goal", "3 gaol", "line 6: 'gaol' stands where a label that is declared"),
-        ("goal\nunused", "goal\ngoal", "declared twice"),
-    ],
+    ("files", "name", "old", "new", "message"),
+    [(FILES, *x) for x in WRONG] + [(STORM, *x) for x in WRONG_OF_STORM],
 )
-def test_what_is_wrong_with_storm_is_named(tmp_path, old, new, message):
-    path = put(tmp_path, STORM | {"m.lab": STORM["m.lab"].replace(old, new, 1)})
+def test_what_is_wrong_is_named(tmp_path, files, name, old, new, message):
+    assert old in files[name]
+    changed = files[name].replace(old, new, 1).encode(errors="surrogateescape")
+    path = put(tmp_path, files | {name: changed})
     with pytest.raises(ValueError, match=message):
         read_prism(path)
 
