@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.algos.feasible import Problem
 from jaxltl.core.host import interval_values
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.parametric import box_of
 
 ACCEPTED, REJECTED, OPEN = 1, -1, 0
+Problem = Any  # as jaxltl.algos.feasible.make_problem makes it
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ only. Shapes are written for the S states of ``problem.game``; states outside th
 where they are and are never entered.
 """
 
-
 from __future__ import annotations
 
 from dataclasses import replace
@@ -27,6 +26,7 @@ from flax import struct
 from jax.tree_util import Partial
 
 from jaxltl.algos import learner, pac, splitmix
+from jaxltl.algos._data_evidence import DataEvidence, data_evidence
 from jaxltl.algos._joint_game import (
     environment_rows,
     joint_game,
@@ -34,16 +34,7 @@ from jaxltl.algos._joint_game import (
     require_start,
     shaped_reward,
 )
-from jaxltl.algos._walk import (
-    Rules,
-    Seen,
-    Walk,
-    marks,
-    move,
-    note_last,
-    record,
-    walk_from,
-)
+from jaxltl.algos._walk import Rules, Seen, Walk, marks, move, note_last, record, walk_from
 from jaxltl.algos.play import (
     check_distributions,
     cumulative,
@@ -206,6 +197,7 @@ class Evidence:
         environment never makes stay unknown, so that `worst` can stay low.
       reachable: ``bool[S]``, the states of the region that can be reached from the start.
       known_at: ``int32[S, A]``, see :class:`State`.
+      data: what the counts guarantee of the strategy, by themselves, if that was asked for.
     """
 
     strategy: jax.Array
@@ -217,6 +209,7 @@ class Evidence:
     epsilon_optimal_met: jax.Array
     reachable: jax.Array
     known_at: jax.Array
+    data: DataEvidence | None = None
 
 
 # --- problems, on the host ------------------------------------------------------------------
@@ -412,10 +405,13 @@ def _observe(state, problem, hparams, action, successor, reward) -> State:
     return _updated(state, walk, problem, hparams)
 
 
-def evidence(state: State, problem: Problem, hparams: Hparams) -> Evidence:
+def evidence(
+    state: State, problem: Problem, hparams: Hparams, *, confidence: float | None = None
+) -> Evidence:
     """What the strategy of a state is worth in the true game, certified; on the host.
 
-    One state at a time: of vmapped seeds, ``jax.tree.map(itemgetter(i), states)``.
+    One state at a time: of vmapped seeds, ``jax.tree.map(itemgetter(i), states)``. With a
+    `confidence` in (0, 1) also what the counts alone guarantee, however few they are.
 
     Raises:
       ValueError: a reward outside [0, R_max] was observed, which voids every guarantee.
@@ -436,6 +432,9 @@ def evidence(state: State, problem: Problem, hparams: Hparams) -> Evidence:
         epsilon_optimal_met=near(met) & problem.region,
         reachable=jnp.zeros(game.num_states, bool).at[reached].set(True),
         known_at=state.known_at,
+        data=None if confidence is None else data_evidence(
+            game, problem.allowed, problem.region, problem.reward, state.counts, play,
+            float(hparams.discount), confidence),
     )
 
 

@@ -21,11 +21,11 @@ def discounted(
     model: HostInterval, reward: Floats, discount: Floats, *, maximize: bool, large: bool,
     tolerance: float,
 ) -> Robust:
-    """``V = opt_r (reward_r + discount_r opt_p p V)``, enclosed.
+    """``V = opt_r opt_p sum_t p_t (reward_t + discount_r V_t)``, enclosed.
 
     Args:
       model: the model.
-      reward: ``float64[R]``, of any sign.
+      reward: ``float64[T]``, what each entry earns, of any sign.
       discount: ``float64[R]``, below 1 in every second step at least.
       maximize: whether the policy makes the value large.
       large: whether nature does.
@@ -39,7 +39,7 @@ def discounted(
     best, sign = (np.maximum, 1) if maximize else (np.minimum, -1)
     value = np.zeros(mdp.num_states)
     row: Integers = mdp.row_start[:-1].astype(np.int64)
-    p = model.nature(value[mdp.successor], maximize=large)
+    p = model.nature(reward, maximize=large)
     low, high = np.full(value.size, -np.inf), np.full(value.size, np.inf)
     rounds, residual = 0, np.inf
     while rounds < _ROUNDS:
@@ -49,7 +49,7 @@ def discounted(
             break
         value = solved
         q, image, noise = _backup(model, reward, discount, value, large)
-        now = reward + discount * model.total(p * value[mdp.successor])
+        now = model.total(p * _ahead(model, reward, discount, value))
         # Nature answers first; only then does the policy improve.
         answers = (image - now) * (1 if large else -1) > noise
         answers &= np.isin(np.arange(mdp.num_rows), row)
@@ -75,11 +75,15 @@ def _backup(
     model: HostInterval, reward: Floats, discount: Floats, value: Floats, large: bool
 ) -> tuple[Floats, Floats, Floats]:
     """Nature's distributions, the value of each row, and how much rounding may change it."""
-    ahead = value[model.mdp.successor]
+    ahead = _ahead(model, reward, discount, value)
     q = model.nature(ahead, maximize=large)
-    image = reward + discount * model.total(q * ahead)
-    size = np.abs(reward) + model.total(q * np.abs(ahead)) + np.abs(value).max(initial=0)
-    return q, image, 2 * model.rounding * size
+    size = np.abs(reward).max(initial=0) + np.abs(value).max(initial=0)
+    return q, model.total(q * ahead), 4 * model.rounding * size
+
+
+def _ahead(model: HostInterval, reward: Floats, discount: Floats, value: Floats) -> Floats:
+    """What each entry earns and leads to."""
+    return reward + discount[model.mdp.row] * value[model.mdp.successor]
 
 
 def _solved(
@@ -88,8 +92,9 @@ def _solved(
 ) -> Any:
     """The value of a policy and nature; None where the system is singular."""
     chain, entry = model.chain(row)
+    earned = chain.total(p[entry] * reward[entry])
     mdp = chain.fixed(p[entry])
     matrix = mdp.matrix.copy()
     matrix.data = matrix.data * discount[row][mdp.row]
     system = factors(matrix, label, np.arange(mdp.num_states))
-    return None if system is None else system.solve(reward[row])
+    return None if system is None else system.solve(earned)

@@ -13,9 +13,9 @@ from jaxltl.core.host.interval_game import Spread, spread
 from jaxltl.core.host.interval_values import Robust
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, make_interval
-from jaxltl.core.models.operators import is_deterministic, require_weights, row_weights
-from jaxltl.core.models.sparse import SparseMDP, row_reward
-from jaxltl.core.types import Method, Solution, Status, require_shape, row_tolerance
+from jaxltl.core.models.operators import is_deterministic, row_weights
+from jaxltl.core.models.sparse import Rewards, SparseMDP, row_reward
+from jaxltl.core.types import Method, Solution, Status, require_shape
 from jaxltl.core.values.bounded import structure
 
 TOLERANCE = 1e-6
@@ -48,7 +48,7 @@ def refuse_nature(nature: str | None) -> None:
 
 
 def robust_reachability(
-    model: IntervalMDP, target: Any, *, policy: Any = None, objective: str = "max",
+    model: Any, target: Any, *, policy: Any = None, objective: str = "max",
     nature: str | None = None, stay: Any = None, tolerance: Any = None,
 ) -> Solution:
     """Probability of reaching a target when probabilities lie in intervals.
@@ -61,7 +61,7 @@ def robust_reachability(
         whose environment wants the opposite of its system.
       target: ``bool[S]``, or the name of a label.
       policy: ``int32[S]``, rows, or ``float[R]``, their weights, to be evaluated; default:
-        optimise.
+        optimise. Of a game, the system's, whose environment still chooses.
       objective: ``"max"`` or ``"min"``, what the policy (the system) makes of the probability.
       nature: ``"min"`` or ``"max"``, what nature makes of it; default: the opposite of
         `objective` (for a given policy: ``"min"``).
@@ -95,7 +95,7 @@ def robust_reachability(
 
 
 def robust_total_reward(
-    model: IntervalMDP, reward: Any, target: Any, *, policy: Any = None, objective: str = "max",
+    model: Any, reward: Any, target: Any, *, policy: Any = None, objective: str = "max",
     nature: str | None = None, tolerance: Any = None,
 ) -> Solution:
     """Expected reward until a target is reached when probabilities lie in intervals.
@@ -130,17 +130,18 @@ def robust_total_reward(
 
 
 def robust_discounted_value(
-    model: IntervalMDP, reward: Any, discount: float, *, policy: Any = None,
+    model: Any, reward: Any, discount: float, *, policy: Any = None,
     objective: str = "max", nature: str | None = None, tolerance: float | None = None,
 ) -> Solution:
     """Discounted value when probabilities lie in intervals.
 
-    ``V(s) = opt_a opt_p (r(s, a) + discount sum_t p_t V(t))`` (Iyengar 2005), by policy iteration;
-    the bounds are ``V +- |Phi V - V| / (1 - discount)``, with rounding.
+    ``V(s) = opt_a opt_p sum_t p_t (r(s, a, t) + discount V(t))`` (Iyengar 2005), by policy
+    iteration; the bounds are ``V +- |Phi V - V| / (1 - discount)``, with rounding.
 
     Args:
       model: the model, or a game on one.
-      reward: of any sign, as of :func:`robust_total_reward`.
+      reward: of any sign, as of :func:`~jaxltl.core.models.sparse.row_reward`; on transitions,
+        what nature picks earns it.
       discount: in ``[0, 1)``.
       policy, objective, nature: as of :func:`robust_reachability`.
       tolerance: the width of the enclosure asked for; default 1e-8 of the largest possible value.
@@ -149,12 +150,12 @@ def robust_discounted_value(
       :class:`Solution`, with `nature`.
 
     Raises:
-      ValueError: shapes, a direction, the discount, or a reward that depends on nature.
+      ValueError: shapes, a direction, the discount, or a reward that is not finite.
     """
     if not 0 <= float(discount) < 1:
         raise ValueError(f"discount={float(discount):.6g}; it must be at least 0 and below 1.")
     sides = sides_of(model, policy, objective, nature)
-    earned = sides.rows(interval_reward(sides.model, reward, signed=True))
+    earned = sides.entries(_entry_reward(sides.model, reward))
     largest = float(np.abs(earned).max(initial=0)) / (1 - float(discount))
     asked = 1e-8 * max(largest, 1e-300) if tolerance is None else float(tolerance)
     found = discounted(
@@ -192,21 +193,35 @@ def robust_expectation(
     return model.host.total(p * ahead), p
 
 
-def interval_reward(model: IntervalMDP, reward: Any, *, signed: bool = False) -> np.ndarray:
+def _entry_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
+    """What each entry earns, ``float64[T]``."""
+    given = structure(model.nominal, reward)
+    host = model.nominal.host
+    apart = row_reward(model.nominal, Rewards(state=given.state, choice=given.choice))
+    earned = apart[host.row]
+    if given.transition is not None:
+        earned = earned + np.asarray(given.transition, np.float64)
+    if not np.isfinite(earned).all():
+        row = int(host.row[np.flatnonzero(~np.isfinite(earned))[0]])
+        raise ValueError(f"the reward of state {host.state[row]}, choice "
+                         f"{row - int(host.row_start[host.state[row]])} is not finite.")
+    return earned
+
+
+def interval_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
     """The reward of each choice, ``float64[R]``.
 
     Raises:
-      ValueError: it is not finite, negative (unless it may be `signed`), or depends on the
-        successor that nature picks.
+      ValueError: it is negative or not finite, or depends on the successor that nature picks.
     """
     earned = row_reward(model.nominal, reward)
-    bad = ~(((earned >= 0) | signed) & np.isfinite(earned))
+    bad = ~((earned >= 0) & np.isfinite(earned))
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
         state = int(model.nominal.host.state[row])
         raise ValueError(f"the reward of state {state}, choice "
                          f"{row - int(model.nominal.row_start[state])} is {earned[row]}; it must "
-                         f"be finite{'' if signed else ' and at least 0'}.")
+                         "be finite and at least 0.")
     of = structure(model.nominal, reward).transition
     if of is not None:
         each = np.asarray(of)
@@ -278,6 +293,12 @@ class Sides(NamedTuple):
         """``bool[S']``, nothing of what is new."""
         return np.append(quantity, np.zeros(np.count_nonzero(self.added), bool))
 
+    def entries(self, quantity: np.ndarray) -> np.ndarray:
+        """``float64[T']``, nothing where nature chooses."""
+        if self.spread is None:
+            return quantity
+        return np.where(self.spread.entry < 0, 0, quantity[self.spread.entry])
+
     def rows(self, quantity: np.ndarray) -> np.ndarray:
         """``float64[R']``, nothing where nature chooses."""
         if self.spread is None:
@@ -298,11 +319,11 @@ def sides_of(
     world, system = world_of(model)
     if policy is None:
         return host_sides(world.host, system, objective, nature)._replace(model=world)
-    if system is not None:
-        raise ValueError("a game takes no policy; restrict the system's rows by with_allowed.")
     helpful = require_direction(nature, objective) == "max"
-    parted = _under(world, np.asarray(policy))
-    return Sides(world, parted.model, helpful, helpful, parted, policy)
+    parted = _under(world, np.asarray(policy), True if system is None else system)
+    # What is left to choose is the environment's, against the policy.
+    against = helpful if system is None else objective == "min"
+    return Sides(world, parted.model, against, helpful, parted, policy)
 
 
 def world_of(model: Any) -> tuple[IntervalMDP, np.ndarray | None]:
@@ -334,18 +355,19 @@ def host_sides(
     return Sides(None, parted.model, not helpful, helpful, parted, None)
 
 
-def _under(model: IntervalMDP, policy: np.ndarray) -> Spread:
-    """The model in which there is nothing to choose but for nature."""
+def _under(model: IntervalMDP, policy: np.ndarray, where: Any) -> Spread:
+    """The model in which a policy's choices are made, in all states or those of one player."""
     host = model.host
-    weight = row_weights(model.nominal, policy)
-    require_weights(host.mdp, weight, row_tolerance(np.float64))
-    if not is_deterministic(policy):
-        weight = weight / host.mdp.over_choices(np.add, weight)[host.mdp.state]
-        return spread(host, np.ones(model.num_states, bool), weight, weight)
-    chain, entry = host.chain(policy)
-    return Spread(
-        chain, np.arange(model.num_states), policy.astype(np.int64), entry,
-        np.full(entry.size, -1))
+    if is_deterministic(policy) and np.all(where):
+        row_weights(model.nominal, policy)
+        chain, entry = host.chain(policy)
+        return Spread(
+            chain, np.arange(model.num_states), policy.astype(np.int64), entry,
+            np.full(entry.size, -1))
+    weight = row_weights(model.nominal, policy, where)
+    total = host.mdp.over_choices(np.add, weight)
+    weight = weight / np.where(total > 0, total, 1)[host.mdp.state]
+    return spread(host, np.broadcast_to(where, (model.num_states,)), weight, weight)
 
 
 def states_of(model: IntervalMDP, states: Any, name: str) -> np.ndarray:
