@@ -18,7 +18,7 @@ _EPS = float(np.finfo(np.float64).eps)
 # The tails of SciPy err by less than 1e-10 of themselves for up to 1e12 trials. What an interval
 # gives away for this margin is less than its 1e-6th part.
 _MARGIN = 1e-7
-_HALVINGS = 80  # until neighbours are apart, from a bracket of some standard deviations
+_STEPS = 100  # of Newton; a few are enough
 
 Ends = tuple[Floats, Floats]
 
@@ -118,30 +118,21 @@ def _of_distinct(
 def _tails(k: Integers, n: Integers, failure: float) -> Floats:
     """The lower ends of Clopper and Pearson for k > 0.
 
-    SciPy's inverse is a guess: for large n and small k it misses by far (1.17.1: a thousand of
-    1e9). Its tails are right, and decide.
+    SciPy's inverse of the tail misses by far for large n and small k (1.17.1: a thousand of 1e9);
+    the tail itself is right.
     """
-    from scipy.special import betainc, betaincinv  # a tenth of a second that few need
+    from scipy.special import betainc, betaln  # a tenth of a second that few need
 
-    side = failure / 2
+    side = np.log(failure / 2)
 
-    def tail(x: Floats, of: slice | Integers = slice(None)) -> Floats:
-        return betainc(k[of], n[of] - k[of] + 1, x)
+    def gap(x: Floats, i: Integers) -> Ends:
+        ones, others = k[i], n[i] - k[i]
+        with np.errstate(divide="ignore"):
+            tail = np.log(betainc(ones, others + 1, x))
+        fit = ones * np.log(x) + others * np.log1p(-x) - betaln(ones, others + 1)
+        return tail - side, np.exp(np.minimum(fit - tail, 500))
 
-    found = betaincinv(k, n - k + 1, side * (1 - 5 * _MARGIN))
-    chance = tail(found)
-    near = (chance <= side * (1 - _MARGIN)) & (chance >= side * (1 - 10 * _MARGIN))
-    if near.all():
-        return found
-    rest = np.flatnonzero(~near)
-    low, _ = hoeffding(k[rest], n[rest], failure)
-    # Chernoff's bound, k / n (failure / 2)^(1 / k) / e, is above zero.
-    low = np.maximum(low, np.exp(np.log(side) / k[rest] - 1) * (k / n)[rest] * (1 - _MARGIN))
-    low = np.where(tail(low, rest) <= side * (1 - _MARGIN), low, 0)
-    found[rest] = _last(
-        lambda x: tail(x, rest) <= side * (1 - _MARGIN), low, frequency(k[rest], n[rest])
-    )
-    return found
+    return _climbed(gap, k, n, -side)
 
 
 def _mixed(k: Integers, n: Integers, failure: float) -> Floats:
@@ -149,28 +140,49 @@ def _mixed(k: Integers, n: Integers, failure: float) -> Floats:
     from scipy.special import betaln
 
     mixture = betaln(k + 0.5, n - k + 0.5) - np.log(np.pi)
+    best = k * np.log(k / n) + (n - k) * np.log1p(-np.minimum(k / n, 1 - _EPS))
 
-    def excluded(x: Floats) -> np.ndarray:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ones = np.where(x > 0, k * np.log(x), -np.inf)
-            others = np.where(n > k, (n - k) * np.log1p(-x), 0)
-        slack = 1e-12 + 64 * _EPS * (np.abs(mixture) + np.abs(ones) + np.abs(others))
-        return (x <= 0) | (ones + others < np.log(failure) + mixture - slack)
+    def gap(x: Floats, i: Integers) -> Ends:
+        ones, others = k[i] * np.log(x), (n - k)[i] * np.log1p(-x)
+        rounding = 64 * _EPS * (np.abs(mixture[i]) + np.abs(ones) + np.abs(others))
+        above = ones + others + rounding - mixture[i] - np.log(failure)
+        return above, k[i] - (n - k)[i] * x / (1 - x)
 
-    # With log m the mixture's, k log x <= log failure + log m - 1 is excluded.
-    low = np.exp((np.log(failure) + mixture - 1) / k)
-    return _last(excluded, np.where(excluded(low), low, 0), frequency(k, n))
+    return _climbed(gap, k, n, np.maximum(best - mixture - np.log(failure), 0))
 
 
-def _last(holds: Callable[[Floats], np.ndarray], low: Floats, high: Floats) -> Floats:
-    """The largest numbers, or nearly, where something holds; it does at `low`, not at `high`."""
-    for _ in range(_HALVINGS):
-        apart = high > low * (1 + 4 * _EPS)
-        if not apart.any():
+def _climbed(
+    gap: Callable[[Floats, Integers], Ends], k: Integers, n: Integers, deviance: Floats | float
+) -> Floats:
+    """The largest x, or nearly, at which a concave, rising function of log x is below zero.
+
+    Newton's steps end left of the zero, where the function is below its tangents; so they climb to
+    it, and what is found does not depend on what else is looked for.
+
+    Args:
+      gap: the function and its derivative, at some x and their numbers.
+      k, n: the zero is left of ``k / n``.
+      deviance: how far the function rises until there, nearly.
+    """
+    # The lower end of Wilson's interval.
+    share, half = k / n, deviance / n
+    x = share * share / (share + half + np.sqrt(half * (half + 2 * share * (1 - share))))
+    x = np.minimum(x, 1 - _EPS)
+    found, active = np.zeros(k.size), np.arange(k.size)
+    for _ in range(_STEPS):
+        at = x[active]
+        above, slope = gap(at, active)
+        below = above <= -_MARGIN
+        found[active[below]] = np.maximum(found[active], at)[below]
+        with np.errstate(invalid="ignore"):
+            step = (-5 * _MARGIN - above) / slope
+        lost = ~np.isfinite(step)  # so far left that it is not told from zero
+        step = np.where(lost, np.log(share[active] / at) / 2, np.maximum(step, -100))
+        new = np.minimum(at * np.exp(step), 1 - _EPS)
+        new = np.where(below, new, np.minimum(new, np.nextafter(at, 0)))
+        done = below & ~lost & (new <= at * (1 + 1e-9 * np.minimum(1, (1 - at) / at)))
+        x[active] = new
+        active = active[~done]
+        if not active.size:
             break
-        # The lower end may be of any order of magnitude: quickly to it, then by halves.
-        middle = np.where(high > 4 * low, np.sqrt(np.maximum(low, 1e-300) * high), (low + high) / 2)
-        inside = holds(middle)
-        low = np.where(apart & inside, middle, low)  # what is found depends on no other number
-        high = np.where(apart & ~inside, middle, high)
-    return low
+    return found
