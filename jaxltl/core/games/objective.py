@@ -105,6 +105,9 @@ def safety(game: Any, safe: States) -> Parity:
       game: the game.
       safe: ``bool[S]`` or a Boolean formula over propositions.
 
+    Returns:
+      :class:`Parity`.
+
     Raises:
       ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
         proposition.
@@ -119,6 +122,9 @@ def reach(game: Any, goal: States, *, safe: States = "true") -> Parity:
       game: the game.
       goal: ``bool[S]`` or a Boolean formula over propositions.
       safe: states not to leave before.
+
+    Returns:
+      :class:`Parity`.
 
     Raises:
       ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
@@ -135,6 +141,9 @@ def buchi(game: Any, accepting: States, *, safe: States = "true") -> Parity:
       accepting: ``bool[S]`` or a Boolean formula over propositions.
       safe: states never to leave.
 
+    Returns:
+      :class:`Parity`.
+
     Raises:
       ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
         proposition.
@@ -150,6 +159,9 @@ def cobuchi(game: Any, persistent: States, *, safe: States = "true") -> Parity:
       game: the game.
       persistent: ``bool[S]`` or a Boolean formula over propositions.
       safe: states never to leave.
+
+    Returns:
+      :class:`Parity`.
 
     Raises:
       ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown

@@ -109,6 +109,9 @@ def avoidable(model: Any, goal: jax.Array, allowed: jax.Array | None = None) -> 
       model: the model.
       goal: ``bool[S]``.
       allowed: ``bool[S, A]``, the actions that count; default the available ones.
+
+    Returns:
+      ``bool[S]``.
     """
     graph = graph_of(model, goal, allowed)
     return to_jax(avoid(graph, *take(graph, (goal, allowed))))

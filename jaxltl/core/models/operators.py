@@ -72,6 +72,9 @@ def exists_successor(model: Any, region: jax.Array) -> jax.Array:
       model: the model.
       region: ``bool[S]``.
 
+    Returns:
+      ``bool[S, A]``.
+
     Raises:
       TypeError: the model is none.
     """
@@ -87,6 +90,9 @@ def forall_successor(model: Any, region: jax.Array) -> jax.Array:
     Args:
       model: the model.
       region: ``bool[S]``.
+
+    Returns:
+      ``bool[S, A]``.
 
     Raises:
       TypeError: the model is none.
@@ -364,7 +370,7 @@ def policy_distribution(model: Any, policy: Any) -> jax.Array:
         if jnp.shape(policy) != states:
             raise ValueError(f"policy has shape {jnp.shape(policy)}; a deterministic policy "
                              f"(integers) for this model has shape {states}.")
-        if isinstance(model, SparseMDP):
+        if isinstance(getattr(model, "mdp", model), SparseMDP):
             return choices(model).one_hot(policy, model.dtype)
         return jax.nn.one_hot(policy, pairs[-1], dtype=model.dtype)
     if jnp.shape(policy) != pairs:
