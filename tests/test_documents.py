@@ -1,12 +1,16 @@
-"""The README's example and the notebooks run as they stand."""
+"""What the README, the page on intervals and the notebooks show runs as it stands."""
 
 import os
 import re
+import shlex
 from pathlib import Path
 
 import nbformat
 import pytest
+from click.testing import CliRunner
 from nbclient import NotebookClient
+
+from jaxltl.cli import main
 
 ROOT = Path(__file__).parent.parent
 
@@ -33,3 +37,25 @@ def test_a_notebook_runs(path, tmp_path):
     outputs = [o for cell in notebook.cells for o in cell.get("outputs", ())]
     assert not [o for o in outputs if o.output_type == "error"]
     assert sum("image/png" in o.get("data", {}) for o in outputs) >= 3
+
+
+def test_the_page_on_intervals_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "intervals.md").read_text()
+    (shell,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    text, command = shell.removeprefix("cat > rover.drn <<'END'\n").split("END\n")
+    (tmp_path / "rover.drn").write_text(text)
+    done = CliRunner().invoke(main, shlex.split(command.replace("\\\n", ""))[1:])
+    assert done.exit_code == 0, done.output
+    shown = re.search(r"\n```\n(imdp.*?)```", page, re.DOTALL)[1].split("\n\n")
+    found = re.sub(r", read in [^\n]*|[0-9.]+ s, ", "", done.stdout).strip().split("\n\n")
+    assert len(shown) == len(found)
+    for promised, printed in zip(shown, found, strict=True):
+        number = re.compile(r"\d\.\d+")
+        # Digits beyond the tolerance depend on the machine.
+        assert number.sub("", promised).split() == number.sub("", printed).split()
+        for a, b in zip(number.findall(promised), number.findall(printed), strict=True):
+            assert abs(float(a) - float(b)) <= 1e-6
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    exec(compile(code, "intervals.md", "exec"), {})
+    assert capsys.readouterr().out == "0.4 [0.4 0.6 1.  1. ]\n[0.7]\n"
