@@ -129,7 +129,9 @@ def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:
         if code == Status.INVALID:
             lanes = np.asarray(solution.policy).reshape(status.size, -1)
             shape = np.shape(solution.policy)[status.ndim :]
-            raise ValueError(f"{_invalid_row(lanes[lane].reshape(shape))}{where}.")
+            policy = lanes[lane].reshape(shape)
+            what = _invalid_weights(policy) if policy.ndim == 1 else _invalid_row(policy)
+            raise ValueError(f"{what}{where}.")
         residual = np.asarray(solution.residual).ravel()[lane]
         raise NotConverged(
             f"the solver ended with {code.name}{where}, residual {residual:.3g}, after "
@@ -186,6 +188,15 @@ def _invalid_row(policy: np.ndarray) -> str:
     bad = ~(np.abs(rows.sum(-1) - 1) <= row_tolerance(rows.dtype)) | ~(rows >= 0).all(-1)
     state = int(np.argmax(bad))
     return describe_row(rows[state], np.unravel_index(state, policy.shape[:-1]))
+
+
+def _invalid_weights(policy: np.ndarray) -> str:
+    """What is wrong with weights ``[R]`` of a sparse model's choices, whose states are not known."""
+    if (bad := ~(policy >= 0)).any():
+        row = int(np.argmax(bad))
+        return (f"the policy's weight of choice {row} is {policy[row]:.4g}; give each state a "
+                "distribution over its choices")
+    return "the policy's weights of some state's choices do not sum to 1; give it a distribution"
 
 
 def describe_row(row: np.ndarray, state: tuple[Any, ...]) -> str:

@@ -47,8 +47,9 @@ class SparseMDP:
     The choices of state s are the rows ``row_start[s]`` to ``row_start[s + 1] - 1``, and row r
     leads to ``successor[e]`` with ``probability[e]`` for the entries e from ``entry_start[r]`` to
     ``entry_start[r + 1] - 1``. Quantities on actions have a number for each row, ``[R]``, and an
-    action of a policy is a row. A Markov chain has one row in each state. Build one with :func:`make_sparse`, which checks it; its
-    arrays are NumPy's, in double precision, whatever JAX's default.
+    action of a policy is a row. A Markov chain has one row in each state. Build one with
+    :func:`make_sparse`, which checks it; its arrays are NumPy's, in double precision, whatever
+    JAX's default.
 
     Attributes:
       row_start: ``int32[S + 1]``.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import chex
@@ -45,11 +45,18 @@ def boltzmann_expansion(num_actions: Any) -> Any:
     xp: Any = jnp if isinstance(num_actions, jax.Array) else np
     n = xp.asarray(num_actions, float)
     others = xp.log(xp.maximum(n - 1, 1))
-    low, high = others, others + 4  # between them the left side goes from 0 to more than 2
-    for _ in range(30):
+
+    def halved(_: Any, ends: Any) -> Any:
+        low, high = ends
         middle = (low + high) / 2
         above = middle * xp.tanh((middle - others) / 2) >= 2
-        low, high = xp.where(above, low, middle), xp.where(above, middle, high)
+        return xp.where(above, low, middle), xp.where(above, middle, high)
+
+    ends = (others, others + 4)  # from one to the other the left side goes from 0 to more than 2
+    if xp is jnp:
+        high = lax.fori_loop(0, 30, halved, ends)[1]
+    else:
+        high = reduce(lambda ends, i: halved(i, ends), range(30), ends)[1]
     # Bisection, and rounding in what it looks at.
     found = xp.where(n > 1, high / 2 * (1 + 64 * float(jnp.finfo(high.dtype).eps)) + 1e-7, 1.0)
     return found if xp is jnp else float(found)

@@ -8,6 +8,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.core.models import operators
 from tests import reference
+from tests.sparse_models import random_sparse
 from tests.support import REPRESENTATIONS, assert_gradients, mass_preserving, random_representation
 
 # Compiled as a whole, which takes less long than operation by operation.
@@ -187,3 +188,86 @@ def test_errors_name_the_argument():
         jl.sample_successor({}, jax.random.key(0), 0, 0)
     with pytest.raises(TypeError, match="dict is not a model"):
         operators.induced_chain({}, jnp.zeros(3, int))
+
+
+# --- sparse models ---------------------------------------------------------------------------
+
+
+def test_primitives_of_rows_equal_those_of_the_padded_model():
+    rng = np.random.default_rng(20)
+    for _ in range(3):
+        model = random_sparse(rng, 9, most=5, width=9)
+        padded = jl.to_padded(model)
+        place = model.host.state, np.arange(model.num_rows) - model.row_start[model.host.state]
+        value, region = rng.normal(size=9), rng.random(9) < 0.5
+        np.testing.assert_allclose(
+            expectation(model, value), expectation(padded, value)[place], rtol=0, atol=1e-14)
+        mass = rng.random(model.num_rows)
+        wide = np.zeros((9, padded.num_actions))
+        wide[place] = mass
+        np.testing.assert_allclose(
+            pushforward(model, mass), pushforward(padded, wide), rtol=0, atol=1e-14)
+        np.testing.assert_allclose(
+            operators.transition_matrix(model, mass), operators.transition_matrix(padded, wide),
+            rtol=0, atol=1e-14)
+        for primitive, x in ((exists_successor, region), (forall_successor, region),
+                             (operators.least_successor, value)):
+            np.testing.assert_array_equal(primitive(model, x), primitive(padded, x)[place])
+        assert not exists_successor(model.replace(probability=0 * model.probability), region).any()
+        rows = np.asarray(model.row_start[1:] - 1)
+        np.testing.assert_allclose(
+            operators.following(model, rows)(value), expectation(model, value)[rows])
+
+
+def test_expectation_of_rows_is_differentiable():
+    rng = np.random.default_rng(21)
+    model = random_sparse(rng, 5, most=3, width=4)
+    point = {"probability": model.probability, "value": rng.normal(size=5)}
+    assert_gradients(
+        lambda x: expectation(model.replace(probability=x["probability"]), x["value"]), point,
+        {name: rng.normal(size=x.shape) for name, x in point.items()})
+
+
+def test_draws_from_a_row_follow_its_probabilities():
+    rng = np.random.default_rng(22)
+    model = random_sparse(rng, 6, most=2, width=6)
+    row = int(np.argmax(np.diff(model.entry_start)))
+    entries = slice(*model.entry_start[row : row + 2])
+    none = np.asarray(model.probability).copy()
+    none[entries.stop - 1] = 0  # of a row that then sums to less than one
+    count = 20_000
+    keys = jax.random.split(jax.random.key(0), count)
+    draw = jax.jit(jax.vmap(jl.sample_successor, (None, 0, None, None)))
+    drawn = np.asarray(draw(model, keys, 0, row))
+    found = np.bincount(drawn, minlength=6)[model.successor[entries]] / count
+    assert found.sum() == 1
+    np.testing.assert_allclose(found, model.probability[entries], atol=5 / np.sqrt(count) / 2)
+    drawn = np.asarray(draw(model.replace(probability=none), keys, 0, row))
+    assert model.successor[entries.stop - 1] not in drawn, "what cannot happen is not drawn"
+
+
+def test_policies_of_rows():
+    rng = np.random.default_rng(23)
+    model = random_sparse(rng, 4, most=3, width=2)
+    assert model.num_rows > 4
+    rows = np.asarray(model.row_start[1:] - 1)
+    weight = np.asarray(operators.policy_distribution(model, rows))
+    np.testing.assert_array_equal(np.flatnonzero(weight), rows)
+    valid = jax.jit(lambda policy, where: operators.valid_policy(model, policy, where).valid)
+    everywhere, wrong = np.ones(4, bool), rows.copy()
+    wrong[0] = rows[1]
+    for policy, good in ((rows, True), (weight, True), (wrong, False), (2 * weight, False),
+                         (weight - 1, False), (np.where(weight > 0, np.nan, 0), False)):
+        assert bool(valid(policy, everywhere)) == good
+        if good:
+            operators.require_policy(model, policy)
+        else:
+            with pytest.raises(ValueError, match="state 0"):
+                operators.require_policy(model, policy)
+    assert valid(wrong, everywhere[:4] & (np.arange(4) > 0))
+    operators.require_policy(model, wrong, np.arange(4) > 0)
+    for shape in (model.num_rows + 1, 3):
+        with pytest.raises(ValueError, match="policy has shape"):
+            operators.policy_distribution(model, np.zeros(shape))
+    with pytest.raises(ValueError, match="a deterministic policy"):
+        operators.policy_distribution(model, np.zeros(3, int))
