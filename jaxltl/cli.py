@@ -511,6 +511,41 @@ def solve(
         raise SystemExit(status)
 
 
+@main.command()
+@click.argument("log", metavar="LOG", type=click.Path(path_type=Path))
+@click.argument("formula")
+@click.option("--confidence", required=True, type=float, help="In (0, 1), such as 0.95.")
+@click.option("--initial", multiple=True, metavar="STATE", help="Where runs start.")
+@click.option("--terminal", multiple=True, metavar="STATE", help="Where they stay.")
+@click.option("--labels", type=click.Path(path_type=Path), help="A table of states and labels.")
+@click.option("--model", type=click.Path(path_type=Path), help="A model file that has the graph.")
+@click.option("--graph", type=click.Choice(["seen", "complete"]), default="seen",
+              show_default=True, help="Whether other transitions than those seen are possible.")
+@click.option("--method", default="anytime", show_default=True,
+              type=click.Choice(["anytime", "clopper-pearson", "hoeffding", "weissman"]))
+@click.option("--min", "smallest", is_flag=True, help="Make the probability small.")
+@click.option("--policy", type=click.Path(path_type=Path), help="Write the policy, as JSON.")
+@click.option("--curve", type=click.Path(path_type=Path),
+              help="Draw the bound over the number of samples (.svg, .png or .pdf).")
+@click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
+@_plain_errors
+def certify(
+    log: Path, formula: str, confidence: float, method: str, smallest: bool, policy: Path | None,
+    curve: Path | None, as_json: bool, **world: Any,
+) -> None:
+    """A policy for a formula from logged transitions, and what is guaranteed of it.
+
+    LOG is a table with the columns state, action and next; see docs/data.md. The exit status is 1
+    where the bounds could not be made narrow, 2 for mistakes in what was asked.
+    """
+    _begin(f"certifying {formula!r} from {log}")
+    from jaxltl.app import certify as app
+
+    asked = app.Asked(formula, confidence, method, "min" if smallest else "max")
+    if app.certify_and_write(log, asked, world, policy, curve, as_json, click.echo):
+        raise SystemExit(1)
+
+
 _EXPERIMENTS = {
     "mlirl": "section 2.5, inverse reinforcement learning with a temporal-logic task",
     "todirl": "section 3.5, reward networks that plan in worlds never seen",

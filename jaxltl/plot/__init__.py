@@ -6,7 +6,7 @@ return the text of an SVG for pages that move.
 """
 
 from jaxltl.plot.automata import automaton
-from jaxltl.plot.curves import bands, curves, lines, paths
+from jaxltl.plot.curves import bands, curves, guarantees, lines, paths
 from jaxltl.plot.games import compare, game_moves, game_region, game_values
 from jaxltl.plot.live import live_automaton, live_curve, live_map
 from jaxltl.plot.maps import grid, strategies
@@ -22,6 +22,7 @@ __all__ = [
     "game_region",
     "game_values",
     "grid",
+    "guarantees",
     "lines",
     "live_automaton",
     "live_curve",

@@ -144,6 +144,42 @@ def lines(
     return figure
 
 
+def guarantees(
+    samples: ArrayLike, bounds: Mapping[str, ArrayLike], *, reference: float | None = None,
+    names: tuple[str, str] = ("transitions", "probability"),
+) -> Figure:
+    """Bounds over the number of samples, on a logarithmic axis.
+
+    Args:
+      samples: ``[T]``, positive.
+      bounds: by name ``[T]``, or ``[N, T]`` of several runs, whose median and range are drawn.
+      reference: what they come near to.
+      names: of the axes.
+
+    Raises:
+      ValueError: there is nothing to show.
+    """
+    if not bounds:
+        raise ValueError("guarantees: nothing to show; give a bound.")
+    figure = Figure(figsize=(4.6, 2.9), layout="constrained", facecolor=PAPER)
+    axes = figure.subplots()
+    plain_axes(axes)
+    count = np.asarray(samples, float)
+    for i, (name, bound) in enumerate(bounds.items()):
+        runs, color = np.atleast_2d(np.asarray(bound, float)), SERIES[i % len(SERIES)]
+        axes.plot(count, np.median(runs, 0), color=color, lw=1.6, marker="o", ms=3, label=name)
+        if len(runs) > 1:
+            axes.fill_between(count, runs.min(0), runs.max(0), color=color, alpha=0.15, lw=0)
+    if reference is not None:
+        axes.axhline(reference, color=MUTED, lw=1, ls="--", label="no policy has more")
+    axes.set_xscale("log")
+    axes.set_ylim(0, 1.02)
+    axes.set_xlabel(names[0], color=INK, fontsize=8.5)
+    axes.set_ylabel(names[1], color=INK, fontsize=8.5)
+    axes.legend(frameon=False, fontsize=8, labelcolor=INK, loc="best")
+    return figure
+
+
 def paths(
     maps: Mapping[str, tuple[ArrayLike, ArrayLike]],
     boxes: Mapping[str, ArrayLike],

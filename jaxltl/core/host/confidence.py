@@ -129,7 +129,7 @@ def intervals_from_counts(
       (4, [[0.401, 0.017, 0.0], [0.159, 0.159, 0.0]], [[0.983, 0.599, 0.355], [0.841, 0.841, 0.0]])
     """
     _check_method(method)
-    _check_confidence(confidence)
+    check_confidence(confidence)
     count, listed, is_entry = _entries(counts, entry_start, used)
     row = np.repeat(np.arange(listed.size), listed)
     shape = (listed.size,) if entry_start is not None else is_entry.shape[:-1]
@@ -225,7 +225,7 @@ def samples_needed(
       [16684, 26492]
     """
     _check_method(method)
-    _check_confidence(confidence)
+    check_confidence(confidence)
     if not 0 < width < 1:
         raise ValueError(f"width={width}; it must lie strictly between 0 and 1.")
     failure = (1 - confidence) / max(num_claims, 1)
@@ -258,7 +258,7 @@ def _check_method(method: str) -> None:
         raise ValueError(f"method={method!r}; choose one of {', '.join(get_args(Method))}.")
 
 
-def _check_confidence(confidence: float) -> None:
+def check_confidence(confidence: float) -> None:
     if not 0 < confidence < 1:  # NaN is not
         raise ValueError(
             f"confidence={confidence}; it must lie strictly between 0 and 1, such as 0.95."

@@ -1,0 +1,230 @@
+"""From a log to a certified policy: what `jaxltl certify` does, without compiling anything."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.host.confidence import check_confidence
+from jaxltl.core.models.counts import TransitionCounts, counted_model, counts_on
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.types import Status
+from jaxltl.core.values.data_guarantee import DataGuarantee, guarantee_curve, learn_guarantee
+
+SHOWN = 5  # choices where more samples help
+POINTS = 13  # of a curve
+PICTURES = (".svg", ".png", ".pdf")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a log shows of a world.
+
+    Attributes:
+      model: the world; its probabilities are frequencies, or those of a given model.
+      counts: ``int64[T]``, beside its entries.
+      states, actions: the names of states, and of each choice's action.
+    """
+
+    model: SparseMDP
+    counts: np.ndarray
+    states: tuple[str, ...]
+    actions: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is to be certified.
+
+    Attributes:
+      formula: the task.
+      confidence, method: of the sets.
+      objective: ``"max"`` or ``"min"``.
+    """
+
+    formula: str
+    confidence: float
+    method: str
+    objective: str
+
+
+def read_evidence(
+    log: Path, *, labels: Path | None = None, model: Path | None = None,
+    initial: Sequence[str] = (), terminal: Sequence[str] = (), graph: str = "seen",
+) -> Evidence:
+    """A log, with its world: a given model, or one that is made of what was counted.
+
+    Raises:
+      ValueError: naming the file and the line, or the option.
+    """
+    from jaxltl.io.log import read_labels, read_log
+
+    if model is not None:
+        from jaxltl.app.solve import load
+
+        given = load(model)
+        if not isinstance(given, SparseMDP):
+            raise ValueError(f"{str(model)!r} has intervals already; solve it by `jaxltl solve`.")
+        if labels is not None or terminal or initial:
+            raise ValueError("a model has its labels and initial states; leave --labels, --initial "
+                             "and --terminal out.")
+        return _named(given, counts_on(given, read_log(log, given)))
+    if not initial:
+        raise ValueError("name the state in which runs start: --initial STATE.")
+    counts = read_log(log)
+    for option, names in (("--initial", initial), ("--terminal", terminal)):
+        unknown = [x for x in names if x not in counts.states]
+        if unknown:
+            raise ValueError(f"{option} {unknown[0]}: the log has no such state; it has "
+                             f"{_some(counts)}.")
+    known = None if labels is None else read_labels(labels, counts.states)
+    sparse, count = counted_model(
+        counts, initial=list(initial), labels=known, terminal=terminal,
+        graph="complete" if graph == "complete" else "seen")
+    return _named(sparse, count)
+
+
+def _some(counts: TransitionCounts) -> str:
+    shown = ", ".join(counts.states[:8])
+    more = len(counts.states) - 8
+    return shown + (f" and {more} more" if more > 0 else "")
+
+
+def _named(model: SparseMDP, counts: np.ndarray) -> Evidence:
+    states = model.valuation.get("state")
+    names = range(model.num_states) if states is None else states
+    rank = np.arange(model.num_rows) - model.host.row_start[model.host.state]
+    number = rank if model.action is None else np.asarray(model.action)
+    actions = [model.action_names[a] if model.action_names else str(a) for a in number]
+    return Evidence(model, counts, tuple(map(str, names)), tuple(actions))
+
+
+def certify(evidence: Evidence, asked: Asked) -> DataGuarantee:
+    """What the log guarantees."""
+    return learn_guarantee(
+        evidence.model, evidence.counts, asked.formula, asked.confidence,
+        method=asked.method, objective=asked.objective)  # type: ignore[arg-type]
+
+
+def text(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float) -> str:
+    """The guarantee for people."""
+    side, other = (">=", "more") if asked.objective == "max" else ("<=", "less")
+    lines = [
+        f"P {side} {found.bound:.6g} with confidence {found.confidence:g}",
+        f"  of {asked.formula!r}, under the policy found; none has {other} than "
+        f"{found.optimistic:.6g}",
+        f"  {int(evidence.counts.sum())} transitions of {evidence.model.num_rows} choices in "
+        f"{evidence.model.num_states} states, {found.sets.num_claims} claims of {asked.method}"]
+    status = Status(int(found.satisfaction.solution.status))
+    if status != Status.CONVERGED:
+        lines.append(f"  the bounds could not be made narrow ({status.name})")
+    for row in most_helpful(found):
+        lines.append(
+            f"  more samples of {evidence.actions[row]} in {_state(evidence, row)} "
+            f"({int(found.sets.num_samples[row])} so far) help most: up to {found.gain[row]:.3g}")
+    return "\n".join([*lines, f"  {seconds:.3f} s"])
+
+
+def most_helpful(found: DataGuarantee) -> list[int]:
+    """The choices where more samples help, the most first."""
+    order = np.argsort(-found.gain, kind="stable")[:SHOWN]
+    return [int(r) for r in order if found.gain[r] > 1e-12]
+
+
+def _state(evidence: Evidence, row: int) -> str:
+    return evidence.states[int(evidence.model.host.state[row])]
+
+
+def entry(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float) -> dict[str, Any]:
+    """The guarantee as a JSON object."""
+    return {
+        "formula": asked.formula, "objective": asked.objective, "bound": found.bound,
+        "optimistic": found.optimistic, "confidence": found.confidence, "method": asked.method,
+        "status": Status(int(found.satisfaction.solution.status)).name,
+        "samples": int(evidence.counts.sum()), "claims": found.sets.num_claims,
+        "states": evidence.model.num_states, "choices": evidence.model.num_rows,
+        "sample_next": [
+            {"state": _state(evidence, r), "action": evidence.actions[r],
+             "gain": float(found.gain[r]), "samples": int(found.sets.num_samples[r])}
+            for r in most_helpful(found)],
+        "seconds": seconds}
+
+
+def policy_file(evidence: Evidence, asked: Asked, found: DataGuarantee) -> bytes:
+    """The policy as JSON: what to do in a state with a memory, which letters update."""
+    of = found.satisfaction
+    product, automaton = of.product, of.automaton
+    rows = np.asarray(of.solution.policy)
+    letters = [sorted(p for p, holds in zip(automaton.propositions, letter, strict=True) if holds)
+               for letter in automaton.letters]
+    moves = [
+        {"state": evidence.states[s], "memory": int(q), "action": evidence.actions[r]}
+        for s, q, r, still in zip(
+            product.base_state.tolist(), product.memory.tolist(), rows.tolist(),
+            product.still.tolist(), strict=True) if not still]
+    table = {
+        **entry(evidence, asked, found, 0.0), "initial_memory": int(automaton.initial),
+        "letters": letters,
+        "letter": {name: letters[i] for name, i in zip(
+            evidence.states, of.letter.tolist(), strict=True)},
+        "update": np.asarray(automaton.delta).tolist(),
+        "update_by": "the letter of the state that is left", "policy": moves}
+    del table["seconds"]
+    return (json.dumps(table, allow_nan=False) + "\n").encode()
+
+
+def curve(evidence: Evidence, asked: Asked) -> tuple[list[int], list[float]]:
+    """The bound over the number of samples, in one random order of the log."""
+    total = int(evidence.counts.sum())
+    sizes = np.unique(np.geomspace(max(total / 10**3, 1), max(total, 1), POINTS).astype(int))
+    bound = guarantee_curve(
+        evidence.model, evidence.counts, asked.formula, asked.confidence, sizes.tolist(),
+        method=asked.method, objective=asked.objective)  # type: ignore[arg-type]
+    return sizes.tolist(), bound.tolist()
+
+
+def timed(evidence: Evidence, asked: Asked) -> tuple[DataGuarantee, float]:
+    """:func:`certify`, and how long it took."""
+    begin = time.perf_counter()
+    return certify(evidence, asked), time.perf_counter() - begin
+
+
+def certify_and_write(
+    log: Path, asked: Asked, world: Mapping[str, Any], policy: Path | None, picture: Path | None,
+    as_json: bool, say: Callable[[str], None],
+) -> bool:
+    """The whole command; whether some bound could not be made narrow.
+
+    Places that cannot be written to are known before the work, not after.
+    """
+    from jaxltl.algos.checkpoint import atomic_write
+
+    check_confidence(asked.confidence)
+    if picture is not None and picture.suffix not in PICTURES:
+        raise ValueError(f"--curve {picture}: the name must end in {', '.join(PICTURES)}.")
+    nothing: Any = contextlib.nullcontext()
+    with nothing if policy is None else atomic_write(policy) as file, (
+            nothing if picture is None else atomic_write(picture)) as drawing:
+        evidence = read_evidence(log, **world)
+        found, seconds = timed(evidence, asked)
+        say(text(evidence, asked, found, seconds))
+        result = entry(evidence, asked, found, seconds)
+        if file is not None:
+            file.write(policy_file(evidence, asked, found))
+        if drawing is not None:
+            from jaxltl import plot
+
+            sizes, bound = curve(evidence, asked)
+            result["curve"] = {"samples": sizes, "bound": bound}
+            figure = plot.guarantees(sizes, {"guaranteed": bound}, reference=found.optimistic)
+            drawing.write(plot.to_bytes(figure, picture.suffix[1:]))  # type: ignore[union-attr]
+        if as_json:
+            say(json.dumps(result, allow_nan=False))
+    return result["status"] != Status.CONVERGED.name

@@ -1,0 +1,106 @@
+"""The command from a log to a guarantee: what it prints, writes and refuses."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from jaxltl.cli import main
+from jaxltl.core.models.counts import counted_model
+from jaxltl.core.values.data_guarantee import learn_guarantee
+from jaxltl.io.log import read_labels, read_log
+
+LINES = [("hall", "left", "kitchen", 900), ("hall", "left", "pit", 100),
+         ("hall", "right", "kitchen", 40), ("hall", "right", "pit", 10),
+         ("kitchen", "rest", "kitchen", 5), ("pit", "rest", "pit", 5)]
+
+
+@pytest.fixture
+def log(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("state,action,next,count\n" + "".join(
+        ",".join(map(str, x)) + "\n" for x in LINES))
+    (tmp_path / "labels.csv").write_text("state,label\nkitchen,safe\npit,lost\n")
+    return path
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, ["certify", *map(str, arguments)])
+
+
+def certified(log, *more):
+    return run(log, "F safe", "--confidence", 0.95, "--initial", "hall", "--labels",
+               log.parent / "labels.csv", *more)
+
+
+def test_what_is_guaranteed_is_printed_and_written(log):
+    out = log.parent / "policy.json"
+    found = certified(log, "--json", "--policy", out)
+    assert found.exit_code == 0, found.output
+    model, counts = counted_model(
+        read_log(log), initial="hall", labels=read_labels(log.parent / "labels.csv"))
+    expected = learn_guarantee(model, counts, "F safe", 0.95)
+    result = json.loads(found.stdout.splitlines()[-1])
+    assert result["bound"] == expected.bound
+    assert 0.8 < result["bound"] < 0.9 < result["optimistic"]
+    assert result["samples"] == int(counts.sum())
+    assert result["sample_next"][0]["action"] == "left"
+    assert f"P >= {expected.bound:.6g} with confidence 0.95" in found.stdout
+    table = json.loads(out.read_text())
+    moves = {(x["state"], x["memory"]): x["action"] for x in table["policy"]}
+    assert moves["hall", table["initial_memory"]] == "left"
+    assert table["letter"]["kitchen"] == ["safe"]
+
+
+def test_the_other_direction_and_methods(log):
+    for method in ("clopper-pearson", "hoeffding", "weissman"):
+        found = certified(log, "--method", method, "--json", "--min")
+        result = json.loads(found.stdout.splitlines()[-1])
+        assert result["optimistic"] <= 0.8 <= result["bound"]
+        assert "P <= " in found.stdout
+
+
+def test_a_curve_is_drawn(log):
+    picture = log.parent / "curve.svg"
+    found = certified(log, "--curve", picture, "--json")
+    result = json.loads(found.stdout.splitlines()[-1])
+    assert picture.read_bytes().startswith(b"<?xml")
+    assert (np.diff(result["curve"]["samples"]) > 0).all()
+    assert result["curve"]["bound"][-1] == result["bound"]
+
+
+def test_a_model_file_has_the_graph(log, tmp_path):
+    place = tmp_path / "world.tra"
+    place.write_text("3 4 6\n0 0 1 0.5 left\n0 0 2 0.5 left\n0 1 1 0.5 right\n0 1 2 0.5 right\n"
+                     "1 0 1 1 rest\n2 0 2 1 rest\n")
+    (tmp_path / "world.lab").write_text('0="init" 1="safe"\n0: 0\n1: 1\n')
+    numbers = tmp_path / "numbers.csv"
+    numbers.write_text("state,action,next\n" + "0,left,1\n" * 9 + "0,left,2\n")
+    found = run(numbers, "F safe", "--confidence", 0.9, "--model", place, "--json")
+    assert found.exit_code == 0, found.output
+    assert 0.4 < json.loads(found.stdout.splitlines()[-1])["bound"] < 0.9
+
+
+@pytest.mark.parametrize(("more", "message"), [
+    (["--confidence", 1.5], "confidence"),
+    (["--initial", "cellar"], "--initial cellar: the log has no such state; it has hall, "),
+    (["--terminal", "hall"], "terminal state 'hall' was left"),
+    (["--curve", "curve.txt"], "--curve curve.txt: the name must end in .svg"),
+])
+def test_mistakes(log, more, message):
+    found = certified(log, *more)
+    assert found.exit_code == 2
+    assert message in found.stderr
+    assert found.stderr.count("\n") == 2  # the first line, and the mistake
+
+
+def test_mistakes_in_files(log):
+    place = log.parent / "labels.csv"
+    place.write_text("state,label\nkitchen,safe\nattic,safe\n")
+    assert "line 3" in certified(log).stderr
+    place.write_text("state,label\nkitchen,sure\n")
+    assert "safe" in certified(log).stderr
+    log.write_text("state,action\nhall,left\n")
+    assert "next" in certified(log).stderr
+    assert "--initial STATE" in run(log, "F safe", "--confidence", 0.9).stderr
