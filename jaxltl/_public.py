@@ -21,10 +21,13 @@ from jaxltl.core.games.verify import Verification, verify
 from jaxltl.core.games.winning import Winning, almost_sure_buchi, winning_region
 from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor, avoidable
 from jaxltl.core.graphs.end_components import end_components
+from jaxltl.core.host.confidence import ConfidenceSets, intervals_from_counts
 from jaxltl.core.logic.ltl import Formula, holds_on_lasso, parse_ltl
 from jaxltl.core.models.batch import lift_memory, stack_products
 from jaxltl.core.models.convert import to_padded, to_sparse
+from jaxltl.core.models.counts import TransitionCounts, counted_model, counts_on, make_counts
 from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models.interval import IntervalMDP, interval_rows, make_interval
 from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp, to_dense
 from jaxltl.core.models.monitor import Monitor, Verdict, make_monitor, monitor_step, verdict
 from jaxltl.core.models.operators import (
@@ -34,6 +37,7 @@ from jaxltl.core.models.operators import (
     pushforward,
     sample_successor,
 )
+from jaxltl.core.models.parametric import ParametricMDP, make_parametric
 from jaxltl.core.models.product import (
     FiniteMemoryPolicy,
     Product,
@@ -58,6 +62,7 @@ from jaxltl.core.values.bounded import (
     next_probability,
     reward_bounded_reachability,
 )
+from jaxltl.core.values.data_guarantee import DataGuarantee, guarantee_curve, learn_guarantee
 from jaxltl.core.values.discounted import optimal_value, policy_value
 from jaxltl.core.values.mean_payoff import mean_payoff
 from jaxltl.core.values.minimax import minimax_value, strategy_value
@@ -73,6 +78,8 @@ from jaxltl.core.values.prepared_interval import (
     solve_interval,
 )
 from jaxltl.core.values.reachability import reachability_probability
+from jaxltl.core.values.robust import robust_discounted_value, robust_expectation
+from jaxltl.core.values.robust_satisfaction import robust_satisfaction
 from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
 from jaxltl.core.values.soft import soft_value
 from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
@@ -81,7 +88,9 @@ from jaxltl.envs.gridworld import gridworld
 from jaxltl.envs.gymnasium_tables import from_gymnasium
 from jaxltl.envs.robots import grid_game
 from jaxltl.io.hoa import read_hoa, write_hoa
+from jaxltl.io.log import read_labels, read_log
 from jaxltl.io.model_files import read_model, write_model
+from jaxltl.io.parametric import read_parametric
 from jaxltl.io.reward_machine import machine_reward, read_reward_machine
 from jaxltl.io.storm import from_stormpy, to_stormpy
 
@@ -98,14 +107,18 @@ __all__ = [
     "GR1",
     "MDP",
     "Automaton",
+    "ConfidenceSets",
+    "DataGuarantee",
     "DenseMDP",
     "FiniteMemoryPolicy",
     "Formula",
     "Game",
+    "IntervalMDP",
     "Monitor",
     "NotConverged",
     "Objective",
     "OptimalActions",
+    "ParametricMDP",
     "Parity",
     "Permissive",
     "Prepared",
@@ -116,6 +129,7 @@ __all__ = [
     "SparseMDP",
     "Status",
     "Trajectories",
+    "TransitionCounts",
     "Verdict",
     "Verification",
     "Winning",
@@ -134,6 +148,8 @@ __all__ = [
     "check",
     "cobuchi",
     "complement",
+    "counted_model",
+    "counts_on",
     "cumulative_reward",
     "end_components",
     "exists_successor",
@@ -148,18 +164,25 @@ __all__ = [
     "gr1",
     "grid_game",
     "gridworld",
+    "guarantee_curve",
     "holds_on_lasso",
     "instantaneous_reward",
+    "interval_rows",
+    "intervals_from_counts",
     "is_equivalent",
+    "learn_guarantee",
     "letters",
     "lift_memory",
     "lift_policy",
     "lift_trajectories",
     "machine_reward",
     "make_automaton",
+    "make_counts",
     "make_game",
+    "make_interval",
     "make_mdp",
     "make_monitor",
+    "make_parametric",
     "make_sparse",
     "make_trajectories",
     "mean_payoff",
@@ -185,10 +208,16 @@ __all__ = [
     "reach",
     "reachability_probability",
     "read_hoa",
+    "read_labels",
+    "read_log",
     "read_model",
+    "read_parametric",
     "read_reward_machine",
     "restrict",
     "reward_bounded_reachability",
+    "robust_discounted_value",
+    "robust_expectation",
+    "robust_satisfaction",
     "rollout",
     "row_reward",
     "safety",
