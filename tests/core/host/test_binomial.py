@@ -60,20 +60,31 @@ def test_clopper_and_pearson_exactly(failure):
 
 @pytest.mark.parametrize(
     ("k", "n"),
-    [(1, 10**9), (3, 10**12), (1000, 10**9), (2000, 10**6), (10**9 - 5, 10**9), (10**6, 10**6)],
+    [
+        (1, 10**9),
+        (3, 10**12),
+        (1000, 10**9),
+        (2000, 10**6),
+        (10**9 - 5, 10**9),
+        (10**6, 10**6),
+        (10**12, 10**12),
+        (10**12 - 3, 10**12),
+        (10**13, 10**13),
+    ],
 )
 def test_clopper_and_pearson_of_many(k, n):
     for failure in (0.05, 1e-9, 1e-15):
         (lower,), (upper,) = clopper_pearson(np.array([k]), np.array([n]), failure)
         chance = tail_of_many(k, n, lower)
         assert chance <= failure / 2
-        # What is lost: the margin, and the distance of floats near one.
-        assert tail_of_many(k, n, np.nextafter(lower * (1 + 1e-6), 2)) > failure / 2 or (
-            lower > 1 - 1e-6 and chance > failure / 2 * 0.99
-        )
+        # What is lost: the margin, and near one the distance of floats.
+        if lower > 1 - 1e-6:
+            assert chance > failure / 2 * 0.99
+        else:
+            assert tail_of_many(k, n, lower * (1 + 1e-6)) > failure / 2
         (other,), (mirrored,) = clopper_pearson(np.array([n - k]), np.array([n]), failure)
         assert mirrored == min(np.nextafter(1 - lower, 2), 1)
-        assert upper == (1 if k == n else np.nextafter(1 - other, 2))
+        assert upper == min(np.nextafter(1 - other, 2), 1)
 
 
 @pytest.mark.parametrize("name", METHODS)
