@@ -1,9 +1,11 @@
 """Parameters that are claimed do what is claimed: closed forms, exact fractions, brute force."""
 
 import itertools
+import re
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -273,6 +275,17 @@ def test_single_precision(tmp_path):
         assert (found.upper - found.lower <= 1e-12).all(), "the proof is in double precision"
         with pytest.raises(ValueError, match="interval of p has no two numbers in float32"):
             within(problem, 0.5, 0.5 + 1e-12)
+
+
+def test_the_script_of_the_page_runs(capsys):
+    page = Path(__file__).parents[2] / "docs" / "parameters.md"
+    (script,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    names: dict = {}
+    exec(compile(script, str(page), "exec"), names)
+    assert names["found"].feasible.all()
+    assert names["found"].upper.min() < 3.325, "3.3229 where p is 0"
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[0].startswith("100 ") and shown[2] == "False" and shown[-1] == "10"
 
 
 # --- what is claimed is proven ----------------------------------------------------------------
