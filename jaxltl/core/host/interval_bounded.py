@@ -1,4 +1,4 @@
-"""What can be reached in so many steps when probabilities lie in intervals, with its rounding."""
+"""What can be had in so many steps when probabilities lie in intervals, with its rounding."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.rows import Booleans, Integers
 from jaxltl.core.host.sparse import Floats
+from jaxltl.core.host.sparse_graph import reaching
 
 _EPS = float(np.finfo(np.float64).eps)
 
@@ -32,7 +33,7 @@ class RobustSteps(NamedTuple):
 
 
 def backup_error(model: HostInterval) -> float:
-    """How far one backup of numbers in [0, 1] may be off.
+    """How far one backup of numbers in [-1, 1] may be off.
 
     A greedy distribution of n entries misses an extreme one by at most (3 n + 3) u of mass that is
     placed wrongly, by n u that is lost in the sum, and by the slack of :attr:`rounding
@@ -62,8 +63,9 @@ def until(
     chance = model.mdp.probability
     while done < num_steps:
         done += 1
-        found, row, chance = _backup(model, value, maximize=maximize, helpful=helpful)
-        new = np.where(open_, found, target)
+        ahead = value[model.mdp.successor]
+        found, row, chance = _backup(model, ahead, maximize=maximize, helpful=helpful)
+        new = np.where(open_, np.clip(found, 0, 1), target)
         if np.array_equal(new, value):
             break
         value = new
@@ -86,9 +88,9 @@ def next_step(
     Args:
       model, target, maximize, helpful: as of :func:`until`.
     """
-    value, row, chance = _backup(
-        model, target.astype(np.float64), maximize=maximize, helpful=helpful)
-    error = np.full(value.size, backup_error(model))
+    ahead = target.astype(np.float64)[model.mdp.successor]
+    value, row, chance = _backup(model, ahead, maximize=maximize, helpful=helpful)
+    value, error = np.clip(value, 0, 1), np.full(value.size, backup_error(model))
     for surely in (False, True):
         rows = _entering(model, target, surely, helpful)
         found = model.mdp.over_choices(_some(maximize), rows)
@@ -97,13 +99,48 @@ def next_step(
     return RobustSteps(value, error, row, chance, 1)
 
 
+def total(
+    model: HostInterval, earned: Floats, start: Floats, num_steps: int, *, maximize: bool,
+    helpful: bool,
+) -> RobustSteps:
+    """Expected reward of so many steps, and then of the state where one is.
+
+    Args:
+      model: the model.
+      earned: ``float64[T]``, what each entry earns.
+      start: ``float64[S]``, of the last state.
+      num_steps, maximize, helpful: as of :func:`until`; what the policy or nature make large.
+    """
+    mdp, one = model.mdp, backup_error(model)
+    value, error, done = start, 0.0, 0
+    row: Integers = mdp.row_start[:-1].astype(np.int64)
+    chance = mdp.probability
+    while done < num_steps:
+        done += 1
+        ahead = earned + value[mdp.successor]
+        found, row, chance = _backup(model, ahead, maximize=maximize, helpful=helpful)
+        still = np.array_equal(found, value)
+        # The same again and again, if nothing changes any more: e -> (1 + one) e + one * size.
+        size, repeated = float(np.abs(ahead).max(initial=0)), num_steps - done + 1 if still else 1
+        growth = float(np.expm1(min(repeated * np.log1p(one), 500)))
+        error = 1.01 * (error * (1 + growth) + growth * size) if still else (
+            error + one * (size + error))
+        value = found
+        if still:
+            break
+    some = start != 0
+    some[mdp.state[mdp.row[earned != 0]]] = True
+    off = np.where(reaching(mdp, some), error if num_steps else 0, 0)
+    return RobustSteps(value, off, row, chance, done)
+
+
 def _backup(
-    model: HostInterval, value: Floats, *, maximize: bool, helpful: bool
+    model: HostInterval, ahead: Floats, *, maximize: bool, helpful: bool
 ) -> tuple[Floats, Integers, Floats]:
-    """One step: the new value, the best rows and nature's distributions."""
-    mdp, ahead = model.mdp, value[model.mdp.successor]
+    """One step to what each entry has ahead: the value, the best rows, nature's distributions."""
+    mdp = model.mdp
     chance = model.nature(ahead, maximize=helpful)
-    image = np.clip(model.total(chance * ahead), 0, 1)
+    image = model.total(chance * ahead)
     best = mdp.over_choices(np.maximum if maximize else np.minimum, image)
     row = mdp.first_choice(image == best[mdp.state])[1].astype(np.int64)
     return best, row, chance

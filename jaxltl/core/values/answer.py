@@ -27,7 +27,12 @@ from jaxltl.core.values import bounded
 from jaxltl.core.values.average_reward import average_reward
 from jaxltl.core.values.opposite import opposite_event
 from jaxltl.core.values.reachability import reachability_probability
-from jaxltl.core.values.robust_bounded import robust_bounded_reachability, robust_next_probability
+from jaxltl.core.values.robust_bounded import (
+    robust_bounded_reachability,
+    robust_cumulative_reward,
+    robust_instantaneous_reward,
+    robust_next_probability,
+)
 from jaxltl.core.values.robust_satisfaction import RobustSatisfaction, robust_satisfaction
 from jaxltl.core.values.sparse_satisfaction import (
     Satisfaction,
@@ -40,11 +45,6 @@ TOLERANCE = 1e-6
 FINER = (1.0, 1e-3, 1e-6)  # parts of the tolerance by which a threshold is tried
 TINY = 1e-12  # width of an interval of rewards that is narrow enough whatever they are
 _OTHER = {"max": "min", "min": "max"}
-_EARNED = {
-    "total": "rewards for ever (C)", "cumulative": "rewards of so many steps (C<=k)",
-    "instantaneous": "rewards after so many steps (I=k)",
-    "average": "averages in the long run",
-}
 
 
 class Strategy(NamedTuple):
@@ -280,24 +280,26 @@ def _solver(
         return lambda tolerance: _plain(states, total_reward(
             model, reward, target, tolerance=tolerance, **aim.directions))
     assert isinstance(path, Earned)
-    return _earned_solver(_without_intervals(model, prop, _EARNED[path.kind]), path, reward,
-                          aim.policy, states)
+    if path.steps is not None:
+        return _steps_solver(model, path.kind == "cumulative", reward, path.steps, aim, states)
+    what = "rewards for ever (C)" if path.kind == "total" else "averages in the long run"
+    known, solve = _without_intervals(model, prop, what), (
+        total_reward if path.kind == "total" else average_reward)
+    return lambda tolerance: _plain(states, solve(
+        known, reward, objective=aim.policy, tolerance=tolerance))
 
 
-def _earned_solver(
-    model: SparseMDP, path: Earned, reward: Any, objective: str, states: np.ndarray
+def _steps_solver(
+    model: SparseMDP | IntervalMDP, cumulative: bool, reward: Any, steps: int, aim: _Aim,
+    states: np.ndarray,
 ) -> Callable[[float], _Found]:
-    if path.kind == "average":
-        return lambda tolerance: _plain(states, average_reward(
-            model, reward, objective=objective, tolerance=tolerance))
-    if path.kind == "total":
-        return lambda tolerance: _plain(states, total_reward(
-            model, reward, objective=objective, tolerance=tolerance))
-    steps: Any = path.steps
-    solve = (bounded.cumulative_reward if path.kind == "cumulative"
-             else bounded.instantaneous_reward)
+    if isinstance(model, IntervalMDP):
+        robust = robust_cumulative_reward if cumulative else robust_instantaneous_reward
+        return lambda tolerance: _plain(
+            states, robust(model, reward, steps, **aim.directions), by="steps")
+    solve = bounded.cumulative_reward if cumulative else bounded.instantaneous_reward
     return lambda tolerance: _plain(
-        states, solve(model, reward, steps, objective=objective), by="steps")
+        states, solve(model, reward, steps, objective=aim.policy), by="steps")
 
 
 def _graph(model: SparseMDP | IntervalMDP) -> SparseMDP:
@@ -313,7 +315,8 @@ def _without_intervals(
         return model
     raise ValueError(
         f"{prop}: {what} are not solved for where probabilities are intervals; solved for are "
-        "probabilities of formulas, and expected rewards or steps until a state is reached (F).")
+        "probabilities of formulas, and expected rewards until a state is reached (F), of so many "
+        "steps (C<=k) and after them (I=k).")
 
 
 def _plain(states: np.ndarray, solution: Solution, by: str = "") -> _Found:

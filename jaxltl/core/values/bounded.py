@@ -148,11 +148,7 @@ def instantaneous_reward(
       ValueError: the reward has no part on states, or as for :func:`cumulative_reward`.
     """
     model, operation = _problem(model, objective, num_step)
-    given = structure(model, reward)
-    if given.state is None:
-        raise ValueError("the reward of a state after so many steps needs a reward on states, and "
-                         "this one has none; give an array of one number a state.")
-    start = finite_reward(model, Rewards(state=given.state))[0][model.host.row_start[:-1]]
+    start = state_reward(model, reward)
     zero = np.zeros(model.num_rows)
     found = host.total(model.host, zero, zero, start, num_step, operation, by_step)
     return enclosed(found.value, found.error, found.row, found.num_steps)
@@ -252,6 +248,19 @@ def structure(model: SparseMDP, reward: Any) -> Rewards:
     sizes = (model.num_states, "state"), (model.num_rows, "choice"), (
         model.num_transitions, "transition")
     return Rewards(**{next(name for size, name in sizes if given.shape == (size,)): given})
+
+
+def state_reward(model: SparseMDP, reward: Any) -> np.ndarray:
+    """What states earn, ``float64[S]``.
+
+    Raises:
+      ValueError: nothing of the reward is on states, or some is not finite.
+    """
+    given = structure(model, reward)
+    if given.state is None:
+        raise ValueError("the reward of a state after so many steps needs a reward on states, and "
+                         "this one has none; give an array of one number a state.")
+    return finite_reward(model, Rewards(state=given.state))[0][model.host.row_start[:-1]]
 
 
 def finite_reward(model: SparseMDP, reward: Any) -> tuple[np.ndarray, np.ndarray]:

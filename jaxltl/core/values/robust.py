@@ -155,7 +155,7 @@ def robust_discounted_value(
     if not 0 <= float(discount) < 1:
         raise ValueError(f"discount={float(discount):.6g}; it must be at least 0 and below 1.")
     sides = sides_of(model, policy, objective, nature)
-    earned = sides.entries(_entry_reward(sides.model, reward))
+    earned = sides.entries(entry_reward(sides.model, reward))
     largest = float(np.abs(earned).max(initial=0)) / (1 - float(discount))
     asked = 1e-8 * max(largest, 1e-300) if tolerance is None else float(tolerance)
     found = discounted(
@@ -193,8 +193,12 @@ def robust_expectation(
     return model.host.total(p * ahead), p
 
 
-def _entry_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
-    """What each entry earns, ``float64[T]``."""
+def entry_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
+    """What each entry earns, ``float64[T]``.
+
+    Raises:
+      ValueError: some of it is not finite.
+    """
     given = structure(model.nominal, reward)
     host = model.nominal.host
     apart = row_reward(model.nominal, Rewards(state=given.state, choice=given.choice))

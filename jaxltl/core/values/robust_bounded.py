@@ -1,7 +1,8 @@
-"""What can be reached in so many steps when probabilities lie in intervals, enclosed."""
+"""What can be had in so many steps when probabilities lie in intervals, enclosed."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -11,8 +12,8 @@ from jaxltl.core.host import interval_bounded
 from jaxltl.core.host.interval_bounded import RobustSteps
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.types import Method, Solution
-from jaxltl.core.values.bounded import enclosed, states
-from jaxltl.core.values.robust import require_direction
+from jaxltl.core.values.bounded import enclosed, state_reward, states
+from jaxltl.core.values.robust import entry_reward, require_direction
 
 
 def robust_next_probability(
@@ -75,19 +76,89 @@ def robust_bounded_reachability(
       >>> robust_bounded_reachability(coin, [False, True], 2, nature="max").value.tolist()
       [0.9375, 1.0]
     """
-    nature = require_direction(nature, objective)
-    if num_steps != int(num_steps) or num_steps < 0:
-        raise ValueError(f"num_steps={num_steps}; it must be a whole number, at least 0.")
+    nature, steps = require_direction(nature, objective), _counted(num_steps)
     goal = states(model.nominal, target, "target")
     free = np.ones_like(goal) if stay is None else states(model.nominal, stay, "stay")
     return _solution(interval_bounded.until(
-        model.host, goal, free, int(num_steps), maximize=objective == "max",
+        model.host, goal, free, steps, maximize=objective == "max",
         helpful=nature == "max"))
 
 
-def _solution(found: RobustSteps) -> Solution:
+def robust_cumulative_reward(
+    model: IntervalMDP, reward: Any, num_steps: int, *, objective: str = "max",
+    nature: str | None = None,
+) -> Solution:
+    """Expected reward of the next so many steps, when probabilities lie in intervals.
+
+    ``x_{k+1}(s) = opt_a opt_p sum_t p_t (r(s, a, t) + x_k(t))`` from ``x_0 = 0``; nature picks anew
+    in each step.
+
+    Args:
+      model: the model.
+      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`; finite, of any sign.
+      num_steps: how many steps.
+      objective, nature: as of :func:`robust_next_probability`.
+
+    Returns:
+      :class:`~jaxltl.core.types.Solution`, as of :func:`robust_bounded_reachability`.
+
+    Raises:
+      ValueError: the reward, a direction, or a negative number of steps.
+
+    Example:
+      >>> from jaxltl.core.models.interval import interval_rows
+      >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
+      >>> robust_cumulative_reward(coin, [1.0, 0.0], 2, nature="max").value.tolist()
+      [1.5, 0.0]
+    """
+    zero = np.zeros(model.num_states)
+    return _earned(model, entry_reward(model, reward), zero, num_steps, objective, nature)
+
+
+def robust_instantaneous_reward(
+    model: IntervalMDP, reward: Any, num_step: int, *, objective: str = "max",
+    nature: str | None = None,
+) -> Solution:
+    """Expected reward of the state in which one is after so many steps, with intervals.
+
+    ``x_{k+1}(s) = opt_a opt_p sum_t p_t x_k(t)`` from the rewards of states ``x_0 = r``.
+
+    Args:
+      model: the model.
+      reward: as for :func:`~jaxltl.core.values.bounded.instantaneous_reward`.
+      num_step: after how many steps.
+      objective, nature: as of :func:`robust_next_probability`.
+
+    Returns:
+      :class:`~jaxltl.core.types.Solution`, as of :func:`robust_bounded_reachability`.
+
+    Raises:
+      ValueError: the reward has no part on states, or as for :func:`robust_cumulative_reward`.
+    """
+    start = state_reward(model.nominal, reward)
+    zero = np.zeros(model.num_transitions)
+    return _earned(model, zero, start, num_step, objective, nature)
+
+
+def _earned(
+    model: IntervalMDP, earned: Any, start: Any, num_steps: int, objective: str,
+    nature: str | None,
+) -> Solution:
+    nature, steps = require_direction(nature, objective), _counted(num_steps)
+    return _solution(interval_bounded.total(
+        model.host, earned, start, steps, maximize=objective == "max", helpful=nature == "max"),
+        highest=math.inf)
+
+
+def _counted(num_steps: int) -> int:
+    if num_steps != int(num_steps) or num_steps < 0:
+        raise ValueError(f"num_steps={num_steps}; it must be a whole number, at least 0.")
+    return int(num_steps)
+
+
+def _solution(found: RobustSteps, highest: float = 1) -> Solution:
     """What sweeps found, enclosed."""
     nature: Any = found.probability
     solution = enclosed(
-        found.value, found.error, found.row.astype(np.int32), found.num_steps, highest=1)
+        found.value, found.error, found.row.astype(np.int32), found.num_steps, highest=highest)
     return replace(solution, nature=nature, method=Method("step by step"))

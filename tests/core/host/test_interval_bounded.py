@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from jaxltl.core.host.interval_bounded import next_step, until
+from jaxltl.core.host.interval_bounded import next_step, total, until
 from jaxltl.core.models.interval import interval_rows
 
 
@@ -41,8 +41,9 @@ def random_interval(rng, num_states=5, chain=False):
     return interval_rows(rows, starts, *entries)
 
 
-def exact_backup(model, value, policy, nature):
+def exact_backup(model, value, policy, nature, earned=None):
     """One step of exact numbers."""
+    earned = [0] * model.num_transitions if earned is None else [Fraction(int(x)) for x in earned]
     host = model.host.mdp
     found = []
     for s in range(host.num_states):
@@ -52,7 +53,8 @@ def exact_backup(model, value, policy, nature):
             points = vertices(*([Fraction(float(x[e])) for e in entry]
                                 for x in (model.lower, model.upper)))
             images.append(nature(
-                sum(p * value[host.successor[e]] for p, e in zip(point, entry, strict=True))
+                sum(p * (earned[e] + value[host.successor[e]])
+                    for p, e in zip(point, entry, strict=True))
                 for point in points))
         found.append(policy(images))
     return found
@@ -75,6 +77,33 @@ def test_bounds_hold_the_exact_value(seed):
                      for t, ok, a in zip(target, stay, ahead, strict=True)]
         found = next_step(model.host, target, maximize=maximize, helpful=helpful)
         assert_holds(found, exact_backup(model, [Fraction(int(x)) for x in target], policy, nature))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bounds_hold_the_exact_reward(seed):
+    rng = np.random.default_rng(seed)
+    model = random_interval(rng, chain=seed % 3 == 0)
+    earned = rng.integers(-3, 4, model.num_transitions) * (rng.random(model.num_transitions) < 0.5)
+    start = rng.integers(-2, 3, 5) * (seed % 2)
+    for maximize, helpful in product((False, True), repeat=2):
+        policy, nature = (max if x else min for x in (maximize, helpful))
+        value = [Fraction(int(x)) for x in start]
+        for steps in range(5):
+            found = total(model.host, earned.astype(float), start.astype(float), steps,
+                          maximize=maximize, helpful=helpful)
+            for approximate, error, true in zip(found.value, found.error, value, strict=True):
+                assert abs(Fraction(float(approximate)) - true) <= Fraction(float(error)) <= 1e-10
+            value = exact_backup(model, value, policy, nature, earned)
+
+
+def test_a_reward_that_changes_no_more_keeps_its_rounding():
+    model = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
+    few, many = (total(model.host, np.zeros(3), np.array([0, 1.0]), n, maximize=True,
+                       helpful=False) for n in (2000, 10**9))
+    assert few.value.tolist() == many.value.tolist() and many.num_steps < 200
+    assert 0 < few.error[0] < many.error[0] < 1e-3
+    nothing = total(model.host, np.zeros(3), np.zeros(2), 10**9, maximize=True, helpful=False)
+    assert nothing.error.tolist() == [0, 0]
 
 
 def assert_holds(found, exact):

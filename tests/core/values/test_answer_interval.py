@@ -257,6 +257,18 @@ def test_steps_lead_to_what_is_reached_without_bound(seed):
         assert answer(model, f'P{directions}=? [ F[1,2] "b" ]').status == Status.CONVERGED
 
 
+def test_rewards_of_so_many_steps(tmp_path):
+    model = robot(tmp_path)
+    first = 'F "goal1" | "goal2"'
+    for directions in BOTH:
+        assert_enclosed(model, f'R{{"time"}}{directions}=? [ C<=7 ]', 7)  # each step takes one
+        assert_enclosed(model, f'R{{"time"}}{directions}=? [ I=7 ]', 1)
+        once = answer(model, f'P{directions}=? [ F<=1 "goal2" ]')
+        assert once.lower[0] <= (0.8 if directions[:3] == "max" else 0) <= once.upper[0]
+    assert answer(model, f'Rminmax<=1.3 [ {first} ]').holds == [True]
+    assert answer(model, 'Rmaxmin<=7 [ C<=7 ]').holds in ([True], [None])
+
+
 def test_what_has_no_intervals_takes_one_direction():
     coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
                        label={"a": [1]})
@@ -270,8 +282,6 @@ def test_what_has_no_intervals_takes_one_direction():
     ('Pmin>0.5 [ F "goal1" ]', r"ask for Pminmin=\? or Pminmax=\?"),
     ('R{"time"}min=? [ F "goal1" ]', r'ask for R\{"time"\}minmin=\? or R\{"time"\}minmax=\?'),
     ('Rminmax=? [ C ]', r"rewards for ever \(C\) are not solved for where probabilities are int"),
-    ('Rminmax=? [ C<=5 ]', r"rewards of so many steps"),
-    ('Rminmax=? [ I=5 ]', r"rewards after so many steps"),
     ('Rminmax=? [ S ]', r"averages in the long run"),
     ('LRAminmax=? [ "goal1" ]', r"averages in the long run"),
     ('Pmaxmin=? [ F{"time"}<=5 "goal1" ]', r"bounds on rewards"),
