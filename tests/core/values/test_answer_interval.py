@@ -10,6 +10,7 @@ from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
 from jaxltl.core.values.answer import answer
 from jaxltl.io.drn import read_drn
+from jaxltl.io.storm import to_stormpy
 from tests.core.host.test_interval_bounded import random_interval, vertices
 
 BOTH = ("maxmin", "maxmax", "minmin", "minmax")
@@ -302,3 +303,23 @@ def test_thresholds_are_for_all_strategies_and_all_of_nature(tmp_path):
     assert answer(model, 'P>=0 [ F "goal1" ]').holds == [True]
     assert answer(model, 'P>0 [ F "goal1" ]').holds == [False]
     assert answer(model, 'Rminmax<1.23 [ F "goal1" | "goal2" ]').holds == [True]
+
+
+def test_storm_finds_the_same():
+    storm = pytest.importorskip("stormpy")
+    rng = np.random.default_rng(11)
+    for _ in range(6):
+        model = labelled(rng)
+        lower = np.maximum(model.lower, np.minimum(model.upper, 1 / 128))  # Storm wants a graph
+        model = interval_rows(
+            model.nominal.row_start, model.nominal.entry_start, model.nominal.successor, lower,
+            model.upper, initial=model.initial, label=model.label,
+            propositions=model.propositions)
+        there = to_stormpy(model)
+        for text, directions in product(('F "a"', '"b" U "a"', 'F<=4 "a"', 'X "b"'), BOTH):
+            (prop,) = storm.parse_properties(f"P{directions[:3]}=? [ {text} ]")
+            mode = getattr(storm.UncertaintyResolutionMode, f"{directions[3:]}imize".upper())
+            value = float(storm.model_checking(
+                there, prop, only_initial_states=True, uncertainty_resolution_mode=mode,
+            ).get_value(0))
+            assert_enclosed(model, f"P{directions}=? [ {text} ]", value, near=1e-4)
