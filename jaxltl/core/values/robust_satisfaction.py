@@ -10,6 +10,7 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import Task
 from jaxltl.core.host.interval import HostInterval
+from jaxltl.core.host.interval_game import spread
 from jaxltl.core.host.interval_graph import joint_accepting
 from jaxltl.core.host.interval_parity import parity_against_nature
 from jaxltl.core.host.interval_values import Robust, reachability
@@ -17,9 +18,10 @@ from jaxltl.core.host.product import HostProduct, host_product
 from jaxltl.core.host.rows import Booleans, Integers
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.operators import is_deterministic, require_weights
 from jaxltl.core.models.product import Product
-from jaxltl.core.types import Method, Solution, Status
-from jaxltl.core.values.robust import TOLERANCE, host_sides, world_of
+from jaxltl.core.types import Method, Solution, Status, require_shape, row_tolerance
+from jaxltl.core.values.robust import TOLERANCE, Sides, host_sides, world_of
 from jaxltl.core.values.sparse_satisfaction import automaton_of
 
 
@@ -90,8 +92,8 @@ def robust_satisfaction(
         priority = np.asarray(automaton.priority)[source]
     moves = None if system is None else system[product.base_state]
     found = _solved(
-        host, yes[product.memory], no[product.memory], priority, moves, objective, nature,
-        automaton.acceptance == "safety", asked)
+        host_sides(host, moves, objective, nature), host, yes[product.memory],
+        no[product.memory], priority, automaton.acceptance == "safety", asked)
     solution = _solution(
         found, asked, product.start.shape, product.start,
         policy=product.base_row[found.row].astype(np.int32))
@@ -112,12 +114,15 @@ def _solution(
 
 
 def robust_product_satisfaction(
-    model: Product, *, objective: str = "max", nature: str | None = None, tolerance: Any = None
+    model: Product, *, policy: Any = None, objective: str = "max", nature: str | None = None,
+    tolerance: Any = None,
 ) -> Solution:
     """The same from every pair of a state and a memory of a product of an interval model.
 
     Args:
       model: a product of an :class:`~jaxltl.core.models.interval.IntervalMDP`.
+      policy: to be evaluated: the world's rows ``int32[S, Q]``, or their weights ``float[R, Q]``;
+        default: optimise.
       objective, nature, tolerance: as of :func:`robust_satisfaction`.
 
     Returns:
@@ -126,7 +131,7 @@ def robust_product_satisfaction(
       for Buchi and parity acceptance read on entry it is left out.
 
     Raises:
-      ValueError: the product's actions are restricted.
+      ValueError: the product's actions are restricted, or a policy is none.
     """
     if model.allowed is not None:
         raise ValueError("a product of an interval model takes no mask of actions; restrict the "
@@ -152,9 +157,15 @@ def robust_product_satisfaction(
     if live:
         level = product.memory % count if delayed else priority[
             product.memory, letter[product.base_state]]
+    sides = host_sides(host, None, objective, nature)
+    if policy is not None:
+        sides = _fixed(model, product, host, np.asarray(policy), count, sides.helpful)
     found = _solved(
-        host, yes[product.memory], no[product.memory], level, None, objective, nature,
+        sides, host, yes[product.memory], no[product.memory], level,
         task.acceptance == "safety", asked)
+    if policy is not None:
+        solution = _solution(found, asked, shape, product.start, np.asarray(policy))
+        return solution.replace(nature=None)  # type: ignore[attr-defined]
     policy = product.base_row[found.row[product.start]].astype(np.int32).reshape(shape)
     solution = _solution(found, asked, shape, product.start, policy)
     return solution.replace(nature=None) if delayed else solution  # type: ignore[attr-defined]
@@ -181,12 +192,32 @@ def _pairs(
     return found._replace(host=host), HostInterval(host, lower, upper)
 
 
+def _fixed(
+    model: Product, product: HostProduct, host: HostInterval, policy: np.ndarray, count: int,
+    helpful: bool,
+) -> Sides:
+    """The product under a policy of the world's rows and the memory, in which nature chooses."""
+    world: Any = model.mdp
+    memory = product.memory[host.mdp.state] // count
+    if is_deterministic(policy):
+        require_shape("policy", policy, model.state_shape)
+        taken = policy[product.base_state[host.mdp.state], memory] == product.base_row
+        weight = taken.astype(np.float64)
+    else:
+        require_shape("policy", policy, (world.num_rows, model.num_memory))
+        weight = policy[product.base_row, memory].astype(np.float64)
+    dtype = policy.dtype if policy.dtype.kind == "f" else np.float64
+    require_weights(host.mdp, weight, row_tolerance(dtype))
+    weight = weight / host.mdp.over_choices(np.add, weight)[host.mdp.state]
+    parted = spread(host, np.ones(host.mdp.num_states, bool), weight, weight)
+    return Sides(None, parted.model, helpful, helpful, parted, policy)
+
+
 def _solved(
-    host: HostInterval, yes: Booleans, no: Booleans, priority: Integers | None,
-    system: Booleans | None, objective: str, nature: str | None, safety: bool, tolerance: float,
+    sides: Sides, host: HostInterval, yes: Booleans, no: Booleans, priority: Integers | None,
+    safety: bool, tolerance: float,
 ) -> Robust:
-    """The probability from all states of a product; of a game where `system` says who moves."""
-    sides = host_sides(host, system, objective, nature)
+    """The probability from all states of a product, for those who choose in it."""
     maximize, helpful = sides.maximize, sides.helpful
     if sides.spread is None:
         return _of_sides(host, yes, no, priority, maximize, helpful, safety, tolerance)

@@ -37,6 +37,7 @@ def satisfaction_probability(
     model: Product,
     policy: jax.Array,
     *,
+    nature: str | None = None,
     method: str = "auto",
     tolerance: jax.Array | float | None = None,
 ) -> Solution:
@@ -50,6 +51,7 @@ def satisfaction_probability(
       model: the product.
       policy: ``float[S, Q, A]`` or ``int32[S, Q]``; where the world is sparse ``float[R, Q]``, or
         its rows ``int32[S, Q]``.
+      nature: of products of interval models only, ``"min"`` (the default) or ``"max"``.
       method, tolerance: as in :func:`reachability_probability`.
 
     Returns:
@@ -59,6 +61,10 @@ def satisfaction_probability(
     Differentiable in the policy and in the world's transition probabilities, with the
     support held fixed.
     """
+    if isinstance(model.mdp, IntervalMDP):
+        return robust_product_satisfaction(
+            model, policy=policy, nature=nature, tolerance=tolerance)
+    refuse_nature(nature)
     if is_sparse(model):
         return product_satisfaction(model, policy=policy, tolerance=tolerance)
     kind = model.automaton.acceptance

@@ -13,12 +13,13 @@ from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
 from jaxltl.core.values.reachability import reachability_probability
 from jaxltl.core.values.robust import (
+    host_sides,
     robust_discounted_value,
     robust_reachability,
     robust_total_reward,
 )
 from jaxltl.core.values.robust_satisfaction import _solved, robust_satisfaction
-from jaxltl.core.values.satisfaction import optimal_satisfaction
+from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
 from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
 from jaxltl.core.values.total_reward import total_reward
 from tests.reference_intervals import chains, parity, random_model, reach, reward
@@ -93,6 +94,34 @@ def test_products(label_on):
             assert int(found.status) == Status.CONVERGED
             np.testing.assert_allclose(
                 found.value[np.arange(4), start], alone.value, atol=2e-6)
+
+
+@pytest.mark.parametrize("label_on", ["entry", "exit"])
+def test_policies_of_products(label_on):
+    """The best policy is worth what it is worth; points are exact models, mixtures too."""
+    rng = np.random.default_rng(12)
+    for task in TASKS:
+        model = labelled(rng)
+        pairs = product(model, task, label_on=label_on)
+        points = product(make_interval(model.nominal, *[model.nominal.probability] * 2), task,
+                         label_on=label_on)
+        exact = product(model.nominal, task, label_on=label_on)
+        host = model.nominal.host
+        weight = rng.random((host.num_rows, pairs.num_memory))
+        weight /= np.add.reduceat(weight, host.row_start[:-1])[host.state]
+        alone = satisfaction_probability(exact, weight).value
+        np.testing.assert_allclose(
+            satisfaction_probability(points, weight).value, alone, atol=2e-6)
+        for nature in ("min", "max"):
+            best = optimal_satisfaction(pairs, nature=nature)
+            if nature == "min":  # else nature, too, has to keep to what attains it
+                own = satisfaction_probability(pairs, best.policy, nature=nature)
+                np.testing.assert_allclose(own.value, best.value, atol=2e-6)
+            found = satisfaction_probability(pairs, weight, nature=nature)
+            assert int(found.status) == Status.CONVERGED
+            side = 1 if nature == "max" else -1
+            assert (side * (found.value - alone) >= -2e-6).all()
+            assert (found.lower <= best.upper + 1e-9).all()
 
 
 def test_parts_of_interval_models():
@@ -189,7 +218,8 @@ def test_games():
                 held(robust_total_reward(game, cost, goal, **of),
                      played(host, goal, system, worth[1], **of))
             yes = np.zeros(4, bool)
-            found = _solved(host, yes, yes, priority, system, "max", nature, False, 1e-6)
+            sides = host_sides(host, system, "max", nature)
+            found = _solved(sides, host, yes, yes, priority, False, 1e-6)
             held(found, played(host, yes, system, worth[2], objective="max", nature=nature))
 
 
