@@ -21,6 +21,7 @@ from jaxltl.core.host.levels import Edges, components_in_order
 from jaxltl.core.host.rows import Booleans, Integers, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import towards
+from jaxltl.core.host.transient import Enclosed
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = 1e-290
@@ -58,15 +59,28 @@ class JointBound(NamedTuple):
 
     Attributes:
       bound: ``float64[S]``: of a maximum no less, of a minimum no more than it.
+      attained: ``float64[S]``, what the choices attain at least, or cost at most; None where that
+        is not proven.
       row: ``int[S]``, the row that leaves the component of a state; a state's first elsewhere.
       probability: ``float64[T]``, nature's distributions of all rows.
       rounds: systems solved.
     """
 
     bound: Floats
+    attained: Floats | None
     row: Integers
     probability: Floats
     rounds: int
+
+    def enclosed(self, maximize: bool, tolerance: float, relative: bool) -> Enclosed | None:
+        """The optimum, if both bounds are proven and as near as asked."""
+        if self.attained is None:
+            return None
+        low, high = (self.attained, self.bound) if maximize else (self.bound, self.attained)
+        scale = high if relative else 1.0
+        if not (np.isfinite(high) & (high - low <= tolerance * scale)).all():
+            return None
+        return Enclosed(low + (high - low) / 2, low, high, self.row, 0, 0.0, "")
 
 
 def joint_bound(
@@ -88,28 +102,35 @@ def joint_bound(
         if system is None:
             break
         rounds += 1
+        value = system.solve(nodes.earned(chosen, p, 0.0))
+        steps = system.solve(np.ones(nodes.size))
         if rounds < _PATIENCE:
-            extra = _extra(nodes, system, chosen, p, tolerance, relative)
+            extra = _extra(nodes, value, steps, tolerance, relative)
         elif rounds % _PATIENCE == 0:
             extra *= 8
-        z = system.solve(nodes.earned(chosen, p, extra))
+        z = value + extra * steps
         if not np.isfinite(z).all():
             break
         proven = nodes.proves(z)
         if not proven:
             chosen, p = nodes.improved(z, chosen, p, extra)
-    if not proven:
-        z = np.full(z.size, np.inf if maximize else 0.0)
-    bound = problem.known.copy()
     states = np.flatnonzero(problem.open)
-    bound[states] = (nodes.sign * z)[nodes.node[states]]
-    if not maximize:
-        bound = np.maximum(bound, 0)
+
+    def everywhere(x: Floats) -> Floats:
+        found = problem.known.copy()
+        found[states] = np.maximum(nodes.sign * x, 0)[nodes.node[states]]
+        return found
+
+    near = None
+    if proven and nodes.attains(value - extra * steps, chosen, p):
+        near = everywhere(value - extra * steps)
+    if not proven:
+        z = np.full(nodes.size, np.inf if maximize else 0.0)
     row = problem.model.mdp.row_start[:-1].astype(np.int64)
     row[states] = nodes.row[chosen][nodes.node[states]]
     chance = problem.model.mdp.probability.copy()
     chance[nodes.entry] = p
-    return JointBound(bound, row, chance, rounds)
+    return JointBound(everywhere(z), near, row, chance, rounds)
 
 
 @dataclass(frozen=True)
@@ -248,14 +269,24 @@ class _Nodes:
         """Whether no row and no distribution gains anything, rounding included."""
         gain = self.difference(z)
         p = self.part.nature(gain, maximize=True)
+        most = self.part.total(p * gain) + self.cost + self._slack(gain, p)
+        return bool((most <= 0).all())
+
+    def attains(self, z: Floats, chosen: Integers, p: Floats) -> bool:
+        """Whether choices gain in every node, rounding included: they leave then, and have that."""
+        gain = self.difference(z)
+        least = self.part.total(p * gain) + self.cost - self._slack(gain, p)
+        return bool((least[chosen] > 0).all())
+
+    def _slack(self, gain: Floats, p: Floats) -> Floats:
+        """How much what rows gain may be off."""
         size = np.abs(gain)
         terms = 2 * np.diff(self.part.mdp.entry_start) + self.depth + 8
         # Who is given the rest of the mass may miss some of it, or have too much.
         partly = (self.part.lower < p) & (p < self.part.upper)
         last = self.part.total(np.where(partly, size, 0)) * self.part.rounding
         slack = terms * _EPS * (self.part.total(p * size) + np.abs(self.cost)) + last
-        slack += terms * _TINY * (slack > 0)
-        return bool((self.part.total(p * gain) + self.cost + slack <= 0).all())
+        return slack + terms * _TINY * (slack > 0)
 
 
 def _nodes(problem: Joint, sign: int) -> _Nodes:
@@ -274,12 +305,11 @@ def _nodes(problem: Joint, sign: int) -> _Nodes:
 
 
 def _extra(
-    nodes: _Nodes, system: Factors, chosen: Integers, p: Floats, tolerance: float, relative: bool
+    nodes: _Nodes, value: Floats, steps: Floats, tolerance: float, relative: bool
 ) -> float:
     """How much more a step earns: little beside the tolerance, and more than rounding."""
-    steps = np.abs(system.solve(np.ones(nodes.size))).max(initial=1)
-    value = system.solve(nodes.earned(chosen, p, 0.0))
+    most = np.abs(steps).max(initial=1)
     size = max(np.abs(value).max(initial=0), np.abs(nodes.known).max(initial=0))
     scale = np.abs(value)[value != 0].min(initial=size) if relative else 1.0
     width = int(np.diff(nodes.part.mdp.entry_start).max()) + nodes.depth
-    return float(max(_AIM * tolerance * scale / steps, 64 * (width + 8) * _EPS * size, _LEAST))
+    return float(max(_AIM * tolerance * scale / most, 64 * (width + 8) * _EPS * size, _LEAST))

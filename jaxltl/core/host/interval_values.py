@@ -172,6 +172,7 @@ def _joint_reachability(
     row: Integers = mdp.row_start[:-1].astype(np.int64)
     chance = mdp.probability.copy()
     bound, rounds = one.astype(np.float64), 0
+    of: Enclosed | None = Enclosed(bound, bound, bound, row, 0, 0.0, "")
     component: Integers = np.arange(mdp.num_states)
     if open_.any():
         if up:
@@ -180,6 +181,7 @@ def _joint_reachability(
             Joint(model, open_, bound, np.zeros(mdp.num_rows), component, depth),
             maximize=up, tolerance=tolerance, relative=False)
         bound, rounds = np.clip(found.bound, 0, 1), found.rounds
+        of = found.enclosed(up, tolerance, relative=False)
         row, chance = np.where(open_, found.row, row), found.probability
         if up and inside.any():
             row, chance = _inner(model, row, chance, component, inside, used)
@@ -190,10 +192,11 @@ def _joint_reachability(
     chance = np.where(rows[mdp.row], model.within(entries), chance)
     some = towards(model.fixed(chance), target, rows) if up else mdp.first_choice(rows)[1]
     row = np.where(keep, some, row)
-    chain, entry = model.chain(row)
-    of = exact(chain.fixed(chance[entry]), np.zeros(0), up)
+    if of is None:
+        chain, entry = model.chain(row)
+        of = exact(chain.fixed(chance[entry]), np.zeros(0), up)
     low, high = (of.lower, np.maximum(bound, of.lower)) if up else (
-        np.minimum(bound, of.upper), of.upper)
+        np.minimum(bound, of.upper), np.minimum(of.upper, 1))
     return Robust(of.value, low, high, row, chance, rounds + of.rounds, of.residual, _METHOD)
 
 
@@ -206,6 +209,7 @@ def _joint_reward(
     row: Integers = mdp.row_start[:-1].astype(np.int64)
     chance = mdp.probability.copy()
     bound, rounds = np.zeros(mdp.num_states), 0
+    of: Enclosed | None = Enclosed(bound, bound, bound, row, 0, 0.0, "")
     earning = np.zeros(mdp.num_states, bool)
     earning[mdp.state[cost > 0]] = True
     open_ = ~target & (reaching(mdp, earning) if up else True)
@@ -218,11 +222,13 @@ def _joint_reward(
             Joint(model, open_, bound, cost, component, depth, wandering=not up),
             maximize=up, tolerance=tolerance, relative=True)
         bound, rounds = found.bound, found.rounds
+        of = found.enclosed(up, tolerance, relative=True)
         row, chance = np.where(open_, found.row, row), found.probability
         if inside.any():
             row, chance = _inner(model, row, chance, component, inside, used)
-    chain, entry = model.chain(row)
-    of = exact(chain.fixed(chance[entry]), cost[row], up)
+    if of is None:
+        chain, entry = model.chain(row)
+        of = exact(chain.fixed(chance[entry]), cost[row], up)
     low, high = (of.lower, np.maximum(bound, of.lower)) if up else (
         np.minimum(bound, of.upper), of.upper)
     return Robust(of.value, low, high, row, chance, rounds + of.rounds, of.residual, _METHOD)
