@@ -96,7 +96,7 @@ def joint_bound(
     """
     nodes = _nodes(problem, 1 if maximize else -1)
     chosen, p = nodes.nearer() if problem.wandering else nodes.first(nodes.started())
-    extra, rounds, proven, system = 0.0, 0, False, None
+    extra, rounds, proven, system = np.inf, 0, False, None
     while not proven and rounds < _ROUNDS:
         system = nodes.system(chosen, p, system)
         if system is None:
@@ -105,7 +105,8 @@ def joint_bound(
         value = system.solve(nodes.earned(chosen, p, 0.0))
         steps = system.solve(np.ones(nodes.size))
         if rounds < _PATIENCE:
-            extra = _extra(nodes, value, steps, tolerance, relative)
+            # Never more again: else who goes round for it comes and goes with it.
+            extra = min(extra, _extra(nodes, value, steps, tolerance, relative))
         elif rounds % _PATIENCE == 0:
             extra *= 8
         z = value + extra * steps

@@ -212,6 +212,7 @@ class _Play(NamedTuple):
     probability: jax.Array
     base: jax.Array  # the solution without anything extra
     z: jax.Array
+    extra: jax.Array
     growth: jax.Array
     rounds: jax.Array
     hasty: jax.Array  # whether both sides move at once
@@ -232,7 +233,8 @@ def enclose(contest: Contest, tolerance: jax.Array, max_rounds: jax.Array) -> Bo
     share = jnp.where(every > 0, jnp.minimum(rest / jnp.where(every > 0, every, 1), 1), 0)
     p = contest.lower + (contest.upper - contest.lower) * share
     zero, no = jnp.zeros(contest.size, p.dtype), jnp.asarray(False)
-    start = _Play(contest.first, p, zero, zero, jnp.ones((), p.dtype), jnp.int32(0), ~no, no, no)
+    start = _Play(contest.first, p, zero, zero, jnp.full((), jnp.inf, p.dtype),
+                  jnp.ones((), p.dtype), jnp.int32(0), ~no, no, no)
     apart = jnp.arange(contest.size + 2)
     near = _played(contest, start, -1.0, apart, tolerance, max_rounds)
     label = apart
@@ -281,7 +283,10 @@ def _played(
         solve = system(target, share)[0]
         base = solve(jnp.sum(known, axis=1) + contest.cost[play.row] / mass)
         time = solve(steps)
-        extra = play.growth * _extra(contest, base, time, tolerance)
+        # Never more again: else who goes round for it comes and goes with it.
+        aim = _extra(contest, base, time, tolerance)
+        least = jnp.where(jnp.isfinite(aim), jnp.minimum(play.extra, aim), play.extra)
+        extra = play.growth * least
         z = base + sign * extra * time
         if equal:
             z = _groups(z, contest.eps)[1]
@@ -296,7 +301,7 @@ def _played(
         still = jnp.all(row == play.row) & jnp.all(chance == play.probability)
         proven = _proves(contest, z, sign) & ~lost
         growth = jnp.where(still & ~proven, _GROWTH * play.growth, play.growth)
-        return _Play(row, chance, base, z, growth, play.rounds + 1, hasty, still, proven)
+        return _Play(row, chance, base, z, least, growth, play.rounds + 1, hasty, still, proven)
 
     def goes_on(play: _Play) -> jax.Array:
         alive = jnp.all(jnp.isfinite(play.z)) & (play.growth < _MOST_GROWTH)
