@@ -10,6 +10,8 @@ proves for which it stays at least.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -38,6 +40,7 @@ _STEPS = 300  # steps that are counted at most
 _LEFT = 0.25  # of the extra cost: what sweeps leave
 _MARGIN = 1.05  # by which a proof has more than it needs
 _PROOFS = 4  # that are tried
+_THREADS = 2**20  # transitions from which two blocks are swept at once
 
 
 class Cut(NamedTuple):
@@ -88,12 +91,14 @@ class Relaxed(NamedTuple):
       far: ``float64[N]``, the one on the other side.
       row: ``int64[N]``.
       sweeps: how many there were.
+      time: the longest time for which its policy was counted to stay.
     """
 
     near: Floats
     far: Floats
     row: Integers
     sweeps: int
+    time: float
 
 
 def cut(
@@ -134,7 +139,7 @@ def cut(
 
 def relaxed(
     sums: Sums, *, sign: int, tolerance: float, relative: bool, unit: float,
-    start: Floats | None = None, most: int = 150,
+    start: Floats | None = None, time: float | None = None, most: int = 150,
 ) -> Relaxed | None:
     """The optimal sums by sweeps.
 
@@ -146,50 +151,59 @@ def relaxed(
       relative: whether that is a share of the value.
       unit: the relative rounding of one application of a row.
       start: ``float[N]``, a first guess.
+      time: and one of how long a policy stays, unless the tolerance is relative.
       most: sweeps at most.
 
     Returns:
       The bounds; None where sweeps would take longer, or too little could be proven.
     """
-    search = _Search(sums, sign, unit, most)
     if max(sums.far.max(initial=0), 0 if sums.cost is None else sums.cost.max()) > _LARGEST:
         return None
+    with ThreadPoolExecutor(1) as pool:
+        many = sums.cut.matrix.nnz >= _THREADS
+        search = _Search(sums, sign, unit, most, pool if many else None)
+        return _relaxed(search, tolerance, relative, start, time)
+
+
+def _relaxed(
+    search: _Search, tolerance: float, relative: bool, start: Floats | None, time: float | None
+) -> Relaxed | None:
+    sums = search.sums
     value: Any = sums.far.astype(np.float32)
     live = np.flatnonzero(sums.live)
     value[live] = 0 if start is None else start[live]
-    if not search.sweep(value, 0.0, _ROUGH):
+    if time is None or relative:
+        if not search.sweep(value, 0.0, _ROUGH):
+            return None
+        found = search.staying(search.chain(search.look(value)[1])[0])
+        if found is None:
+            return None
+        extra = search.extra(value, found[0], tolerance, relative)
+    else:
+        extra = search.extra(value, np.full(1, time), tolerance, relative)
+    if not search.sweep(value, extra, 0.0):
         return None
-    found = search.staying(search.chain(search.policy(value), np.float32))
-    if found is None:
-        return None
-    extra = search.extra(value, found[0], tolerance, relative)
-    for double in (False, True):
-        if double:
-            value = np.where(sums.live, value, sums.far)
-        for _ in range(_PROOFS if double else 1):
-            if not search.sweep(value, extra, 0.0):
-                return None
-            if not double:
-                continue
-            proven = search.prove(value, extra)
-            if proven is None:
-                return None
-            width = search.excess(*proven[:2], tolerance, relative)
-            if width <= 1:
-                near, far, row = proven
-                return Relaxed(near, far, row, search.sweeps)
-            extra *= 0.8 / width
+    value = np.where(sums.live, value, sums.far)
+    for _ in range(_PROOFS):
+        proven = search.prove(value, extra) if search.sweep(value, extra, 0.0) else None
+        if proven is None:
+            return None
+        width = search.excess(proven, tolerance, relative)
+        if width <= 1:
+            return proven
+        extra *= 0.8 / width
     return None
 
 
 @dataclass
 class _Search:
-    """Sweeps, which are counted."""
+    """Sweeps, which are counted. Two blocks at a time read the same and then are written."""
 
     sums: Sums
     sign: int
     unit: float
     most: int
+    pool: Executor | None = None
     sweeps: int = 0
     left: float = 0.0  # what the last one changed
     parts: list[Any] = field(default_factory=list)
@@ -202,6 +216,18 @@ class _Search:
             cost = None if sums.cost is None else sums.cost[first:last]
             barred = None if sums.rows is None else ~sums.rows[first:last]
             self.parts.append((a, b, begin, cost, barred))
+
+    def in_pairs(self, one: Callable[[int], Any]) -> Iterator[list[tuple[int, Any]]]:
+        """What is found of each block, of one in either half at a time."""
+        half = (len(self.parts) + 1) // 2
+        for i in range(half):
+            if (j := i + half) == len(self.parts):
+                yield [(i, one(i))]
+            elif self.pool is None:
+                yield [(i, one(i)), (j, one(j))]
+            else:
+                other = self.pool.submit(one, j)
+                yield [(i, one(i)), (j, other.result())]
 
     def images(self, i: int, value: Values) -> Values:
         """What the rows of a block lead to; of those that may not be taken the worst."""
@@ -231,13 +257,18 @@ class _Search:
         shift = kind(self.sign * extra)
         before: Any = None
         rate, since, worst = 0.0, 0, []
+
+        def one(i: int) -> Values:
+            return self.best(i, self.images(i, value))
+
         while True:
             old = value.copy()
-            for i, (a, b, *_) in enumerate(self.parts):
-                found = self.best(i, self.images(i, value))
-                if extra:
-                    found += shift
-                np.copyto(value[a:b], found, where=self.sums.live[a:b])
+            for blocks in self.in_pairs(one):
+                for i, found in blocks:
+                    a, b, *_ = self.parts[i]
+                    if extra:
+                        found += shift
+                    np.copyto(value[a:b], found, where=self.sums.live[a:b])
             change: Any = np.subtract(value, old, out=old)
             self.sweeps += 1
             self.left = float(np.abs(change).max(initial=0))
@@ -274,45 +305,49 @@ class _Search:
             return len(worst) > 2 * _TRIAL
         return bool(self.sweeps + np.log(goal / worst[-1]) / np.log(rate) > 2 * self.most)
 
-    def policy(self, value: Values) -> Integers:
-        """The first best row of each node."""
-        return self.look(value)[1]
-
     def look(self, value: Values) -> tuple[Values, Integers]:
         """The optimum of each node, from values that stay as they are, and the first such row."""
         best = np.empty(self.sums.open.size, value.dtype)
         row = np.empty(best.size, np.int64)
-        for i, (a, b, begin, *_) in enumerate(self.parts):
+
+        def one(i: int) -> tuple[Values, Integers]:
             image = self.images(i, value)
-            best[a:b] = self.best(i, image)
-            first = self.sums.cut.row_start[a]
-            row[a:b] = first + _first(image, best[a:b], begin, self.sums.cut.width)
+            found = self.best(i, image)
+            return found, _first(image, found, self.parts[i][2], self.sums.cut.width)
+
+        for blocks in self.in_pairs(one):
+            for i, (found, first) in blocks:
+                a, b, *_ = self.parts[i]
+                best[a:b], row[a:b] = found, self.sums.cut.row_start[a] + first
         return np.where(self.sums.open, best, 0), row
 
-    def chain(self, row: Integers, dtype: Any) -> tuple[Any, Floats | None]:
+    def chain(self, row: Integers) -> tuple[Any, Floats | None]:
         """The rows of a policy, and their costs."""
         cost = None if self.sums.cost is None else self.sums.cost[row]
-        return self.sums.cut.matrix[row].astype(dtype, copy=False), cost
+        return self.sums.cut.matrix[row], cost
 
-    def staying(self, chain: tuple[Any, Floats | None]) -> tuple[Values, float] | None:
+    def staying(self, chain: Any) -> tuple[Values, float] | None:
         """A time that a policy stays at least, and by how much less it is after a step.
 
         Args:
-          chain: of the policy.
+          chain: ``float64[N, M]``, of the policy.
 
         Returns:
-          ``float32[N]``, zero where nobody reads it, and the share; None where it stays too long.
+          ``float32[M]``, zero where nobody reads it, and the share; None where it stays too long.
         """
+        from scipy import sparse
+
         live = self.sums.live[: self.sums.open.size]
-        columns = self.sums.live.size
-        stays: Any = np.zeros(columns, np.float32)
+        rows = sparse.csr_array(
+            (chain.data.astype(np.float32), chain.indices, chain.indptr), shape=chain.shape)
+        stays: Any = np.zeros(self.sums.live.size, np.float32)
         stays[: live.size] = live
-        time = np.zeros(columns, np.float32)
+        time: Any = np.zeros(self.sums.live.size, np.float32)
         for _ in range(_STEPS):
             time += stays
-            stays[: live.size] = (chain[0] @ stays) * live
+            stays[: live.size] = (rows @ stays) * live
             if stays.max(initial=0) <= _STAYS:
-                ahead = time[: live.size] - chain[0] @ time
+                ahead = time[: live.size] - rows @ time
                 least = float(ahead[live].min(initial=1.0)) - 64 * _EPS32 * float(time.max())
                 return (time, least) if least > 0.5 else None
         return None
@@ -328,7 +363,7 @@ class _Search:
         needed = _MARGIN * (1 + _LEFT) / (1 - _STAYS) + 1  # times of it, of which bounds differ
         return max(0.9 * tolerance * share / needed, 32 * self.unit * max(size, 1e-300))
 
-    def prove(self, value: Values, extra: float) -> tuple[Floats, Floats, Integers] | None:
+    def prove(self, value: Values, extra: float) -> Relaxed | None:
         """The bound that a policy attains, the one beyond which nothing is, and the policy."""
         sums, sign, unit = self.sums, self.sign, self.unit
         nodes = sums.open.size
@@ -339,8 +374,8 @@ class _Search:
         if not (sign * best + slack <= sign * value[:nodes])[live].all():
             return None
         far = np.where(live, value[:nodes], best + sign * slack)
-        chain, cost = self.chain(row, np.float64)
-        found = self.staying((chain.astype(np.float32), None))
+        chain, cost = self.chain(row)
+        found = self.staying(chain)
         if found is None:
             return None
         time, least = found
@@ -353,15 +388,16 @@ class _Search:
         slack = unit * (image + 2 * max(-float(near.min(initial=0)), 0.0))
         if not (sign * near[:nodes] <= sign * image - slack)[live].all():
             return None
-        return np.where(live, near[:nodes], image - sign * slack), far, row
+        near = np.where(live, near[:nodes], image - sign * slack)
+        return Relaxed(near, far, row, self.sweeps, float(time.max(initial=0)))
 
-    def excess(self, near: Floats, far: Floats, tolerance: float, relative: bool) -> float:
+    def excess(self, found: Relaxed, tolerance: float, relative: bool) -> float:
         """How many times the tolerance bounds are apart, more than those of what is known are."""
         known = np.abs(self.sums.far - self.sums.near)[~self.sums.live].max(initial=0)
-        width = np.abs(far - near)[self.sums.open] - known
+        width = np.abs(found.far - found.near)[self.sums.open] - known
         if relative:
-            width = width / np.maximum(np.abs(near if self.sign > 0 else far), 1e-300)[
-                self.sums.open]
+            size = np.abs(found.near if self.sign > 0 else found.far)[self.sums.open]
+            width = width / np.maximum(size, 1e-300)
         return float(width.max(initial=0)) / tolerance
 
 

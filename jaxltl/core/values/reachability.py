@@ -21,11 +21,12 @@ from jaxltl.core.graphs.attractor import attract, avoid, surely
 from jaxltl.core.graphs.end_components import EndComponents, components_within
 from jaxltl.core.graphs.graph import Graph, TracedGraph, graph_of, is_table, take
 from jaxltl.core.host import reach as host
+from jaxltl.core.host.layers import World, layered
 from jaxltl.core.host.quickest import quickest
 from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.mdp import DenseMDP, support
+from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.operators import (
     action_argmax,
     action_mean,
@@ -144,6 +145,9 @@ def reachability_probability(
     if traced:
         sets, components = in_turn(partial(_decided, objective=objective), model, target)
         return _optimize(model, sets, components, tolerance, max_steps, objective=objective)
+    found = _by_layers(model, target, tolerance, objective)
+    if found is not None:
+        return found
     graph = graph_of(model)
     sets, components = _decided(model, np.asarray(target), objective=objective)
     if components is not None and not components.inside.any():
@@ -240,6 +244,28 @@ def _host_solution(model: Any, found: host.Bounds, policy: Any, tolerance: Any) 
               np.asarray(found.residual, dtype), np.int32(found.rounds),
               np.int32(Status.CONVERGED))
     return Solution(*to_jax(arrays))
+
+
+def _by_layers(model: Any, target: Any, tolerance: Any, objective: str) -> Solution | None:
+    """Of a large product, one part of the automaton after the other; None where that is no help."""
+    world = model.mdp if isinstance(model, Product) else None
+    if not isinstance(world, MDP) or model.label_on != "entry" or model.num_states <= QUICK_LIMIT:
+        return None
+    eps = float(np.finfo(np.dtype(model.dtype)).eps)
+    width = max(64 * eps, 1e-11) if tolerance is None else 2 * float(tolerance) - 4 * eps
+    beside = World(
+        np.asarray(world.successor), support(world), np.asarray(world.probability),
+        np.asarray(world.available), np.asarray(model.automaton.delta), np.asarray(model.letter),
+        None if model.allowed is None else np.asarray(model.allowed))
+    found = layered(beside, np.asarray(target), maximize=objective == "max", tolerance=width)
+    if found is None:
+        return None
+    half = (found.upper - found.lower) / 2
+    # The operator carries the bounds towards each other, so the value by half of what is between.
+    bounds = host.Bounds(
+        found.lower + half, found.lower, found.upper, float(half.max()), found.sweeps,
+        found.action, half > 0)
+    return _host_solution(model, bounds, found.action, tolerance)
 
 
 def _policy_on_host(model: Any, target: Any, policy: Any, tolerance: Any) -> Solution | None:
