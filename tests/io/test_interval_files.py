@@ -181,6 +181,9 @@ LOWER = [0.4, 0.3, 0.2, 0.8, 0.9, 0, 1, 1]
 UPPER = [0.6, 0.7, 0.2, 0.8, 1, 0.1, 1, 1]
 
 
+THIRDS = u64(1, 3, 2, 3, 1, 3, 2, 3, 1, 5, 1, 5, 4, 5, 4, 5, 9, 10, 1, 1, 1, 100, 1, 10, *[1] * 8)
+
+
 def pairs(lower=LOWER, upper=UPPER):
     return f64(*np.stack([lower, upper], 1).ravel())
 
@@ -193,45 +196,9 @@ def test_umb_as_others_write_it(tmp_path):
     assert model.lower.tolist() == LOWER and model.upper.tolist() == UPPER
     assert model.rewards["r"].choice.tolist() == [1, 0, 2.5, 0, 0]
     assert model.propositions == ("Goal!",)
-    thirds = u64(
-        *[
-            1,
-            3,
-            2,
-            3,
-            1,
-            3,
-            2,
-            3,
-            1,
-            5,
-            1,
-            5,
-            4,
-            5,
-            4,
-            5,
-            9,
-            10,
-            1,
-            1,
-            0,
-            1,
-            1,
-            10,
-            1,
-            1,
-            1,
-            1,
-            2,
-            2,
-            2,
-            2,
-        ]
-    )
-    path.write_bytes(interval_archive("rational-interval", 256, thirds))
+    path.write_bytes(interval_archive("rational-interval", 256, THIRDS))
     model = read_umb(path)
-    assert model.lower.tolist() == [1 / 3, 1 / 3, 1 / 5, 4 / 5, 9 / 10, 0, 1, 1]
+    assert model.lower.tolist() == [1 / 3, 1 / 3, 1 / 5, 4 / 5, 9 / 10, 1 / 100, 1, 1]
     assert model.upper.tolist() == [2 / 3, 2 / 3, 1 / 5, 4 / 5, 1, 1 / 10, 1, 1]
 
 
@@ -368,6 +335,20 @@ def test_storm_reads_what_is_written(tmp_path):
         back = from_stormpy(to_stormpy(model))
         assert back.lower.tobytes() == model.lower.tobytes()
         assert back.upper.tobytes() == model.upper.tobytes()
+
+
+def test_storm_reads_fractions_in_the_same_order(tmp_path):
+    storm = pytest.importorskip("stormpy")
+    path = tmp_path / "m.umb"
+    path.write_bytes(interval_archive("rational-interval", 256, THIRDS))
+    there = storm.build_model_from_umb(str(path)).transition_matrix
+    ends = [
+        (float(e.value.lower()), float(e.value.upper()))
+        for r in range(there.nr_rows)
+        for e in there.get_row(r)
+    ]
+    model = read_umb(path)
+    assert ends == list(zip(model.lower.tolist(), model.upper.tolist(), strict=True))
 
 
 def test_what_storm_writes_is_read(tmp_path):
