@@ -19,6 +19,7 @@ from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 
 _EPS = float(np.finfo(np.float64).eps)
+_PAIRS = 5  # entries of a row up to which each pair is compared
 _WIDTHS = 12  # different numbers of successors up to which rows of each are sorted together
 
 
@@ -73,6 +74,9 @@ class HostInterval:
             if entry.shape[1] == 1:
                 found[entry] = self.upper[entry]
                 continue
+            if used is None and entry.shape[1] <= _PAIRS:
+                found[entry] = self._by_pairs(key, free, row, entry)
+                continue
             rank = key[entry] if used is None else np.where(used, key[entry], np.inf)
             order = np.argsort(rank, axis=1, kind="stable")
             entry = np.take_along_axis(entry, order, 1)
@@ -91,6 +95,25 @@ class HostInterval:
             else:
                 found[entry[used]] = mass[used]
         return found
+
+    def _by_pairs(
+        self, key: Floats, free: Floats, row: Integers, entry: Integers
+    ) -> Floats:
+        """The distributions of some rows, ``[N, W]``: few entries are compared, not sorted."""
+        rank, room = (np.ascontiguousarray(x[entry].T) for x in (key, free))
+        rest, rounding = self.rest[row], self.rounding[row]
+        mass = np.empty(entry.shape)
+        for i in range(entry.shape[1]):
+            left = rest.copy()
+            for j in range(entry.shape[1]):
+                if j != i:
+                    first = rank[j] <= rank[i] if j < i else rank[j] < rank[i]
+                    left -= first * room[j]
+            given = np.clip(np.where(left > rounding, left, 0), 0, room[i])
+            mine = entry[:, i]
+            # What is given whole is the upper end itself, without rounding.
+            mass[:, i] = np.where(given == room[i], self.upper[mine], self.lower[mine] + given)
+        return mass
 
     def may_keep(self, entries: Booleans) -> Booleans:
         """Whether nature may put all mass on some entries: ``bool[R]`` from ``bool[T]``."""
