@@ -21,9 +21,6 @@ from jaxltl.core.values.bounded import structure
 TOLERANCE = 1e-6
 
 
-RobustSolution = Solution
-
-
 def require_direction(nature: str | None, objective: str) -> str:
     """Nature's direction; against the objective where nothing is said.
 
