@@ -10,10 +10,13 @@ from jax import lax
 
 from jaxltl.core.models.choices import choices
 from jaxltl.core.models.compiled import compiled_form, flat_policy
+from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.operators import pushforward, require_policy, valid_policy
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.models.tables import table
 from jaxltl.core.types import Solution, status_code
-from jaxltl.core.values.evidence import most_choices, refuse, widest_row
+from jaxltl.core.values.evidence import most_choices, refuse
 from jaxltl.core.values.fixed_point import implicit
 from jaxltl.core.values.iterate import in_turn
 from jaxltl.core.values.linear import System, solver
@@ -78,12 +81,13 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
     visits, n = in_turn(_visits, model, policy, discount, start, linear)
     residual = jnp.sum(jnp.abs(flow(visits) - visits))
     gap = jnp.where(discount < 1, 1 - discount, jnp.nan)
-    # The operator is a contraction in the sum norm, and each state's inflow may sum up
-    # contributions of all pairs.
-    rounding = (
-        (most_choices(model) * widest_row(model) + 4)
-        * jnp.finfo(model.dtype).eps * jnp.sum(jnp.abs(visits)) / gap
-    )
+    # The operator is a contraction in the sum norm, and a state's inflow sums what all pairs that
+    # lead there contribute.
+    epsilon = float(jnp.finfo(model.dtype).eps)
+    terms = lax.stop_gradient(_inflow_terms(model)) + most_choices(model) + 4
+    rounding = epsilon * jnp.sum(terms * jnp.abs(visits)) / gap
+    # So does the sum over the states.
+    rounding, residual = (x * (1 + model.num_states * epsilon) for x in (rounding, residual))
     bound = residual / gap + rounding
     finite = jnp.isfinite(bound)
     bound = jnp.where(finite, bound, jnp.inf)
@@ -103,6 +107,20 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
             lax.stop_gradient(bound <= goal), lax.stop_gradient(finite), bound <= 8 * rounding),
     )
     return refuse(solution, checked.given, checked.valid)
+
+
+def _inflow_terms(model: Any) -> Any:
+    """How many numbers are added up for what flows into a state, in some order: ``[S]`` or more."""
+    if isinstance(model, Product):
+        return _inflow_terms(model.mdp)[:, None] + model.num_memory
+    if isinstance(model, MDP):
+        used = model.successor_probability > 0
+        return jnp.zeros(model.num_states, jnp.int32).at[model.successor].add(used)
+    if isinstance(model, DenseMDP):
+        return jnp.sum(model.successor_probability > 0, axis=(0, 1))
+    if isinstance(model, SparseMDP):
+        return jnp.bincount(jnp.asarray(model.successor), length=model.num_states)
+    return jnp.full(model.state_shape, model.num_states * most_choices(model))
 
 
 def _visits(model, policy, discount, start, linear) -> tuple[jax.Array, jax.Array]:

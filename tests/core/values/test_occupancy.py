@@ -98,3 +98,22 @@ def test_bad_policies_are_named():
     mdp = as_mdp(reference.random_model(np.random.default_rng(5), 5, 3, 2))
     with pytest.raises(ValueError, match=r"policy has shape \(5, 2\)"):
         jl.occupancy_measure(mdp, jnp.zeros((5, 2)), 0.9)
+
+
+@pytest.mark.parametrize("kind", ["padded", "rows"])
+def test_what_flows_into_a_hub_is_enclosed_in_single_precision(kind):
+    """Of a sum of many terms more is lost than of a few."""
+    size = 2**17
+    start = np.random.default_rng(5).random(size).astype(np.float32)
+    start /= start.sum()
+    with jax.enable_x64(False):
+        model = jl.make_mdp(np.zeros((size, 1, 1), int), np.ones((size, 1, 1)))
+        policy = np.zeros(size, np.int32)
+        if kind == "rows":
+            model, policy = jl.to_sparse(model), np.arange(size, dtype=np.int32)
+        found = jl.occupancy_measure(model, policy, np.float32(0.9), initial=start)
+    discount, exact = float(np.float32(0.9)), start.astype(float)
+    exact[0] = (exact[0] + discount * exact[1:].sum()) / (1 - discount)
+    assert found.value.dtype == np.float32
+    assert np.abs(found.value.ravel() - exact).max() > 1e-4
+    assert_encloses(found, exact)
