@@ -58,8 +58,15 @@ class Asked:
 def read_evidence(
     log: Path, *, labels: Path | None = None, model: Path | None = None,
     initial: Sequence[str] = (), terminal: Sequence[str] = (), graph: str = "seen",
+    option: str = "--{} ",
 ) -> Evidence:
     """A log, with its world: a given model, or one that is made of what was counted.
+
+    Args:
+      log, labels, model: files.
+      initial, terminal: names of states.
+      graph: what is known of successors; see :func:`~jaxltl.core.models.counts.counted_model`.
+      option: how an option stands where it was given, for messages.
 
     Raises:
       ValueError: naming the file and the line, or the option.
@@ -77,13 +84,13 @@ def read_evidence(
                              "and --terminal out.")
         return _named(given, counts_on(given, read_log(log, given)))
     if not initial:
-        raise ValueError("name the state in which runs start: --initial STATE.")
+        raise ValueError(f"name the state in which runs start: {option.format('initial')}STATE.")
     counts = read_log(log)
-    for option, names in (("--initial", initial), ("--terminal", terminal)):
+    for what, names in (("initial", initial), ("terminal", terminal)):
         unknown = [x for x in names if x not in counts.states]
         if unknown:
-            raise ValueError(f"{option} {unknown[0]}: the log has no such state; it has "
-                             f"{_some(counts)}.")
+            raise ValueError(f"{option.format(what)}{unknown[0]}: the log has no such state; it "
+                             f"has {_some(counts)}.")
     known = None if labels is None else read_labels(labels, counts.states)
     sparse, count = counted_model(
         counts, initial=list(initial), labels=known, terminal=terminal,
@@ -150,11 +157,15 @@ def entry(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float
         "status": Status(int(found.satisfaction.solution.status)).name,
         "samples": int(evidence.counts.sum()), "claims": found.sets.num_claims,
         "states": evidence.model.num_states, "choices": evidence.model.num_rows,
-        "sample_next": [
-            {"state": _state(evidence, r), "action": evidence.actions[r],
-             "gain": float(found.gain[r]), "samples": int(found.sets.num_samples[r])}
-            for r in most_helpful(found)],
-        "seconds": seconds}
+        "sample_next": sample_next(evidence, found), "seconds": seconds}
+
+
+def sample_next(evidence: Evidence, found: DataGuarantee) -> list[dict[str, Any]]:
+    """Where more samples help, the most first, as JSON objects."""
+    return [
+        {"state": _state(evidence, r), "action": evidence.actions[r],
+         "gain": float(found.gain[r]), "samples": int(found.sets.num_samples[r])}
+        for r in most_helpful(found)]
 
 
 def policy_file(evidence: Evidence, asked: Asked, found: DataGuarantee) -> bytes:

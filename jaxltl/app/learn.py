@@ -288,6 +288,7 @@ class Outcome:
       attempt: how a probability that was asked for was reached, if one was.
       expected_steps: by who acts, from the initial states; None if a task does not end.
       satisfaction: ``float[N, S]``, of every seed's policy from every start.
+      data: what a log guarantees of the kept policy, where the world is known from one.
       seed: the first of the seeds.
       seconds: spent.
     """
@@ -299,6 +300,7 @@ class Outcome:
     attempt: Attempt | None
     expected_steps: dict[str, Any] | None
     satisfaction: np.ndarray
+    data: dict[str, Any] | None
     seed: int
     seconds: float
 
@@ -330,9 +332,11 @@ def prepare(task: Task, seed: int) -> Setup:
 def describe(setup: Setup) -> str:
     """What a task comes to, in one line."""
     lengths = np.asarray(setup.demonstrations.length)
+    logged = setup.world.logged
     return (
         f"{setup.world.mdp.num_states} states, {setup.model.num_memory} memory states, "
         f"{many(len(lengths), 'demonstration')} of {many(int(lengths.sum()), 'pair')}"
+        + ("" if logged is None else f", {many(logged.num_samples, 'logged transition')}")
     )
 
 
@@ -344,7 +348,8 @@ def learn(
     report: Report | None = None,
     checkpoint: Path | None = None,
     progress: Callable[[str], None] = lambda stage: None,
-) -> tuple[Learned, int, Solution, Attempt | None, dict[str, Any] | None, np.ndarray]:
+) -> tuple[Learned, int, Solution, Attempt | None, dict[str, Any] | None, np.ndarray,
+           dict[str, Any] | None]:
     """Learns with N seeds, keeps the best, and evaluates it; see :class:`Outcome`.
 
     What it is at is told to `report`, steps and figures, and to `progress`, the stage's name.
@@ -363,7 +368,15 @@ def learn(
     ]
     expected_steps = _expected_steps(setup, learned.policy[chosen])
     values = np.stack([at_start(s.value) for s in each])
-    return learned, chosen, solution, attempt, expected_steps, values
+    data = None
+    if setup.world.logged is not None:
+        # Deferred: only worlds that are known from a log have intervals.
+        from jaxltl.app.logged import guaranteed
+
+        progress("certifying")
+        data = guaranteed(
+            setup.world.logged, model, setup.task.formula, learned.policy[chosen])
+    return learned, chosen, solution, attempt, expected_steps, values, data
 
 
 def summary(outcome: Outcome) -> dict[str, Any]:
@@ -415,6 +428,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             "loss": learned.loss,
             "neg_log_likelihood": learned.neg_log_likelihood,
         },
+        **({} if outcome.data is None else {"data": outcome.data}),
         **took(outcome.seconds),
     }
     return plain(result)
@@ -461,12 +475,14 @@ def save(out: Path, outcome: Outcome) -> None:
 
     Its arrays: ``policy [S, Q, A]``; ``initial_memory [S]`` and ``next_memory [S, Q]``, the memory
     at the start in s and after reading the label of s; ``label_on``; ``actions [A]``; ``weights
-    [F]`` and ``features [F]``; ``satisfaction``, ``lower`` and ``upper`` ``[S, Q]``.
+    [F]`` and ``features [F]``; ``satisfaction``, ``lower`` and ``upper`` ``[S, Q]``; of a log,
+    ``states [S]``, its names.
 
     Raises:
       ValueError: the place cannot be written to.
     """
     model, learned, i = outcome.setup.model, outcome.learned, outcome.chosen
+    logged = outcome.setup.world.logged
     save_arrays(out / "policy.npz", {
         "policy": learned.policy[i],
         **memory_arrays(model),
@@ -477,6 +493,7 @@ def save(out: Path, outcome: Outcome) -> None:
         "satisfaction": outcome.solution.value,
         "lower": outcome.solution.lower,
         "upper": outcome.solution.upper,
+        **({} if logged is None else {"states": logged.states}),
     })
 
 
@@ -508,6 +525,7 @@ def live(outcome: Outcome) -> list[Explorer | TooLarge | Curves]:
     setup, model = outcome.setup, outcome.setup.model
     policy = np.asarray(outcome.learned.policy[outcome.chosen])
     caption = "Figures of the weights before each step" + over_seeds(len(outcome.learned.loss))
+    logged = setup.world.logged
     return [
         explorer(
             LIVE, "What it does", "An arrow is as long as its action is likely; colours are the "
@@ -516,6 +534,7 @@ def live(outcome: Outcome) -> list[Explorer | TooLarge | Curves]:
             [*demonstrated_runs(model, setup.demonstrations),
              *learned_runs(model, policy, outcome.seed)],
             size=setup.world.mdp.num_states, place=setup.world.cells, actions=setup.world.actions,
+            places=None if logged is None else dict(enumerate(logged.states)),
             label=_LABEL, wall=setup.task.world.get("wall", "#"),
             marked=left_out(model, setup.guarantee, setup.demonstrations),
             marks="Demonstrated steps that lower the best probability and were left out",

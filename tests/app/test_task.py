@@ -121,7 +121,7 @@ def test_the_digest_covers_named_files(write):
     (("[task]", '[task]\nover = "worst"'), r"over belongs to a guarantee that is a probability"),
     (('file = "shown.json"', 'file = "shown.json"\nlength = 3'), r"length belongs to synthetic"),
     (('file = "shown.json"', 'file = "gone.json"'), r"gone\.json': No such file"),
-    (("map = '''\n. . r\nb . y\n'''", ""), r"\[world\] must have either a map or a model"),
+    (("map = '''\n. . r\nb . y\n'''", ""), r"\[world\] must have either a map, a model"),
     (("map = '''\n. . r\nb . y\n'''", 'model = "m.npz"'), r"absorbing belongs to a map"),
     (("map = '''\n. . r\nb . y\n'''", "map = { name = 'x' }"), r'or \{ file = "map\.txt" \}'),
 ])

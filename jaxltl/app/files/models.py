@@ -14,7 +14,7 @@ from jaxltl.core.games.objective import Parity
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.padded import to_padded
+from jaxltl.core.models.padded import action_of, to_padded
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.io.model_files import read_model
 from jaxltl.io.npz import model_of, parse_arrays
@@ -85,11 +85,16 @@ def read_padded(path: Path, more: Sequence[str] = ()) -> ReadModel:
             objective = objective_of(model)
         model = model.mdp
     with tables.errors_in(f"{name!r}: "):
-        mdp, names = _padded(model)
+        mdp, names, _ = padded(model)
     return ReadModel(mdp, names, found, objective)
 
 
-def _padded(model: SparseMDP) -> tuple[MDP, tuple[str, ...]]:
+def padded(model: SparseMDP) -> tuple[MDP, tuple[str, ...], np.ndarray]:
+    """A sparse model with padded successor lists, the names of actions, and each choice's action.
+
+    Raises:
+      ValueError: it is too large when padded, with the size.
+    """
     names = tuple(x or "(no name)" for x in model.action_names)
     if model.action is not None and names:
         state, action = model.host.state, np.asarray(model.action)
@@ -98,10 +103,11 @@ def _padded(model: SparseMDP) -> tuple[MDP, tuple[str, ...]]:
         listed = tuple(names[a] for a in used)
         if pairs.size == action.size and len(set(listed)) == used.size <= _MOST_NAMES:
             column = np.searchsorted(used, action).astype(np.int32)
-            return to_padded(replace(model, action=column, action_names=())), listed
+            return to_padded(replace(model, action=column, action_names=())), listed, column
         model = replace(model, action=None)
     mdp = to_padded(model)
-    return mdp, _numbered("choice" if model.action is None else "action", mdp.num_actions)
+    kind = "choice" if model.action is None else "action"
+    return mdp, _numbered(kind, mdp.num_actions), action_of(model)
 
 
 def _numbered(what: str, count: int) -> tuple[str, ...]:

@@ -152,10 +152,10 @@ def off_map(shape: Sequence[int]) -> str:
 
 
 def require_one(
-    path: Path, table: str, data: Mapping[str, Any], keys: tuple[str, str], wanted: str
+    path: Path, table: str, data: Mapping[str, Any], keys: Iterable[str], wanted: str
 ) -> None:
-    """Raises a ValueError unless a table has exactly one of two keys."""
-    reject(path, table, [((keys[0] in data) == (keys[1] in data), f"must have either {wanted}")])
+    """Raises a ValueError unless a table has exactly one of some keys."""
+    reject(path, table, [(sum(key in data for key in keys) != 1, f"must have either {wanted}")])
 
 
 def refuse(path: Path, table: str, data: Iterable[str], keys: Iterable[str], belong: str) -> None:
@@ -170,11 +170,25 @@ def reject(path: Path, table: str, faults: Iterable[tuple[bool, str]]) -> None:
             raise ValueError(f"{path}: [{table}] {told}.")
 
 
-def check_source(path: Path, table: str, data: Mapping[str, Any], of_map: Iterable[str]) -> None:
-    """Raises a ValueError unless there is a map or a model; keys of a map do not fit a model."""
-    require_one(path, table, data, ("map", "model"), "a map or a model (a file)")
+def check_source(
+    path: Path, table: str, data: Mapping[str, Any], of_map: Iterable[str],
+    of_log: Iterable[str] | None = None,
+) -> None:
+    """Raises a ValueError unless there is a map, a model, or a log where one is taken.
+
+    Keys of a map do not fit a model, and those of a log fit nothing else.
+    """
+    sources, wanted = ["map", "model"], "a map or a model (a file)"
+    if of_log is not None:
+        sources.append("transitions")
+        wanted = "a map, a model (a file) or transitions (a log)"
+    require_one(path, table, data, sources, wanted)
     if "model" in data:
         refuse(path, table, data, of_map, "a map; a model has it in its arrays")
+    if "transitions" in data:
+        refuse(path, table, data, of_map, "a map; of a log, labels name states in a file")
+    else:
+        refuse(path, table, data, of_log or (), "transitions, a log")
 
 
 def check_demonstrations(

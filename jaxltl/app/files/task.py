@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -20,6 +20,7 @@ from jaxltl.app.files import tables
 from jaxltl.app.files.tables import COUNT, NAMES, TEXT, Rule, choice, is_list, is_number, number_in
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.logic.labels import satisfying
+from jaxltl.core.models.counts import listed
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, project_trajectories
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
@@ -27,6 +28,9 @@ from jaxltl.core.types import Solution
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
 from jaxltl.io.prism_explicit import files_beside
+
+if TYPE_CHECKING:
+    from jaxltl.app.logged import Logged
 
 
 @dataclass(frozen=True)
@@ -110,22 +114,25 @@ class World(NamedTuple):
       mdp: the model.
       cells: ``str[rows, columns]``, or None for a model from arrays.
       actions: A names.
+      logged: the log that the model was counted from, or None.
     """
 
     mdp: MDP
     cells: np.ndarray | None
     actions: tuple[str, ...]
+    logged: Logged | None = None
 
-    def where(self, state: int) -> dict[str, int]:
-        """A state's number from 0 and, on a map, its row and column from 1."""
-        return where(state, None if self.cells is None else self.cells.shape)
+    def where(self, state: int) -> dict[str, Any]:
+        """A state's number from 0 and, on a map, its row and column from 1; of a log, its name."""
+        found = where(state, None if self.cells is None else self.cells.shape)
+        return found if self.logged is None else {**found, "name": self.logged.states[state]}
 
     def place(self, state: int) -> str:
         """A state for people."""
         return place(self.where(state))
 
 
-def where(state: int, shape: Sequence[int] | None) -> dict[str, int]:
+def where(state: int, shape: Sequence[int] | None) -> dict[str, Any]:
     """A state's number from 0 and, on a map of a shape, its row and column from 1."""
     if shape is None:
         return {"state": int(state)}
@@ -133,11 +140,12 @@ def where(state: int, shape: Sequence[int] | None) -> dict[str, int]:
     return {"state": int(state), "row": row + 1, "column": column + 1}
 
 
-def place(where: Mapping[str, int]) -> str:
-    """A state as people name it: row and column from 1 on a map, else its number from 0."""
+def place(where: Mapping[str, Any]) -> str:
+    """A state as people name it: row and column from 1 on a map, else its name, or number from 0.
+    """
     if "row" in where:
         return f"row {where['row']}, column {where['column']}"
-    return f"state {where['state']}"
+    return f"state {where.get('name', where['state'])}"
 
 
 def many(number: int, what: str) -> str:
@@ -167,8 +175,22 @@ REQUIRED: dict[str, Sequence[str]] = {
     "task": ("formula",),
     "learner": ("method", "discount"),
 }
+_NAMES_OF_STATES = Rule(lambda v: is_list(v, str) and bool(v), "a list of names of states")
+_OF_LOG: dict[str, Rule] = {
+    "confidence": Rule(
+        lambda v: is_number(v) and 0 < v < 1, "a number between 0 and 1, such as 0.95"),
+    "labels": TEXT,
+    "terminal": _NAMES_OF_STATES,
+    "graph": choice("seen", "complete"),
+    "method": choice("anytime", "clopper-pearson", "hoeffding", "weissman"),
+}
 _KEYS: dict[str, dict[str, Rule]] = {
-    "world": {"map": tables.MAP, **WORLD, "model": TEXT},
+    "world": {
+        "map": tables.MAP, **WORLD, "model": TEXT, "transitions": TEXT, **_OF_LOG,
+        "initial": Rule(
+            lambda v: TEXT.holds(v) or _NAMES_OF_STATES.holds(v),
+            "a text; of a log, the name of a state or a list of names"),
+    },
     "task": TASK,
     "demonstrations": {"file": TEXT, **SYNTHETIC},
     "learner": {
@@ -217,12 +239,21 @@ def read_task(path: str | Path) -> Task:
     path = Path(path)
     data, raw = tables.read_tables(path, "the task file", _KEYS, REQUIRED)
     world, shown = data["world"], data["demonstrations"]
-    tables.check_source(path, "world", world, ("legend", "wall", "slip", "absorbing"))
+    tables.check_source(path, "world", world, ("legend", "wall", "slip", "absorbing"), _OF_LOG)
+    tables.reject(path, "world", (
+        ("transitions" in world and "confidence" not in world,
+         "lacks confidence, with which the log is to guarantee something, such as 0.95"),
+        ("transitions" in world and "initial" not in world,
+         "lacks initial, the name of the state in which runs start, or a list of names"),
+        ("transitions" not in world and isinstance(world.get("initial"), list),
+         "initial is a list of names of states, which a log has; here it must be a text"),
+    ))
     tables.check_demonstrations(path, shown, "file", 'file = "..."', ("discount", "length"))
     _check_learner(path, data["learner"])
     text = world.get("map")
     named = [text["file"]] if isinstance(text, dict) else []
-    named += [table[key] for table, key in ((world, "model"), (shown, "file")) if key in table]
+    files = (world, "model"), (world, "transitions"), (world, "labels"), (shown, "file")
+    named += [table[key] for table, key in files if key in table]
     if "model" in world:  # PRISM's labels stand in a file of their own
         named += [str(x.absolute()) for x in files_beside(path.parent / world["model"])]
     return make_task(path, data, raw, named, "entry")
@@ -258,6 +289,12 @@ def load_world(task: Task) -> World:
     """
     spec = dict(task.world)
     with tables.errors_in(f"{task.path}: [world] "):
+        if "transitions" in spec:
+            # Deferred: that of a log is more than a map needs.
+            from jaxltl.app.logged import load_logged
+
+            mdp, actions, logged = load_logged(task.path.parent, spec)
+            return World(mdp, None, actions, logged)
         if "model" in spec:
             path = task.path.parent / spec["model"]
             # Deferred: readers of all formats are more than a map needs.
@@ -300,7 +337,8 @@ def read_demonstrations(path: Path, world: World) -> Trajectories:
     The file is JSON, ``{"demonstrations": [...]}``. Each demonstration is an object with
     ``"cells"``, ``[row, column]`` counted from 1 at the top left (or ``"states"``, numbers
     counted from 0), and ``"actions"``, names or numbers from 0, one per cell. A cell more than
-    actions is where the demonstration ended.
+    actions is where the demonstration ended. In the world of a log, states and actions are those
+    names that the log has.
 
     Raises:
       ValueError: not such a file, or a demonstration that the world cannot have made. The
@@ -379,13 +417,25 @@ def _read_cell(value: Any, world: World) -> int:
 
 
 def _read_state(value: Any, world: World) -> int:
+    if world.logged is not None:
+        return _read_name("state", value, world.logged.states)
     last = world.mdp.num_states - 1
     if not is_list([value], int) or not 0 <= value <= last:
         raise ValueError(f"the state is {value!r}; states are 0 to {last}.")
     return int(value)
 
 
+def _read_name(what: str, value: Any, names: tuple[str, ...]) -> int:
+    """The number of what a log names; a name that is a number may stand without quotes."""
+    name = str(value) if is_list([value], int) else value
+    if name in names:
+        return names.index(name)
+    raise ValueError(f"the {what} {value!r} is not in the log, which has {listed(names)}.")
+
+
 def _read_action(value: Any, world: World) -> int:
+    if world.logged is not None:
+        return _read_name("action", value, world.actions)
     if value in world.actions:
         return world.actions.index(value)
     if is_list([value], int) and 0 <= value < len(world.actions):

@@ -84,8 +84,11 @@ _GENERATED = {
     "shape": Rule(lambda v: is_list(v, int) and len(v) == 2 and min(v) >= 1, "[rows, columns]"),
     "seed": _WHOLE,
 }
+_NO_LOG = Rule(
+    lambda v: False,
+    'left out: a log has no cells for a network to look around in; "mlirl" learns from logs')
 _KEYS: dict[str, dict[str, Rule]] = {
-    "world": {"maps": _MAPS, **_COLORED, **tasks.WORLD},
+    "world": {"maps": _MAPS, **_COLORED, **tasks.WORLD, "transitions": _NO_LOG},
     "task": tasks.TASK,
     "demonstrations": {
         "files": Rule(lambda v: is_list(v, str) and len(v) > 0, "a list of files, one per world"),

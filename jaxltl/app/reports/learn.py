@@ -40,27 +40,65 @@ def page(result: Mapping[str, Any], *shown: Any) -> str:
 def _told(result: Mapping[str, Any]) -> list[str]:
     """What stands after the policies."""
     return [
-        "<h2>Probability of doing the task</h2>", _evidence_table(result),
+        f"<h2>Probability of doing the task{_by_frequencies(result)}</h2>", _evidence_table(result),
         "<h2>Weights</h2>", _weights_table(result), _seeds(result),
     ]
 
 
 def remarks(result: Mapping[str, Any]) -> list[Remark]:
     """What the page says first."""
-    return [*(("warning", text) for text in warnings(result)), *_notes(result)]
+    data = result.get("data")
+    first = [] if data is None else _of_log(data)
+    return [*first, *(("warning", text) for text in warnings(result)), *_notes(result)]
+
+
+def _of_log(data: Mapping[str, Any]) -> list[Remark]:
+    """What a log guarantees, what another policy could have, and where more of it would help."""
+    found: list[Remark] = [("good" if data["guaranteed"] > 0 else "warning", (
+        f"{_guaranteed(data)}. That is what the log guarantees of this policy, whatever the "
+        "probabilities are that it leaves possible; other figures are by the log's frequencies, "
+        "as if they were the truth. The best that could be guaranteed by this log is "
+        f"{probability(data['best_guaranteed'])}, by the policy of jaxltl certify; no policy has "
+        f"more than {probability(data['optimistic'])}, with the same confidence."))]
+    if data["status"] != "CONVERGED":
+        found.append(("warning", (
+            f"The solver for what the log guarantees ended with {data['status']}; it holds, and "
+            "may be less than could be shown.")))
+    if data["sample_next"]:
+        first = data["sample_next"][0]
+        found.append(("note", (
+            f"More samples of {first['action']} in {first['state']} ({first['samples']} so far) "
+            "would raise what can be guaranteed most, by up to "
+            f"{probability(first['gain'])}.")))
+    return found
+
+
+def _guaranteed(data: Mapping[str, Any]) -> str:
+    return (f"P >= {math.floor(data['guaranteed'] * 1e4) / 1e4:.4f} with confidence "
+            f"{data['confidence']:g}, from {many(data['samples'], 'logged transition')}")
+
+
+def _by_frequencies(result: Mapping[str, Any]) -> str:
+    return " by the log's frequencies" if "data" in result else ""
 
 
 def _notes(result: Mapping[str, Any]) -> list[Remark]:
     """What holds of the policy and why, and what was left out for it."""
     found, best, learned = [], result["best_achievable"], result["satisfaction"]
-    asked = result["guarantee"]["asked"]
+    asked, logged = result["guarantee"]["asked"], "data" in result
     if asked == "best":
         if learned["minimum"]["lower"] == 1:
-            found.append(("good", (
-                "By the graph: from every initial state the policy does the task with probability "
-                "1, whatever the numbers. It takes moves that keep that possible, and no others.")))
+            graph = ("By the graph, which is what the log showed" if logged else "By the graph")
+            found.append(("note" if logged else "good", (
+                f"{graph}: from every initial state the policy does the task with probability "
+                "1, whatever the numbers"
+                + (", if no move leads where the log never saw it lead" if logged else "")
+                + ". It takes moves that keep that possible, and no others.")))
         else:
-            found.append(_nearly_best(learned["mean"]["lower"], best["mean"]))
+            kind, text = _nearly_best(learned["mean"]["lower"], best["mean"])
+            found.append(
+                ("note", f"If the log's frequencies were the truth: {text[0].lower()}{text[1:]}")
+                if logged and kind == "good" else (kind, text))
     elif asked != "none":
         found.append(("good", _asked(result["guarantee"])))
     if (lost := result["guarantee"].get("left_out")) is not None:
@@ -125,13 +163,15 @@ def table(result: Mapping[str, Any]) -> str:
         f"{many(shown['number'], 'synthetic ' * shown['synthetic'] + 'demonstration')} "
         f"({many(shown['pairs'], 'pair')}{dropped}), {result['method']} in the {result['in']}",
         "",
-        "probability of doing the task, over "
+        f"probability of doing the task{_by_frequencies(result)}, over "
         f"{many(result['satisfaction']['num_starts'], 'initial state')}",
     ]
     lines += [
         f"  {title:16} {what:8} {value:>9}   certified {bounds:15} {where}".rstrip()
         for title, what, value, bounds, where, _ in _evidence(result)
     ]
+    if "data" in result:
+        lines.append(f"  {_guaranteed(result['data'])}")
     weights = result["weights"]
     width = max(map(len, weights))
     lines += [
@@ -222,12 +262,19 @@ def _tiles(result: Mapping[str, Any]) -> str:
     training = result["training"]
     how = ("<span class=good>converged</span>" if training["converged"]
            else "<span class=bad>not converged</span>")
+    data = result.get("data")
+    sure = [] if data is None else [(
+        probability(math.floor(data["guaranteed"] * 1e4) / 1e4),
+        f"guaranteed with confidence {data['confidence']:g}, from "
+        f"{many(data['samples'], 'logged transition')}")]
+    by = _by_frequencies(result)
     return tiles([
+        *sure,
         (probability(learned["mean"]["value"]),
-         f"mean probability over {many(learned['num_starts'], 'initial state')}"),
+         f"mean probability{by} over {many(learned['num_starts'], 'initial state')}"),
         (probability(learned["minimum"]["value"]),
          f"minimum, from {html.escape(place(learned['minimum']))}"),
-        (probability(best["mean"]["value"]), "best achievable mean"),
+        (probability(best["mean"]["value"]), f"best achievable mean{by}"),
         (number(result["neg_log_likelihood"]),
          f"negative log-likelihood; {how} in {training['steps']} steps"),
     ])
@@ -244,9 +291,11 @@ def _evidence(result: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
 
 
 def _evidence_table(result: Mapping[str, Any]) -> str:
-    lines = [(f"{title}, {what}", *rest) for title, what, *rest in _evidence(result)]
+    lines = [(f"{title}, {what}", *map(html.escape, rest))
+             for title, what, *rest in _evidence(result)]
+    true = "The probability" if "data" in result else "The true probability"
     return rows(("policy", "probability", "certified", "where", "solver"), lines) + (
-        "<p class=muted>The true probability is certified to be that close.</p>"
+        f"<p class=muted>{true}{_by_frequencies(result)} is certified to be that close.</p>"
     )
 
 
