@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxltl.core.host import discounted, mixing, optimal, transient
+from jaxltl.core.host import discounted, mixing, optimal, relaxation, transient
 from jaxltl.core.models.sparse import make_sparse
 from tests.sparse_models import random_sparse
 
@@ -113,3 +113,20 @@ def test_what_mixes_slowly_is_left_to_others():
     assert mixing.by_sweeps(problem, maximize=True, tolerance=1e-8, relative=False) is None
     found = mixing.optimum(problem, maximize=True, tolerance=1e-8, relative=False)
     np.testing.assert_allclose(found.value, 1 - np.arange(size) / (size - 1), atol=1e-8)
+
+
+@pytest.mark.parametrize("maximize", [True, False])
+def test_what_sweeps_leave_unsolved_is_not_proven(always, maximize, monkeypatch):
+    """Sweeps that end much too early find bounds that hold, or none."""
+    sweep = relaxation._Search.sweep
+    monkeypatch.setattr(
+        relaxation._Search, "sweep",
+        lambda self, value, extra, rough: sweep(self, value, extra, max(rough, 0.2)))
+    for rng, host, goal in cases(40, 4):
+        stay = rng.random(goal.size) < 0.8
+        asked = {"maximize": maximize, "stay": stay, "tolerance": 1e-7}
+        ours = optimal.reachability(host, goal, **asked)
+        with monkeypatch.context() as patch:
+            patch.setattr(optimal, "optimum", transient.optimum)
+            agree(ours, optimal.reachability(host, goal, **asked))
+    assert any(x is None for x in always)
