@@ -341,11 +341,11 @@ def test_storm_reads_fractions_in_the_same_order(tmp_path):
     storm = pytest.importorskip("stormpy")
     path = tmp_path / "m.umb"
     path.write_bytes(interval_archive("rational-interval", 256, THIRDS))
-    there = storm.build_model_from_umb(str(path)).transition_matrix
+    there = storm.build_model_from_umb(str(path))  # its matrix does not outlive it
     ends = [
         (float(e.value.lower()), float(e.value.upper()))
-        for r in range(there.nr_rows)
-        for e in there.get_row(r)
+        for r in range(there.transition_matrix.nr_rows)
+        for e in there.transition_matrix.get_row(r)
     ]
     model = read_umb(path)
     assert ends == list(zip(model.lower.tolist(), model.upper.tolist(), strict=True))
