@@ -5,11 +5,14 @@ import os
 import sys
 from typing import NoReturn
 
-from jaxltl.cli import main
-
 
 def run() -> NoReturn:
     """Runs the command and ends the process as soon as all is written."""
+    # Here, since processes that draw load this file too.
+    from jaxltl.app.programs import few_collections
+    from jaxltl.cli import main
+
+    few_collections()
     status: object = 0
     try:
         main()

@@ -28,7 +28,7 @@ from jaxltl.app.drawing import artist
 if TYPE_CHECKING:
     import numpy as np
 
-    from jaxltl.app.drawing import Picture
+    from jaxltl.app.drawing import Artist, Picture
     from jaxltl.core.automata.automaton import Automaton
 
 
@@ -83,6 +83,7 @@ def _compiling(*, soon: bool) -> Callable[[Callable[..., None]], Callable[..., N
             programs.keep_programs(not no_cache)
             if soon:
                 programs.compile_soon()
+                programs.one_thread()
             command(*args, **options)
 
         return run
@@ -131,15 +132,15 @@ def learn(
     stopped when it is started again with the same task and options.
     """
     _begin(f"learning from {task_file}")
-    alone = programs.is_alone()
-    job = _job(task_file)
-    task = job.read_task(task_file)
-    out = _directory(out, task.name)
-    with _float64():
-        mark = job.fingerprint(task, seed, seeds)
-        result = None if again else _finished(out, mark)
-        done = result is not None
-        result = result or _learn(job, task, out, seed, seeds, mark, alone)
+    with artist(apart=programs.is_alone()) as begin:  # before anything else, so that it can load
+        job = _job(task_file)
+        task = job.read_task(task_file)
+        out = _directory(out, task.name)
+        with _float64():
+            mark = job.fingerprint(task, seed, seeds)
+            result = None if again else _finished(out, mark)
+            done = result is not None
+            result = result or _learn(job, task, out, seed, seeds, mark, begin)
     click.echo(_report(result).table(result))
     click.echo(f"\n{'done before: see' if done else 'wrote'} {out}/report.html and the files "
                f"beside it{'; --again does it again' if done else ''}")
@@ -171,7 +172,7 @@ def _finished(out: Path, mark: str) -> dict[str, Any] | None:
 
 
 def _learn(
-    job: Any, task: Any, out: Path, seed: int, seeds: int, mark: str, alone: bool
+    job: Any, task: Any, out: Path, seed: int, seeds: int, mark: str, begin: Artist
 ) -> dict[str, Any]:
     """Does the whole job, shows how far it is, and returns what result.json holds."""
     from jaxltl.algos.checkpoint import atomic_write
@@ -186,7 +187,7 @@ def _learn(
     if checkpoint.exists():
         _say(f"going on from {checkpoint}")
     steps = task.learner.get("steps", job.STEPS)
-    with artist(apart=alone) as begin, _learning(steps) as bar:
+    with _learning(steps) as bar:
         pictures = [(p, begin(p.drawing)) for p in job.task_pictures(setup)]
 
         def report(step: int, figures: Mapping[str, np.ndarray]) -> None:

@@ -448,14 +448,11 @@ def test_a_dead_process_draws_nothing_and_loses_nothing(monkeypatch):
         def __init__(self, *_):
             pass
 
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_):
-            pass
-
         def submit(self, *_):
             return self
+
+        def shutdown(self, **_):
+            pass
 
         def result(self):
             raise BrokenExecutor

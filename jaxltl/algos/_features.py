@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxltl.core.host.quickest import until_read
 from jaxltl.core.host.reach import policy_row, steps_until
+from jaxltl.core.models.concrete import namespace, to_jax
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.operators import expectation
 from jaxltl.core.models.product import Product, expected_reads, lift_trajectories
@@ -24,19 +25,22 @@ from jaxltl.core.values.reachability import action_matrices
 from jaxltl.core.values.satisfaction import as_reachability, visiting
 
 
-@jax.jit  # one program, where it is called alone
 def pair_counts(
-    model: Any, trajectories: Trajectories, kept: jax.Array | None = None
+    model: Any, trajectories: Trajectories, kept: Any = None
 ) -> jax.Array:
     """How often each state-action pair occurs in trajectories of a model: ``float[S, A]``.
 
     In those steps that are `kept`, ``bool[N, T]``; default all.
     """
-    kept = trajectories.mask if kept is None else kept
+    xp, steps, kept = namespace(trajectories, trajectories.mask if kept is None else kept)
     actions = (*model.state_shape, model.num_actions)
-    pair = trajectories.state * model.num_actions + trajectories.action
-    flat = jnp.zeros(int(np.prod(actions)), model.dtype)
-    return flat.at[pair].add(kept.astype(model.dtype)).reshape(actions)
+    pair, kept = steps.state * model.num_actions + steps.action, kept.astype(model.dtype)
+    flat = xp.zeros(int(np.prod(actions)), model.dtype)
+    if xp is jnp:
+        flat = flat.at[pair].add(kept)
+    else:
+        np.add.at(flat, pair, kept)
+    return to_jax(flat.reshape(actions))
 
 
 class Features(NamedTuple):
@@ -103,7 +107,8 @@ def task_features(
     if best is not None and kind != "safety":
         nearer = _nearer(model, best)
         remark = _TOO_LONG if nearer is None else None
-    values = _task_values(model, demonstrations, nearer, avoid=tuple(avoid), progress=chosen)
+    counts = pair_counts(model, lift_trajectories(model, demonstrations))
+    values = _task_values(model, counts, nearer, avoid=tuple(avoid), progress=chosen)
     main = {"cosafe": ("goal", "progress"), "safety": ()}.get(kind, ("accepting",))
     names = ("demonstrated", *main, *(("avoid",) if avoid else ()))
     names += (("time",) if kind == "cosafe" else ()) + (("nearer",) if nearer is not None else ())
@@ -155,36 +160,39 @@ def _steps(rows: list[Any], policy: Any, ended: np.ndarray) -> np.ndarray | None
 
 @partial(jax.jit, static_argnames=("avoid", "progress"))
 def _task_values(
-    model: Product, demonstrations: Trajectories, nearer: jax.Array | None, *,
+    model: Product, counts: jax.Array, nearer: jax.Array | None, *,
     avoid: tuple[str, ...], progress: tuple[int, ...],
 ) -> jax.Array:
-    lifted, num_memory = lift_trajectories(model, demonstrations), model.num_memory
-    kind = model.automaton.acceptance
-    columns = [(pair_counts(model, lifted) > 0).astype(model.dtype)]
+    kind, num_memory = model.automaton.acceptance, model.num_memory
+    columns = [(counts > 0).astype(model.dtype)]
     done = model.final if kind == "cosafe" else jnp.zeros(model.state_shape, bool)
+    regions = [_shows(model.mdp, avoid)[:, None]] if avoid else []
     if kind == "cosafe":
-        target, every = np.isin(np.arange(num_memory), progress), jnp.arange(num_memory)
-
-        def entering(q: jax.Array) -> jax.Array:
-            region = jnp.broadcast_to(target & (every != q), model.state_shape)
-            return expectation(model, region.astype(model.dtype))[:, q]
-
-        columns += [
-            expectation(model, model.final.astype(model.dtype)),
-            jax.vmap(entering, out_axes=1)(every),
-        ]
+        target, every = np.isin(np.arange(num_memory), progress), np.arange(num_memory)
+        regions += [model.final, *(target & (every != q) for q in every)]
+    entered = _chances(model, regions)
+    if kind == "cosafe":
+        goal, *entering = entered[-1 - num_memory:]
+        columns += [goal, jnp.stack([x[:, q] for q, x in enumerate(entering)], axis=1)]
     elif kind != "safety":
         priority = jnp.asarray(model.automaton.priority)
         even = jnp.where(priority % 2 == 0, priority, jnp.iinfo(priority.dtype).max)
         columns.append(expected_reads(model, priority == jnp.min(even)))
     if avoid:
-        red = _shows(model.mdp, avoid)[:, None] & jnp.ones(num_memory, bool)
-        columns.append(-expectation(model, red.astype(model.dtype)))
+        columns.append(-entered[0])
     if kind == "cosafe":
         columns.append(-jnp.ones_like(columns[0]))
     if nearer is not None:
         columns.append(nearer)
     return _stacked(columns, done)
+
+
+def _chances(model: Product, regions: Sequence[Any]) -> list[jax.Array]:
+    """Of being in a region after a step, ``float[S, Q, A]`` for each; traced once for all."""
+    if not regions:
+        return []
+    inside = jnp.stack([jnp.broadcast_to(x, model.state_shape) for x in regions])
+    return list(jax.vmap(partial(expectation, model))(inside.astype(model.dtype)))
 
 
 def world_features(
@@ -205,8 +213,9 @@ def world_features(
     """
     for names, argument in ((goal, "goal"), (progress, "progress"), (avoid, "avoid")):
         _require_known(world, names, argument)
+    counts = pair_counts(world, demonstrations)
     values = _world_values(
-        world, demonstrations, goal=tuple(goal), progress=tuple(progress), avoid=tuple(avoid)
+        world, counts, goal=tuple(goal), progress=tuple(progress), avoid=tuple(avoid)
     )
     shown = ("avoid",) if avoid else ()
     return Features(values, ("demonstrated", "goal", "progress", *shown, "time"))
@@ -214,11 +223,11 @@ def world_features(
 
 @partial(jax.jit, static_argnames=("goal", "progress", "avoid"))
 def _world_values(
-    world: MDP | DenseMDP, demonstrations: Trajectories, *, goal: tuple[str, ...],
+    world: MDP | DenseMDP, counts: jax.Array, *, goal: tuple[str, ...],
     progress: tuple[str, ...], avoid: tuple[str, ...],
 ) -> jax.Array:
     columns = [
-        (pair_counts(world, demonstrations) > 0).astype(world.dtype),
+        (counts > 0).astype(world.dtype),
         expectation(world, _shows(world, goal).astype(world.dtype)),
         expectation(world, _shows(world, progress).astype(world.dtype)),
     ]
@@ -251,8 +260,9 @@ def progress_states(model: Product) -> tuple[int, ...]:
     Nearer in letters that occur in the world; the starts are the memories of initial
     states.
     """
-    delta = np.asarray(model.automaton.delta)[:, np.unique(np.asarray(model.letter))]
-    final = np.asarray(model.automaton.final)
+    automaton = jax.tree.map(np.asarray, model.automaton)
+    delta = automaton.delta[:, np.unique(np.asarray(model.letter))]
+    final = automaton.final
     distance = np.where(final, 0.0, np.inf)
     for _ in range(len(delta)):
         distance = np.minimum(distance, 1 + distance[delta].min(axis=1))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -101,14 +100,14 @@ def step(evaluate: Callable[[Any, Point], Point], search: Search) -> tuple[Searc
         size = jnp.where(jnp.isfinite(high), (low + high) / 2, 2 * low)
         better = good | (new.loss < k.best.loss)
         later = k._replace(
-            best=_choose(better, new, k.best), moved=k.moved | better, size=size, low=low,
+            best=learner.either(better, new, k.best), moved=k.moved | better, size=size, low=low,
             high=high, done=good | (k.n + 1 >= _MOST), n=k.n + 1)
         # The very first evaluation is of the start, and gives the first direction.
         scale = -jnp.minimum(1, 1 / optax.tree.norm(new.gradient))
         first = k._replace(
             base=new, best=new, known=jnp.bool_(True),
             direction=optax.tree.scale(scale, new.gradient), size=jnp.ones_like(size))
-        return _choose(k.known, later, first)
+        return learner.either(k.known, later, first)
 
     one = jnp.ones((), search.point.loss.dtype)
     begin = _Trial(
@@ -120,8 +119,8 @@ def step(evaluate: Callable[[Any, Point], Point], search: Search) -> tuple[Searc
     # A direction that does not descend, or a step that led nowhere, starts afresh.
     fresh = ~(optax.tree.vdot(moved, new.gradient) > 0) | ~found.moved
     scale = jnp.minimum(1, 1 / optax.tree.norm(new.gradient))
-    moved = _choose(fresh, optax.tree.scale(scale, new.gradient), moved)
-    memory = _choose(fresh & ~jnp.isnan(new.loss), learner.strong(
+    moved = learner.either(fresh, optax.tree.scale(scale, new.gradient), moved)
+    memory = learner.either(fresh & ~jnp.isnan(new.loss), learner.strong(
         _directions().init(new.parameters)), memory)
     return Search(new, optax.tree.scale(-1, moved), memory, jnp.bool_(True)), found.base
 
@@ -129,6 +128,3 @@ def step(evaluate: Callable[[Any, Point], Point], search: Search) -> tuple[Searc
 def _ahead(base: Point, direction: Any, size: jax.Array) -> Any:
     return jax.tree.map(lambda x, d: x + size.astype(x.dtype) * d, base.parameters, direction)
 
-
-def _choose(condition: jax.Array, one: Any, other: Any) -> Any:
-    return jax.tree.map(partial(jnp.where, condition), one, other)

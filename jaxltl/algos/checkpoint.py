@@ -25,6 +25,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.core.models.concrete import to_jax
+
 _GIVEN = "given"  # the fingerprint's name in the file
 
 
@@ -143,7 +145,7 @@ def load(
                 f"{str(path)!r} does not belong to this run: {name} is {is_}, expected "
                 f"{expected.dtype}{list(expected.shape)}. Delete the file to start afresh."
             )
-        value = jnp.asarray(found)
+        value = to_jax(found)
         if expected is not leaf:
             value = jax.random.wrap_key_data(value, impl=jax.random.key_impl(leaf))
         leaves.append(value)
@@ -174,9 +176,16 @@ def _named(tree: Any) -> list[tuple[str, Any]]:
     """Leaves with distinct file-safe names, whose numbers keep nested paths apart."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return [
-        (f"{i}{jax.tree_util.keystr(path)}".replace("/", "_"), jnp.asarray(leaf))
+        (f"{i}{jax.tree_util.keystr(path)}".replace("/", "_"), _array_of(leaf))
         for i, (path, leaf) in enumerate(leaves)
     ]
+
+
+def _array_of(leaf: Any) -> Any:
+    """As ``jnp.asarray``, but NumPy's arrays stay on the host, where nothing is compiled."""
+    if not isinstance(leaf, np.ndarray):
+        return jnp.asarray(leaf)
+    return leaf.astype(jax.dtypes.canonicalize_dtype(leaf.dtype), copy=False)
 
 
 def _data(leaf: jax.Array) -> jax.Array:

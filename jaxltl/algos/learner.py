@@ -28,6 +28,7 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.algos import checkpoint as files
+from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.types import Status, worst
 
 Init = Callable[..., Any]
@@ -435,7 +436,7 @@ def run_in_chunks(
         if os.path.exists(checkpoint):
             now, rows = files.load(checkpoint, (now, rows), given)
     advance = _lane_steps(step, keep, num_lanes)
-    while (made := int(np.max(now.count))) < num_steps and not np.all(now.done):
+    while (made := int(np.asarray(now.count).max())) < num_steps and not np.asarray(now.done).all():
         now, fresh = run(
             advance, strong(now), problem, (hparams, until),
             num_steps=min(chunk, num_steps - made), max_rows=max_rows,
@@ -445,7 +446,7 @@ def run_in_chunks(
         if checkpoint is not None:
             files.save(checkpoint, (now, rows), given)
         if report is not None:
-            report(int(np.max(now.count)), jax.tree.map(lambda x: x[-1], rows[1]))
+            report(int(np.asarray(now.count).max()), jax.tree.map(lambda x: x[-1], rows[1]))
     step_of = np.asarray(rows[0])
     return Chunks(
         now.state, jax.tree.map(np.asarray, rows[1]), step_of[:, 0] if lanes else step_of,
@@ -456,14 +457,26 @@ def run_in_chunks(
 def _begin(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | None) -> _Progress:
     """Before the first chunk; nothing is compiled for it."""
     lanes = () if num_lanes is None else (num_lanes,)
+    shape = _metrics_of(step, state, problem, hparams, num_lanes)
+    metrics = jax.tree.map(lambda x: np.zeros((*lanes, *x.shape), x.dtype), shape)
+    count = np.asarray(state.step, np.int32)
+    return _Progress(state, *to_jax((metrics, count, np.zeros(count.shape, bool))))
+
+
+def _metrics_of(
+    step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | None
+) -> Any:
+    """Shapes of the metrics of one run, from a step's trace."""
     one = (state, hparams)
-    if lanes:
+    if num_lanes is not None:
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), one)
     # As a program, whose trace is kept for the next run.
-    _, shape = jax.eval_shape(jax.jit(step), one[0], problem, one[1])
-    metrics = jax.tree.map(lambda x: jnp.asarray(np.zeros((*lanes, *x.shape), x.dtype)), shape)
-    count = np.asarray(state.step, np.int32)
-    return _Progress(state, metrics, jnp.asarray(count), jnp.asarray(np.zeros(count.shape, bool)))
+    return jax.eval_shape(jax.jit(step), one[0], problem, one[1])[1]
+
+
+def trace_lanes(step: Step, state: Any, problem: Any, hparams: Any) -> None:
+    """Does of :func:`run_in_chunks` with lanes what takes only the shapes of the first states."""
+    _metrics_of(step, state, problem, _spread(hparams, state), len(state.step))
 
 
 @cache  # compiled once for each step, so it must stay the same function
@@ -472,13 +485,17 @@ def _lane_steps(step: Step, keep: str, num_lanes: int | None) -> Step:
 
     def one(now: _Progress, problem: Any, given: Any) -> tuple[_Progress, Any]:
         hparams, until = given
-        after, metrics = step(now.state, problem, hparams)
-        new = _Progress(after, metrics, now.count + 1, now.done)
-        if until is not None:
+
+        def go(now: _Progress) -> _Progress:
+            after, metrics = step(now.state, problem, hparams)
+            if until is None:
+                return replace(now, state=after, metrics=metrics)
             done = jnp.asarray(until(now.state, after, metrics))
-            state = choose(done, now.state, after) if keep == "before" else after
-            new = choose(now.done, now, replace(new, state=state, done=done))
-            new = replace(new, count=now.count + 1)
+            state = either(done, now.state, after) if keep == "before" else after
+            return replace(now, state=state, metrics=metrics, done=done)
+
+        new = go(now) if until is None else lax.cond(now.done, lambda x: x, go, now)
+        new = replace(new, count=now.count + 1)
         return new, (new.count, new.metrics)
 
     if num_lanes is None:
@@ -501,12 +518,12 @@ def _spread(hparams: Any, state: Any) -> Any:
         x.dtype for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)
     ]
 
-    def one(x: Any) -> jax.Array:
+    def one(x: Any) -> np.ndarray:
         x = np.asarray(x)
         x = x.astype(floats[0]) if floats and np.issubdtype(x.dtype, np.floating) else x
-        return jnp.asarray(np.broadcast_to(x, (size, *x.shape[1:])))
+        return np.broadcast_to(x, (size, *x.shape[1:]))
 
-    return jax.tree.map(one, hparams)
+    return to_jax(jax.tree.map(one, hparams))
 
 
 def strong(tree: Any) -> Any:
@@ -576,6 +593,11 @@ def stop_early(
     newest = Best(after, jnp.full_like(held_out, jnp.nan), state.step + 1)
     stopped = state.stopped | (judged & (state.step - best.step >= patience))
     return choose(judged, best, newest), stopped
+
+
+def either(condition: jax.Array, one: Any, other: Any) -> Any:
+    """As :func:`choose`, as one branch, which compiles sooner than a choice of each array."""
+    return lax.cond(condition, lambda: one, lambda: other)
 
 
 def choose(condition: jax.Array, one: Any, other: Any) -> Any:

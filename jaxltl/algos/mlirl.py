@@ -25,6 +25,7 @@ from jaxltl.algos._features import pair_counts
 from jaxltl.algos._features import progress_states as progress_states
 from jaxltl.algos._features import task_features as task_features
 from jaxltl.algos._features import world_features as world_features
+from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.product import Product, allowed_steps, lift_trajectories
 from jaxltl.core.models.restrict import with_allowed
@@ -184,6 +185,7 @@ def make_problem(
                 f'satisfaction_over={weight!r}; choose "initial", "all" or weights.')
         starts = np.asarray(model.initial) > 0
         weight = np.ones(model.state_shape) if weight == "all" else starts
+        weight = to_jax(weight.astype(model.dtype))
     weight = jnp.asarray(weight, model.dtype)
     require_shape("satisfaction_over", weight, model.state_shape)
     start = np.zeros(features.shape[-1]) if start is None else start

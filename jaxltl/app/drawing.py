@@ -13,6 +13,8 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.util import Finalize
 from typing import Any, NamedTuple
 
+from jaxltl.app.programs import few_collections
+
 _PROCESSES = 2
 
 
@@ -69,32 +71,36 @@ def artist(apart: bool) -> Iterator[Artist]:
     """What begins to draw a picture and returns how to get it.
 
     Args:
-      apart: draw in processes of their own, which load matplotlib from now on; else when the
-        picture is asked for.
+      apart: draw in processes of their own, of which the first loads matplotlib from now on, the
+        others with the first picture; else when the picture is asked for.
     """
     if not apart:
         yield lambda picture: lambda: draw(picture)
         return
     # Spawned, since a process with threads, which JAX has, must not fork.
-    with ProcessPoolExecutor(_PROCESSES, get_context("spawn"), _prepare) as pool:
-        for _ in range(_PROCESSES):
-            pool.submit(int)
+    pool = ProcessPoolExecutor(_PROCESSES, get_context("spawn"), _prepare)
 
-        def begin(picture: Drawing) -> Callable[[], bytes]:
-            drawn = pool.submit(draw, picture)
+    def begin(picture: Drawing) -> Callable[[], bytes]:
+        drawn = pool.submit(draw, picture)
+        pool.submit(int)  # so that the next process begins to load if this one is busy
 
-            def finish() -> bytes:
-                try:
-                    return drawn.result()
-                except BrokenExecutor:
-                    return draw(picture)
+        def finish() -> bytes:
+            try:
+                return drawn.result()
+            except BrokenExecutor:
+                return draw(picture)
 
-            return finish
+        return finish
 
+    try:
+        pool.submit(int)
         yield begin
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _prepare() -> None:
+    few_collections()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command itself says what is to be done
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # Else what was loaded is freed piece by piece, for half a second.

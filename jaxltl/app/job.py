@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
 import json
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -42,7 +44,11 @@ def run_seeds(
       seeds: the first, and how many.
       options: for :func:`~jaxltl.algos.learner.run_in_chunks`.
     """
-    states = _first_states(algorithm.init, *seeds, problem, hparams)
+    given = (algorithm.init, *seeds, problem, hparams)
+    wait = compile_beside(_first_states, *given)
+    learner.trace_lanes(algorithm.step, jax.eval_shape(_first_states, *given), problem, hparams)
+    wait()
+    states = _first_states(*given)
     by_name = report and (lambda step, metrics: report(step, vars(metrics)))
     found = learner.run_in_chunks(
         algorithm.step, states, problem, hparams, lanes=True, report=by_name, **options
@@ -56,8 +62,29 @@ def _first_states(
 ) -> Any:
     """A learner's N first states, each from a key of its own; one program."""
     root = jax.random.fold_in(jax.random.key(seed), 1)
-    keys = jax.vmap(functools.partial(jax.random.fold_in, root))(jnp.arange(num_seeds))
-    return jax.vmap(init, (0, None, None))(keys, problem, hparams)
+
+    def first(n: Any) -> Any:
+        return init(jax.random.fold_in(root, n), problem, hparams)
+
+    if num_seeds == 1:  # without vmap, a smaller program
+        return jax.tree.map(lambda x: x[None], first(0))
+    return jax.vmap(first)(jnp.arange(num_seeds))
+
+
+def compile_beside(function: Any, *given: Any) -> Callable[[], None]:
+    """Begins to compile a jitted function in another thread; returns what waits for that.
+
+    A call of the function with as much then finds its program.
+    """
+    lowered = function.lower(*given)
+
+    def work() -> None:
+        with contextlib.suppress(Exception):  # which the call itself will raise
+            lowered.compile()
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    return thread.join
 
 
 def fingerprint(task: Any, seed: int, num_seeds: int) -> str:

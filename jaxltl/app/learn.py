@@ -49,6 +49,7 @@ from jaxltl.app.job import (
     Report,
     about,
     automaton_picture,
+    compile_beside,
     hyperparameters,
     memory_arrays,
     over_seeds,
@@ -60,6 +61,7 @@ from jaxltl.app.job import (
     took,
 )
 from jaxltl.app.job import fingerprint as fingerprint
+from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.product import Product, lift_policy, product
 from jaxltl.core.models.restrict import restrict
@@ -129,7 +131,7 @@ def _problem(setup: Setup, allowed: np.ndarray | None) -> tuple[tuple[str, ...],
     problem = mlirl.make_problem(
         model.mdp if in_world else model, features.values, setup.demonstrations,
         start=start, satisfaction_over=spec.get("satisfaction_over", "initial"),
-        allowed=None if allowed is None else jnp.asarray(allowed),
+        allowed=None if allowed is None else to_jax(allowed),
     )
     return features.names, problem
 
@@ -140,10 +142,12 @@ def _trained(
 ) -> Learned:
     """What N seeds learn of a problem."""
     spec, model = setup.task.learner, setup.model
+    wait = _compile_policy(problem, hparams)
     found, history = run_seeds(
         mlirl, seeds, problem, hparams, report, num_steps=spec.get("steps", STEPS), keep="before",
         until=learner.gradient_vanishes(spec.get("tolerance", _TOLERANCE)), checkpoint=checkpoint,
     )
+    wait()
     states = jax.device_get(dataclasses.replace(found.state, key=None))
     weights = states.parameters
     lanes = [jax.tree.map(lambda x, i=i: x[i], states) for i in range(len(weights))]
@@ -231,6 +235,14 @@ def _policy_and_likelihood(
         policy = _softmax_policy(state.parameters, parts.value, problem, hparams)
         return policy, parts.neg_log_likelihood, parts.status
     return _solved(state.parameters, problem, hparams)
+
+
+def _compile_policy(problem: mlirl.Problem, hparams: mlirl.Hparams) -> Callable[[], None]:
+    """Begins to compile what :func:`_policy_and_likelihood` will want; returns what waits."""
+    if hparams.optimizer != "lbfgs":
+        return lambda: None
+    value = jax.ShapeDtypeStruct(problem.model.state_shape, problem.model.dtype)
+    return compile_beside(_softmax_policy, problem.start, value, problem, hparams)
 
 
 @jax.jit

@@ -1,11 +1,12 @@
 """How the command line has programs compiled: soon, and once.
 
 All of it by the environment, before JAX is imported, where what the user has set there stands. The
-library itself leaves JAX's settings alone.
+library itself leaves JAX's and Python's settings alone.
 """
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import mmap
 import os
@@ -27,6 +28,24 @@ def compile_soon() -> None:
     """Has the compiler spend less on each program."""
     if is_alone() and "XLA_FLAGS" not in os.environ:
         os.environ["XLA_FLAGS"] = known_flags(SOON)
+
+
+def one_thread() -> None:
+    """Has NumPy solve its systems in one thread.
+
+    On some hundred rows others gain nothing, and wait by turning, which holds up whoever is at
+    work beside: the compiler, and the processes that draw.
+    """
+    if "numpy" not in sys.modules:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def few_collections() -> None:
+    """Has Python look for circles of garbage more seldom, in a process of the command's own.
+
+    Imports and traces make many objects that stay; going over them takes a tenth of a short run.
+    """
+    gc.set_threshold(20_000, 50, 100)
 
 
 def keep_programs(wanted: bool) -> None:

@@ -21,7 +21,7 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.labels import distinct_rows, require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.models import kernels, operators
-from jaxltl.core.models.concrete import namespace, to_jax
+from jaxltl.core.models.concrete import is_traced, namespace, to_jax
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.trajectories import Trajectories, require_states
@@ -405,10 +405,15 @@ def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectorie
       ValueError: they are not the world's.
     """
     require_states(trajectories, model.mdp)
-    return _lifted(model, trajectories)
+    if is_traced((model, trajectories)):
+        return _lifted(model, trajectories)
+    state = np.asarray(trajectories.state)
+    lifted = np.where(
+        trajectories.mask, state * model.num_memory + memory_along(model, state), 0)
+    return replace(
+        trajectories, state=to_jax(lifted.astype(np.int32)), state_shape=model.state_shape)
 
 
-@jax.jit  # so that a call outside of jit compiles once, not operation by operation
 def _lifted(model: Product, trajectories: Trajectories) -> Trajectories:
     delta = jnp.asarray(model.automaton.delta)
 

@@ -81,11 +81,10 @@ def make_trajectories(
                 raise ValueError(f"{where}: action {a} is not available in state {s}; "
                                  f"available are {np.flatnonzero(available[s]).tolist()}.")
             state[n, t], action[n, t] = s, a
-    trajectories = Trajectories(
-        jnp.asarray(state, jnp.int32), jnp.asarray(action, jnp.int32),
-        jnp.asarray(length, jnp.int32), state_shape=model.state_shape)
-    _check_steps(model, state, action, np.asarray(length))
-    return trajectories
+    given = (state, action, np.asarray(length, np.int32))
+    _check_steps(model, *given)
+    state, action, length = to_jax(given)
+    return Trajectories(state, action, length, state_shape=model.state_shape)
 
 
 def require_states(trajectories: Trajectories, model: Any) -> None:
