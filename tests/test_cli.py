@@ -419,6 +419,22 @@ except SystemExit:
     assert known_flags({"xla_no_compiler_has_this": "1"}) == ""
 
 
+def test_short_work_solves_its_systems_in_one_thread(tmp_path):
+    code = """
+import os
+from jaxltl.app import programs
+programs.one_thread()
+print(os.environ.get("OPENBLAS_NUM_THREADS"))
+import numpy
+del os.environ["OPENBLAS_NUM_THREADS"]
+programs.one_thread()
+print(os.environ.get("OPENBLAS_NUM_THREADS"))"""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+        assert alone(code, tmp_path).split() == ["1", "None"]  # too late beside NumPy
+    assert alone(code, tmp_path, OPENBLAS_NUM_THREADS="3").split() == ["3", "None"]
+
+
 @pytest.mark.parametrize(("platform", "environment", "place"), [
     ("linux", {}, ".cache"), ("linux", {"XDG_CACHE_HOME": "relative"}, ".cache"),
     ("linux", {"XDG_CACHE_HOME": "/caches"}, "/caches"), ("darwin", {}, "Library/Caches"),

@@ -38,7 +38,11 @@ def test_pair_counts_in_a_product_follow_the_memory():
     world, demonstrations = grid()
     lazy = jl.product(world, TASK)
     assert lazy.num_memory == 3
-    counts = mlirl.pair_counts(lazy, jl.lift_trajectories(lazy, demonstrations))
+    lifted = jl.lift_trajectories(lazy, demonstrations)
+    traced = jax.jit(jl.lift_trajectories)(lazy, demonstrations)
+    jax.tree.map(np.testing.assert_array_equal, lifted, traced)  # the host finds the same
+    counts = mlirl.pair_counts(lazy, lifted)
+    np.testing.assert_array_equal(counts, jax.jit(mlirl.pair_counts)(lazy, traced))
     start = int(lazy.initial_memory[0])
     middle = int(lazy.initial_memory[1])
     expected = np.zeros((6, 3, 4))
