@@ -17,6 +17,7 @@ import numpy as np
 from jaxltl.core.host.bits import LARGEST, BitSets, bit_graph, decided, pack
 from jaxltl.core.host.contract import merged
 from jaxltl.core.host.levels import Edges, components_in_order
+from jaxltl.core.host.mixing import spreads
 from jaxltl.core.host.optimal import leaving_by
 from jaxltl.core.host.relaxation import Cut, Relaxed, Sums, cut, relaxed
 from jaxltl.core.host.rows import Booleans, Integers, starts_of
@@ -25,6 +26,8 @@ from jaxltl.core.host.sparse_graph import end_components
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = 1e-290
+_STARTS = 8  # states from one of which few steps
+_MET = 4096  # lead to so many, where the graph is shallow and sweeps end soon
 _MOST = 2**27  # transitions of a component that is written out, at most
 
 
@@ -114,7 +117,7 @@ def layered(
       The bounds; None where sweeps would take long, or could not prove them.
     """
     num_memory = world.delta.shape[0]
-    if num_memory > LARGEST:
+    if num_memory > LARGEST or not _mixes(world):
         return None
     graph = bit_graph(
         world.successor, world.used, world.available, world.delta, world.letter, world.allowed)
@@ -124,6 +127,17 @@ def layered(
         return None
     search = _Search(world, sets, 1 if maximize else -1, tolerance)
     return search.found() if search.solve() else None
+
+
+def _mixes(world: World) -> bool:
+    """Whether few steps from some state lead to many others."""
+    size = world.letter.size
+
+    def follow(states: Any) -> Any:
+        return world.successor[states][world.used[states]]
+
+    return any(spreads(follow, np.array([i * size // _STARTS]), size, _MET)
+               for i in range(_STARTS))
 
 
 class _Search:

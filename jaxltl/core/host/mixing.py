@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -85,18 +86,34 @@ def _without_loops(problem: Transient) -> tuple[Floats, Booleans | None]:
 
 def _spreads(mdp: HostMDP, open_: Booleans) -> bool:
     """Whether few steps from a state lead to many, as they do where elimination fills."""
-    seen: Any = np.zeros(mdp.num_states, bool)
-    node = np.flatnonzero(open_)
-    frontier, met = node[node.size // 2 : node.size // 2 + 1], 1
-    seen[frontier] = True
-    first = mdp.entry_start[mdp.row_start]
+    node, first = np.flatnonzero(open_), mdp.entry_start[mdp.row_start]
+
+    def follow(states: Any) -> Any:
+        after = mdp.successor[spans(first[states], first[states + 1] - first[states])]
+        return after[open_[after]]
+
+    return spreads(follow, node[node.size // 2 : node.size // 2 + 1], open_.size)
+
+
+def spreads(
+    follow: Callable[[Any], Any], start: Any, num_states: int, met: int | None = None
+) -> bool:
+    """Whether few steps from a state lead to many others.
+
+    Args:
+      follow: the states to which some states ``int[M]`` lead, maybe repeatedly.
+      start: ``int[1]``.
+      num_states: S.
+      met: to how many; default 4096.
+    """
+    left = (_MET if met is None else met) - 1
+    seen: Any = np.zeros(num_states, bool)
+    seen[start] = True
     for _ in range(_STEPS):
-        after = mdp.successor[spans(first[frontier], first[frontier + 1] - first[frontier])]
-        frontier = np.unique(after[open_[after] & ~seen[after]])
-        seen[frontier] = True
-        met += frontier.size
-        if met >= _MET:
+        if left <= 0:
             return True
-        if not frontier.size:
-            return False
-    return False
+        after = follow(start)
+        start = np.unique(after[~seen[after]])
+        seen[start] = True
+        left -= start.size
+    return left <= 0

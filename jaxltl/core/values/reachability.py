@@ -81,7 +81,8 @@ def reachability_probability(
     (Baier and Katoen 2008, section 10.6). Small concrete models are solved on the host by
     elimination and policy iteration, and nothing is compiled. Other optima: interval iteration
     (Haddad and Monmege 2018) with maximal end components collapsed and each bound rounded
-    outwards. Sparse models are solved by :mod:`jaxltl.core.host.optimal`.
+    outwards. Sparse models are solved by :mod:`jaxltl.core.host.optimal`, large products whose
+    worlds mix by :mod:`jaxltl.core.host.layers`.
 
     Args:
       model: the model.
@@ -252,11 +253,13 @@ def _by_layers(model: Any, target: Any, tolerance: Any, objective: str) -> Solut
     if not isinstance(world, MDP) or model.label_on != "entry" or model.num_states <= QUICK_LIMIT:
         return None
     eps = float(np.finfo(np.dtype(model.dtype)).eps)
-    width = max(64 * eps, 1e-11) if tolerance is None else 2 * float(tolerance) - 4 * eps
+    width = max(4 * eps, 1e-11) if tolerance is None else 2 * float(tolerance) - 4 * eps
     beside = World(
         np.asarray(world.successor), support(world), np.asarray(world.probability),
         np.asarray(world.available), np.asarray(model.automaton.delta), np.asarray(model.letter),
         None if model.allowed is None else np.asarray(model.allowed))
+    if not width > 0:
+        return None
     found = layered(beside, np.asarray(target), maximize=objective == "max", tolerance=width)
     if found is None:
         return None
