@@ -25,6 +25,7 @@ from jaxltl.algos import (
     cce,
     checkpoint,
     feasible,
+    interval_learning,
     learner,
     maximin_q,
     mlirl,
@@ -226,6 +227,13 @@ def parameters():
     return Case(feasible, problem, feasible.Hparams(), feasible.Hparams(learning_rate=0.01))
 
 
+def intervals():
+    """Slips that lose, beside tries that may be repeated."""
+    problem = interval_learning.make_problem(world()[0], "!r U g")
+    setting = partial(interval_learning.Hparams, num_runs=2, length=5)
+    return Case(interval_learning, problem, setting(), setting(strength=1.0, exploration=0.5))
+
+
 LEARNERS = {
     "toy": lambda: Case(TOY, jnp.arange(3.0), 0.1, 0.2),
     "mlirl-world": mlirl_world,
@@ -239,6 +247,7 @@ LEARNERS = {
     "cce": cross_entropy,
     "cloning": cloning,
     "feasible": parameters,
+    "intervals": intervals,
 }
 
 by_learner = pytest.mark.parametrize("name", LEARNERS)
@@ -422,7 +431,7 @@ REWARDS = {"mlirl-world": "features", "mlirl-product": "features", "rmax": "rewa
            "q-generalized": "reward", "q-maximin": "reward"}
 
 
-@pytest.mark.parametrize("name", [*REWARDS, "todirl"])
+@pytest.mark.parametrize("name", [*REWARDS, "todirl", "intervals"])
 def test_what_is_not_available_changes_nothing(name):
     """Bit for bit: what was learned, and all figures."""
     module, problem, hparams, _ = case(name)

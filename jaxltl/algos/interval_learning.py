@@ -1,0 +1,573 @@
+"""Robust anytime learning: a task in an unknown world, by intervals that follow the data.
+
+The graph of a Markov decision process is known, its probabilities are not (Suilen, Simao, Parker
+and Jansen 2022). Every choice has intervals, which each step's samples update; between them nature
+picks against the task and for it, which gives a pessimistic and an optimistic value. Sampled is
+what is best for the optimistic one, and with a small probability any move; where the task can be
+done almost surely, every policy on the way does it, by the graph.
+
+What the graph decides is decided once (:func:`make_problem`): where the task is won almost surely,
+where it is lost, and the end components between, in which a run may stay but wins nothing. Their
+states share the value of the best way out. So both values are the only solutions of their
+equations, and sweeps may go on from the last values however the intervals have moved.
+
+The world is touched through ``sample_successor`` only. Values have shape ``[S, Q]``: S states of
+the world, Q of the task's automaton, which reads the label of the state that is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+from jax.tree_util import Partial
+
+from jaxltl.algos import learner, pac, splitmix
+from jaxltl.algos.play import cumulative, draw, successor_slot, take
+from jaxltl.core.automata.translate import Task
+from jaxltl.core.graphs.acceptance import accepting_bottom_components, accepting_end_components
+from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor
+from jaxltl.core.graphs.end_components import bottom_components, end_components
+from jaxltl.core.models.convert import to_padded, to_sparse
+from jaxltl.core.models.game import as_game
+from jaxltl.core.models.mdp import support
+from jaxltl.core.models.operators import forall_successor, sample_successor
+from jaxltl.core.models.product import Product, product
+from jaxltl.core.types import Status, status_code
+from jaxltl.core.values.contest import chances
+from jaxltl.core.values.data_guarantee import DataGuarantee, learn_guarantee
+
+INTERVALS = ("linear", "confidence")
+
+
+@struct.dataclass
+class Problem:
+    """A world with a task; made by :func:`make_problem`.
+
+    Attributes:
+      model: the world beside the task's automaton; of its probabilities the learner uses which are
+        positive, and samples.
+      won: ``bool[S, Q]``, from where the task can be done almost surely.
+      lost: ``bool[S, Q]``, from where it cannot be done at all.
+      allowed: ``bool[S, Q, A]``, the moves that are tried; where the task is won, those of which
+        all may be made for ever, and it is done almost surely.
+      component: ``int32[S * Q]``, the end component of each undecided state, or its own number.
+      staying: ``bool[S, Q, A]``, the moves of undecided states that stay in it.
+      start_table: where runs start, for drawing.
+      num_claims: how many probabilities have to be known at once.
+    """
+
+    model: Product
+    won: jax.Array
+    lost: jax.Array
+    allowed: jax.Array
+    component: jax.Array
+    staying: jax.Array
+    start_table: jax.Array
+    num_claims: jax.Array
+
+
+@struct.dataclass
+class Hparams:
+    """How to learn. Numbers are traced.
+
+    Attributes:
+      intervals: ``"linear"``: linearly updating intervals, which come together soon and forget a
+        wrong prior; ``"confidence"``: intervals that hold all true probabilities at all times with
+        a chance of `confidence`, by which the pessimistic value never exceeds the truth, and the
+        optimistic one is never below; static.
+      confidence: in (0, 1); for ``"confidence"``.
+      least: the smallest probability that a transition of the graph is taken to have, positive.
+      strength, most_strength: as how many samples the first linear intervals count, at least where
+        data contradict them, and where they do not; positive, the second not below the first.
+      exploration: the probability of making any allowed move, in (0, 1].
+      restart: the probability with which a run starts anew before a move where the task is decided.
+      discount: in (0, 1); among moves of one optimistic value those are made that lead soonest to
+        where the task is won.
+      sweeps: of each value in a step.
+      tolerance: the change by the last sweep up to which values count as settled.
+      num_runs: that a step samples; static.
+      length: moves of each; static.
+    """
+
+    intervals: str = struct.field(pytree_node=False, default="linear")
+    confidence: jax.Array | float = 0.9
+    least: jax.Array | float = 1e-4
+    strength: jax.Array | float = 5.0
+    most_strength: jax.Array | float = 10.0
+    exploration: jax.Array | float = 0.1
+    restart: jax.Array | float = 0.5
+    discount: jax.Array | float = 0.99
+    sweeps: jax.Array | int = 20
+    tolerance: jax.Array | float = 1e-4
+    num_runs: int = struct.field(pytree_node=False, default=4)
+    length: int = struct.field(pytree_node=False, default=64)
+
+
+@struct.dataclass
+class State:
+    """What has been seen, and what is made of it.
+
+    Attributes:
+      key: of the whole run.
+      step: steps made.
+      samples: transitions seen; near 2^31 a run is over, and steps see no more.
+      counts: ``int32[S, A, K]``, how often each was.
+      lower, upper: ``float[S, A, K]``, the intervals; 0 at what is no transition.
+      pessimistic, optimistic: ``float[S, Q]``, the largest probability of the task with nature
+        against it and for it, as far as sweeps have come.
+      pace: ``float[S, Q]``, how soon the task may be won, discounted.
+      best: ``bool[S, Q, A]``, the moves that are preferred.
+      residual: the largest change by the last sweep.
+    """
+
+    key: jax.Array
+    step: jax.Array
+    samples: jax.Array
+    counts: jax.Array
+    lower: jax.Array
+    upper: jax.Array
+    pessimistic: jax.Array
+    optimistic: jax.Array
+    pace: jax.Array
+    best: jax.Array
+    residual: jax.Array
+
+
+@struct.dataclass
+class Metrics:
+    """Figures after a step.
+
+    Attributes:
+      samples: so far.
+      lower, upper: the pessimistic and the optimistic value at the start.
+      residual: see :class:`State`.
+      status: CONVERGED where values have settled; MAX_STEPS if not, or if all samples that can be
+        counted have been seen.
+    """
+
+    samples: jax.Array
+    lower: jax.Array
+    upper: jax.Array
+    residual: jax.Array
+    status: jax.Array
+
+
+# --- problems, on the host ------------------------------------------------------------------
+
+
+def make_problem(world: Any, task: Task) -> Problem:
+    """A checked :class:`Problem`: the product with the task, and what its graph decides.
+
+    Args:
+      world: an MDP or a sparse model; its labels, start and graph are known to the learner.
+      task: any formula, its text, or an automaton over the letters that occur. For a probability
+        to be made small, negate the formula.
+
+    Raises:
+      ValueError: the world is a game or no model, or the formula has unknown labels.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import make_mdp
+      >>> world = make_mdp([[[1, 2], [0, 1]], [[1, 0], [1, 0]], [[2, 0], [2, 0]]],
+      ...                  [[[.7, .3], [.5, .5]], [[1, 0], [1, 0]], [[1, 0], [1, 0]]],
+      ...                  initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["home"])
+      >>> problem = make_problem(world, "F home")
+      >>> problem.won[0].tolist()  # by trying the second move again and again
+      [True, True]
+      >>> problem.allowed[0, 0].tolist()
+      [False, True]
+    """
+    system = np.asarray(as_game(world).system)
+    if hasattr(world, "system") and not system.all():
+        raise ValueError(
+            "interval_learning plays alone; of a game with an environment learn by "
+            "jaxltl.algos.rmax, whose evidence(confidence=) bounds what counts say."
+        )
+    # Through the sparse form a successor stands once in each choice, as it is seen.
+    world = to_padded(to_sparse(getattr(world, "mdp", world) if system.all() else world))
+    model = product(world, task, label_on="exit")
+    accepting = accepting_end_components(model)
+    won = almost_surely_reaching(model, accepting.region).region
+    lost = ~attractor(model, won).region
+    between = end_components(model, ~won & ~lost)
+    safe = forall_successor(model, won) & model.available & won[..., None]
+    inside = jnp.where(accepting.region[..., None], accepting.inside, safe)
+    outcomes = support(world).sum(-1)
+    claims = np.where(outcomes > 2, outcomes, outcomes > 1).sum()
+    return Problem(
+        model=model,
+        won=won,
+        lost=lost,
+        allowed=jnp.where(won[..., None], inside, model.available),
+        component=jnp.asarray(between.component, jnp.int32).reshape(-1),
+        staying=between.inside,
+        start_table=jnp.asarray(cumulative(np.asarray(world.initial, float))),
+        num_claims=jnp.asarray(max(int(claims), 1), jnp.int32),
+    )
+
+
+# --- the learner ----------------------------------------------------------------------------
+
+
+@jax.jit
+def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """Nothing seen: every transition of a choice may have nearly all of its probability.
+
+    Raises:
+      ValueError: unknown `intervals`, or runs without moves.
+    """
+    _check(hparams)
+    world = problem.model.mdp
+    used = world.successor_probability > 0
+    alone = used.sum(-1, keepdims=True) == 1
+    least = jnp.asarray(hparams.least, world.dtype)
+    lower = jnp.where(alone, 1, least) * used
+    upper = jnp.where(alone, 1, 1 - least) * used
+    lower, upper = _with_room(lower, upper)
+    won = problem.won.astype(world.dtype)
+    return State(
+        key=key,
+        step=jnp.int32(0),
+        samples=jnp.int32(0),
+        counts=jnp.zeros(used.shape, jnp.int32),
+        lower=lower,
+        upper=upper,
+        pessimistic=won,
+        optimistic=1 - problem.lost.astype(world.dtype),
+        pace=won,
+        best=problem.allowed,
+        residual=jnp.asarray(jnp.inf, world.dtype),
+    )
+
+
+def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """Some runs from the start, the intervals after them, and sweeps from the last values."""
+    _check(hparams)
+    size = hparams.num_runs * hparams.length
+    more = state.samples <= learner.MOST - size
+    new = _sampled(state, problem, hparams) * more
+    counts = state.counts + new
+    update = _linear if hparams.intervals == "linear" else _confident
+    lower, upper = update(state, counts, new, problem, hparams)
+    seen = jnp.any(new > 0, axis=-1, keepdims=True)
+    seen &= jnp.sum(problem.model.mdp.successor_probability > 0, -1, keepdims=True) > 1
+    state = replace(
+        state,
+        step=state.step + 1,
+        samples=state.samples + size * more,
+        counts=counts,
+        lower=jnp.where(seen, lower, state.lower),
+        upper=jnp.where(seen, upper, state.upper),
+    )
+    state = _solved(state, problem, hparams)
+    return state, measure(state, problem, hparams)
+
+
+run, train, run_until, train_until = learner.bind(init, step)
+
+
+def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
+    """The :class:`Metrics` of a state."""
+    model = problem.model
+    more = state.samples <= learner.MOST - hparams.num_runs * hparams.length
+    settled = (state.residual <= hparams.tolerance) & more
+    return Metrics(
+        samples=state.samples,
+        lower=jnp.sum(model.initial * state.pessimistic),
+        upper=jnp.sum(model.initial * state.optimistic),
+        residual=state.residual,
+        status=status_code(settled, jnp.isfinite(state.residual)),
+    )
+
+
+def known_within(width: chex.Numeric) -> learner.Until:
+    """A condition for :func:`run_until`: the values have settled, so close to each other."""
+    return Partial(_known_within, width)
+
+
+def _known_within(width: Any, before: State, after: State, metrics: Metrics) -> jax.Array:
+    return (metrics.upper - metrics.lower <= width) & (metrics.status == Status.CONVERGED)
+
+
+def behavior(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """What is sampled, ``float[S, Q, A]``: preferred moves, and now and then any allowed one."""
+    dtype = problem.model.dtype
+    return pac.hat_strategy(state.best, problem.allowed, hparams.exploration).astype(dtype)
+
+
+def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """What was learned, ``float[S, Q, A]``: best with nature against it.
+
+    Where the task is won almost surely it makes all allowed moves alike, and so wins almost surely.
+    In an end component between it makes the best moves out, and those that stay.
+    """
+    nature = jnp.full(1, -1, state.lower.dtype)
+    moves = _moves(problem, state.pessimistic[None], state.lower, state.upper, nature)[0]
+    best = _backed_up(problem, moves)[..., None]
+    out = problem.allowed & ~problem.staying & (moves >= best)
+    used = jnp.where(problem.won[..., None], problem.allowed, out | problem.staying)
+    used = jnp.where(problem.lost[..., None], problem.allowed, used)
+    return used / jnp.maximum(used.sum(-1, keepdims=True), 1).astype(moves.dtype)
+
+
+def guarantee(state: State, problem: Problem, confidence: float, **options: Any) -> DataGuarantee:
+    """What the counts guarantee of the task, certified, on the host; however they were sampled.
+
+    Of the graph, and of nothing else that the learner assumes. Each look has the confidence, and
+    so do all looks at once.
+
+    Args:
+      state: one of them; of vmapped seeds, ``jax.tree.map(itemgetter(i), states)``.
+      problem: of it.
+      confidence: in (0, 1).
+      options: `tolerance` and the like of
+        :func:`~jaxltl.core.values.data_guarantee.learn_guarantee`.
+
+    Returns:
+      :class:`~jaxltl.core.values.data_guarantee.DataGuarantee`, by anytime intervals.
+
+    Raises:
+      ValueError: the confidence.
+    """
+    world = problem.model.mdp
+    counts = np.asarray(state.counts)[support(world)]
+    return learn_guarantee(
+        world, counts, problem.model.automaton, confidence, method="anytime", **options
+    )
+
+
+def wins_almost_surely(problem: Problem, play: jax.Array) -> bool:
+    """Whether a memoryless policy does the task almost surely wherever that is possible.
+
+    On the graph: it stays where the task is won, and all components in which it can end there
+    are accepting.
+
+    Args:
+      problem: the problem.
+      play: ``float[S, Q, A]``; only what is positive counts.
+    """
+    model, used = problem.model, play > 0
+    kept = used.any(-1) & (~used | forall_successor(model, problem.won)).all(-1)
+    ends = bottom_components(model, used).inside.any(-1)
+    good = kept & (~ends | accepting_bottom_components(model, used.astype(model.dtype)))
+    return bool(jnp.all(good | ~problem.won))
+
+
+# --- samples ----------------------------------------------------------------------------------
+
+
+class _Rules(NamedTuple):
+    """What the moves of a step need."""
+
+    problem: Problem
+    best: jax.Array
+    explore: jax.Array
+    restart: jax.Array
+    start: jax.Array
+    next_memory: jax.Array
+
+
+def _sampled(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """How often transitions came in a step's runs, ``int32[S, A, K]``."""
+    model = problem.model
+    dtype, num_runs = model.dtype, hparams.num_runs
+    key = learner.step_key(state)
+    stream = splitmix.streams(jax.random.fold_in(key, 0), (num_runs,))
+    rules = _Rules(
+        problem,
+        state.best,
+        jnp.asarray(hparams.exploration, dtype),
+        jnp.asarray(hparams.restart, dtype),
+        jnp.asarray(model.automaton.initial, jnp.int32),
+        model.next_memory,
+    )
+    begin = draw(problem.start_table, splitmix.words(stream, jnp.uint32(0)))
+    places = begin, jnp.broadcast_to(rules.start, (num_runs,))
+    keys = jax.random.split(jax.random.fold_in(key, 1), hparams.length)
+
+    def move(places: Any, given: Any) -> Any:
+        number, key = given
+        words = [splitmix.words(stream, 4 * number + i) for i in range(1, 5)]
+        return _move(rules, places, words, jax.random.split(key, num_runs))
+
+    number = jnp.arange(hparams.length, dtype=jnp.uint32)
+    _, (s, a, k) = lax.scan(move, places, (number, keys))
+    return jnp.zeros(state.counts.shape, jnp.int32).at[s, a, k].add(1)
+
+
+def _move(rules: _Rules, places: Any, words: Any, keys: jax.Array) -> Any:
+    """A move of each run, and which transitions these were."""
+    problem, (s, q) = rules.problem, places
+    world, dtype = problem.model.mdp, problem.model.dtype
+    decided = take(problem.won, (s, q)) | take(problem.lost, (s, q))
+    anew = decided & (splitmix.uniform(words[0], dtype) < rules.restart)
+    s = jnp.where(anew, draw(problem.start_table, words[1]), s)
+    q = jnp.where(anew, rules.start, q)
+    explore = splitmix.uniform(words[2], dtype) < rules.explore
+    moves = jnp.where(explore[:, None], take(problem.allowed, (s, q)), take(rules.best, (s, q)))
+    total = jnp.cumsum(moves.astype(dtype), axis=-1)
+    drawn = splitmix.uniform(words[3], dtype)[:, None] * total[:, -1:]
+    a = jnp.argmax(total > drawn, axis=-1).astype(jnp.int32)
+    t = jax.vmap(sample_successor, (None, 0, 0, 0))(world, keys, s, a)
+    slot = successor_slot(as_game(world), s, a, t)
+    return (t, take(rules.next_memory, (s, q))), (s, a, slot)
+
+
+# --- intervals --------------------------------------------------------------------------------
+
+
+def _linear(
+    state: State, counts: jax.Array, new: jax.Array, problem: Problem, hparams: Hparams
+) -> tuple[jax.Array, jax.Array]:
+    """Linearly updating intervals (Suilen et al. 2022, definition 4; Walter and Augustin 2009).
+
+    ``(n P + k) / (n + N)`` for both ends P, with the larger strength n if all of a choice's
+    frequencies ``k / N`` are on the right side of P, and the smaller one if any is not. Strengths
+    grow by N.
+    """
+    dtype = state.lower.dtype
+    before = jnp.sum(counts - new, -1, keepdims=True).astype(dtype)
+    weak, strong = before + hparams.strength, before + hparams.most_strength
+    number = jnp.sum(new, -1, keepdims=True).astype(dtype)
+    share = new / jnp.maximum(number, 1)
+
+    def end(prior: jax.Array, agrees: jax.Array) -> jax.Array:
+        n = jnp.where(jnp.all(agrees, -1, keepdims=True), strong, weak)
+        return (n * prior + new) / (n + number)
+
+    lower = end(state.lower, share >= state.lower)
+    return _with_room(lower, end(state.upper, share <= state.upper))
+
+
+def _confident(
+    state: State, counts: jax.Array, new: jax.Array, problem: Problem, hparams: Hparams
+) -> tuple[jax.Array, jax.Array]:
+    """Intervals of all times at once, in closed form.
+
+    The set of :func:`~jaxltl.core.host.binomial.anytime` lies in ``n kl(k / n, p) <= log(2 sqrt(n)
+    / failure)``, since Jeffreys' mixture is at least ``1 / (2 sqrt(n))`` of any likelihood
+    (Willems, Shtarkov and Tjalkens 1995). That is enclosed by ``kl(a, b) >= 2 (a - b)^2`` and
+    ``kl(a, b) >= (a - b)^2 / (2 max(a, b))``, of the probabilities and of what is left of one. As
+    all these sets hold at once, so does what they have in common.
+    """
+    dtype = state.lower.dtype
+    used = state.upper > 0
+    failure = (1 - jnp.asarray(hparams.confidence, dtype)) / problem.num_claims.astype(dtype)
+    total = jnp.sum(counts, -1, keepdims=True).astype(dtype)
+    n = jnp.maximum(total, 1)
+    share, c = counts / n, (jnp.log(2 * jnp.sqrt(n)) - jnp.log(failure)) / n
+    lower, upper = _least(share, c), 1 - _least(1 - share, c)
+    floor = jnp.minimum(jnp.asarray(hparams.least, dtype), upper)
+    lower = jnp.where(used, jnp.maximum(jnp.maximum(lower, floor), state.lower), 0)
+    upper = jnp.where(used, jnp.minimum(upper, state.upper), 0)
+    return _with_room(lower, upper)
+
+
+def _least(a: jax.Array, c: jax.Array) -> jax.Array:
+    """A number below all b with ``kl(a, b) <= c``."""
+    other = jnp.maximum(1 - a, 0)
+    near = jnp.minimum(jnp.sqrt(c / 2), jnp.sqrt(2 * c * a))
+    return jnp.maximum(a - jnp.minimum(near, c + jnp.sqrt(c * c + 2 * c * other)), 0)
+
+
+def _with_room(lower: jax.Array, upper: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Ends between which there is a distribution, which data may deny, and rounding."""
+    lower = lower / jnp.maximum(jnp.sum(lower, -1, keepdims=True), 1)
+    upper = jnp.maximum(upper, lower)
+    total = jnp.sum(upper, -1, keepdims=True)
+    short = (total > 0) & (total < 1)
+    return lower, jnp.minimum(jnp.where(short, upper / jnp.where(short, total, 1), upper), 1)
+
+
+# --- values -------------------------------------------------------------------------------------
+
+
+def _solved(state: State, problem: Problem, hparams: Hparams) -> State:
+    """The values after some sweeps, and the moves that are preferred by the last of them."""
+    nature = jnp.asarray([-1, 1, 1], state.lower.dtype)
+
+    def sweep(_: Any, now: Any) -> Any:
+        values, _, _ = now
+        moves = _moves(problem, values, state.lower, state.upper, nature)
+        known = jax.vmap(partial(_backed_up, problem))(moves[:2])
+        pace, best = _soonest(problem, hparams, moves[1], known[1], moves[2])
+        change = jnp.max(jnp.abs(known - values[:2]))
+        return jnp.concatenate([known, pace[None]]), best, change
+
+    values = jnp.stack([state.pessimistic, state.optimistic, state.pace])
+    values, best, change = lax.fori_loop(
+        0, hparams.sweeps, sweep, (values, state.best, state.residual)
+    )
+    return replace(
+        state,
+        pessimistic=values[0],
+        optimistic=values[1],
+        pace=values[2],
+        best=best,
+        residual=change,
+    )
+
+
+def _moves(
+    problem: Problem, values: jax.Array, lower: jax.Array, upper: jax.Array, nature: jax.Array
+) -> jax.Array:
+    """Each move's expectation of V values, ``float[V, S, Q, A]``.
+
+    Args:
+      problem: whose graph it is.
+      values: ``float[V, S, Q]``.
+      lower, upper: ``float[S, A, K]``.
+      nature: ``float[V]``, 1 where it makes a value large, -1 where small.
+    """
+    world: Any = problem.model.mdp
+    next_memory = problem.model.next_memory[:, :, None, None]
+    reached = values[:, world.successor[:, None], next_memory]
+    shape, width = reached.shape, reached.shape[-1]
+    low, high = (jnp.broadcast_to(x[:, None], shape).reshape(-1, width) for x in (lower, upper))
+    key = -nature[:, None, None, None, None] * reached
+    share = chances(low, high, key.reshape(-1, width))
+    return jnp.sum(share.reshape(shape) * reached, axis=-1)
+
+
+def _backed_up(problem: Problem, moves: jax.Array) -> jax.Array:
+    """The best move's value; that of the best way out of a component; 1 and 0 where decided."""
+    out = problem.allowed & ~problem.staying
+    best = jnp.max(jnp.where(out, moves, 0), axis=-1).reshape(-1)
+    best = jnp.zeros_like(best).at[problem.component].max(best)
+    best = jnp.minimum(take(best, problem.component), 1).reshape(problem.won.shape)
+    return _decided(problem, best)
+
+
+def _decided(problem: Problem, value: jax.Array) -> jax.Array:
+    return jnp.where(problem.won, 1, jnp.where(problem.lost, 0, value))
+
+
+def _soonest(
+    problem: Problem, hparams: Hparams, moves: jax.Array, value: jax.Array, ahead: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """How soon the task may be won by moves of the best optimistic value, and which are soonest."""
+    slack = 64 * jnp.finfo(moves.dtype).eps
+    near = problem.allowed & (problem.staying | (moves >= value[..., None] - slack))
+    near = jnp.where((problem.won | problem.lost)[..., None], problem.allowed, near)
+    ahead = jnp.where(near, ahead, -1)
+    most = jnp.max(ahead, axis=-1)
+    best = near & (ahead >= (most * (1 - slack))[..., None])
+    best = jnp.where(problem.won[..., None], problem.allowed, best)
+    pace = jnp.asarray(hparams.discount, moves.dtype) * jnp.maximum(most, 0)
+    return _decided(problem, pace), best
+
+
+def _check(hparams: Hparams) -> None:
+    if hparams.intervals not in INTERVALS:
+        raise ValueError(f'intervals={hparams.intervals!r}; choose "linear" or "confidence".')
+    for name in ("num_runs", "length"):
+        if getattr(hparams, name) < 1:
+            raise ValueError(f"{name}={getattr(hparams, name)}; it must be at least 1.")
