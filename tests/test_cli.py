@@ -325,7 +325,7 @@ def test_check(write):  # noqa: F811
 
 def test_the_examples_are_sound():
     for name in ("two_goals", "slippery_delivery", "one_demonstration", "patrol_two",
-                 "patrol_anywhere"):
+                 "patrol_anywhere", "log_patrol"):
         assert run("check", f"examples/{name}.toml").stdout.startswith("ok: ")
 
 

@@ -1,4 +1,4 @@
-"""What the README, the page on intervals and the notebooks show runs as it stands."""
+"""What the README, the pages on intervals and on data and the notebooks show runs as it stands."""
 
 import os
 import re
@@ -15,10 +15,10 @@ from jaxltl.cli import main
 ROOT = Path(__file__).parent.parent
 
 
-def test_the_readme_example_runs(tmp_path, monkeypatch):
+def test_the_readme_example_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert len(blocks) == 3
+    assert len(blocks) == 5
     names: dict = {}
     for code in blocks:
         exec(compile(code, "README.md", "exec"), names)
@@ -26,6 +26,9 @@ def test_the_readme_example_runs(tmp_path, monkeypatch):
     assert names["model"].num_transitions == names["coin"].num_transitions == 6
     assert names["metrics"].loss.shape == (4, 20)
     assert (names["metrics"].loss[:, -1] < names["metrics"].loss[:, 0]).all()
+    printed = capsys.readouterr().out
+    for told in ("P >= 0.938 with confidence 0.95\n", "no policy has more than 0.986\n", "\n0.83333"):
+        assert told in printed
 
 
 @pytest.mark.notebook
@@ -59,3 +62,19 @@ def test_the_page_on_intervals_runs(tmp_path, monkeypatch, capsys):
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     exec(compile(code, "intervals.md", "exec"), {})
     assert capsys.readouterr().out == "0.4 [0.4 0.6 1.  1. ]\n[0.7]\n"
+
+
+def test_the_page_on_data_shows_what_the_command_prints(tmp_path, monkeypatch):
+    """And the log of the example is what the script on the page writes."""
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "data.md").read_text()
+    (script,) = (x for x in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "WORLD" in x)
+    exec(compile(script, "data.md", "exec"), {})
+    log = (ROOT / "examples" / "log_patrol.csv").read_text()
+    assert (tmp_path / "log_patrol.csv").read_text() == log
+    monkeypatch.chdir(ROOT)
+    (shell,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    done = CliRunner().invoke(main, shlex.split(shell.replace("\\\n", ""))[1:])
+    assert done.exit_code == 0, done.output
+    shown = re.search(r"\n```\n(P >= .*?)```", page, re.DOTALL)[1]
+    assert re.sub(r"\n  [0-9.]+ s\n", "\n", done.stdout) == shown
