@@ -3,6 +3,7 @@
 import gzip
 import json
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -343,7 +344,7 @@ def test_storm_reads_fractions_in_the_same_order(tmp_path):
     path.write_bytes(interval_archive("rational-interval", 256, THIRDS))
     there = storm.build_model_from_umb(str(path))  # its matrix does not outlive it
     ends = [
-        (float(e.value.lower()), float(e.value.upper()))
+        tuple(float(Fraction(str(x))) for x in (e.value.lower(), e.value.upper()))
         for r in range(there.transition_matrix.nr_rows)
         for e in there.transition_matrix.get_row(r)
     ]
