@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 from jax import lax
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from jaxltl.core.values.linear import solve_linear
 
@@ -41,6 +43,9 @@ def implicit(
       >>> round(slope.item(), 3)
       4.0
     """
+    if solve is None and transpose_solve is None:
+        return _seldom_differentiated(operator, lax.stop_gradient(fixed_point))
+
     def forward(jacobian: Operator, b: jax.Array) -> jax.Array:
         return solve_linear(jacobian, b) if solve is None else solve(b)
 
@@ -56,3 +61,30 @@ def implicit(
         solve=lambda _, start: start,
         tangent_solve=solve_tangent,
     )
+
+
+def _seldom_differentiated(operator: Operator, fixed_point: jax.Array) -> jax.Array:
+    """The same with :func:`~jaxltl.core.values.linear.solve_linear`.
+
+    That is traced only where a derivative is taken, which ``lax.custom_root`` does in any case:
+    half of a solver's trace.
+    """
+    closed = jax.make_jaxpr(operator)(fixed_point)
+
+    def image(constants: list[Any], v: jax.Array) -> jax.Array:
+        return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))(v)[0]
+
+    @jax.custom_jvp
+    def root(constants: list[Any], v: jax.Array) -> jax.Array:
+        return v
+
+    @root.defjvp
+    def _(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+        constants, v = primals
+        v = root(constants, v)
+        _, change = jax.jvp(lambda c: image(c, v), (constants,), (tangents[0],))
+        _, jacobian = jax.linearize(lambda x: image(constants, x), v)
+        return v, lax.custom_linear_solve(
+            lambda x: x - jacobian(x), change, solve=solve_linear, transpose_solve=solve_linear)
+
+    return root(closed.consts, fixed_point)

@@ -335,9 +335,9 @@ def _horizon(rows: Any, play: _Play, moves, live, per: str, defined, max_steps) 
 
     With tau the expected number of undiscounted moves before the next discounted one, at most,
     and L its maximum: ``h = (1 + discount * L) / (1 - discount) + tau``. It is the value of the
-    play in which both players want it long.
+    play in which both players want it long. Where each move is discounted it is one number.
     """
-    tau = jnp.zeros(live.shape, play.discount.dtype)
+    tau = jnp.zeros((), play.discount.dtype)
     if per == "system_move":
         free = live & ~play.system
         slow = play._replace(system=jnp.ones_like(live))
@@ -352,7 +352,7 @@ def _horizon(rows: Any, play: _Play, moves, live, per: str, defined, max_steps) 
             rows, lambda over, q, given: _chosen(over, q, given[0]), judge,
             newton.Backup(_gains(rows, slow, ones, moves, free), free.astype(tau.dtype),
                           jnp.zeros_like(play.discount), (slow, defined)),
-            tau, max_steps=max_steps)
+            jnp.zeros(live.shape, tau.dtype), max_steps=max_steps)
         growth = jnp.max(after - tau)
         tau = jnp.where(growth < 0.5, tau / (1 - growth), jnp.inf)
     horizon = (1 + play.discount * jnp.max(tau)) / (1 - play.discount) + tau
@@ -443,18 +443,26 @@ def _solve(
         _gains(rows, play, over.columns(reward), columns, flat), rate.ravel(),
         jnp.zeros_like(discount), play)
     zero = jnp.zeros(flat.shape, game.dtype)
+    policies = method == "policy_iteration"
     if method == "strategy_iteration":
         value, image, num_steps = _strategy_iteration(rows, numbers, zero, max_steps)
     else:
-        value, image, num_steps = newton.solve(
-            rows, _chosen, _judge, numbers, zero, newton=method == "policy_iteration",
-            monotone=False, first_sweeps=_FIRST_SWEEPS if flat.size > DENSE_LIMIT else 0,
-            max_steps=max_steps)
+        value, image, num_steps, *chosen = newton.solve(
+            rows, _chosen, _judge, numbers, zero, newton=policies, monotone=False,
+            first_sweeps=_FIRST_SWEEPS if flat.size > DENSE_LIMIT else 0,
+            max_steps=max_steps, weights=policies)
     rows, numbers, play, horizon = lax.stop_gradient((rows, numbers, play, horizon))
-    q = newton.action_values(rows.choices, numbers, rows.expectation(value))
-    weight = over.whole(_chosen(rows.choices, q, play)[1])
+    weight: Any
+    if policies:
+        weight = rows.choices.unpacked(*chosen)
+    else:
+        q = newton.action_values(rows.choices, numbers, rows.expectation(value))
+        weight = _chosen(rows.choices, q, play)[1]
+    weight = over.whole(weight)
     verdict = _certify(play, value, image)
-    evidence = _certify(play._replace(horizon=horizon), value, image)
+    evidence = verdict
+    if per == "system_move":
+        evidence = _certify(play._replace(horizon=horizon), value, image)
     known = jnp.all(evidence.half < jnp.inf)
 
     def answer(x: jax.Array) -> jax.Array:

@@ -85,7 +85,8 @@ def solve(
     monotone: bool = True,
     first_sweeps: int = 0,
     max_steps: jax.Array | int,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+    weights: bool = False,
+) -> tuple[jax.Array, ...]:
     """A value near the fixed point of a backup; nothing is proven here.
 
     Sweeps ``v <- v + (1 - damping) (T v - v)`` and steps of Newton's method, whose linear systems
@@ -104,9 +105,10 @@ def solve(
       monotone: whether the backup is monotone and convex, so that Newton's method converges.
       first_sweeps: sweeps before the first step of Newton's method.
       max_steps: applications of P at most.
+      weights: of Newton's method, whether to return the weights at the value too.
 
     Returns:
-      The value, its image, and the applications of P.
+      The value, its image, and the applications of P; and the weights, packed.
     """
     # Elsewhere an exact step is no better than another.
     small = monotone and value.shape[0] <= DENSE_LIMIT
@@ -137,7 +139,8 @@ def solve(
     lanes = "side by side" if not newton and value.dtype.itemsize <= 4 else "in turn"
     last, n = iterate(
         step, lambda k, _: k.done, table, start, backup, max_steps=max_steps, lanes=lanes)
-    return last.value, last.image, n
+    found = (last.value, last.image, n)
+    return (*found, last.weight) if weights else found
 
 
 def _look(

@@ -94,3 +94,20 @@ def test_the_given_fixed_point_is_returned_and_its_own_derivative_dropped():
     assert jax.grad(root, 1)(0.5, jnp.array(2.0)) == 0.0
     # dv/da = v / (1 - a)
     np.testing.assert_allclose(jax.grad(root)(0.5, jnp.array(2.0)), 4.0)
+
+
+def test_implicit_derivatives_of_both_kinds_inside_jit_and_vmap_and_of_second_order():
+    """``v = 1 + w[i] a v`` has ``v = 1 / (1 - w[i] a)``; the index is traced, and no number."""
+    weight = jnp.array([0.2, 0.4])
+
+    @jax.jit
+    def root(a, i):
+        return implicit(lambda v: 1 + weight[i] * a * v, 1 / (1 - weight[i] * a))
+
+    def expected(a, i):
+        return 1 / (1 - weight[i] * a)
+
+    points, indices = jnp.array([0.5, 1.5]), jnp.array([1, 0])
+    for derive in (jax.jacfwd, jax.jacrev, jax.hessian, lambda f: jax.jacrev(jax.jacrev(f))):
+        found, right = (jax.vmap(derive(f))(points, indices) for f in (root, expected))
+        np.testing.assert_allclose(found, right, rtol=1e-5)
