@@ -27,7 +27,10 @@ _EPS = float(np.finfo(np.float64).eps)
 _TINY = 1e-290
 _LEAST = 1e-270
 _AIM = 0.1  # of the tolerance: how much of it the extra of all steps may take
-_SWEEPS = 40  # of value iteration, to begin with
+_STARTS = 60  # improvements to begin with
+_SWEEPS = 100  # of what each of them found
+_SLOW = 1e-5  # change of a sweep, as a share of the values, at which they are improved
+_NEARLY = 1e-3  # and change since the last improvement at which systems are solved
 _ROUNDS = 200
 _PATIENCE = 30  # rounds after which the extra grows
 
@@ -95,7 +98,7 @@ def joint_bound(
       relative: whether as a share of the value.
     """
     nodes = _nodes(problem, 1 if maximize else -1)
-    chosen, p = nodes.nearer() if problem.wandering else nodes.first(nodes.started())
+    chosen, p = nodes.nearer() if problem.wandering else nodes.started()
     extra, rounds, proven, system = np.inf, 0, False, None
     while not proven and rounds < _ROUNDS:
         system = nodes.system(chosen, p, system)
@@ -202,22 +205,22 @@ class _Nodes:
         best = np.maximum.reduceat(gain, self.part.mdp.row_start[:-1])
         return best, self.part.mdp.first_choice(gain == best[self.part.mdp.state])[1]
 
-    def started(self) -> Floats:
-        """Values after some sweeps, from zero."""
+    def started(self) -> tuple[Integers, Floats]:
+        """Rows and distributions that leave, improved as values rise from zero by their sweeps."""
+        p = self.part.nature(self.out.astype(np.float64), maximize=True)
+        chosen = self.best(self.part.total(p * self.out))[1]
         z = np.zeros(self.size)
-        for _ in range(_SWEEPS):
-            gain = self.best(self.greedy(z, 0.0)[1])[0]
-            new = z + (np.maximum(gain, 0) if self.sign > 0 else gain)
-            if np.abs(new - z).max(initial=0) <= 1e-3 * np.abs(new).max(initial=0):
-                return new
-            z = new
-        return z
-
-    def first(self, z: Floats) -> tuple[Integers, Floats]:
-        """Rows and distributions that leave, greedy where something is gained."""
-        leaving = self.part.nature(self.out.astype(np.float64), maximize=True)
-        chosen = self.best(self.part.total(leaving * self.out))[1]
-        return self.improved(z, chosen, leaving, 0.0)
+        for _ in range(_STARTS):
+            chosen, p = self.improved(z, chosen, p, 0.0)
+            matrix, rest = self.chain(chosen, p), self.earned(chosen, p, 0.0)
+            before = z
+            for _ in range(_SWEEPS):
+                last, z = z, matrix @ z + rest
+                if np.abs(z - last).max() <= _SLOW * np.abs(z).max():
+                    break
+            if np.abs(z - before).max() <= _NEARLY * np.abs(z).max():
+                break
+        return self.improved(z, chosen, p, 0.0)
 
     def nearer(self) -> tuple[Integers, Floats]:
         """Rows and distributions by which all that is open is left almost surely."""
@@ -253,6 +256,14 @@ class _Nodes:
 
     def system(self, chosen: Integers, p: Floats, before: Factors | None) -> Factors | None:
         """The system of rows and distributions; None where it is singular."""
+        matrix = self.chain(chosen, p)
+        every = np.arange(self.size)
+        if before is None:
+            return factors(matrix, self.label, every)
+        return before._replace(rows=matrix).other(every)
+
+    def chain(self, chosen: Integers, p: Floats) -> Any:
+        """How rows and distributions lead from node to node: ``float64[M, M]``, SciPy's."""
         from scipy.sparse import csr_array
 
         taken = np.zeros(self.part.mdp.num_rows, bool)
@@ -260,11 +271,7 @@ class _Nodes:
         kept = taken[self.part.mdp.row] & self.out & (self.target >= 0) & (p > 0)
         share = p[kept] / self._leaving(p)[self.part.mdp.row[kept]]
         place = self.owner[kept], self.target[kept]
-        matrix = csr_array((share, place), shape=(self.size, self.size))
-        every = np.arange(self.size)
-        if before is None:
-            return factors(matrix, self.label, every)
-        return before._replace(rows=matrix).other(every)
+        return csr_array((share, place), shape=(self.size, self.size))
 
     def proves(self, z: Floats) -> bool:
         """Whether no row and no distribution gains anything, rounding included."""
