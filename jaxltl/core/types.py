@@ -191,7 +191,7 @@ def _invalid_row(policy: np.ndarray) -> str:
 
 
 def _invalid_weights(policy: np.ndarray) -> str:
-    """What is wrong with weights ``[R]`` of a sparse model's choices, whose states are not known."""
+    """What is wrong with weights ``[R]`` of a sparse model's choices; the states are not known."""
     if (bad := ~(policy >= 0)).any():
         row = int(np.argmax(bad))
         return (f"the policy's weight of choice {row} is {policy[row]:.4g}; give each state a "

@@ -15,7 +15,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.kernels import gather, owners
 from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.models.product import Product, flat_successor
-from jaxltl.core.models.sparse import Rewards, SparseMDP, row_reward
+from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts
 from jaxltl.core.types import Solution
 
 
@@ -36,7 +36,7 @@ def compiled_form(model: Any, reward: Any = None) -> tuple[Any, Any]:
 
     Returns:
       A sparse model without names, rewards and variables, which programs would only be compiled
-      anew for, or a game on one; and the reward of each choice.
+      anew for, or a game on one; and the reward, of a sparse model a structure.
     """
     if isinstance(model, Game):
         form, reward = compiled_form(model.mdp, reward)
@@ -47,7 +47,7 @@ def compiled_form(model: Any, reward: Any = None) -> tuple[Any, Any]:
     if isinstance(model, Product):
         model = _written_out(model) if is_traced(model) else to_sparse(model)
     if reward is not None:
-        reward = row_reward(model, reward)
+        reward = reward_parts(model, reward)
     none = np.zeros((model.num_states, 0), bool)
     return replace(
         model, label=none, propositions=(), rewards={}, valuation={}, action=None, action_names=()

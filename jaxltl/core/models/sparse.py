@@ -152,17 +152,7 @@ def row_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = Non
     Raises:
       ValueError: there is no such reward, or its shape fits nothing.
     """
-    if reward is None:
-        if len(model.rewards) != 1:
-            raise ValueError(f"name the reward: the model has {_listed(model.rewards)}.")
-        reward = next(iter(model.rewards))
-    if isinstance(reward, str):
-        if reward not in model.rewards:
-            raise ValueError(f"there is no reward {reward!r}; the model has "
-                             f"{_listed(model.rewards)}.")
-        reward = model.rewards[reward]
-    if not isinstance(reward, Rewards):
-        reward = _shaped(model, reward)
+    reward = reward_parts(model, reward)
     if is_traced((model, reward)):
         return _traced_reward(model, reward)
     host = model.host
@@ -175,6 +165,36 @@ def row_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = Non
         earned = host.probability * np.asarray(reward.transition, np.float64)
         total += np.add.reduceat(earned, host.entry_start[:-1])
     return total
+
+
+def reward_parts(model: SparseMDP, reward: str | Rewards | chex.Array | None = None) -> Rewards:
+    """A reward as a structure, by name or however else it is given to :func:`row_reward`.
+
+    Raises:
+      ValueError: as there.
+    """
+    if reward is None:
+        if len(model.rewards) != 1:
+            raise ValueError(f"name the reward: the model has {_listed(model.rewards)}.")
+        reward = next(iter(model.rewards))
+    if isinstance(reward, str):
+        if reward not in model.rewards:
+            raise ValueError(f"there is no reward {reward!r}; the model has "
+                             f"{_listed(model.rewards)}.")
+        reward = model.rewards[reward]
+    if not isinstance(reward, Rewards):
+        return _shaped(model, reward)
+    for size, name in _sizes(model):
+        part = getattr(reward, name)
+        if part is not None and np.shape(part) != (size,):
+            raise ValueError(f"reward has shape {np.shape(part)} on its {name} part; expected "
+                             f"({size},).")
+    return reward
+
+
+def _sizes(model: SparseMDP) -> tuple[tuple[int, str], ...]:
+    return ((model.num_states, "state"), (model.num_rows, "choice"),
+            (model.num_transitions, "transition"))
 
 
 def _traced_reward(model: SparseMDP, reward: Rewards) -> Any:
@@ -196,8 +216,7 @@ def _listed(names: Mapping[str, Any]) -> str:
 
 def _shaped(model: SparseMDP, reward: Any) -> Rewards:
     reward = reward if isinstance(reward, jax.Array) else np.asarray(reward, np.float64)
-    for size, name in ((model.num_states, "state"), (model.num_rows, "choice"),
-                       (model.num_transitions, "transition")):
+    for size, name in _sizes(model):
         if reward.shape == (size,):
             return Rewards(**{name: reward})
     raise ValueError(

@@ -22,6 +22,7 @@ from jaxltl.core.values.discounted import (
     expected_reward,
     gains,
     optimal_value,
+    reward_size,
 )
 from jaxltl.core.values.evidence import most_choices, rounding_unit
 from jaxltl.core.values.linear import System
@@ -123,9 +124,9 @@ def _boltzmann_value(
     model: Any, reward: Any, discount: Any, initial: Any, tolerance: Any, max_steps: Any, *,
     adjoint: str, method: str,
 ) -> Solution:
-    reward, over = expected_reward(model, reward), choices(model)
     discount = jnp.asarray(discount, model.dtype)
     given = _given(model, reward, discount, tolerance)
+    reward, over = expected_reward(model, reward), choices(model)
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
     damping = jnp.where(given.contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
     value, image, n = newton.solve(
@@ -175,7 +176,7 @@ def _given(model: Any, reward: jax.Array, discount: jax.Array, tolerance: Any) -
     expansion = discount * boltzmann_expansion(most_choices(model))
     contracts = expansion < 1
     gap = jnp.where(contracts, 1 - expansion, 1)
-    size = jnp.max(jnp.abs(reward))
+    size = reward_size(model, reward)
     rounding = rounding_unit(model) * (size + size / (1 - discount)) / gap
     goal = 4 * rounding if tolerance is None else jnp.asarray(tolerance, model.dtype)
     return _Given(contracts, gap, rounding, goal, jnp.maximum(goal, 2 * rounding))

@@ -13,7 +13,7 @@ import numpy as np
 from jaxltl.core.host import bounded as host
 from jaxltl.core.host.spending import bounded_cost, in_units
 from jaxltl.core.models.convert import to_sparse
-from jaxltl.core.models.sparse import Rewards, SparseMDP, row_reward
+from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts, row_reward
 from jaxltl.core.types import Solution, Status
 
 TOLERANCE = 1e-6  # half the width of an enclosure up to which it counts as narrow, relative
@@ -237,17 +237,7 @@ def states(model: SparseMDP, given: Any, name: str) -> np.ndarray:
 
 def structure(model: SparseMDP, reward: Any) -> Rewards:
     """A reward as a structure, whatever it is given as; see :func:`row_reward`."""
-    if reward is None and len(model.rewards) == 1:
-        return next(iter(model.rewards.values()))
-    if isinstance(reward, Rewards):
-        return reward
-    if isinstance(reward, str) and reward in model.rewards:
-        return model.rewards[reward]
-    row_reward(model, reward)  # what is wrong is named there
-    given = np.asarray(reward, np.float64)
-    sizes = (model.num_states, "state"), (model.num_rows, "choice"), (
-        model.num_transitions, "transition")
-    return Rewards(**{next(name for size, name in sizes if given.shape == (size,)): given})
+    return reward_parts(model, reward)
 
 
 def state_reward(model: SparseMDP, reward: Any) -> np.ndarray:

@@ -76,6 +76,14 @@ def expected_reward(model: Any, reward: jax.Array) -> jax.Array:
     raise ValueError(f"reward has shape {reward.shape}; expected {actions} or {transitions}.")
 
 
+def reward_size(model: Any, reward: Any) -> jax.Array:
+    """The largest sum of magnitudes behind an expected reward; its rounding is in terms of that.
+
+    Large rewards of transitions may cancel in the expectation, their rounding does not.
+    """
+    return jnp.max(expected_reward(model, jax.tree.map(jnp.abs, reward)))
+
+
 # --- what discounted solvers share -----------------------------------------------------------
 
 
@@ -84,7 +92,7 @@ class Parameters(NamedTuple):
 
     Attributes:
       discount: a scalar.
-      size: the largest reward.
+      size: the largest reward, see :func:`reward_size`.
       unit: relative rounding of a backup.
       tolerance: certified error asked for, or None.
       policy: a policy's weights, in columns, or None.
@@ -108,11 +116,11 @@ def _enclosed(value: jax.Array, image: jax.Array, given: Parameters) -> Enclosur
     return enclose(value, image, given.discount, rounding, given.tolerance)
 
 
-def parameters(model: Any, reward: jax.Array, discount: Any, tolerance: Any) -> Parameters:
-    """Of a problem with an expected reward ``[S, A]``."""
+def parameters(model: Any, reward: Any, discount: Any, tolerance: Any) -> Parameters:
+    """Of a problem with a reward as it was given."""
     goal = None if tolerance is None else jnp.asarray(tolerance, model.dtype)
     return Parameters(
-        jnp.asarray(discount, model.dtype), jnp.max(jnp.abs(reward)),
+        jnp.asarray(discount, model.dtype), reward_size(model, reward),
         jnp.asarray(rounding_unit(model), model.dtype), goal)
 
 
@@ -218,8 +226,8 @@ def policy_value(
 
 @jax.jit
 def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solution:
-    reward = expected_reward(model, reward)
     given = parameters(model, reward, discount, tolerance)
+    reward = expected_reward(model, reward)
     checked = valid_policy(model, policy)
     over, rows = choices(model), table(model)
     weight = over.columns(checked.distribution)
@@ -314,8 +322,8 @@ def _optimal_value(
     if method == "auto":
         few = math.prod(model.state_shape) <= DENSE_LIMIT
         method = "policy_iteration" if few else "modified_policy_iteration"
-    reward, over = expected_reward(model, reward), choices(model)
     given = parameters(model, reward, discount, tolerance)
+    reward, over = expected_reward(model, reward), choices(model)
     zero = jnp.zeros(model.num_states, model.dtype)
     if method == "modified_policy_iteration":
         value, image, n = _modified_policy_iteration(

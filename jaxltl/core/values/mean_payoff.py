@@ -21,7 +21,7 @@ from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.game import Game, as_game, as_padded_game, is_deterministic
 from jaxltl.core.models.operators import induced_chain
 from jaxltl.core.models.padded import padded_rows
-from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.models.sparse import SparseMDP, row_reward
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted import expected_reward
 
@@ -68,8 +68,8 @@ def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> S
     form, reward = compiled_form(asked, reward)
     if isinstance(form.mdp, SparseMDP):
         host = form.mdp.host
-        game = as_padded_game(form)
-        found = mean_payoff(game, padded_rows(form.mdp, reward), max_steps=max_steps)
+        earned = padded_rows(form.mdp, row_reward(form.mdp, reward))
+        found = mean_payoff(as_padded_game(form), earned, max_steps=max_steps)
         row = padded_rows(form.mdp, np.arange(host.num_rows))
         policy = row[np.arange(host.num_states), np.asarray(found.policy)]
         return in_shape_of(asked, replace(found, policy=jnp.asarray(policy, jnp.int32)))

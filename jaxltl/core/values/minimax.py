@@ -417,6 +417,7 @@ def _solve(
     max_steps, *, per: str, method: str,
 ) -> Solution:
     discount = jnp.asarray(discount, game.dtype)
+    size = jnp.where(moves, expected_reward(game, jax.tree.map(jnp.abs, reward)), 0)
     reward, over = jnp.where(moves, expected_reward(game, reward), 0), choices(game)
     free = ~game.system if per == "system_move" else jnp.zeros_like(game.system)
     rate = jnp.where(live, jnp.where(free, 1, discount), 0)
@@ -434,7 +435,7 @@ def _solve(
         game.system.ravel(), None if drawn is None else drawn.used.ravel(),
         None if drawn is None else over.columns(drawn.weight),
         discount, discount, jnp.asarray(rounding_unit(game), game.dtype),
-        jnp.max(jnp.abs(reward)),
+        jnp.max(size),
         None if tolerance is None else jnp.asarray(tolerance, game.dtype))
     rows, columns = table(game), over.columns(moves)
     horizon = _horizon(rows, play, columns, flat, per, defined, max_steps)

@@ -85,8 +85,8 @@ def _soft_value(
     model: Any, reward: Any, discount: Any, initial: Any, tolerance: Any, max_steps: Any, *,
     method: str,
 ) -> Solution:
-    reward, over = expected_reward(model, reward), choices(model)
     given = parameters(model, reward, discount, tolerance)
+    reward, over = expected_reward(model, reward), choices(model)
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
     value, image, n = newton.solve(
         table(model), soft_maximum, judge,
