@@ -145,8 +145,7 @@ def total_reward(
         found = _led_by_nature(
             part, part.within(np.ones(part.mdp.num_transitions, bool)), solve, -1)
     else:
-        first = attracting(part, ends)
-        found = _led_by_policy(part, first, solve, -1)
+        found = _led_by_policy(part, _surely_soon(part, ends, solve), solve, -1)
     value, lower, upper = (
         np.where(finite, x, np.inf) for x in (found.value, found.lower, found.upper))
     chance = halted.mdp.probability.copy()
@@ -374,6 +373,18 @@ def _greedy_start(model: HostInterval, target: Booleans) -> Integers:
             break
         value = np.maximum(new, value)
     return row
+
+
+def _surely_soon(model: HostInterval, goal: Booleans, solve: _Solve) -> Integers:
+    """Rows by which a goal is surely reached whatever nature picks; cheap ones where that does.
+
+    Any rows that surely get there will do to begin with, but slips that lead there by chance alone
+    may take longer than floats can tell.
+    """
+    row = solve.exact(model.mdp, solve.cost, False).row
+    sure, _ = surely(
+        model.chain(row)[0], goal, np.ones(goal.size, bool), maximize=True, helpful=False)
+    return np.where(sure, row, attracting(model, goal | sure))
 
 
 def _restricted(

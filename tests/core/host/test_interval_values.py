@@ -7,6 +7,7 @@ from jaxltl.core.host import interval_values
 from jaxltl.core.host.accepting import accepting_region
 from jaxltl.core.host.interval_parity import parity_against_nature
 from jaxltl.core.host.optimal import reachability
+from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.values.robust_satisfaction import _largest
 from tests.reference_intervals import chains, optima, parity, random_model, reach, reward
 
@@ -121,3 +122,24 @@ def test_ties_and_scales():
             assert (found.upper == 0).all()
             found = interval_values.reachability(model, ~none, maximize=maximize, helpful=helpful)
             assert (found.lower == 1).all()
+
+
+def test_a_reward_whose_first_way_there_would_hardly_end():
+    """On a grid where every move slips, some rows lead to the goal by slips alone."""
+    n, moves = 15, np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+    place = np.stack(np.divmod(np.arange(n * n), n), 1)
+    to = np.clip(place[:, None] + moves, 0, n - 1) @ [n, 1]
+    slips = np.stack([np.roll(to, -k, 1) for k in (0, 1, 3)], 2)
+    size = slips.size
+    model = interval_rows(
+        np.arange(0, 4 * n * n + 1, 4), np.arange(0, size + 1, 3), slips.ravel(),
+        np.resize([0.7, 0.05, 0.05], size), np.resize([0.9, 0.15, 0.15], size)).host
+    goal = np.arange(n * n) == n * n - 1
+    found = interval_values.total_reward(
+        model, np.ones(4 * n * n), goal, maximize=False, large=True)
+    value = np.zeros(n * n)
+    for _ in range(400):
+        ahead = value[model.mdp.successor]
+        step = 1 + model.total(model.nature(ahead, maximize=True) * ahead)
+        value = np.where(goal, 0, step.reshape(n * n, 4).min(1))
+    enclosed(found, value)
