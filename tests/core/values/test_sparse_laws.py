@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from fractions import Fraction
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -19,8 +20,14 @@ import jaxltl as jl
 from jaxltl.core.types import Status
 from jaxltl.core.values.boltzmann import boltzmann_expansion
 from jaxltl.core.values.soft import soft_policy_adjoint
-from tests.sparse_models import random_sparse
-from tests.support import assert_gradients, assert_solutions_agree, lane, stack
+from tests.sparse_models import exact_solve, random_sparse
+from tests.support import (
+    assert_encloses,
+    assert_gradients,
+    assert_solutions_agree,
+    lane,
+    stack,
+)
 
 COUNT = 9
 SYSTEM = np.arange(COUNT) % 2 == 0
@@ -391,3 +398,23 @@ def test_the_environment_may_move_for_nothing():
         assert_solutions_agree(found, expected, 1e-10)
         return
     raise AssertionError("no such model was found")
+
+
+@pytest.mark.parametrize("kind", ["padded", "rows"])
+def test_rewards_that_cancel_leave_their_rounding(kind):
+    """The sum of what large rewards of transitions leave is enclosed, exactly computed."""
+    rng, size = np.random.default_rng(6), 3
+    matrix = rng.dirichlet(np.ones(size), size=(size, 1))
+    padded = jl.from_dense(matrix)
+    reward = rng.normal(size=matrix.shape) * 1e8
+    reward -= (matrix * reward).sum(-1, keepdims=True)
+    exact = [[Fraction(float(x)) for x in row] for row in np.asarray(padded.probability)[:, 0]]
+    earned = [sum(p * Fraction(float(x)) for p, x in zip(row, reward[s, 0], strict=True))
+              for s, row in enumerate(exact)]
+    system = [[Fraction(int(s == t)) - Fraction(1, 2) * p for t, p in enumerate(row)]
+              for s, row in enumerate(exact)]
+    solve = jax.jit(lambda m, r: jl.optimal_value(m, r, 0.5))
+    found = solve(padded, reward) if kind == "padded" else solve(
+        jl.to_sparse(padded), reward.ravel())
+    assert found.status == Status.CONVERGED
+    assert_encloses(found, exact_solve(system, earned))
