@@ -64,6 +64,7 @@ class JointBound(NamedTuple):
       bound: ``float64[S]``: of a maximum no less, of a minimum no more than it.
       attained: ``float64[S]``, what the choices attain at least, or cost at most; None where that
         is not proven.
+      value: ``float64[S]``, what they are worth, without bounds.
       row: ``int[S]``, the row that leaves the component of a state; a state's first elsewhere.
       probability: ``float64[T]``, nature's distributions of all rows.
       rounds: systems solved.
@@ -71,6 +72,7 @@ class JointBound(NamedTuple):
 
     bound: Floats
     attained: Floats | None
+    value: Floats
     row: Integers
     probability: Floats
     rounds: int
@@ -83,7 +85,7 @@ class JointBound(NamedTuple):
         scale = high if relative else 1.0
         if not (np.isfinite(high) & (high - low <= tolerance * scale)).all():
             return None
-        return Enclosed(low + (high - low) / 2, low, high, self.row, 0, 0.0, "")
+        return Enclosed(np.clip(self.value, low, high), low, high, self.row, 0, 0.0, "")
 
 
 def joint_bound(
@@ -98,8 +100,9 @@ def joint_bound(
       relative: whether as a share of the value.
     """
     nodes = _nodes(problem, 1 if maximize else -1)
-    chosen, p = nodes.nearer() if problem.wandering else nodes.started()
+    chosen, p = nodes.nearer(worth=False) if problem.wandering else nodes.started()
     extra, rounds, proven, system = np.inf, 0, False, None
+    value = np.zeros(nodes.size)
     while not proven and rounds < _ROUNDS:
         system = nodes.system(chosen, p, system)
         if system is None:
@@ -134,7 +137,7 @@ def joint_bound(
     row[states] = nodes.row[chosen][nodes.node[states]]
     chance = problem.model.mdp.probability.copy()
     chance[nodes.entry] = p
-    return JointBound(everywhere(z), near, row, chance, rounds)
+    return JointBound(everywhere(z), near, everywhere(value), row, chance, rounds)
 
 
 @dataclass(frozen=True)
@@ -209,6 +212,8 @@ class _Nodes:
         """Rows and distributions that leave, improved as values rise from zero by their sweeps."""
         p = self.part.nature(self.out.astype(np.float64), maximize=True)
         chosen = self.best(self.part.total(p * self.out))[1]
+        if self.sign > 0 and (self.known > 0).any():
+            chosen, p = self.nearer(worth=True)
         z = np.zeros(self.size)
         for _ in range(_STARTS):
             chosen, p = self.improved(z, chosen, p, 0.0)
@@ -222,17 +227,22 @@ class _Nodes:
                 break
         return self.improved(z, chosen, p, 0.0)
 
-    def nearer(self) -> tuple[Integers, Floats]:
-        """Rows and distributions by which all that is open is left almost surely."""
+    def nearer(self, *, worth: bool) -> tuple[Integers, Floats]:
+        """Rows and distributions by which all that is open is left, maybe for what is worth more.
+
+        Args:
+          worth: whether only what is known to be worth something counts.
+        """
         mdp, end = self.part.mdp, self.size
-        width = np.append(np.diff(mdp.entry_start), 1)
-        target = np.append(np.where(self.target < 0, end, self.target), end)
+        width = np.concatenate([np.diff(mdp.entry_start), [1, 1]])
+        ends = np.where(self.outside > 0, end, end + 1) if worth else end
+        target = np.concatenate([np.where(self.target < 0, ends, self.target), [end, end + 1]])
+        row_start = np.concatenate([mdp.row_start, mdp.num_rows + np.array([1, 2])])
         graph = HostMDP(
-            np.append(mdp.row_start, mdp.num_rows + 1), starts_of(width), target.astype(np.int32),
-            np.ones(target.size))
-        row = towards(graph, np.arange(end + 1) == end, np.ones(graph.num_rows, bool))
+            row_start, starts_of(width), target.astype(np.int32), np.ones(target.size))
+        row = towards(graph, np.arange(end + 2) == end, np.ones(graph.num_rows, bool))
         every = np.ones(mdp.num_transitions, bool)
-        return row[:-1].astype(np.int64), self.part.within(every)
+        return row[:-2].astype(np.int64), self.part.within(every)
 
     def improved(
         self, z: Floats, chosen: Integers, p: Floats, extra: float

@@ -9,7 +9,7 @@ the one player and optimising the other (strategy improvement, Hoffman and Karp 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,10 @@ from jaxltl.core.host.transient import Enclosed
 
 _EPS = float(np.finfo(np.float64).eps)
 _ROUNDS = 100
+_STARTS = 60  # improvements to begin with
+_SWEEPS = 100  # of what each of them found
+_SLOW = 1e-7  # change of a sweep at which they are improved
+_NEARLY = 1e-5  # and change since the last improvement at which systems are solved
 
 
 class Robust(NamedTuple):
@@ -92,11 +96,11 @@ def reachability(
     if maximize == helpful:
         found = joint(halted, solve.cost, maximize)
     elif maximize:
-        found = _led_by_policy(halted, _greedy_start(halted, target), solve, 1)
+        start, _ = _started(halted, target, maximize=True)
+        found = _led_by_policy(halted, start, solve, 1)
     else:
-        start = halted.nature(
-            _sweeps(halted, target)[halted.mdp.successor], maximize=True)
-        found = _led_by_nature(halted, start, solve, 1)
+        _, p = _started(halted, target, maximize=False)
+        found = _led_by_nature(halted, p, solve, 1)
     return _unhalted(model, halted, row, target | blocked, found)
 
 
@@ -344,35 +348,40 @@ def _noise(value: Floats) -> Floats:
     return 64 * _EPS * (np.abs(value) + np.abs(value).max(initial=0))
 
 
-def _sweeps(model: HostInterval, target: Booleans) -> Floats:
-    """Some sweeps of value iteration of a policy that makes the probability small."""
-    value = target.astype(np.float64)
-    for _ in range(60):
-        image = model.total(
-            model.nature(value[model.mdp.successor], maximize=True)
-            * value[model.mdp.successor])
-        new = np.maximum(model.mdp.over_choices(np.minimum, image), value)
-        if (new - value).max() <= 1e-3:
-            return new
-        value = new
-    return value
+def _started(
+    model: HostInterval, target: Booleans, *, maximize: bool
+) -> tuple[Integers, Floats]:
+    """Good rows and distributions where policy and nature want the opposite of a probability.
 
+    Both are improved as values rise from zero by sweeps of what they chose.
+    """
+    from scipy.sparse import csr_array
 
-def _greedy_start(model: HostInterval, target: Booleans) -> Integers:
-    """Rows that come near the target against nature, after some sweeps."""
     mdp, value = model.mdp, target.astype(np.float64)
-    row = mdp.row_start[:-1].astype(np.int64)
-    for _ in range(60):
+    row: Integers = attracting(model, target)
+    opt: Any = np.maximum if maximize else np.minimum
+    shape = (mdp.num_states, mdp.num_states)
+    for _ in range(_STARTS):
         ahead = value[mdp.successor]
-        image = model.total(model.nature(ahead, maximize=False) * ahead)
-        new = mdp.over_choices(np.maximum, image)
-        better = new > value
-        found = mdp.first_choice(image == new[mdp.state])[1]
+        p = model.nature(ahead, maximize=not maximize)
+        image = model.total(p * ahead)
+        best = mdp.over_choices(opt, image)
+        better = np.abs(best - image[row]) > _noise(value)
+        found = mdp.first_choice(image == best[mdp.state])[1]
         row = np.where(better, found, row)
-        if not better.any() or (new - value).max() <= 1e-3:
+        taken = np.zeros(mdp.num_rows, bool)
+        taken[row] = True
+        kept = taken[mdp.row]
+        start = np.concatenate([[0], np.diff(mdp.entry_start)[row].cumsum()])
+        chain = csr_array((p[kept], mdp.successor[kept], start), shape=shape)
+        before = value
+        for _ in range(_SWEEPS):
+            last, value = value, chain @ value
+            if np.abs(value - last).max() <= _SLOW:
+                break
+        if np.abs(value - before).max() <= _NEARLY:
             break
-        value = np.maximum(new, value)
-    return row
+    return row, model.nature(value[mdp.successor], maximize=not maximize)
 
 
 def _surely_soon(model: HostInterval, goal: Booleans, solve: _Solve) -> Integers:
