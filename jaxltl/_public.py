@@ -79,7 +79,14 @@ from jaxltl.core.values.prepared_interval import (
 )
 from jaxltl.core.values.reachability import reachability_probability
 from jaxltl.core.values.robust import robust_discounted_value, robust_expectation
+from jaxltl.core.values.robust_bounded import (
+    robust_bounded_reachability,
+    robust_cumulative_reward,
+    robust_instantaneous_reward,
+    robust_next_probability,
+)
 from jaxltl.core.values.robust_satisfaction import robust_satisfaction
+from jaxltl.core.values.robust_sensitivity import robust_sensitivity
 from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
 from jaxltl.core.values.soft import soft_value
 from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
@@ -215,9 +222,14 @@ __all__ = [
     "read_reward_machine",
     "restrict",
     "reward_bounded_reachability",
+    "robust_bounded_reachability",
+    "robust_cumulative_reward",
     "robust_discounted_value",
     "robust_expectation",
+    "robust_instantaneous_reward",
+    "robust_next_probability",
     "robust_satisfaction",
+    "robust_sensitivity",
     "rollout",
     "row_reward",
     "safety",

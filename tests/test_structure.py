@@ -54,13 +54,14 @@ PUBLIC = [
     "prepare", "prepare_interval", "product", "project_policy", "project_trajectories",
     "pushforward", "reach", "reachability_probability", "read_hoa", "read_labels", "read_log",
     "read_model", "read_parametric", "read_reward_machine", "restrict",
-    "reward_bounded_reachability", "robust_discounted_value", "robust_expectation",
-    "robust_satisfaction", "rollout", "row_reward", "safety", "sample_successor",
-    "satisfaction_probability", "shield", "soft_value", "solve_interval", "solve_prepared",
-    "sparse_satisfaction", "stack_products", "states_where", "strategy_value", "synchronize",
-    "task_performance", "task_performances", "to_automaton", "to_dense", "to_padded", "to_sparse",
-    "to_stormpy", "total_reward", "verdict", "verify", "winning_region", "with_allowed",
-    "write_hoa", "write_model",
+    "reward_bounded_reachability", "robust_bounded_reachability", "robust_cumulative_reward",
+    "robust_discounted_value", "robust_expectation", "robust_instantaneous_reward",
+    "robust_next_probability", "robust_satisfaction", "robust_sensitivity", "rollout", "row_reward",
+    "safety", "sample_successor", "satisfaction_probability", "shield", "soft_value",
+    "solve_interval", "solve_prepared", "sparse_satisfaction", "stack_products", "states_where",
+    "strategy_value", "synchronize", "task_performance", "task_performances", "to_automaton",
+    "to_dense", "to_padded", "to_sparse", "to_stormpy", "total_reward", "verdict", "verify",
+    "winning_region", "with_allowed", "write_hoa", "write_model",
 ]
 
 
