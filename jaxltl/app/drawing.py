@@ -96,7 +96,8 @@ def artist(apart: bool) -> Iterator[Artist]:
         pool.submit(int)
         yield begin
     finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+        # Waits, else the end of this process leaves semaphores, of which Python warns.
+        pool.shutdown(cancel_futures=True)
 
 
 def _prepare() -> None:
