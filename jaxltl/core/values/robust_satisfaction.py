@@ -22,7 +22,7 @@ from jaxltl.core.models.operators import is_deterministic, require_weights
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Method, Solution, Status, require_shape, row_tolerance
 from jaxltl.core.values.robust import TOLERANCE, Sides, host_sides, world_of
-from jaxltl.core.values.sparse_satisfaction import automaton_of
+from jaxltl.core.values.sparse_satisfaction import automaton_of, starting_states
 
 
 class RobustSatisfaction(NamedTuple):
@@ -68,7 +68,7 @@ def robust_satisfaction(
       :class:`RobustSatisfaction`.
 
     Raises:
-      ValueError: an unknown label or direction, or a product beyond 2^31 states.
+      ValueError: an unknown label, state or direction, or a product beyond 2^31 states.
 
     Example:
       >>> from jaxltl.core.models.interval import interval_rows
@@ -80,8 +80,7 @@ def robust_satisfaction(
     model, system = world_of(model)
     asked = TOLERANCE if tolerance is None else float(tolerance)
     automaton, letter = automaton_of(model.nominal, task)
-    states = np.flatnonzero(np.asarray(model.initial) > 0) if states is None else states
-    states = np.asarray(states, np.int64)
+    states = starting_states(model, states)
     yes, no = universal_states(automaton), ~live_states(automaton)
     initial = np.broadcast_to(automaton.initial, states.shape)
     product, host = _pairs(

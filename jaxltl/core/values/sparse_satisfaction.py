@@ -72,7 +72,8 @@ def sparse_satisfaction(
       :class:`Satisfaction`.
 
     Raises:
-      ValueError: an unknown label, objective or reading, or a product beyond 2^31 states.
+      ValueError: an unknown label, state, objective or reading, or a product beyond 2^31
+        states.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
@@ -86,14 +87,32 @@ def sparse_satisfaction(
     if label_on not in ("entry", "exit"):
         raise ValueError(f'label_on={label_on!r}; it must be "entry" or "exit".')
     automaton, letter = automaton_of(model, task)
-    states = np.flatnonzero(np.asarray(model.initial) > 0) if states is None else states
-    states = np.asarray(states, np.int64)
+    states = starting_states(model, states)
     yes, no = universal_states(automaton), ~live_states(automaton)
     on_entry = label_on == "entry"
     product = _product(model, automaton, letter, states, on_entry, yes | no)
     found, row = _best(product, automaton, letter, yes, no, on_entry, objective, tolerance)
     return Satisfaction(
         at_states(found, product.start), automaton, letter, product, product.base_row[row])
+
+
+def starting_states(model: Any, states: Any) -> np.ndarray:
+    """Where runs start, ``int64[I]``: the numbers that are given, else the initial states.
+
+    Raises:
+      ValueError: they are no numbers of states.
+    """
+    if states is None:
+        return np.flatnonzero(np.asarray(model.initial) > 0)
+    given = np.asarray(states)
+    if not given.size or given.dtype.kind not in "iu":
+        raise ValueError(f"states is {given.dtype}{list(given.shape)}; give the numbers of states, "
+                         "at least one.")
+    wrong = (given < 0) | (given >= model.num_states)
+    if wrong.any():
+        raise ValueError(f"states has {given[wrong][0]}; the states are 0 to "
+                         f"{model.num_states - 1}.")
+    return given.astype(np.int64)
 
 
 def _best(

@@ -338,3 +338,16 @@ def test_bad_questions():
         robust_total_reward(model, [0, -1, 0], target)
     with pytest.raises(ValueError, match="differs between its successors"):
         robust_total_reward(model, Rewards(transition=np.array([1.0, 2, 0, 0])), target)
+
+
+@pytest.mark.parametrize(("states", "message"), [
+    ([3], r"states has 3; the states are 0 to 2"), ([0, -1], r"states has -1"),
+    ([True, False, True], r"states is bool\[3\]"), ([0.0], "states is float64"),
+    ([], "at least one")])
+def test_states_that_are_none(states, message):
+    coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
+                       label={"a": [1]})
+    model = make_interval(coin, coin.probability, coin.probability)
+    for solve, of in ((robust_satisfaction, model), (sparse_satisfaction, coin)):
+        with pytest.raises(ValueError, match=message):
+            solve(of, "F a", states=states)
