@@ -79,6 +79,7 @@ def read_log(
       >>> counts.states, counts.successor.tolist(), counts.count.tolist()
       (('hall', 'kitchen'), [0, 1], [1, 1])
     """
+    _check_columns(columns, 3)
     known = None
     if model is not None:
         if states is not None or actions is not None:
@@ -129,6 +130,7 @@ def read_labels(
     Raises:
       ValueError: naming the file and the line, as :func:`read_log`.
     """
+    _check_columns(columns, 2)
     known = set(states or ())
     found: dict[str, dict[str, bool]] = {}
     for lines in read_columns(path, columns):
@@ -142,6 +144,11 @@ def read_labels(
     return {label: tuple(some) for label, some in found.items()}
 
 
+def _check_columns(columns: Sequence[str], number: int) -> None:
+    if isinstance(columns, str) or len(columns) != number or len(set(columns)) < number:
+        raise ValueError(f"columns={columns!r}; give {number} names, all different.")
+
+
 @dataclass
 class _Names:
     """Names by number; new ones are added if they are not all known."""
@@ -151,7 +158,11 @@ class _Names:
 
 
 def _names(given: Sequence[str] | None) -> _Names:
-    return _Names({str(x): i for i, x in enumerate(given or ())}, given is not None)
+    number = {str(x): i for i, x in enumerate(given or ())}
+    if given is not None and len(number) < len(given):
+        twice = next(x for i, x in enumerate(map(str, given)) if number[x] != i)
+        raise ValueError(f"the name {twice!r} stands twice; names tell states, or actions, apart.")
+    return _Names(number, given is not None)
 
 
 def _unknown(what: str, name: str, names: Sequence[str]) -> str:

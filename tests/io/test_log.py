@@ -164,6 +164,18 @@ def test_empty_lines_wherever_the_parts_end(tmp_path, monkeypatch, step):
         read_log(path)
 
 
+def test_names_that_do_not_tell(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_bytes(HEAD + b"a,b,c\n")
+    for columns in (("state", "action"), ("state", "state", "next"), "abc"):
+        with pytest.raises(ValueError, match="give 3 names, all different"):
+            read_log(path, columns=columns)
+    with pytest.raises(ValueError, match="give 2 names"):
+        read_labels(path, columns=("state", "action", "next"))
+    with pytest.raises(ValueError, match="the name 'a' stands twice"):
+        read_log(path, states=["a", "a", "c"])
+
+
 def test_files_that_cannot_be_read(tmp_path):
     path = tmp_path / "log.csv"
     for bad in (path, tmp_path, f"{path}\0"):

@@ -218,7 +218,8 @@ def samples_needed(
       num_outcomes: J, which only ``"weissman"`` asks for.
 
     Raises:
-      ValueError: `width` or `confidence` is not in (0, 1), or more than 2^53 throws are needed.
+      ValueError: `width` or `confidence` is not in (0, 1), `num_claims` is below 1 or
+        `num_outcomes` below 2, or more than 2^53 throws are needed.
 
     Example:
       >>> [samples_needed(0.02, 0.99, method=m) for m in ("clopper-pearson", "hoeffding")]
@@ -228,7 +229,11 @@ def samples_needed(
     check_confidence(confidence)
     if not 0 < width < 1:
         raise ValueError(f"width={width}; it must lie strictly between 0 and 1.")
-    failure = (1 - confidence) / max(num_claims, 1)
+    if not num_claims >= 1:
+        raise ValueError(f"num_claims={num_claims}; it must be at least 1.")
+    if not num_outcomes >= 2:
+        raise ValueError(f"num_outcomes={num_outcomes}; it must be at least 2.")
+    failure = (1 - confidence) / num_claims
 
     def widest(total: int) -> float:
         half, whole = np.array([total // 2]), np.array([total])
@@ -259,9 +264,10 @@ def _check_method(method: str) -> None:
 
 
 def check_confidence(confidence: float) -> None:
-    if not 0 < confidence < 1:  # NaN is not
+    given = np.asarray(confidence)
+    if given.ndim or given.dtype.kind not in "fiu" or not 0 < given < 1:  # NaN is not
         raise ValueError(
-            f"confidence={confidence}; it must lie strictly between 0 and 1, such as 0.95."
+            f"confidence={confidence!r}; it must lie strictly between 0 and 1, such as 0.95."
         )
 
 

@@ -31,7 +31,7 @@ def l1_expectation(
       The expectations ``float64[R]``, and distributions ``float64[T]`` that attain them.
 
     Raises:
-      ValueError: shapes do not fit, or a row is empty.
+      ValueError: shapes do not fit, a row is empty, or a radius is negative.
 
     Example:
       >>> least, chosen = l1_expectation(np.array([0.0, 1.0, 2.0]), np.array([0.5, 0.25, 0.25]),
@@ -52,6 +52,9 @@ def l1_expectation(
             f"entry_start goes from {start[0]} to {start[-1]}; it must ascend from 0 to "
             f"{value.size}, without an empty row."
         )
+    if not (radius >= 0).all():
+        r = int(np.argmin(radius >= 0))
+        raise ValueError(f"the radius of row {r} is {radius[r]}; it must be at least 0.")
     row = np.repeat(np.arange(radius.size), width)
     key = -value if maximize else value
     order = np.lexsort((key, row))

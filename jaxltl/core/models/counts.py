@@ -16,6 +16,7 @@ from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
 
 _INTEGER = re.compile(r"-?[1-9][0-9]{0,17}|0")
+MOST_SAMPLES = 2**53  # up to which doubles count
 _MOST_ENTRIES = 10**8
 _ANY = "any"  # the only action of a state in which nothing was tried
 
@@ -86,6 +87,11 @@ def make_counts(
             )
         if (x < 0).any():
             raise ValueError(f"{name}[{int(np.argmax(x < 0))}] is {x.min()}; none is negative.")
+    if count is not None and sum(arrays["count"].tolist()) > MOST_SAMPLES:
+        raise ValueError(
+            f"count adds up to {sum(arrays['count'].tolist())}; at most 2^53 "
+            "transitions are counted."
+        )
     most = {"state": max(arrays["state"].max(), arrays["successor"].max()) + 1}
     most |= {"action": arrays["action"].max() + 1}
     state_names = _checked_names("states", states, int(most["state"]))

@@ -177,8 +177,13 @@ def guarantee_curve(
     """
     sparse = to_sparse(model)
     whole = counts_on(sparse, counts) if isinstance(counts, TransitionCounts) else counts
-    whole = np.asarray(whole, np.int64)
-    wanted = np.asarray(sizes)
+    whole, wanted = np.asarray(whole), np.asarray(sizes)
+    for name, x in (("counts", whole), ("sizes", wanted)):
+        if x.ndim != 1 or x.dtype.kind not in "iuf" or (x != np.floor(x)).any():
+            raise ValueError(f"{name} is {x.dtype}{list(x.shape)}; expected a list of integers.")
+    if (whole < 0).any():
+        raise ValueError(f"counts[{int(np.argmax(whole < 0))}] is {whole.min()}; none is negative.")
+    whole = whole.astype(np.int64)
     total = int(whole.sum())
     wrong = (wanted < 0) | (wanted > total)
     if wrong.any():

@@ -160,6 +160,8 @@ def test_dtypes_and_empty_tables():
         ({"confidence": 1}, "confidence=1;"),
         ({"confidence": float("nan")}, "confidence=nan"),
         ({"confidence": -3}, "strictly between"),
+        ({"confidence": None}, "confidence=None"),
+        ({"confidence": "0.9"}, "confidence='0.9'"),
         ({"method": "exact"}, "method='exact'; choose one of clopper-pearson"),
         ({"counts": [[1, -1]]}, r"counts\[0, 1\] is -1"),
         ({"counts": [[1.5, 1]]}, r"counts\[0, 0\] is 1.5"),
@@ -204,7 +206,15 @@ def test_samples_that_are_needed(method):
 
 
 def test_samples_that_cannot_be_asked_for():
-    for bad in ({"width": 0.0}, {"width": 1}, {"confidence": 1.0}, {"method": "x"}):
+    for bad in (
+        {"width": 0.0},
+        {"width": 1},
+        {"confidence": 1.0},
+        {"method": "x"},
+        {"num_claims": 0},
+        {"num_claims": -5},
+        {"num_outcomes": 1},
+    ):
         with pytest.raises(ValueError, match=next(iter(bad))):
             samples_needed(**{"width": 0.1, "confidence": 0.9} | bad)
     with pytest.raises(ValueError, match="more than 2"):

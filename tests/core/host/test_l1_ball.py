@@ -63,6 +63,9 @@ def test_what_is_refused():
     two = np.array([0.5, 0.5])
     with pytest.raises(ValueError, match="radius"):
         l1_expectation(two, two, two, np.array([0, 2]), maximize=True)
+    for radius in (-0.1, np.nan):
+        with pytest.raises(ValueError, match="the radius of row 0 is"):
+            l1_expectation(two, two, np.array([radius]), np.array([0, 2]), maximize=True)
     with pytest.raises(ValueError, match="without an empty row"):
         l1_expectation(two, two, two, np.array([0, 0, 2]), maximize=True)
     with pytest.raises(ValueError, match="ascend from 0 to 2"):

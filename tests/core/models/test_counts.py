@@ -239,6 +239,7 @@ def test_models_that_are_refused(arguments, message):
         (([0], [0], [0], [-1]), "count.0. is -1; none is negative"),
         (([0], [-2], [0]), "action.0. is -2"),
         (([10**12], [0], [0]), "states go up to 1000000000000; number them from 0"),
+        (([0, 0], [0, 0], [0, 0], [2**62, 2**62]), "count adds up to 9223372036854775808; at most"),
     ],
 )
 def test_counts_that_are_refused(arguments, message):

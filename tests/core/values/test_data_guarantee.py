@@ -131,6 +131,11 @@ def test_the_curve_of_a_log():
     assert again[0] == whole
     with pytest.raises(ValueError, match=r"sizes\[1\] is 20001; there are 20000 transitions"):
         guarantee_curve(coins(), counts, "F a", 0.9, [5, 20_001])
+    for numbers, sizes, message in (
+            (counts, [0.5], "sizes is float64"), (counts, 5, "sizes is int64"),
+            (counts + 0.5, [5], "counts is float64"), (-counts, [5], "none is negative")):
+        with pytest.raises(ValueError, match=message):
+            guarantee_curve(coins(), numbers, "F a", 0.9, sizes)
 
 
 def test_counts_by_name():
