@@ -24,7 +24,7 @@ from jaxltl.core.types import Status
 from jaxltl.core.values.robust import robust_reachability
 from jaxltl.io.model_files import read_model, write_model
 
-REPEATS = 3
+REPEATS = 2
 LANES = 1000
 
 
@@ -106,19 +106,23 @@ def queues(size: int, rng: Any) -> IntervalMDP:
 
 
 def random_graph(size: int, rng: Any) -> IntervalMDP:
-    """Two choices of four successors each; one state in fifty is lost, and one the goal."""
+    """Two choices of four successors each, and of an end with one chance in fifty."""
     rows: list[Any] = []
     end = rng.random(size) < 0.04
-    end[0] = False
+    end[0], end[-1] = False, True
+    ends = np.flatnonzero(end)
     for s in range(size):
         if end[s]:
             rows.append([[(s, 1.0)]])
             continue
         rows.append([
-            _joined(list(zip(rng.integers(size, size=4).tolist(),
-                             rng.dirichlet(np.ones(4)).tolist(), strict=True)))
+            _joined([(int(rng.choice(ends)), 0.02), *zip(
+                rng.integers(size, size=4).tolist(),
+                (0.98 * rng.dirichlet(np.ones(4))).tolist(), strict=True)])
             for _ in range(2)])
-    return _model(rng, rows, end & (rng.random(size) < 0.5))
+    goal = end & (rng.random(size) < 0.5)
+    goal[-1] = True
+    return _model(rng, rows, goal)
 
 
 FAMILIES: dict[str, Callable[[int, Any], IntervalMDP]] = {
