@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import NullFormatter
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.plot.style import (
@@ -173,6 +174,8 @@ def guarantees(
     if reference is not None:
         axes.axhline(reference, color=MUTED, lw=1, ls="--", label="no policy has more")
     axes.set_xscale("log")
+    if count.max() > 10 * count.min():  # else no power of ten may be among them
+        axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_ylim(0, 1.02)
     axes.set_xlabel(names[0], color=INK, fontsize=8.5)
     axes.set_ylabel(names[1], color=INK, fontsize=8.5)

@@ -226,6 +226,9 @@ def test_what_is_learned_is_told_with_its_guarantee(write, tmp_path):
     found["satisfaction"]["minimum"]["lower"] = 1
     ((kind, told),) = [x for x in remarks(found) if "By the graph" in x[1]]
     assert kind == "note" and told.startswith("By the graph, which is what the log showed: ")
+    found["guarantee"] |= {"asked": 0.5, "attained": 0.6, "share": 0, "weight": 0}
+    ((kind, told),) = [x for x in remarks(found) if "sked for" in x[1]]
+    assert kind == "note" and told.startswith("If the log's frequencies were the truth: asked for")
 
 
 def test_what_the_log_never_showed_is_taken_for_impossible_or_not(write):

@@ -78,6 +78,13 @@ def _guaranteed(data: Mapping[str, Any]) -> str:
             f"{data['confidence']:g}, from {many(data['samples'], 'logged transition')}")
 
 
+def _if_true(said: Remark) -> Remark:
+    """What is proven of a log's frequencies is proven of nothing else."""
+    kind, text = said
+    return "note" if kind == "good" else kind, (
+        f"If the log's frequencies were the truth: {text[0].lower()}{text[1:]}")
+
+
 def _by_frequencies(result: Mapping[str, Any]) -> str:
     return " by the log's frequencies" if "data" in result else ""
 
@@ -95,12 +102,11 @@ def _notes(result: Mapping[str, Any]) -> list[Remark]:
                 + (", if no move leads where the log never saw it lead" if logged else "")
                 + ". It takes moves that keep that possible, and no others.")))
         else:
-            kind, text = _nearly_best(learned["mean"]["lower"], best["mean"])
-            found.append(
-                ("note", f"If the log's frequencies were the truth: {text[0].lower()}{text[1:]}")
-                if logged and kind == "good" else (kind, text))
+            said = _nearly_best(learned["mean"]["lower"], best["mean"])
+            found.append(_if_true(said) if logged else said)
     elif asked != "none":
-        found.append(("good", _asked(result["guarantee"])))
+        reached = "good", _asked(result["guarantee"])
+        found.append(_if_true(reached) if logged else reached)
     if (lost := result["guarantee"].get("left_out")) is not None:
         found.append(("note", _left_out(lost)))
     found += [("note", result[key]) for key in ("remark", "trivial") if result.get(key)]
@@ -226,8 +232,9 @@ def warnings(result: Mapping[str, Any]) -> list[str]:
     starts, total = result["impossible_starts"], result["satisfaction"]["num_starts"]
     if starts:
         listed = "; ".join(place(s) for s in starts[:5]) + ("; ..." if len(starts) > 5 else "")
+        none = "By what the log showed, no" if "data" in result else "No"
         found.append(
-            f"No policy can do the task from {len(starts)} of {total} initial states: {listed}."
+            f"{none} policy can do the task from {len(starts)} of {total} initial states: {listed}."
         )
     training = result["training"]
     if not training["converged"]:
