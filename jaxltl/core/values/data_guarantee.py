@@ -100,8 +100,9 @@ def learn_guarantee(
     center = np.asarray(sets.center, np.float64)[kept]
     sign = 1 if objective == "max" else -1
     return DataGuarantee(
-        bound=_mean(share, getattr(found.solution, sure)), confidence=float(confidence),
-        optimistic=_mean(share, getattr(best.solution, most)), satisfaction=found,
+        bound=_mean(share, getattr(found.solution, sure), up=objective != "max"),
+        confidence=float(confidence), satisfaction=found,
+        optimistic=_mean(share, getattr(best.solution, most), up=objective == "max"),
         model=interval, sets=sets, gain=sign * _gain(interval, found, center, share))
 
 
@@ -115,8 +116,14 @@ def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.
     return found, np.isin(*code)
 
 
-def _mean(share: np.ndarray, value: Any) -> float:
-    return float(np.clip(share @ np.asarray(value) / share.sum(), 0, 1))
+def _mean(share: np.ndarray, value: Any, *, up: bool) -> float:
+    """The mean of bounds in [0, 1], rounded up or down."""
+    value = np.asarray(value)
+    if (value == value[0]).all():
+        return float(value[0])
+    slack = (share.size + 4) * float(np.finfo(np.float64).eps)
+    mean = float(share @ value / share.sum())
+    return min(mean * (1 + slack), 1.0) if up else mean * (1 - slack)
 
 
 def _gain(

@@ -1,12 +1,14 @@
 """What data guarantee holds as often as it says, and tightens with more of them."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
 from jaxltl.core.models.counts import make_counts
 from jaxltl.core.models.interval import make_interval
 from jaxltl.core.models.sparse import make_sparse
-from jaxltl.core.values.data_guarantee import guarantee_curve, learn_guarantee
+from jaxltl.core.values.data_guarantee import _mean, guarantee_curve, learn_guarantee
 from jaxltl.core.values.robust_satisfaction import robust_satisfaction
 from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
 from tests.reference_intervals import random_model
@@ -145,3 +147,14 @@ def test_counts_by_name():
     assert found.bound == same.bound > 0.4
     with pytest.raises(ValueError, match="confidence"):
         learn_guarantee(coins(), counts, "F a", 1.0)
+
+
+def test_means_are_rounded_to_the_safe_side():
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        share, value = rng.dirichlet(np.ones(4)), rng.random(4)
+        weights = [Fraction(x) for x in share.tolist()]
+        mean = sum(w * Fraction(x) for w, x in zip(weights, value.tolist(), strict=True))
+        low, high = (_mean(share, value, up=up) for up in (False, True))
+        assert Fraction(low) <= mean / sum(weights) <= Fraction(high) <= low + Fraction(1, 10**14)
+    assert _mean(share, np.ones(4), up=False) == 1
