@@ -14,7 +14,8 @@ from jaxltl.app.files.models import padded
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.types import Status
-from jaxltl.core.values.mixture import at_starts
+from jaxltl.core.values.data_guarantee import safe_mean
+from jaxltl.core.values.mixture import from_starts
 from jaxltl.core.values.satisfaction import satisfaction_probability
 
 
@@ -87,10 +88,12 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> dic
     against = product(best.model, model.automaton, label_on=model.label_on)
     weights: Any = np.asarray(policy)[evidence.model.host.state, :, logged.column]
     found = satisfaction_probability(against, weights, nature="min")
+    share = np.asarray(evidence.model.initial)
+    lower = from_starts(against, found.lower)[share > 0]
     codes = int(found.status), int(best.satisfaction.solution.status)
     status = next((c for c in codes if c != Status.CONVERGED), int(Status.CONVERGED))
     return {
-        "confidence": logged.confidence, "guaranteed": at_starts(against, found.lower, "mean")[0],
+        "confidence": logged.confidence, "guaranteed": safe_mean(share[share > 0], lower, up=False),
         "best_guaranteed": best.bound, "optimistic": best.optimistic,
         "samples": logged.num_samples, "method": logged.method, "status": Status(status).name,
         "sample_next": sample_next(evidence, best),

@@ -100,9 +100,9 @@ def learn_guarantee(
     center = np.asarray(sets.center, np.float64)[kept]
     sign = 1 if objective == "max" else -1
     return DataGuarantee(
-        bound=_mean(share, getattr(found.solution, sure), up=objective != "max"),
+        bound=safe_mean(share, getattr(found.solution, sure), up=objective != "max"),
         confidence=float(confidence), satisfaction=found,
-        optimistic=_mean(share, getattr(best.solution, most), up=objective == "max"),
+        optimistic=safe_mean(share, getattr(best.solution, most), up=objective == "max"),
         model=interval, sets=sets, gain=sign * _gain(interval, found, center, share))
 
 
@@ -116,7 +116,7 @@ def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.
     return found, np.isin(*code)
 
 
-def _mean(share: np.ndarray, value: Any, *, up: bool) -> float:
+def safe_mean(share: np.ndarray, value: Any, *, up: bool) -> float:
     """The mean of bounds in [0, 1], rounded up or down."""
     value = np.asarray(value)
     if (value == value[0]).all():

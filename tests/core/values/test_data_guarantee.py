@@ -8,7 +8,7 @@ import pytest
 from jaxltl.core.models.counts import make_counts
 from jaxltl.core.models.interval import make_interval
 from jaxltl.core.models.sparse import make_sparse
-from jaxltl.core.values.data_guarantee import _mean, guarantee_curve, learn_guarantee
+from jaxltl.core.values.data_guarantee import guarantee_curve, learn_guarantee, safe_mean
 from jaxltl.core.values.robust_satisfaction import robust_satisfaction
 from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
 from tests.reference_intervals import random_model
@@ -155,6 +155,6 @@ def test_means_are_rounded_to_the_safe_side():
         share, value = rng.dirichlet(np.ones(4)), rng.random(4)
         weights = [Fraction(x) for x in share.tolist()]
         mean = sum(w * Fraction(x) for w, x in zip(weights, value.tolist(), strict=True))
-        low, high = (_mean(share, value, up=up) for up in (False, True))
+        low, high = (safe_mean(share, value, up=up) for up in (False, True))
         assert Fraction(low) <= mean / sum(weights) <= Fraction(high) <= low + Fraction(1, 10**14)
-    assert _mean(share, np.ones(4), up=False) == 1
+    assert safe_mean(share, np.ones(4), up=False) == 1
