@@ -19,6 +19,7 @@ from jaxltl.core.host.sparse import Floats
 
 LARGEST = 1000  # unknowns
 _OPERATIONS = 150_000  # on fractions, in one elimination
+_BITS = 1024  # of numbers, from which an operation counts as more
 _ROUNDS = 50
 
 
@@ -105,9 +106,9 @@ def _solved(rows: list[_Row], order: list[int]) -> list[Fraction] | None:
                 else:
                     weights[i][j] = weights[i].get(j, Fraction(0)) + share * w
                     into[j].add(i)
-            done += len(mine) + 1
-        if done > _OPERATIONS:
-            return None
+            done += (len(mine) + 1) * (1 + share.denominator.bit_length() // _BITS)
+            if done > _OPERATIONS:
+                return None
     value = [Fraction(0)] * size
     for k in order:
         value[k] = (known[k] + sum(w * value[j] for j, w in weights[k].items())) / total[k]

@@ -60,11 +60,19 @@ class _Solve(NamedTuple):
       joint: values of an interval model's joint optimum; from the model, its rewards of rows, and
         whether to maximise.
       cost: ``float64[R]``.
+      tolerance, relative: the width asked for, and whether as a share of the value.
     """
 
     exact: Callable[[HostMDP, Floats, bool], Enclosed]
     joint: Callable[[HostInterval, Floats, bool], Robust]
     cost: Floats
+    tolerance: float
+    relative: bool
+
+    def narrow(self, low: Floats, high: Floats) -> bool:
+        """Whether bounds are as near as asked."""
+        scale = high if self.relative else 1.0
+        return bool((np.isfinite(high) & (high - low <= self.tolerance * scale)).all())
 
 
 def reachability(
@@ -92,7 +100,7 @@ def reachability(
     def joint(part: HostInterval, _: Floats, up: bool) -> Robust:
         return _joint_reachability(part, target, up, tolerance, depth, exact)
 
-    solve = _Solve(exact, joint, np.zeros(halted.mdp.num_rows))
+    solve = _Solve(exact, joint, np.zeros(halted.mdp.num_rows), tolerance, False)
     if maximize == helpful:
         found = joint(halted, solve.cost, maximize)
     elif maximize:
@@ -142,7 +150,7 @@ def total_reward(
 
     ends = target | ~finite
     cost = np.where(ends[part.mdp.state], 0, cost[origin])
-    solve = _Solve(exact, joint, cost)
+    solve = _Solve(exact, joint, cost, tolerance, True)
     if maximize == large:
         found = joint(part, cost, maximize)
     elif maximize:
@@ -285,6 +293,11 @@ def _led_by_policy(
         better = best > _noise(inner.value)
         if rounds == _ROUNDS or not better.any():
             break
+        if _is_tried(rounds):
+            other = solve.exact(model.fixed(p), solve.cost, up)
+            low, high = (inner.lower, other.upper) if up else (other.lower, inner.upper)
+            if solve.narrow(low, high):
+                break
         new = mdp.first_choice(sign * gain == best[mdp.state])[1]
         row = np.where(better, new, row)
     other = solve.exact(model.fixed(p), solve.cost, up)
@@ -311,13 +324,30 @@ def _led_by_nature(
         better = more > _noise(found.value)[mdp.state]
         if rounds == _ROUNDS or not better.any():
             break
+        if _is_tried(rounds):
+            row = _least(mdp, sign * gain)
+            part, _ = model.chain(row)
+            inner = solve.joint(part, solve.cost[row], up)
+            low, high = (found.lower, inner.upper) if up else (inner.lower, found.upper)
+            if solve.narrow(low, high):
+                break
         p = np.where(better[mdp.row], q, p)
-    best = mdp.over_choices(np.minimum, sign * gain)
-    row = mdp.first_choice(sign * gain == best[mdp.state])[1].astype(np.int64)
+    row = _least(mdp, sign * gain)
     part, _ = model.chain(row)
     inner = solve.joint(part, solve.cost[row], up)
     low, high = (found.lower, inner.upper) if up else (inner.lower, found.upper)
     return _between(found.value, low, high, row, p, rounds + inner.rounds, float(more.max()))
+
+
+def _is_tried(rounds: int) -> bool:
+    """Whether bounds are looked at while something is gained: after 4, 8, 16, ... rounds."""
+    return rounds >= 4 and rounds & (rounds - 1) == 0
+
+
+def _least(mdp: HostMDP, gain: Floats) -> Integers:
+    """The first row of each state that gains least."""
+    best = mdp.over_choices(np.minimum, gain)
+    return mdp.first_choice(gain == best[mdp.state])[1].astype(np.int64)
 
 
 def _between(

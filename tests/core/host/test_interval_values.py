@@ -143,3 +143,16 @@ def test_a_reward_whose_first_way_there_would_hardly_end():
         step = 1 + model.total(model.nature(ahead, maximize=True) * ahead)
         value = np.where(goal, 0, step.reshape(n * n, 4).min(1))
     enclosed(found, value)
+
+
+def test_who_stops_when_bounds_are_near(monkeypatch):
+    """Bounds that are looked at in every round enclose the values too."""
+    monkeypatch.setattr(interval_values, "_is_tried", lambda rounds: True)
+    rng = np.random.default_rng(11)
+    for _ in range(15):
+        model = random_model(rng)
+        goal = np.arange(4) == rng.integers(4)
+        for (maximize, helpful), value in optima(
+                [reach(p, goal) for _, p in chains(model, goal)]).items():
+            enclosed(interval_values.reachability(
+                model, goal, maximize=maximize, helpful=helpful), value)
