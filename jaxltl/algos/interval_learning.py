@@ -88,10 +88,11 @@ class Hparams:
       strength, most_strength: as how many samples the first linear intervals count, at least where
         data contradict them, and where they do not; positive, the second not below the first.
       exploration: the probability of making any allowed move, in (0, 1].
-      restart: the probability with which a run starts anew before a move where the task is decided.
+      restart: the probability with which a run starts anew before a move where the task is won;
+        where it is lost, it always does.
       discount: in (0, 1); among moves of one optimistic value those are made that lead soonest to
         where the task is won.
-      sweeps: of each value in a step.
+      sweeps: of each value in a step; as many as it takes moves to where the task is won, or more.
       tolerance: the change by the last sweep up to which values count as settled.
       num_runs: that a step samples; static.
       length: moves of each; static.
@@ -103,9 +104,9 @@ class Hparams:
     strength: jax.Array | float = 5.0
     most_strength: jax.Array | float = 10.0
     exploration: jax.Array | float = 0.1
-    restart: jax.Array | float = 0.5
+    restart: jax.Array | float = 0.05
     discount: jax.Array | float = 0.99
-    sweeps: jax.Array | int = 20
+    sweeps: jax.Array | int = 40
     tolerance: jax.Array | float = 1e-4
     num_runs: int = struct.field(pytree_node=False, default=4)
     length: int = struct.field(pytree_node=False, default=64)
@@ -123,7 +124,6 @@ class State:
       lower, upper: ``float[S, A, K]``, the intervals; 0 at what is no transition.
       pessimistic, optimistic: ``float[S, Q]``, the largest probability of the task with nature
         against it and for it, as far as sweeps have come.
-      pace: ``float[S, Q]``, how soon the task may be won, discounted.
       best: ``bool[S, Q, A]``, the moves that are preferred.
       residual: the largest change by the last sweep.
     """
@@ -136,7 +136,6 @@ class State:
     upper: jax.Array
     pessimistic: jax.Array
     optimistic: jax.Array
-    pace: jax.Array
     best: jax.Array
     residual: jax.Array
 
@@ -242,7 +241,6 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         upper=upper,
         pessimistic=won,
         optimistic=1 - problem.lost.astype(world.dtype),
-        pace=won,
         best=problem.allowed,
         residual=jnp.asarray(jnp.inf, world.dtype),
     )
@@ -310,7 +308,8 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     In an end component between it makes the best moves out, and those that stay.
     """
     nature = jnp.full(1, -1, state.lower.dtype)
-    moves = _moves(problem, state.pessimistic[None], state.lower, state.upper, nature)[0]
+    ends = state.lower[None], state.upper[None]
+    moves = _moves(problem, state.pessimistic[None], *ends, nature)[0]
     best = _backed_up(problem, moves)[..., None]
     out = problem.allowed & ~problem.staying & (moves >= best)
     used = jnp.where(problem.won[..., None], problem.allowed, out | problem.staying)
@@ -407,8 +406,8 @@ def _move(rules: _Rules, places: Any, words: Any, keys: jax.Array) -> Any:
     """A move of each run, and which transitions these were."""
     problem, (s, q) = rules.problem, places
     world, dtype = problem.model.mdp, problem.model.dtype
-    decided = take(problem.won, (s, q)) | take(problem.lost, (s, q))
-    anew = decided & (splitmix.uniform(words[0], dtype) < rules.restart)
+    ends = splitmix.uniform(words[0], dtype) < rules.restart
+    anew = take(problem.lost, (s, q)) | (take(problem.won, (s, q)) & ends)
     s = jnp.where(anew, draw(problem.start_table, words[1]), s)
     q = jnp.where(anew, rules.start, q)
     explore = splitmix.uniform(words[2], dtype) < rules.explore
@@ -473,7 +472,8 @@ def _confident(
 
 def _least(a: jax.Array, c: jax.Array) -> jax.Array:
     """A number below all b with ``kl(a, b) <= c``."""
-    other = jnp.maximum(1 - a, 0)
+    a = jnp.clip(a, 0, 1)  # a quotient of equal numbers may be rounded beyond
+    other = 1 - a
     near = jnp.minimum(jnp.sqrt(c / 2), jnp.sqrt(2 * c * a))
     return jnp.maximum(a - jnp.minimum(near, c + jnp.sqrt(c * c + 2 * c * other)), 0)
 
@@ -493,16 +493,23 @@ def _with_room(lower: jax.Array, upper: jax.Array) -> tuple[jax.Array, jax.Array
 def _solved(state: State, problem: Problem, hparams: Hparams) -> State:
     """The values after some sweeps, and the moves that are preferred by the last of them."""
     nature = jnp.asarray([-1, 1, 1], state.lower.dtype)
+    used = problem.model.mdp.successor_probability > 0
+    seen = state.counts.astype(nature.dtype) + used
+    share = seen / jnp.maximum(jnp.sum(seen, -1, keepdims=True), 1)
+    lower = jnp.stack([state.lower, state.lower, share])
+    upper = jnp.stack([state.upper, state.upper, share])
 
     def sweep(_: Any, now: Any) -> Any:
         values, _, _ = now
-        moves = _moves(problem, values, state.lower, state.upper, nature)
+        moves = _moves(problem, values, lower, upper, nature)
         known = jax.vmap(partial(_backed_up, problem))(moves[:2])
         pace, best = _soonest(problem, hparams, moves[1], known[1], moves[2])
         change = jnp.max(jnp.abs(known - values[:2]))
         return jnp.concatenate([known, pace[None]]), best, change
 
-    values = jnp.stack([state.pessimistic, state.optimistic, state.pace])
+    # The pace begins anew: what was hoped for once would fade slowly where runs may stay.
+    begin = problem.won.astype(nature.dtype)
+    values = jnp.stack([state.pessimistic, state.optimistic, begin])
     values, best, change = lax.fori_loop(
         0, hparams.sweeps, sweep, (values, state.best, state.residual)
     )
@@ -510,7 +517,6 @@ def _solved(state: State, problem: Problem, hparams: Hparams) -> State:
         state,
         pessimistic=values[0],
         optimistic=values[1],
-        pace=values[2],
         best=best,
         residual=change,
     )
@@ -524,14 +530,14 @@ def _moves(
     Args:
       problem: whose graph it is.
       values: ``float[V, S, Q]``.
-      lower, upper: ``float[S, A, K]``.
+      lower, upper: ``float[V, S, A, K]``.
       nature: ``float[V]``, 1 where it makes a value large, -1 where small.
     """
     world: Any = problem.model.mdp
     next_memory = problem.model.next_memory[:, :, None, None]
     reached = values[:, world.successor[:, None], next_memory]
     shape, width = reached.shape, reached.shape[-1]
-    low, high = (jnp.broadcast_to(x[:, None], shape).reshape(-1, width) for x in (lower, upper))
+    low, high = (jnp.broadcast_to(x[:, :, None], shape).reshape(-1, width) for x in (lower, upper))
     key = -nature[:, None, None, None, None] * reached
     share = chances(low, high, key.reshape(-1, width))
     return jnp.sum(share.reshape(shape) * reached, axis=-1)
@@ -553,7 +559,10 @@ def _decided(problem: Problem, value: jax.Array) -> jax.Array:
 def _soonest(
     problem: Problem, hparams: Hparams, moves: jax.Array, value: jax.Array, ahead: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """How soon the task may be won by moves of the best optimistic value, and which are soonest."""
+    """How soon the task may be won by moves of the best optimistic value, and which are soonest.
+
+    By the frequencies: how to get to where there is something to hope for needs no hope itself.
+    """
     slack = 64 * jnp.finfo(moves.dtype).eps
     near = problem.allowed & (problem.staying | (moves >= value[..., None] - slack))
     near = jnp.where((problem.won | problem.lost)[..., None], problem.allowed, near)

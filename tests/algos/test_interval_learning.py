@@ -213,6 +213,11 @@ def test_intervals_with_a_confidence_hold_those_of_any_time_and_only_shrink():
     assert np.mean(width) < 1.6 * np.mean(best)
 
 
+def test_frequencies_that_are_rounded_beyond_one_make_no_nan():
+    ends = learning._least(jnp.array([-3e-16, 0.0, 0.5, 1.0, 1 + 3e-16]), jnp.float64(0.01))
+    assert (ends[:2] == 0).all() and (ends[3:] > 0.9).all() and 0.4 < ends[2] < 0.45
+
+
 # --- values -------------------------------------------------------------------------------------
 
 
