@@ -169,6 +169,11 @@ def make_problem(
         raise ValueError(f'bound={bound!r}; it must be ">=" or "<=".')
     if objective not in ("max", "min"):
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    if not isinstance(model, ParametricMDP):
+        raise ValueError(
+            f"{type(model).__name__} has no box of parameters; give what "
+            "make_parametric makes, or read_parametric(path).over(low, high)."
+        )
     here = model.model
     target = here.states_where(target) if isinstance(target, str) else np.asarray(target, bool)
     require_shape("target", target, (here.num_states,))

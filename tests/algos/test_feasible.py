@@ -393,3 +393,8 @@ def test_searches_that_are_none(tmp_path, threshold, changed, message):
     problem = make_problem(coins(tmp_path).over(0.1, 0.9), "goal", bound=">=")
     with pytest.raises(ValueError, match=message):
         feasible(problem, threshold, **changed)
+
+
+def test_a_model_without_a_box():
+    with pytest.raises(ValueError, match="NoneType has no box of parameters"):
+        make_problem(None, "goal", bound=">=")

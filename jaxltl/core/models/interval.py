@@ -138,6 +138,9 @@ def make_interval(model: MDP | SparseMDP, lower: Array, upper: Array) -> Interva
       >>> model.lower.tolist(), model.upper.tolist()
       ([0.4, 0.3, 1.0, 1.0], [0.7, 0.6, 1.0, 1.0])
     """
+    if not isinstance(model, MDP | SparseMDP):
+        raise ValueError(f"{type(model).__name__} takes no intervals; give an MDP or a SparseMDP "
+                         "(of an interval model, its nominal one).")
     lower, upper = (np.asarray(x, np.float64) for x in (lower, upper))
     shape = np.shape(model.probability)
     for name, ends in (("lower", lower), ("upper", upper)):

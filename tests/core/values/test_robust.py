@@ -327,6 +327,8 @@ def test_one_successor_twice():
 
 def test_bad_questions():
     model = make_interval(COIN, [0.1, 0.2, 1, 1], [0.8, 0.9, 1, 1])
+    with pytest.raises(ValueError, match=r"IntervalMDP takes no intervals; .*its nominal one"):
+        make_interval(model, [0.1, 0.2, 1, 1], [0.8, 0.9, 1, 1])
     target = [False, True, False]
     with pytest.raises(ValueError, match=r'nature=.adverse.; it must be "min"'):
         robust_reachability(model, target, nature="adverse")
