@@ -138,6 +138,47 @@ def test_a_risk_is_not_taken_where_there_is_a_sure_way():
     assert not learning.wins_almost_surely(problem, jnp.full(problem.allowed.shape, 0.5))
 
 
+def test_where_a_task_is_won_only_what_may_be_done_for_ever_is_done():
+    """Each of two states can be left for the other, but for ever only one may be kept to."""
+    world = jl.make_mdp(
+        [[[0], [1]], [[0], [1]]],
+        np.ones((2, 2, 1)),
+        initial=[0.5, 0.5],
+        label=[[1, 0], [0, 0]],
+        propositions=["a", "b"],
+    )
+    problem = learning.make_problem(world, "F G a | G F b")
+    assert problem.won.all()
+    state = learning.init(jax.random.key(0), problem, settings())
+    for play in (
+        learning.behavior(state, problem, settings()),
+        learning.policy(state, problem, settings()),
+    ):
+        assert wins(problem, play) and learning.wins_almost_surely(problem, play)
+    assert not wins(problem, np.ones(problem.allowed.shape))
+    assert not learning.wins_almost_surely(problem, jnp.full(problem.allowed.shape, 0.5))
+
+
+def test_who_may_stay_has_the_value_of_the_best_way_out():
+    """Two states in a circle, one of which has a risky way home; and values once too high."""
+    world = jl.make_mdp(
+        [[[1, 0], [1, 0]], [[0, 0], [2, 3]], [[2, 0], [2, 0]], [[3, 0], [3, 0]]],
+        [[[1, 0], [1, 0]], [[1, 0], [0.7, 0.3]], [[1, 0], [1, 0]], [[1, 0], [1, 0]]],
+        initial=[1, 0, 0, 0],
+        label=[[0], [0], [1], [0]],
+        propositions=["home"],
+    )
+    problem, hparams = learning.make_problem(world, "F home"), settings()
+    state, metrics = learning.train(jax.random.key(0), problem, hparams, num_steps=60)
+    q = int(problem.model.automaton.initial)
+    for value, end in ((state.pessimistic, state.lower), (state.optimistic, state.upper)):
+        np.testing.assert_allclose(value[:2, q], end[1, 1, 0], rtol=1e-6)
+    assert 0.6 < metrics.lower[-1] < metrics.upper[-1] < 0.8
+    play = learning.policy(state, problem, hparams)
+    reached = satisfaction_probability(problem.model, play).value
+    np.testing.assert_allclose(reached[0, q], 0.7, rtol=1e-6)
+
+
 # --- samples ------------------------------------------------------------------------------------
 
 
