@@ -124,7 +124,8 @@ def make_interval(model: MDP | SparseMDP, lower: Array, upper: Array) -> Interva
       lower, upper: shaped as ``model.probability``: ``float[T]``, or ``float[S, A, K]``.
 
     Returns:
-      :class:`IntervalMDP`. Entries to which nature cannot give any mass are left out. A padded
+      :class:`IntervalMDP`. Entries to which nature cannot give any mass, up to the rounding of a
+      row's sum (4e-16 times its successors), are left out. A padded
       model's row i of a state is the i-th of its available actions.
 
     Raises:

@@ -19,6 +19,7 @@ from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.operators import is_deterministic, row_weights
 from jaxltl.core.types import Method, Solution, Status, require_shape, status_code
+from jaxltl.core.values.bounded import states
 from jaxltl.core.values.contest import (
     Bounds,
     Contest,
@@ -30,7 +31,7 @@ from jaxltl.core.values.contest import (
 )
 from jaxltl.core.values.fixed_point import implicit
 from jaxltl.core.values.iterate import in_turn
-from jaxltl.core.values.robust import interval_reward, require_direction, states_of
+from jaxltl.core.values.robust import interval_reward, require_direction
 
 _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
 
@@ -133,8 +134,8 @@ def prepare_interval(
     if stay is not None and reward is not None:
         raise ValueError("expected rewards are until the target alone: leave stay out.")
     nature = require_direction(nature, objective)
-    target = states_of(model, target, "target")
-    stay = None if stay is None else states_of(model, stay, "stay")
+    target = states(model.nominal, target, "target")
+    stay = None if stay is None else states(model.nominal, stay, "stay")
     host: HostInterval = model.host
     entry: Any = np.arange(model.num_transitions)
     if policy is not None:

@@ -16,7 +16,7 @@ from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.operators import is_deterministic, row_weights
 from jaxltl.core.models.sparse import Rewards, SparseMDP, row_reward
 from jaxltl.core.types import Method, Solution, Status, require_shape
-from jaxltl.core.values.bounded import structure
+from jaxltl.core.values.bounded import states, structure
 
 TOLERANCE = 1e-6
 
@@ -35,6 +35,23 @@ def require_direction(nature: str | None, objective: str) -> str:
         raise ValueError(f'nature={nature!r}; it must be "min" (nature makes the value small) or '
                          '"max" (large).')
     return nature
+
+
+def width_asked(tolerance: Any) -> float:
+    """The width of an enclosure that is asked for, 1e-6 where nothing is said.
+
+    Raises:
+      ValueError: it is negative or no number.
+    """
+    if tolerance is None:
+        return TOLERANCE
+    try:
+        width = float(tolerance)
+    except (TypeError, ValueError):
+        width = float("nan")
+    if not width >= 0:
+        raise ValueError(f"tolerance={tolerance!r}; it must be a number of at least 0.")
+    return width
 
 
 def refuse_nature(nature: str | None) -> None:
@@ -79,12 +96,12 @@ def robust_reachability(
       >>> robust_reachability(model, [False, True, False]).value.tolist()
       [0.4, 1.0, 0.0]
     """
-    asked = TOLERANCE if tolerance is None else float(tolerance)
+    asked = width_asked(tolerance)
     sides = sides_of(model, policy, objective, nature)
     model = sides.model
-    target = sides.states(states_of(model, target, "target"))
+    target = sides.states(states(model.nominal, target, "target"))
     if stay is not None:
-        stay = sides.states(states_of(model, stay, "stay")) | sides.added
+        stay = sides.states(states(model.nominal, stay, "stay")) | sides.added
     found = interval_values.reachability(
         sides.host, target, maximize=sides.maximize, helpful=sides.helpful, stay=stay,
         tolerance=asked)
@@ -115,10 +132,10 @@ def robust_total_reward(
     Raises:
       ValueError: shapes, a direction, or a reward that is negative or depends on nature.
     """
-    asked = TOLERANCE if tolerance is None else float(tolerance)
+    asked = width_asked(tolerance)
     sides = sides_of(model, policy, objective, nature)
     model = sides.model
-    target = sides.states(states_of(model, target, "target"))
+    target = sides.states(states(model.nominal, target, "target"))
     earned = sides.rows(interval_reward(model, reward))
     found = interval_values.total_reward(
         sides.host, earned, target, maximize=sides.maximize, large=sides.helpful,
@@ -369,11 +386,3 @@ def _under(model: IntervalMDP, policy: np.ndarray, where: Any) -> Spread:
     total = host.mdp.over_choices(np.add, weight)
     weight = weight / np.where(total > 0, total, 1)[host.mdp.state]
     return spread(host, np.broadcast_to(where, (model.num_states,)), weight, weight)
-
-
-def states_of(model: IntervalMDP, states: Any, name: str) -> np.ndarray:
-    """``bool[S]`` from an array or the name of a label."""
-    if isinstance(states, str):
-        return np.asarray(model.states_where(states), bool)
-    require_shape(name, states, model.state_shape)
-    return np.asarray(states, bool)

@@ -21,7 +21,7 @@ from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.operators import is_deterministic, require_weights
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Method, Solution, Status, require_shape, row_tolerance
-from jaxltl.core.values.robust import TOLERANCE, Sides, host_sides, world_of
+from jaxltl.core.values.robust import Sides, host_sides, width_asked, world_of
 from jaxltl.core.values.sparse_satisfaction import automaton_of, starting_states
 
 
@@ -78,7 +78,7 @@ def robust_satisfaction(
       [0.4]
     """
     model, system = world_of(model)
-    asked = TOLERANCE if tolerance is None else float(tolerance)
+    asked = width_asked(tolerance)
     automaton, letter = automaton_of(model.nominal, task)
     states = starting_states(model, states)
     yes, no = universal_states(automaton), ~live_states(automaton)
@@ -135,7 +135,7 @@ def robust_product_satisfaction(
     if model.allowed is not None:
         raise ValueError("a product of an interval model takes no mask of actions; restrict the "
                          "world by with_allowed(world, rows).")
-    asked = TOLERANCE if tolerance is None else float(tolerance)
+    asked = width_asked(tolerance)
     world: Any = model.mdp
     task, letter, shape = model.automaton, np.asarray(model.letter), model.state_shape
     delta, priority = np.asarray(task.delta), np.asarray(task.priority)

@@ -12,7 +12,8 @@ from jaxltl.core.host.sparse_graph import reaching
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.types import Solution
-from jaxltl.core.values.robust import require_direction, states_of
+from jaxltl.core.values.bounded import states
+from jaxltl.core.values.robust import require_direction
 
 
 class Sensitivity(NamedTuple):
@@ -63,8 +64,8 @@ def robust_sensitivity(
       ([0.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0])
     """
     require_direction(nature, "max")
-    goal = states_of(model, target, "target")
-    passed = np.ones(goal.size, bool) if stay is None else states_of(model, stay, "stay")
+    goal = states(model.nominal, target, "target")
+    passed = np.ones(goal.size, bool) if stay is None else states(model.nominal, stay, "stay")
     weight = np.asarray(model.initial if initial is None else initial, np.float64)
     value, policy = np.asarray(solution.value, np.float64), np.asarray(solution.policy)
     if weight.shape != goal.shape or value.shape != goal.shape:

@@ -332,6 +332,11 @@ def test_bad_questions():
     target = [False, True, False]
     with pytest.raises(ValueError, match=r'nature=.adverse.; it must be "min"'):
         robust_reachability(model, target, nature="adverse")
+    for tolerance in (float("nan"), -1.0, "fine"):
+        with pytest.raises(ValueError, match=r"tolerance=.*at least 0"):
+            robust_reachability(model, target, tolerance=tolerance)
+    with pytest.raises(ValueError, match="target is int64"):
+        robust_reachability(model, [0, 2, 0])
     with pytest.raises(ValueError, match="objective='best'"):
         robust_reachability(model, target, objective="best")
     with pytest.raises(ValueError, match="takes row 3 in state 0, whose rows are 0 to 0"):
