@@ -166,8 +166,12 @@ def robust_discounted_value(
     Raises:
       ValueError: shapes, a direction, the discount, or a reward that is not finite.
     """
-    if not 0 <= float(discount) < 1:
-        raise ValueError(f"discount={float(discount):.6g}; it must be at least 0 and below 1.")
+    try:
+        rate = float(discount)
+    except (TypeError, ValueError):
+        rate = float("nan")
+    if not 0 <= rate < 1:
+        raise ValueError(f"discount={discount!r}; it must be at least 0 and below 1.")
     sides = sides_of(model, policy, objective, nature)
     earned = sides.entries(entry_reward(sides.model, reward))
     largest = float(np.abs(earned).max(initial=0)) / (1 - float(discount))
@@ -201,8 +205,11 @@ def robust_expectation(
       [2.0, 4.0]
     """
     require_direction(nature, "max")
+    model, _ = world_of(model)
     require_shape("value", value, model.state_shape)
     ahead = np.asarray(value, np.float64)[model.host.mdp.successor]
+    if not np.isfinite(ahead).all():
+        raise ValueError("value is not finite in some successor; give numbers.")
     p = model.host.nature(ahead, maximize=nature == "max")
     return model.host.total(p * ahead), p
 

@@ -15,6 +15,7 @@ from jaxltl.core.values.reachability import reachability_probability
 from jaxltl.core.values.robust import (
     host_sides,
     robust_discounted_value,
+    robust_expectation,
     robust_reachability,
     robust_total_reward,
 )
@@ -335,6 +336,13 @@ def test_bad_questions():
     for tolerance in (float("nan"), -1.0, "fine"):
         with pytest.raises(ValueError, match=r"tolerance=.*at least 0"):
             robust_reachability(model, target, tolerance=tolerance)
+    for discount in (None, 1.0, [0.5]):
+        with pytest.raises(ValueError, match=r"discount=.*below 1"):
+            robust_discounted_value(model, [0, 1, 0], discount)
+    with pytest.raises(ValueError, match="SparseMDP has no intervals"):
+        robust_expectation(COIN, [0, 1, 0])
+    with pytest.raises(ValueError, match="not finite"):
+        robust_expectation(model, [0, np.nan, 0])
     with pytest.raises(ValueError, match="target is int64"):
         robust_reachability(model, [0, 2, 0])
     with pytest.raises(ValueError, match="objective='best'"):
