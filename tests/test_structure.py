@@ -28,7 +28,8 @@ STOREYS = (
 )
 # What a private helper helps is one learner; these serve several.
 SHARED_BY_LEARNERS = (
-    "checkpoint", "exponential_family", "learner", "pac", "play", "schedules", "splitmix",
+    "checkpoint", "early_stopping", "exponential_family", "learner", "pac", "play", "schedules",
+    "splitmix",
 )
 NO_JAX = ("core.logic", "core.host", "core.automata")
 

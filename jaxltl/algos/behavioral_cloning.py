@@ -19,6 +19,7 @@ from flax import linen as nn
 from flax import struct
 
 from jaxltl.algos import learner
+from jaxltl.algos.early_stopping import Best, stop_early
 from jaxltl.core.models.batch import stack_models, stack_observations, training_counts
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
@@ -139,7 +140,7 @@ class State:
     step: jax.Array
     parameters: Any
     optimizer: Any
-    best: learner.Best
+    best: Best
     stopped: jax.Array
 
 
@@ -281,7 +282,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         optimizer=jax.tree.map(
             lambda x: jnp.asarray(x, jnp.result_type(x)), _optimizer(hparams).init(parameters)
         ),
-        best=learner.Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
+        best=Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
         stopped=jnp.bool_(False),
     )
 
@@ -307,7 +308,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     updates, optimizer = _optimizer(hparams).update(gradient, state.optimizer, state.parameters)
     parameters = optax.apply_updates(state.parameters, updates)
     held_out = neg_log_likelihood(state.parameters, problem, problem.held_out)
-    best, stopped = learner.stop_early(
+    best, stopped = stop_early(
         state, parameters, held_out, jnp.any(problem.held_out > 0), hparams.patience)
     parameters, optimizer = learner.choose(
         stopped, (state.parameters, state.optimizer), (parameters, optimizer))

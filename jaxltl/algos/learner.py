@@ -558,41 +558,7 @@ def optimizer(name: str, learning_rate: Any) -> optax.GradientTransformationExtr
     return optax.with_extra_args_support(optax.chain(kinds[name](), rate))
 
 
-# --- early stopping ------------------------------------------------------------------------
-
-
-@struct.dataclass
-class Best:
-    """The parameters with the best held-out likelihood; without held-out data the newest.
-
-    Attributes:
-      parameters: of the network.
-      neg_log_likelihood: held out, per pair; NaN without held-out data.
-      step: the number of steps after which they were reached.
-    """
-
-    parameters: Any
-    neg_log_likelihood: jax.Array
-    step: jax.Array
-
-
-def stop_early(
-    state: Any, after: Any, held_out: jax.Array, judged: jax.Array, patience: jax.Array | int
-) -> tuple[Best, jax.Array]:
-    """The best parameters so far, and whether patience has run out.
-
-    Args:
-      state: before a step, with ``parameters``, ``step``, ``best`` and ``stopped``.
-      after: the parameters after it.
-      held_out: negative log-likelihood of the parameters before it.
-      judged: whether there is held-out data.
-      patience: steps without anything better after which learning stops.
-    """
-    better = judged & (held_out < state.best.neg_log_likelihood) & ~state.stopped
-    best = choose(better, Best(state.parameters, held_out, state.step), state.best)
-    newest = Best(after, jnp.full_like(held_out, jnp.nan), state.step + 1)
-    stopped = state.stopped | (judged & (state.step - best.step >= patience))
-    return choose(judged, best, newest), stopped
+# --- choices ---------------------------------------------------------------------------------
 
 
 def either(condition: jax.Array, one: Any, other: Any) -> Any:

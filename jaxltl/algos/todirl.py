@@ -23,6 +23,7 @@ from flax import struct
 from jax import lax
 
 from jaxltl.algos import learner
+from jaxltl.algos.early_stopping import Best, stop_early
 from jaxltl.core.models.batch import narrow, stack_models, stack_observations, training_counts
 from jaxltl.core.models.batch import world as lane
 from jaxltl.core.models.product import Product
@@ -163,7 +164,7 @@ class State:
     parameters: Any
     value: jax.Array
     optimizer: Any
-    best: learner.Best
+    best: Best
     stopped: jax.Array
 
 
@@ -502,7 +503,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         optimizer=jax.tree.map(
             lambda x: jnp.asarray(x, jnp.result_type(x)), _optimizer(hparams).init(parameters)
         ),
-        best=learner.Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
+        best=Best(parameters, jnp.asarray(jnp.inf, dtype), jnp.int32(0)),
         stopped=jnp.bool_(False),
     )
 
@@ -530,7 +531,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
         gradient_norm=optax.tree.norm(gradient), error=parts.error, status=parts.status,
     )
     parameters = optax.apply_updates(state.parameters, updates)
-    best, stopped = learner.stop_early(
+    best, stopped = stop_early(
         state, parameters, parts.score, jnp.any(problem.held_out > 0), hparams.patience)
     # A solve that failed would poison the next one's start.
     value = jnp.where(parts.status != Status.NONFINITE, parts.value, 0)

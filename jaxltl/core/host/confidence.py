@@ -264,6 +264,7 @@ def _check_method(method: str) -> None:
 
 
 def check_confidence(confidence: float) -> None:
+    """Raises a ValueError unless a confidence is a number strictly between 0 and 1."""
     given = np.asarray(confidence)
     if given.ndim or given.dtype.kind not in "fiu" or not 0 < given < 1:  # NaN is not
         raise ValueError(
