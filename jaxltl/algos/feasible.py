@@ -33,10 +33,10 @@ from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.parametric import Ends, ParametricMDP
 from jaxltl.core.models.sparse import row_reward
 from jaxltl.core.types import Status, require_shape
+from jaxltl.core.values.mixture import safe_mean
 from jaxltl.core.values.prepared import Prepared, prepare, solve_prepared
 from jaxltl.core.values.prepared_chain import evaluate_prepared, is_direct
 
-_UNIT = float(np.finfo(np.float64).eps)
 _FINEST = 1e-12  # the width asked for where the one that was asked for does not tell
 
 
@@ -569,12 +569,12 @@ def _bounds(problem: Problem, model: Any, tolerance: float) -> tuple[float, floa
         found = optimal.total_reward(model.host, earned, problem.target, **given)
     weight = np.asarray(model.initial, np.float64)
     start = np.flatnonzero(weight)
-    weight, lower, upper = weight[start], found.lower[start], found.upper[start]
-    if start.size == 1:
-        return float(lower[0]), float(upper[0])
-    share = (start.size + 2) * _UNIT
-    low, high = float(weight @ lower) * (1 - share), float(weight @ upper) * (1 + share)
-    return (low, high) if problem.reward is not None else (low, min(high, 1.0))
+    highest = 1.0 if problem.reward is None else np.inf
+    low, high = (
+        safe_mean(weight[start], x[start], up=up, highest=highest)
+        for x, up in ((found.lower, False), (found.upper, True))
+    )
+    return low, high
 
 
 def _positive(name: str, number: int) -> int:

@@ -17,6 +17,7 @@ import numpy as np
 from jaxltl.core.host import interval_values
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.parametric import box_of
+from jaxltl.core.values.mixture import safe_mean
 
 ACCEPTED, REJECTED, OPEN = 1, -1, 0
 Problem = Any  # as jaxltl.algos.feasible.make_problem makes it
@@ -114,10 +115,11 @@ def _value(
             model.host, earned, problem.target, maximize=maximize, large=large, depth=depth)
     share = np.asarray(model.initial, np.float64)
     start = np.flatnonzero(share)
-    share = share[start] / share[start].sum()
-    slack = 0.0 if start.size == 1 else (start.size + 2) * float(np.finfo(np.float64).eps)
-    low, high = (float(share @ x[start]) for x in (found.lower, found.upper))
-    return low * (1 - slack), high * (1 + slack)
+    highest = 1.0 if problem.reward is None else np.inf
+    low, high = (
+        safe_mean(share[start], x[start], up=up, highest=highest)
+        for x, up in ((found.lower, False), (found.upper, True)))
+    return low, high
 
 
 def verdict_of(problem: Problem, threshold: float, lower: float, upper: float) -> int:

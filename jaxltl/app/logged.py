@@ -14,8 +14,7 @@ from jaxltl.app.files.models import padded
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.types import Status
-from jaxltl.core.values.data_guarantee import safe_mean
-from jaxltl.core.values.mixture import from_starts
+from jaxltl.core.values.mixture import from_starts, safe_mean
 from jaxltl.core.values.satisfaction import satisfaction_probability
 
 

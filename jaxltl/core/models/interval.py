@@ -20,6 +20,7 @@ from jaxltl.core.models.sparse import (
     check_entries,
     checked_starts,
     make_sparse,
+    placed,
 )
 
 NEAR = 1e-6  # how far a row may miss a distribution and still be scaled to one
@@ -215,11 +216,6 @@ def interval_rows(
         row_start, entry_start, successor, centre, rewards=rewards | extra, **rest))
 
 
-def _place(row_start: np.ndarray, row: int) -> str:
-    state = int(np.searchsorted(row_start, row, "right")) - 1
-    return f"state {state}, choice {row - int(row_start[state])}"
-
-
 def _check_ends(
     row_start: np.ndarray, row: np.ndarray, successor: np.ndarray, lower: np.ndarray,
     upper: np.ndarray,
@@ -228,7 +224,7 @@ def _check_ends(
     if bad.any():
         e = int(np.flatnonzero(bad)[0])
         raise ValueError(
-            f"{_place(row_start, int(row[e]))}: the interval of successor {successor[e]} is "
+            f"{placed(row_start, int(row[e]))}: the interval of successor {successor[e]} is "
             f"[{lower[e]:.9g}, {upper[e]:.9g}]; ends must satisfy 0 <= lower <= upper <= 1.")
 
 
@@ -244,7 +240,7 @@ def _scaled(
         r = int(np.flatnonzero(bad)[0])
         what = (f"the lower ends sum to {low[r]:.9g}, which is above 1" if low[r] > 1 else
                 f"the upper ends sum to {high[r]:.9g}, which is below 1")
-        raise ValueError(f"{_place(row_start, r)}: {what}; no distribution lies between them.")
+        raise ValueError(f"{placed(row_start, r)}: {what}; no distribution lies between them.")
     lower = np.where((low > 1 + rounding)[row], lower / np.maximum(low, 1)[row], lower)
     upper = np.where((high < 1 - rounding)[row], upper / np.minimum(high, 1)[row], upper)
     return lower, np.clip(np.maximum(upper, lower), 0, 1)

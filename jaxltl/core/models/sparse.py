@@ -325,7 +325,7 @@ def checked_starts(name: str, start: Any, total: int, of: str) -> np.ndarray:
     return start.astype(np.int64)  # NumPy takes no unsigned ones for counts
 
 
-def _place(row_start: np.ndarray, row: int) -> str:
+def placed(row_start: np.ndarray, row: int) -> str:
     """A choice by its state and rank, for messages."""
     state = int(np.searchsorted(row_start, row, "right")) - 1
     return f"state {state}, choice {row - int(row_start[state])}"
@@ -341,17 +341,17 @@ def check_entries(
                          "it one, for example a loop to itself.")
     if (np.diff(entry_start) == 0).any():
         row = int(np.flatnonzero(np.diff(entry_start) == 0)[0])
-        raise ValueError(f"{_place(row_start, row)} leads nowhere; give it a successor.")
+        raise ValueError(f"{placed(row_start, row)} leads nowhere; give it a successor.")
     if successor.min() < 0 or successor.max() >= num_states:
         e = int(np.flatnonzero((successor < 0) | (successor >= num_states))[0])
         row = int(np.searchsorted(entry_start, e, "right")) - 1
-        raise ValueError(f"{_place(row_start, row)}: successor {successor[e]} is out of range; "
+        raise ValueError(f"{placed(row_start, row)}: successor {successor[e]} is out of range; "
                          f"states are 0 to {num_states - 1}.")
     # A sum is NaN or infinite if any of it is.
     if not probability.min() >= 0 or not np.isfinite(probability.sum()):
         e = int(np.flatnonzero(~(probability >= 0) | np.isinf(probability))[0])
         row = int(np.searchsorted(entry_start, e, "right")) - 1
-        raise ValueError(f"{_place(row_start, row)}: probability {probability[e]}; probabilities "
+        raise ValueError(f"{placed(row_start, row)}: probability {probability[e]}; probabilities "
                          "must be finite and not negative.")
 
 
@@ -416,7 +416,7 @@ def _canonical(
         found[name] = reward
     count = np.bincount(row[start], minlength=entry_start.size - 1)
     if (count == 0).any():
-        place = _place(row_start, int(np.flatnonzero(count == 0)[0]))
+        place = placed(row_start, int(np.flatnonzero(count == 0)[0]))
         raise ValueError(f"{place}: the probabilities sum to 0, not 1; correct the row.")
     starts = np.concatenate([[0], count.cumsum()]).astype(index)
     return starts, target[start].astype(np.int32), merged, found
@@ -440,7 +440,7 @@ def _scaled(row_start: np.ndarray, entry_start: np.ndarray, probability: np.ndar
     off = np.abs(total - 1)
     if off.max() > 1e-6:
         row = int(np.flatnonzero(off > 1e-6)[0])
-        raise ValueError(f"{_place(row_start, row)}: the probabilities sum to {total[row]:.9g}, "
+        raise ValueError(f"{placed(row_start, row)}: the probabilities sum to {total[row]:.9g}, "
                          "not 1; correct the row.")
     count = np.diff(entry_start)
     wrong = off > (count + 2) * np.finfo(np.float64).eps

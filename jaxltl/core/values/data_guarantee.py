@@ -14,6 +14,7 @@ from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.counts import TransitionCounts, counts_on
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.values.mixture import safe_mean
 from jaxltl.core.values.robust_satisfaction import RobustSatisfaction, robust_satisfaction
 
 
@@ -100,9 +101,9 @@ def learn_guarantee(
     center = np.asarray(sets.center, np.float64)[kept]
     sign = 1 if objective == "max" else -1
     return DataGuarantee(
-        bound=safe_mean(share, getattr(found.solution, sure), up=objective != "max"),
+        bound=safe_mean(share, getattr(found.solution, sure), up=objective != "max", highest=1),
         confidence=float(confidence), satisfaction=found,
-        optimistic=safe_mean(share, getattr(best.solution, most), up=objective == "max"),
+        optimistic=safe_mean(share, getattr(best.solution, most), up=objective == "max", highest=1),
         model=interval, sets=sets, gain=sign * _gain(interval, found, center, share))
 
 
@@ -114,16 +115,6 @@ def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.
     code = [np.asarray(x.host.row, np.int64) * model.num_states + x.successor
             for x in (model, found.nominal)]
     return found, np.isin(*code)
-
-
-def safe_mean(share: np.ndarray, value: Any, *, up: bool) -> float:
-    """The mean of bounds in [0, 1], rounded up or down."""
-    value = np.asarray(value)
-    if (value == value[0]).all():
-        return float(value[0])
-    slack = (share.size + 4) * float(np.finfo(np.float64).eps)
-    mean = float(share @ value / share.sum())
-    return min(mean * (1 + slack), 1.0) if up else mean * (1 - slack)
 
 
 def _gain(

@@ -156,3 +156,24 @@ def reaching(
         other = least_mixture(model, policy, quickest, probability, over=over)
         found = other if other.share < found.share else found
     return found
+
+
+def safe_mean(share: np.ndarray, bound: np.ndarray, *, up: bool, highest: float = np.inf) -> float:
+    """The mean of bounds of at least 0, rounded up or down.
+
+    Args:
+      share: ``float64[I]``, positive weights of any sum.
+      bound: ``float64[I]``, maybe infinite.
+      up: whether upper bounds are given, else lower ones.
+      highest: what no value exceeds.
+
+    Example:
+      >>> safe_mean(np.array([0.5, 0.5]), np.array([1.0, 1.0]), up=False)
+      1.0
+    """
+    bound = np.asarray(bound, np.float64)
+    if (bound == bound[0]).all():
+        return float(bound[0])
+    slack = (share.size + 4) * float(np.finfo(np.float64).eps)
+    mean = float(share @ bound / share.sum())
+    return min(mean * (1 + slack), highest) if up else mean * (1 - slack)

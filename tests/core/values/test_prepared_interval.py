@@ -13,6 +13,7 @@ from jaxltl.core.values.contest import chances
 from jaxltl.core.values.prepared_interval import prepare_interval, solve_interval
 from jaxltl.core.values.robust import robust_reachability, robust_total_reward
 from jaxltl.core.values.robust_sensitivity import robust_sensitivity
+from tests.reference_intervals import vertices
 
 DIRECTIONS = list(itertools.product(("max", "min"), repeat=2))
 GOAL = np.array([True, False, False, False, False])
@@ -49,23 +50,12 @@ def _model(successor, lower, upper):
                          initial=np.ones(5) / 5)
 
 
-def _vertices(lower, upper):
-    found = set()
-    for order in itertools.permutations(range(len(lower))):
-        p, rest = list(lower), 1 - sum(lower)
-        for i in order:
-            given = min(upper[i] - lower[i], rest)
-            p[i], rest = p[i] + given, rest - given
-        found.add(tuple(p))
-    return found
-
-
 def _by_force(model, cost=None):
     """Values of all policies and natures, ``[policies, natures, S]``, by squaring matrices."""
     mdp, rows = model.host.mdp, []
     for r in range(mdp.num_rows):
         part = slice(mdp.entry_start[r], mdp.entry_start[r + 1])
-        corners = _vertices(model.host.lower[part], model.host.upper[part])
+        corners = vertices(model.host.lower[part], model.host.upper[part])
         rows.append(np.zeros((len(corners), 5)))
         rows[r][:, mdp.successor[part]] = list(corners)
     found = []
