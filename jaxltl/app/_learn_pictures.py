@@ -59,9 +59,8 @@ def live(outcome: Any) -> list[Explorer | TooLarge | Curves]:
     logged = setup.world.logged
     return [
         explorer(
-            LIVE, "What it does", "An arrow is as long as its action is likely; colours are the "
-            "probability of doing the task from there. Cells that cannot be met with a memory are "
-            "blank.", model.automaton, _layers(outcome),
+            LIVE, "What it does", _TABLE if setup.world.cells is None else _MAP, model.automaton,
+            _layers(outcome),
             [*demonstrated_runs(model, setup.demonstrations),
              *learned_runs(model, policy, outcome.seed)],
             size=setup.world.mdp.num_states, place=setup.world.cells, actions=setup.world.actions,
@@ -75,6 +74,10 @@ def live(outcome: Any) -> list[Explorer | TooLarge | Curves]:
 
 
 _LABEL = "probability of doing the task"
+_MAP = ("An arrow is as long as its action is likely; colours are the probability of doing the task "
+        "from there. Cells that cannot be met with a memory are blank.")
+_TABLE = ("How likely each action is, and the probability of doing the task from there, stand in the "
+          "table below, for each memory.")
 
 
 def _layers(outcome: Any) -> dict[str, Layer]:
