@@ -75,11 +75,11 @@ def live(outcome: Any) -> list[Explorer | TooLarge | Curves]:
 
 _LABEL = "probability of doing the task"
 _MAP = (
-    "An arrow is as long as its action is likely; colours are the probability of doing the task from "
-    "there. Cells that cannot be met with a memory are blank.")
+    "An arrow is as long as its action is likely; colours are the probability of doing the task "
+    "from there. Cells that cannot be met with a memory are blank.")
 _TABLE = (
-    "How likely each action is, and the probability of doing the task from there, stand in the table "
-    "below, for each memory.")
+    "How likely each action is, and the probability of doing the task from there, stand in the "
+    "table below, for each memory.")
 
 
 def _layers(outcome: Any) -> dict[str, Layer]:
