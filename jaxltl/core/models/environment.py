@@ -1,0 +1,505 @@
+"""Worlds that are simulated: pure functions of one trajectory, the same for every learner.
+
+An :class:`Environment` is made of functions of one trajectory, without batch axes and without
+state of their own::
+
+    reset(key) -> world
+    step(world, action, key) -> Timestep(world, reward, terminated, truncated, cost)
+    observe(world) -> observation, an array or a tree of arrays
+    labels(world) -> bool[P], which propositions hold
+    allowed(world) -> bool[A], which of finitely many actions may be taken (optional)
+
+``world`` is any tree of arrays. Many trajectories are a ``vmap``. Two ways in which an episode ends
+are told apart: it is *terminated* if nothing comes after it, and *truncated* if something would,
+but is not simulated; a value is bootstrapped at the second alone. ``step`` never starts anew by
+itself, so that the world in which an episode ended is seen; :func:`step_or_reset` does, for those
+who draw episodes one after the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+from jax.tree_util import Partial
+from numpy.typing import ArrayLike
+
+from jaxltl.core.types import require_shape
+
+
+@struct.dataclass
+class Finite:
+    """The actions ``0 .. num - 1``; `num` is static."""
+
+    num: int = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class Box:
+    """Arrays between two bounds; made by :func:`box`.
+
+    Attributes:
+      low, high: arrays that broadcast to the shape; infinite where there is no bound.
+      shape: static.
+      dtype: by name; static.
+    """
+
+    low: chex.Array
+    high: chex.Array
+    shape: tuple[int, ...] = struct.field(pytree_node=False)
+    dtype: str = struct.field(pytree_node=False, default="float32")
+
+
+def box(
+    low: ArrayLike, high: ArrayLike, shape: Sequence[int] | None = None, dtype: Any = None
+) -> Box:
+    """A :class:`Box`.
+
+    Args:
+      low, high: bounds, numbers or arrays; infinite for none.
+      shape: of what is in it; default that of the bounds together.
+      dtype: default that of the bounds together, at least a float of the default precision.
+
+    Raises:
+      ValueError: bounds that cross, are no numbers, or do not fit the shape.
+
+    Example:
+      >>> box(-1.0, [1.0, 2.0]).shape
+      (2,)
+    """
+    bounds = {"low": np.asarray(low), "high": np.asarray(high)}
+    for name, bound in bounds.items():
+        if bound.dtype.kind not in "biuf" or np.isnan(bound.astype(float)).any():
+            raise ValueError(f"box: {name}={bound.tolist()!r}; give numbers.")
+    least, most = bounds.values()
+    try:
+        full = np.broadcast_shapes(least.shape, most.shape) if shape is None else tuple(
+            int(n) for n in shape)
+        fits = np.broadcast_shapes(least.shape, most.shape, full) == full
+    except (TypeError, ValueError):
+        fits, full = False, ()
+    if not fits:
+        raise ValueError(
+            f"box: bounds of shapes {list(least.shape)} and {list(most.shape)} do not fit the "
+            f"shape {shape}; give numbers, or arrays of that shape.")
+    if (least > most).any():
+        place = np.argwhere(least > most)[0].tolist()
+        raise ValueError(f"box: low is above high at {place}; exchange them.")
+    kind = jnp.dtype(dtype or jnp.result_type(float))
+    if kind.kind in "iu":  # an infinite bound of integers is that of their type
+        ends = jnp.iinfo(kind)
+        least, most = (np.clip(x.astype(float), ends.min, ends.max) for x in (least, most))
+    return Box(least.astype(kind), most.astype(kind), full, kind.name)
+
+
+class Timestep(NamedTuple):
+    """What a step leads to; all but the world are scalars.
+
+    Attributes:
+      world: after the step, also where the episode ends with it.
+      reward: earned by the step.
+      terminated: whether the episode is over: nothing comes after `world`.
+      truncated: whether it is merely cut off. Both may hold; then it is over.
+      cost: of the step, for learners that keep to a limit.
+    """
+
+    world: Any
+    reward: chex.Numeric
+    terminated: chex.Numeric
+    truncated: chex.Numeric = False
+    cost: chex.Numeric = 0.0
+
+
+@struct.dataclass
+class Environment:
+    """A simulated world; made by :func:`make_environment`, whose text tells the functions.
+
+    All of its numbers are arrays of the functions, ``jax.tree_util.Partial(function, *arrays)``:
+    new ones do not recompile, and environments of one shape are stacked and vmapped.
+
+    Attributes:
+      reset, step, observe, labels: see the module's text.
+      allowed: the actions that may be taken, or None: all.
+      actions: :class:`Finite` or :class:`Box`.
+      observations: a tree of :class:`Box`, as `observe` returns arrays.
+      propositions: names of the P labels; static.
+      horizon: after how many steps every episode has ended; None: not known; static.
+    """
+
+    reset: Callable[..., Any]
+    step: Callable[..., Timestep]
+    observe: Callable[..., Any]
+    labels: Callable[..., jax.Array]
+    allowed: Callable[..., jax.Array] | None
+    actions: Finite | Box
+    observations: Any
+    propositions: tuple[str, ...] = struct.field(pytree_node=False)
+    horizon: int | None = struct.field(pytree_node=False, default=None)
+
+
+def make_environment(
+    reset: Callable[..., Any],
+    step: Callable[..., Timestep],
+    observe: Callable[..., Any],
+    *,
+    actions: Finite | Box | int,
+    labels: Callable[..., jax.Array] | None = None,
+    propositions: Sequence[str] = (),
+    allowed: Callable[..., jax.Array] | None = None,
+    observations: Any = None,
+    horizon: int | None = None,
+) -> Environment:
+    """A checked :class:`Environment`.
+
+    Args:
+      reset, step, observe: see the module's text; functions, or ``Partial`` objects that hand over
+        arrays. A step may leave out what the last fields of :class:`Timestep` have by default.
+      actions: what a step takes; a number is that of finitely many actions.
+      labels: ``world -> bool[P]``; a row of all False where it is left out.
+      propositions: their names.
+      allowed: ``world -> bool[A]``, for finitely many actions.
+      observations: a tree of :class:`Box`; default: without bounds.
+      horizon: after how many steps every episode has ended, if that is known.
+
+    Raises:
+      ValueError: a function that returns something of another shape, that is not pure (it keeps
+        what it was called with, or is another function each time), or a name given twice.
+
+    Example:
+      >>> def reset(key):
+      ...     return jnp.int32(0)
+      >>> def step(place, action, key):
+      ...     place = jnp.clip(place + jnp.array([-1, 1])[action], 0, 4)
+      ...     return Timestep(place, reward=0.0, terminated=place == 4)
+      >>> corridor = make_environment(
+      ...     reset, step, lambda place: place[None] / 4, actions=2,
+      ...     labels=lambda place: jnp.array([place == 4]), propositions=["goal"])
+      >>> corridor.actions.num, corridor.observations.shape
+      (2, (1,))
+    """
+    names = tuple(propositions)
+    for name in names:
+        if not isinstance(name, str) or names.count(name) > 1:
+            raise ValueError(
+                f"propositions: {name!r} is no name, or is given twice; give each label its name.")
+    if horizon is not None and horizon < 1:
+        raise ValueError(f"horizon={horizon}; it must be at least 1, or None.")
+    if isinstance(actions, int | np.integer):
+        actions = Finite(int(actions))
+    if not isinstance(actions, Finite | Box):
+        raise ValueError(f"actions={actions!r}; give Finite(number), or box(low, high).")
+    if isinstance(actions, Finite) and actions.num < 1:
+        raise ValueError(f"actions: Finite({actions.num}); there must be at least one.")
+    if labels is None:
+        if names:
+            raise ValueError(f"propositions={list(names)}, but no labels; give both or neither.")
+        labels = Partial(no_labels)
+    made = Environment(
+        reset=as_partial(reset), step=as_partial(step), observe=as_partial(observe),
+        labels=as_partial(labels), allowed=None if allowed is None else as_partial(allowed),
+        actions=actions, observations=observations, propositions=names, horizon=horizon)
+    seen = _check_functions(made)
+    if observations is None:
+        def free(x: Any) -> Box:
+            return box(-np.inf, np.inf, x.shape, x.dtype)
+        made = replace(made, observations=jax.tree.map(free, seen))
+    elif (found := _described(_as_arrays(observations))) != _described(seen):
+        raise ValueError(f"observe returns {_described(seen)}, but observations is of {found}.")
+    return made
+
+
+def as_partial(function: Callable[..., Any]) -> Partial:
+    """A function as a tree of arrays, which those that ``jit`` compiles take as an argument."""
+    return function if isinstance(function, Partial) else Partial(function)
+
+
+def no_labels(world: Any) -> jax.Array:
+    """``bool[0]``: the labels of a world without propositions."""
+    del world
+    return jnp.zeros(0, bool)
+
+
+def some_action(actions: Finite | Box) -> jax.ShapeDtypeStruct:
+    """The shape and type of one action."""
+    if isinstance(actions, Finite):
+        return jax.ShapeDtypeStruct((), jnp.int32)
+    return jax.ShapeDtypeStruct(actions.shape, jnp.dtype(actions.dtype))
+
+
+def random_action(
+    key: chex.PRNGKey, actions: Finite | Box, allowed: chex.Array | None = None
+) -> jax.Array:
+    """One action, uniform among those that are allowed; where a box has no bound, normal."""
+    if isinstance(actions, Finite):
+        weight = jnp.zeros(actions.num) if allowed is None else jnp.where(allowed, 0, -jnp.inf)
+        return jax.random.categorical(key, weight).astype(jnp.int32)
+    space = some_action(actions)
+    low, high = (jnp.broadcast_to(x, space.shape) for x in (actions.low, actions.high))
+    bounded = jnp.isfinite(low) & jnp.isfinite(high)
+    share = jax.random.uniform(key, space.shape, space.dtype)
+    inside = jnp.where(bounded, low, 0) + share * jnp.where(bounded, high - low, 0)
+    normal = jax.random.normal(key, space.shape, space.dtype)
+    return jnp.where(bounded, inside, jnp.clip(normal, low, high))
+
+
+def with_time_limit(environment: Environment, num_steps: int) -> Environment:
+    """The same world, whose episodes are truncated after so many steps.
+
+    Its worlds are pairs ``(world, time)``. What is observed is as before: where the best thing to
+    do depends on the time that is left, tell it in `observe`.
+
+    Raises:
+      ValueError: a number below 1.
+    """
+    if num_steps < 1:
+        raise ValueError(f"num_steps={num_steps}; it must be at least 1.")
+    inner = environment
+    return replace(
+        inner, reset=Partial(_reset_clock, inner.reset),
+        step=Partial(_step_clock, inner.step, np.int32(num_steps)),
+        observe=Partial(_of_first, inner.observe), labels=Partial(_of_first, inner.labels),
+        allowed=None if inner.allowed is None else Partial(_of_first, inner.allowed),
+        horizon=min(num_steps, inner.horizon or num_steps))
+
+
+def _reset_clock(reset: Callable[..., Any], key: chex.PRNGKey) -> Any:
+    return reset(key), jnp.int32(0)
+
+
+def _step_clock(
+    step: Callable[..., Timestep], limit: jax.Array, timed: Any, action: Any, key: chex.PRNGKey
+) -> Timestep:
+    found, time = Timestep(*step(timed[0], action, key)), timed[1] + 1
+    return found._replace(
+        world=(found.world, time), truncated=jnp.asarray(found.truncated, bool) | (time >= limit))
+
+
+def _of_first(function: Callable[..., Any], timed: Any) -> Any:
+    return function(timed[0])
+
+
+# --- episodes -------------------------------------------------------------------------------------
+
+
+@struct.dataclass
+class Agent:
+    """What acts in an environment, for :func:`run_episode` and evaluations.
+
+    Attributes:
+      act: ``(memory, observation, allowed, key) -> (action, memory)``; `allowed` is ``bool[A]``, or
+        None where the environment allows everything.
+      memory: before anything is seen; a tree of arrays, ``()`` for none.
+    """
+
+    act: Callable[..., tuple[Any, Any]]
+    memory: Any = ()
+
+
+def agent_of(function: Callable[..., Any]) -> Agent:
+    """An :class:`Agent` without memory that ignores masks, of ``(observation, key) -> action``."""
+    return Agent(Partial(_without_memory, as_partial(function)))
+
+
+def _without_memory(
+    function: Callable[..., Any], memory: Any, observation: Any, allowed: Any, key: chex.PRNGKey
+) -> tuple[Any, Any]:
+    del allowed
+    return function(observation, key), memory
+
+
+class Episode(NamedTuple):
+    """One trajectory of T steps, or with a leading axis many.
+
+    What comes after its end repeats the last world and is not `valid`.
+
+    Attributes:
+      world: before each step and after the last, a tree with a first axis of T + 1.
+      observation: before each step, a tree with a first axis of T.
+      action: a first axis of T.
+      reward, cost: ``float[T]``, zero after the end.
+      label: ``bool[T + 1, P]``, of the worlds.
+      valid: ``bool[T]``, whether the step was made.
+      terminated, truncated: ``bool[]``, how it ended; neither if T steps were not enough.
+    """
+
+    world: Any
+    observation: Any
+    action: Any
+    reward: jax.Array
+    cost: jax.Array
+    label: jax.Array
+    valid: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+
+
+def run_episode(
+    key: chex.PRNGKey, environment: Environment, agent: Agent, *, num_steps: int
+) -> Episode:
+    """One episode of an agent, from ``reset`` to its end or for `num_steps` steps.
+
+    For ``jit`` and ``vmap``; what is not used of the result is not computed under ``jit``.
+
+    Args:
+      key: of everything that is drawn; the same one gives the same episode.
+      environment, agent: what is run.
+      num_steps: T; static.
+
+    Returns:
+      :class:`Episode`.
+
+    Raises:
+      ValueError: a number below 1.
+    """
+    if num_steps < 1:
+        raise ValueError(f"num_steps={num_steps}; it must be at least 1.")
+    start, path = jax.random.split(key)
+    world = environment.reset(start)
+    begin = world, agent.memory, jnp.bool_(False), jnp.bool_(False)
+
+    def move(carry: Any, key: chex.PRNGKey) -> Any:
+        world, memory, terminated, truncated = carry
+        active = ~(terminated | truncated)
+        act_key, step_key = jax.random.split(key)
+        observation, allowed = environment.observe(world), allowed_in(environment, world)
+        action, memory = agent.act(memory, observation, allowed, act_key)
+        found = Timestep(*environment.step(world, action, step_key))
+        reward, cost = (jnp.where(active, x, 0.0) for x in (found.reward, found.cost))
+        after = jax.tree.map(lambda x, y: jnp.where(active, x, y), found.world, world)
+        row = world, observation, action, reward, cost, environment.labels(world), active
+        ended = (t | (active & jnp.asarray(f, bool)) for t, f in (
+            (terminated, found.terminated), (truncated, found.truncated)))
+        return (after, memory, *ended), row
+
+    (last, _, terminated, truncated), rows = lax.scan(
+        move, begin, jax.random.split(path, num_steps))
+    worlds, observation, action, reward, cost, label, valid = rows
+
+    def append(row: Any, end: Any) -> Any:
+        return jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), row, end)
+
+    return Episode(
+        append(worlds, last), observation, action, reward, cost,
+        append(label, environment.labels(last)), valid, terminated, truncated)
+
+
+def allowed_in(environment: Environment, world: Any) -> jax.Array | None:
+    """``bool[A]``, the actions that may be taken in a world, or None: all."""
+    return None if environment.allowed is None else environment.allowed(world)
+
+
+def step_or_reset(
+    environment: Environment, world: Any, action: Any, key: chex.PRNGKey
+) -> tuple[Any, Timestep]:
+    """A step, and a fresh start where an episode ends with it; for episodes one after the other.
+
+    Returns:
+      The world to go on from, and the :class:`Timestep`, whose world is the one that the step led
+      to, also where the episode ended there.
+    """
+    step_key, reset_key = jax.random.split(key)
+    found = Timestep(*environment.step(world, action, step_key))
+    ended = jnp.asarray(found.terminated, bool) | jnp.asarray(found.truncated, bool)
+    fresh = environment.reset(reset_key)
+    return jax.tree.map(lambda x, y: jnp.where(ended, x, y), fresh, found.world), found
+
+
+# --- checks ---------------------------------------------------------------------------------------
+
+
+def _check_functions(made: Environment) -> Any:
+    """Shapes of all that the functions return; those of an observation are returned."""
+    key = jax.random.key(0)
+    world = _traced("reset", made.reset, key)
+    seen = _traced("observe", made.observe, world)
+    if not jax.tree.leaves(seen):
+        raise ValueError("observe returns no array; return what the agent sees.")
+    found = _traced("step", made.step, world, some_action(made.actions), key)
+    if not isinstance(found, tuple) or not 3 <= len(found) <= 5:
+        raise ValueError(
+            "step must return Timestep(world, reward, terminated, truncated, cost), the last two "
+            f"if they are wanted; it returns {_described(found)}.")
+    found = Timestep(*found)
+    for name in Timestep._fields[1:]:
+        number = getattr(found, name)
+        if np.shape(number) != () or not (np.isscalar(number) or hasattr(number, "dtype")):
+            raise ValueError(f"step returns {name} of shape {list(np.shape(number))}; it must be "
+                             "a scalar. Functions are of one trajectory: vmap them for more.")
+    for name in ("terminated", "truncated"):
+        if not _is_bool(getattr(found, name)):
+            raise ValueError(f"step returns {name} as {getattr(found, name).dtype}; return a "
+                             "Boolean.")
+    if (after := _described(found.world)) != (before := _described(world)):
+        raise ValueError(f"step returns the world {after}, but reset {before}; both must have the "
+                         "same structure, shapes and dtypes.")
+    require_labels(_traced("labels", made.labels, world), made.propositions)
+    if made.allowed is not None:
+        if not isinstance(made.actions, Finite):
+            raise ValueError("allowed is for finitely many actions; clip those of a box in step.")
+        mask = _traced("allowed", made.allowed, world)
+        require_shape("allowed(world)", mask, (made.actions.num,))
+        if not _is_bool(mask):
+            raise ValueError(f"allowed returns {mask.dtype}; return Booleans.")
+    return seen
+
+
+def require_labels(label: Any, propositions: Sequence[str]) -> None:
+    """Refuses labels of a world that are not ``bool[P]``."""
+    if getattr(label, "shape", None) != (len(propositions),) or not _is_bool(label):
+        raise ValueError(
+            f"labels returns {_described(label)}; return bool[{len(propositions)}], one for each "
+            f"of the propositions {list(propositions)}.")
+
+
+def _traced(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """The shapes of what a function returns, if two calls are the same pure function."""
+    try:
+        with jax.checking_leaks():
+            first, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+            # Another object, so that the second trace is not the first, remembered.
+            again = jax.make_jaxpr(lambda *given: function(*given))(*arguments)
+    except (jax.errors.JAXTypeError, jax.errors.ConcretizationTypeError) as problem:
+        text = str(problem).split("\n", 1)[0]
+        raise ValueError(
+            f"{name} cannot be traced: {text} Write it with jax.numpy; lax.cond and jnp.where "
+            "take the place of if.") from problem
+    except Exception as problem:
+        if "Leaked" not in str(problem):
+            raise
+        raise ValueError(
+            f"{name} is not pure: it keeps what it was called with. Keep it in the world that "
+            "is returned.") from problem
+    if not _same(first, again):
+        raise ValueError(
+            f"{name} is not pure: called twice it is two different functions. Draw from the key "
+            "that is given, and keep what changes in the world that is returned.")
+    return shapes
+
+
+def _same(first: Any, again: Any) -> bool:
+    constants = zip(first.consts, again.consts, strict=False)
+    return len(first.consts) == len(again.consts) and str(first.jaxpr) == str(again.jaxpr) and all(
+        np.array_equal(np.asarray(x), np.asarray(y), equal_nan=np.asarray(x).dtype.kind == "f")
+        for x, y in constants if not jax.dtypes.issubdtype(
+            getattr(x, "dtype", np.dtype(float)), jax.dtypes.prng_key))
+
+
+def _is_bool(x: Any) -> bool:
+    return np.dtype(getattr(x, "dtype", type(x))) == np.bool_
+
+
+def _as_arrays(observations: Any) -> Any:
+    return jax.tree.map(lambda b: jax.ShapeDtypeStruct(b.shape, jnp.dtype(b.dtype)), observations,
+                        is_leaf=lambda b: isinstance(b, Box))
+
+
+def _described(tree: Any) -> Any:
+    return jax.tree.map(
+        lambda x: f"{x.dtype}{list(x.shape)}" if hasattr(x, "dtype") else type(x).__name__, tree)
