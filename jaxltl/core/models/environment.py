@@ -4,7 +4,7 @@ An :class:`Environment` is made of functions of one trajectory, without batch ax
 state of their own::
 
     reset(key) -> world
-    step(world, action, key) -> Timestep(world, reward, terminated, truncated, cost)
+    step(world, action, key) -> Timestep(world, reward, terminated, truncated, cost, discount)
     observe(world) -> observation, an array or a tree of arrays
     labels(world) -> bool[P], which propositions hold
     allowed(world) -> bool[A], which of finitely many actions may be taken (optional)
@@ -108,6 +108,7 @@ class Timestep(NamedTuple):
       terminated: whether the episode is over: nothing comes after `world`.
       truncated: whether it is merely cut off. Both may hold; then it is over.
       cost: of the step, for learners that keep to a limit.
+      discount: of all that comes after the step, times the learner's own.
     """
 
     world: Any
@@ -115,6 +116,7 @@ class Timestep(NamedTuple):
     terminated: chex.Numeric
     truncated: chex.Numeric = False
     cost: chex.Numeric = 0.0
+    discount: chex.Numeric = 1.0
 
 
 @struct.dataclass
@@ -327,6 +329,7 @@ class Episode(NamedTuple):
       label: ``bool[T + 1, P]``, of the worlds.
       valid: ``bool[T]``, whether the step was made.
       terminated, truncated: ``bool[]``, how it ended; neither if T steps were not enough.
+      discount: ``float[T]``, that of each step; one after the end.
     """
 
     world: Any
@@ -338,6 +341,7 @@ class Episode(NamedTuple):
     valid: jax.Array
     terminated: jax.Array
     truncated: jax.Array
+    discount: jax.Array
 
 
 def run_episode(
@@ -373,21 +377,23 @@ def run_episode(
         found = Timestep(*environment.step(world, action, step_key))
         reward, cost = (jnp.where(active, x, 0.0) for x in (found.reward, found.cost))
         after = jax.tree.map(lambda x, y: jnp.where(active, x, y), found.world, world)
-        row = world, observation, action, reward, cost, environment.labels(world), active
+        discount = jnp.where(active, found.discount, 1.0)
+        label = environment.labels(world)
+        row = world, observation, action, reward, cost, label, active, discount
         ended = (t | (active & jnp.asarray(f, bool)) for t, f in (
             (terminated, found.terminated), (truncated, found.truncated)))
         return (after, memory, *ended), row
 
     (last, _, terminated, truncated), rows = lax.scan(
         move, begin, jax.random.split(path, num_steps))
-    worlds, observation, action, reward, cost, label, valid = rows
+    worlds, observation, action, reward, cost, label, valid, discount = rows
 
     def append(row: Any, end: Any) -> Any:
         return jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), row, end)
 
     return Episode(
         append(worlds, last), observation, action, reward, cost,
-        append(label, environment.labels(last)), valid, terminated, truncated)
+        append(label, environment.labels(last)), valid, terminated, truncated, discount)
 
 
 def allowed_in(environment: Environment, world: Any) -> jax.Array | None:
@@ -422,10 +428,10 @@ def _check_functions(made: Environment) -> Any:
     if not jax.tree.leaves(seen):
         raise ValueError("observe returns no array; return what the agent sees.")
     found = _traced("step", made.step, world, some_action(made.actions), key)
-    if not isinstance(found, tuple) or not 3 <= len(found) <= 5:
+    if not isinstance(found, tuple) or not 3 <= len(found) <= len(Timestep._fields):
         raise ValueError(
-            "step must return Timestep(world, reward, terminated, truncated, cost), the last two "
-            f"if they are wanted; it returns {_described(found)}.")
+            f"step must return Timestep({', '.join(Timestep._fields)}), the last three if they are "
+            f"wanted; it returns {_described(found)}.")
     found = Timestep(*found)
     for name in Timestep._fields[1:]:
         number = getattr(found, name)
