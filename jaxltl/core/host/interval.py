@@ -3,7 +3,7 @@
 A row is the set of all distributions p with ``lower <= p <= upper``. Each time that it is taken,
 nature picks one of them. A linear function is extreme where mass goes first to the best successors
 (Nilim and El Ghaoui 2005; Givan, Leach and Dean 2000). Sums that miss one by no more than the
-rounding of their terms count as one.
+rounding of their terms count as one. Where there is a ball too, p lies in both.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.host.ball import Ball, Sorted, narrowed, share_of
 from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 
@@ -30,11 +31,13 @@ class HostInterval:
     Attributes:
       mdp: its rows; probabilities are one distribution of each, positive where upper is.
       lower, upper: ``float64[T]``; each end is met by some distribution of the row.
+      ball: how far from its center each row may be besides; None: as far as the ends allow.
     """
 
     mdp: HostMDP
     lower: Floats
     upper: Floats
+    ball: Ball | None = None
 
     @cached_property
     def rounding(self) -> Floats:
@@ -67,15 +70,16 @@ class HostInterval:
           quantity: ``float64[T]``, finite, of each entry.
           maximize: whether nature makes the sum large.
         """
-        found = self.lower.copy()
         key = -quantity if maximize else quantity
-        free = self.upper - self.lower
+        box = self._ends_for(key)
+        found = box.lower.copy()
+        free = box.upper - box.lower
         for row, entry, used in self._groups:
             if entry.shape[1] == 1:
-                found[entry] = self.upper[entry]
+                found[entry] = box.upper[entry]
                 continue
             if used is None and entry.shape[1] <= _PAIRS:
-                found[entry] = self._by_pairs(key, free, row, entry)
+                found[entry] = box._by_pairs(key, free, row, entry)
                 continue
             rank = key[entry] if used is None else np.where(used, key[entry], np.inf)
             order = np.argsort(rank, axis=1, kind="stable")
@@ -86,15 +90,41 @@ class HostInterval:
                 room = np.where(used, room, 0)
             before = np.zeros_like(room)
             np.cumsum(room[:, :-1], axis=1, out=before[:, 1:])
-            left = self.rest[row, None] - before
+            left = box.rest[row, None] - before
             given = np.clip(np.where(left > self.rounding[row, None], left, 0), 0, room)
             # What is given whole is the upper end itself, without rounding.
-            mass = np.where(given == room, self.upper[entry], self.lower[entry] + given)
+            mass = np.where(given == room, box.upper[entry], box.lower[entry] + given)
             if used is None:
                 found[entry] = mass
             else:
                 found[entry[used]] = mass[used]
         return found
+
+    def _ends_for(self, key: Floats) -> HostInterval:
+        """The intervals in whose stead a ball's best distribution, least keys first, is theirs."""
+        if self.ball is None:
+            return self
+        lower, upper = self.lower.copy(), self.upper.copy()
+        for row, entry, used in self._groups:
+            if entry.shape[1] == 1:
+                continue
+            rank = key[entry] if used is None else np.where(used, key[entry], np.inf)
+            order = np.argsort(rank, axis=1, kind="stable")
+            entry = np.take_along_axis(entry, order, 1)
+            used = None if used is None else np.take_along_axis(used, order, 1)
+            ends = narrowed(Sorted(
+                self.lower[entry], self.upper[entry], self.ball.center[entry], used,
+                self.ball.most[row], self._lack[row], self.rounding[row]))
+            for end, found in zip((lower, upper), ends, strict=True):
+                end[entry if used is None else entry[used]] = found if used is None else found[used]
+        return HostInterval(self.mdp, lower, upper)
+
+    @cached_property
+    def _lack(self) -> Floats:
+        """``float64[R]``, what the centers of a ball miss of one."""
+        assert self.ball is not None
+        found = 1 - self.total(self.ball.center)
+        return np.where(np.abs(found) > self.rounding, found, 0)
 
     def _by_pairs(
         self, key: Floats, free: Floats, row: Integers, entry: Integers
@@ -120,7 +150,14 @@ class HostInterval:
         room = self.total(np.where(entries, self.upper, 0))
         needed = np.logical_or.reduceat(
             ~entries & (self.lower > 0), self.mdp.entry_start[:-1])
-        return (room >= 1 - self.rounding) & ~needed
+        return (room >= 1 - self.rounding) & ~needed & self._near(entries)
+
+    def _near(self, entries: Booleans) -> Booleans:
+        """Whether a ball holds something that keeps to some entries: ``bool[R]``."""
+        if self.ball is None:
+            return np.ones(self.mdp.num_rows, bool)
+        gained = 1 - self.total(np.where(entries, self.ball.center, 0))
+        return gained <= self.ball.most + self.rounding
 
     def may_stay(self, region: Booleans) -> Booleans:
         """Whether nature may keep to a region: ``bool[R]`` from ``bool[S]``."""
@@ -137,6 +174,9 @@ class HostInterval:
         inside = region[mdp.successor[entry]]
         room = np.add.reduceat(np.where(inside, 0, self.upper[entry]), start)
         sure = np.logical_or.reduceat(inside & (self.lower[entry] > 0), start)
+        if self.ball is not None:
+            gained = 1 - np.add.reduceat(np.where(inside, 0, self.ball.center[entry]), start)
+            sure |= gained > self.ball.most[row] + self.rounding[row]
         return sure | (room < 1 - self.rounding[row])
 
     def within(self, entries: Booleans) -> Floats:
@@ -151,9 +191,23 @@ class HostInterval:
         entries = entries | ~self.may_keep(entries)[self.mdp.row]
         free = np.where(entries, self.upper - self.lower, 0)
         room = self.total(free)
-        share = np.divide(self.rest, room, out=np.zeros_like(room), where=room > 0)
-        found = self.lower + free * np.minimum(share, 1)[self.mdp.row]
-        return np.where(entries, found, 0)
+        found = np.where(entries, self.lower + free * share_of(self.rest, room)[self.mdp.row], 0)
+        return found if self.ball is None else self._drawn_in(found, entries, self.ball)
+
+    def _drawn_in(self, found: Floats, entries: Booleans, ball: Ball) -> Floats:
+        """The same distributions, nearer to the center where they are too far from it."""
+        center = np.where(entries, ball.center, 0)
+        lack = 1 - self.total(center)
+        room, free = (np.where(entries, x, 0) for x in (
+            self.upper - ball.center, ball.center - self.lower))
+        more, less = share_of(lack, self.total(room)), share_of(-lack, self.total(free))
+        # What gains least keeps to the entries; half of the rest is spent on all of them.
+        near = center + room * more[self.mdp.row] - free * less[self.mdp.row]
+        gained = self.total(np.maximum(found - center, 0))
+        least = np.maximum(lack, 0)
+        share = share_of((ball.most - least) / 2, gained - least)
+        far = (gained > ball.most)[self.mdp.row]
+        return np.where(far, near + (found - near) * share[self.mdp.row], found)
 
     def fixed(self, probability: Floats) -> HostMDP:
         """The decision process that is left when nature's choices are known.
@@ -178,7 +232,8 @@ class HostInterval:
         width = np.diff(mdp.entry_start)[row]
         entry = spans(mdp.entry_start[row], width)
         part = HostMDP(row_start, starts_of(width), mdp.successor[entry], mdp.probability[entry])
-        return HostInterval(part, self.lower[entry], self.upper[entry]), entry
+        ball = None if self.ball is None else self.ball.of(entry, row)
+        return HostInterval(part, self.lower[entry], self.upper[entry], ball), entry
 
     def halted(self, states: Booleans) -> tuple[HostInterval, Integers]:
         """The model in which some states stand still, and the row that each row was."""
@@ -198,7 +253,12 @@ class HostInterval:
         lower[first] = upper[first] = chance[first] = 1
         width = np.add.reduceat(kept.astype(np.int64), part.mdp.entry_start[:-1])
         small = HostMDP(part.mdp.row_start, starts_of(width), successor[kept], chance[kept])
-        return HostInterval(small, lower[kept], upper[kept]), row
+        ball = part.ball
+        if ball is not None:
+            center = ball.center.copy()
+            center[first] = 1
+            ball = ball._replace(center=center[kept])
+        return HostInterval(small, lower[kept], upper[kept], ball), row
 
 
 class _Group(NamedTuple):

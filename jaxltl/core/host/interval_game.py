@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxltl.core.host.ball import Ball
 from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
@@ -85,9 +86,16 @@ def spread(model: HostInterval, states: Booleans, lower: Floats, upper: Floats) 
         x = np.empty(given.size)
         x[given], x[~given] = of[entry[given]], at[moved]
         ends.append(x)
-    host = HostMDP(row_start, starts, successor, ends[1])
-    found = HostInterval(host, *ends)
+    lower, upper = ends
+    host = HostMDP(row_start, starts, successor, upper)
+    ball = None
+    if model.ball is not None:  # where nature chooses it may gain all that the ends leave
+        center, most = lower.copy(), np.ones(row.size)
+        center[given] = model.ball.center[entry[given]]
+        most[row >= 0] = model.ball.most[row[row >= 0]]
+        ball = Ball(center, most)
+    found = HostInterval(host, lower, upper, ball)
     chance = found.within(np.ones(given.size, bool))
     host = HostMDP(row_start, starts, successor, chance)
     source = np.concatenate([np.arange(mdp.num_states), mdp.state[moved]])
-    return Spread(HostInterval(host, *ends), source, row, entry, chosen)
+    return Spread(HostInterval(host, lower, upper, ball), source, row, entry, chosen)

@@ -302,6 +302,8 @@ class _Nodes:
         terms = 2 * np.diff(self.part.mdp.entry_start) + self.depth + 8
         # Who is given the rest of the mass may miss some of it, or have too much.
         partly = (self.part.lower < p) & (p < self.part.upper)
+        if self.part.ball is not None:
+            partly &= p != self.part.ball.center
         last = self.part.total(np.where(partly, size, 0)) * self.part.rounding
         slack = terms * _EPS * (self.part.total(p * size) + np.abs(self.cost)) + last
         return slack + terms * _TINY * (slack > 0)

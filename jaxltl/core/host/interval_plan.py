@@ -150,7 +150,7 @@ def _for_nothing(
     taken[first[~some]] = True
     row = np.flatnonzero(taken)
     part, entry = model.of_rows(starts_of(np.bincount(mdp.state[row], minlength=some.size)), row)
-    asked = _Asking(part.mdp, part.lower, part.upper, log, entry)
+    asked = _Asking(part.mdp, part.lower, part.upper, log=log, origin=entry)
     return surely(asked, target, finite & some, maximize=True, helpful=not large)[0]
 
 
@@ -170,7 +170,7 @@ class _Question(NamedTuple):
     room: Booleans
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Asking(HostInterval):
     """A model that writes down what it is asked, where positive ends alone do not answer it.
 
@@ -209,7 +209,8 @@ class _Asking(HostInterval):
 
 
 def _asking(model: HostInterval, log: list[_Question]) -> _Asking:
-    return _Asking(model.mdp, model.lower, model.upper, log, np.arange(model.mdp.num_transitions))
+    every: Integers = np.arange(model.mdp.num_transitions)
+    return _Asking(model.mdp, model.lower, model.upper, log=log, origin=every)
 
 
 def _answers(model: HostInterval, log: list[_Question], entries: Integers) -> Answers:

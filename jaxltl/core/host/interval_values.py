@@ -453,12 +453,15 @@ def _restricted(
     kept = np.where(lone, head, kept)
     successor = np.where(lone, source, part.mdp.successor)[kept]
     lower, upper = (np.where(lone, 1, x)[kept] for x in (part.lower, part.upper))
+    ball = part.ball
+    if ball is not None:
+        ball = ball._replace(center=np.where(lone, 1, ball.center)[kept])
     width = np.add.reduceat(kept.astype(np.int64), part.mdp.entry_start[:-1])
     inner = part.within(kept)
     chance = np.where(lone, 1, inner)[kept]
     small = HostMDP(
         starts, np.concatenate([[0], width.cumsum()]), successor.astype(np.int32), chance)
-    return HostInterval(small, lower, upper), row, entry[kept]
+    return HostInterval(small, lower, upper, ball), row, entry[kept]
 
 
 def _unhalted(

@@ -186,9 +186,13 @@ def _pairs(
     chance, lower, upper = (
         np.where(loop, 1.0, x[entry])
         for x in (mdp.probability, model.host.lower, model.host.upper))
+    ball = model.host.ball
+    if ball is not None:
+        ball = ball.of(entry, found.base_row)
+        ball = ball._replace(center=np.where(loop, 1.0, ball.center))
     host = HostMDP(
         found.host.row_start, found.host.entry_start, found.host.successor, chance)
-    return found._replace(host=host), HostInterval(host, lower, upper)
+    return found._replace(host=host), HostInterval(host, lower, upper, ball)
 
 
 def _fixed(
