@@ -1,0 +1,222 @@
+"""What an automaton still asks for, as sequences of what to reach and what to avoid on the way.
+
+Whoever has read a finite word stands in a state of the automaton, and satisfies the task along a
+path from there into acceptance. Each move of such a path says: read one of *these* letters next,
+and none of *those* before it. Such sequences look the same for every formula, so that one agent
+that can follow them does formulas that it never saw (Jackermeier and Abate 2025, "DeepLTL").
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.runs import live_states, universal_states
+from jaxltl.core.host.components import strong_components
+from jaxltl.core.logic.labels import require_known
+
+_MOST_PATHS = 20_000  # looked at from each state
+
+
+@dataclass(frozen=True)
+class Sequences:
+    """For each state of an automaton at most M sequences of at most D steps, shortest first.
+
+    Attributes:
+        reach: bool `[Q, M, D, E]`, the events of which a step asks for one.
+        avoid: bool `[Q, M, D, E]`, those that set back the task before it.
+        length: int32 `[Q, M]`, how many steps there are in all, also beyond D; for an infinite
+            task, up to and with the first accepting round. 0: there is no such sequence.
+    """
+
+    reach: NDArray[np.bool_]
+    avoid: NDArray[np.bool_]
+    length: NDArray[np.int32]
+
+
+class _Move(NamedTuple):
+    """The events that lead from one state to another with one priority."""
+
+    target: int
+    priority: int
+    events: tuple[int, ...]
+
+
+_Path = tuple[tuple[int, _Move], ...]  # states, and the moves that leave them
+
+
+def reach_avoid_sequences(
+    automaton: Automaton,
+    events: ArrayLike,
+    propositions: tuple[str, ...],
+    *,
+    depth: int = 6,
+    most: int = 16,
+) -> Sequences:
+    """The sequences that lead from each state of an automaton to acceptance.
+
+    A step from state q to state r of a path asks for an event that leads from q to r. It avoids
+    those that lead to a state from which nothing is accepted, or from which acceptance is no nearer
+    than from q, counted in moves; an event that is progress of another kind is neither. The path of
+    an infinite task runs into a cycle whose least priority is even, and round it until the depth is
+    full; on it, what has a smaller odd priority is avoided too. States where every word is
+    accepted, or none is, have no sequence.
+
+    Args:
+        automaton: the task, with any acceptance.
+        events: bool `[E, P]`, the labels that occur in the world; others are not looked at.
+        propositions: names of the P columns; the automaton need not use all.
+        depth: D, the steps that are kept.
+        most: M, the sequences that are kept; they differ within their first D steps, or in
+            their length.
+
+    Returns:
+        `Sequences`, whose tables are arrays of the host.
+
+    Raises:
+        ValueError: An event that the automaton cannot read, an unknown proposition, or a size
+            below 1.
+
+    >>> from jaxltl.core.automata.translate import to_automaton
+    >>> task = to_automaton("!a U (b & F c)", letters=[{}, {"a"}, {"b"}, {"c"}])
+    >>> events = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    >>> found = reach_avoid_sequences(task, events, ("a", "b", "c"), depth=2, most=1)
+    >>> found.length[0].tolist(), found.reach[0, 0].astype(int).tolist()
+    ([2], [[0, 0, 1, 0], [0, 0, 0, 1]])
+    >>> found.avoid[0, 0].astype(int).tolist()
+    [[0, 1, 0, 0], [0, 0, 0, 0]]
+    """
+    for name, number in (("depth", depth), ("most", most)):
+        if number < 1:
+            raise ValueError(f"{name}={number}; it must be at least 1.")
+    delta, priority = _on_events(automaton, events, propositions)
+    live, done = live_states(automaton), universal_states(automaton)
+    tables = _Tables(delta, priority, live, _distances(delta, priority, live, done))
+    moves = [_moves(*rows) for rows in zip(delta, priority, strict=True)]
+    count, width = delta.shape
+    reach = np.zeros((count, most, depth, width), bool)
+    avoid, length = reach.copy(), np.zeros((count, most), np.int32)
+    for q in np.flatnonzero(live & ~done):
+        found: set[tuple[int, bytes, bytes]] = set()
+        for stem, cycle in _paths(int(q), moves, live, done):
+            size, (wanted, shunned) = len(stem) + len(cycle), _steps(tables, stem, cycle, depth)
+            key = (size, wanted.tobytes(), shunned.tobytes())
+            if key in found:
+                continue
+            row = len(found)
+            found.add(key)
+            reach[q, row], avoid[q, row], length[q, row] = wanted, shunned, size
+            if len(found) == most:
+                break
+    return Sequences(reach, avoid, length)
+
+
+class _Tables(NamedTuple):
+    """An automaton on events, from where words are accepted, and how far acceptance is."""
+
+    delta: NDArray[np.int32]
+    priority: NDArray[np.int32]
+    live: NDArray[np.bool_]
+    distance: NDArray[np.float64]
+
+
+def _steps(tables: _Tables, stem: _Path, cycle: _Path, depth: int) -> NDArray[np.bool_]:
+    """What the moves of a path ask for, and what they avoid: bool `[2, D, E]`."""
+    delta, priority, live, distance = tables
+    least = min((m.priority for _, m in cycle), default=0)
+    turns = -(-max(depth - len(stem), 0) // len(cycle)) if cycle else 0
+    wanted, shunned = found = np.zeros((2, depth, delta.shape[1]), bool)
+    for i, (state, move) in enumerate((stem + cycle * turns)[:depth]):
+        wanted[i, list(move.events)] = True
+        after = delta[state]
+        shunned[i] = ~live[after] | ((distance[after] >= distance[state]) & (after != state))
+        if i >= len(stem):
+            shunned[i] |= (priority[state] < least) & (priority[state] % 2 == 1)
+        shunned[i] &= ~wanted[i]
+    return found
+
+
+def _on_events(
+    automaton: Automaton, events: ArrayLike, propositions: tuple[str, ...]
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """The automaton's tables with a column for each event: int32 `[Q, E]`, twice."""
+    rows = np.asarray(events, bool)
+    if rows.ndim != 2 or rows.shape[1] != len(propositions) or not len(rows):
+        raise ValueError(
+            f"events has shape {list(rows.shape)}; give Booleans [E, {len(propositions)}], a "
+            f"column for each of the propositions {list(propositions)}."
+        )
+    require_known(automaton.propositions, propositions, "the automaton")
+    seen = rows[:, [list(propositions).index(p) for p in automaton.propositions]]
+    same = (seen[:, None] == np.asarray(automaton.letters)[None]).all(-1)
+    for e in np.flatnonzero(~same.any(1))[:1]:
+        holds = [p for p, h in zip(propositions, rows[e], strict=True) if h]
+        raise ValueError(
+            f"the automaton does not read the event {{{', '.join(holds)}}}. Make it with all "
+            "letters that occur, as to_automaton does by default."
+        )
+    letter = same.argmax(1)
+    return np.asarray(automaton.delta)[:, letter], np.asarray(automaton.priority)[:, letter]
+
+
+def _moves(delta: NDArray[np.int32], priority: NDArray[np.int32]) -> list[_Move]:
+    groups: dict[tuple[int, int], list[int]] = {}
+    for event, (target, number) in enumerate(zip(delta.tolist(), priority.tolist(), strict=True)):
+        groups.setdefault((target, number), []).append(event)
+    return [_Move(target, number, tuple(found)) for (target, number), found in groups.items()]
+
+
+def _distances(
+    delta: NDArray[np.int32],
+    priority: NDArray[np.int32],
+    live: NDArray[np.bool_],
+    done: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """The moves from each state up to one that accepts: into `done`, or on an accepting cycle."""
+    count, width = delta.shape
+    source = np.repeat(np.arange(count), width)
+    target, number = delta.ravel(), priority.ravel()
+    accepts = done[target]
+    for even in np.unique(number[number % 2 == 0]):
+        kept = (number >= even) & live[source] & live[target]
+        part = strong_components(source[kept], target[kept], count)
+        accepts |= kept & (number == even) & (part[source] == part[target])
+    distance = np.where(done, 0.0, np.inf)
+    np.minimum.at(distance, source[accepts], np.where(done[source[accepts]], 0.0, 1.0))
+    for _ in range(count):
+        nearer = distance.copy()
+        np.minimum.at(nearer, source, distance[target] + 1)
+        if (nearer == distance).all():
+            break
+        distance = nearer
+    return distance
+
+
+def _paths(
+    start: int, moves: list[list[_Move]], live: NDArray[np.bool_], done: NDArray[np.bool_]
+) -> Iterator[tuple[_Path, _Path]]:
+    """Stems, and cycles with an even least priority that follow them, shortest first."""
+    queue: deque[_Path] = deque([()])
+    for _ in range(_MOST_PATHS):
+        if not queue:
+            return
+        path = queue.popleft()
+        state = path[-1][1].target if path else start
+        visited = [s for s, _ in path]
+        for move in moves[state]:
+            longer = (*path, (state, move))
+            if done[move.target]:
+                yield longer, ()
+            elif move.target == state or move.target in visited:
+                begin = (*visited, state).index(move.target)
+                cycle = longer[begin:]
+                if min(m.priority for _, m in cycle) % 2 == 0:
+                    yield longer[:begin], cycle
+            elif live[move.target]:
+                queue.append(longer)
