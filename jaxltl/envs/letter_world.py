@@ -1,0 +1,280 @@
+"""LetterWorld: letters on a torus of cells (Vaezipoor et al. 2021, section 5.1).
+
+As published there and used by Jackermeier and Abate (2025, appendix): 7 x 7 cells whose opposite
+sides are joined, each of 12 letters on two of them, four moves that always succeed, and 75 steps.
+An episode has a map of its own. The agent starts on an empty cell from which every cell is reached
+across empty ones, so that no task has to step on a letter that it does not name. What is seen is
+the map with the agent in its middle: one plane for each letter, and one for the agent.
+
+Two readings. There the agent starts in the upper left corner; here in any empty cell, which on a
+torus that is seen from the agent is the same. And which cells of a map have letters is drawn from a
+table that was drawn once, with all its turns and reflections, while which letters they have is
+drawn anew: the published drawing tries 73 maps for each that it takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+from numpy.typing import ArrayLike
+
+from jaxltl.core.models.environment import (
+    Environment,
+    Timestep,
+    box,
+    make_environment,
+    with_time_limit,
+)
+from jaxltl.envs.text_map import parse_map
+
+ACTIONS = ("up", "down", "left", "right")
+_MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
+_NAMES = "abcdefghijklmnopqrstuvwxyz"
+
+
+class LetterState(NamedTuple):
+    """A map and a place on it.
+
+    Attributes:
+      letter: ``int8[C]``, the number of each cell's letter, or that of the letters for none; cells
+        are counted row by row from the upper left.
+      place: ``int32[]``, the agent's cell.
+    """
+
+    letter: Any
+    place: Any
+
+
+def letter_world(
+    *,
+    size: int = 7,
+    letters: int | Sequence[str] = 12,
+    copies: int = 2,
+    horizon: int | None = 75,
+    layout: str | ArrayLike | None = None,
+    start: int | None = None,
+    connected: bool = True,
+    flat: bool = False,
+    num_maps: int = 1024,
+    seed: int = 0,
+) -> Environment:
+    """The letter world, with a map drawn for each episode or with one that is given.
+
+    Actions are up, down, left and right; there is no reward. Observations are ``float32[size, size,
+    letters + 1]`` of zeros and ones, rolled so that the agent is in the middle, which is what the
+    last plane says.
+
+    Args:
+      size: cells a side.
+      letters: how many there are, named a, b, c, ...; or their names.
+      copies: how many cells each letter has.
+      horizon: after how many steps an episode is truncated; None: never.
+      layout: the map of every episode: a text (see :func:`~jaxltl.envs.text_map.parse_map`) with
+        ``.`` for empty cells, or ``int[size, size]``, numbers of letters, -1 for none. It decides
+        the size, and by the letters in it what `letters` must at least have.
+      start: the cell in which a given layout is begun; default any that is empty.
+      connected: draw maps all of whose cells are reached across empty ones.
+      flat: observations as one axis.
+      num_maps: how many sets of cells are drawn, for connected maps; each has eight turns and
+        reflections, and ``(letters * copies)! / copies!^letters`` ways to be lettered.
+      seed: of that drawing.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Environment`, whose worlds are :class:`LetterState`,
+      or with a horizon pairs of one and the time.
+
+    Raises:
+      ValueError: letters that do not fit on the map, a malformed layout, a start that is no cell,
+        or too few connected maps of such a size.
+
+    Example:
+      >>> world = letter_world()
+      >>> world.propositions[:3], world.observations.shape, world.horizon
+      (('a', 'b', 'c'), (7, 7, 13), 75)
+    """
+    names = _names(letters)
+    if layout is None:
+        if start is not None:
+            raise ValueError(f"start={start} is for a given layout; leave it out.")
+        used = len(names) * copies
+        if size < 2 or copies < 1 or used >= size * size:
+            raise ValueError(
+                f"letter_world: {len(names)} letters on {copies} cells each do not fit on "
+                f"{size} x {size} cells with one left for the agent.")
+        if connected:
+            maps = connected_cells(size, used, num_maps, seed)
+            reset = Partial(_draw_connected, *_orders(maps, size), np.zeros((copies, len(names))))
+        else:
+            reset = Partial(_draw_any, np.zeros((size, size)), np.zeros((copies, len(names))))
+    else:
+        letter, size, names = _given(layout, names, letters)
+        empty = np.flatnonzero(letter == len(names))
+        if start is None and not len(empty):
+            raise ValueError("layout: no cell is empty; say where to begin, start=0.")
+        if start is not None and not 0 <= start < size * size:
+            raise ValueError(f"start={start}; the cells are 0 to {size * size - 1}.")
+        places = (empty if start is None else np.array([start])).astype(np.int32)
+        reset = Partial(_begin, letter, places)
+    views, count = _views(size), len(names)
+    shape = (size * size * (count + 1),) if flat else (size, size, count + 1)
+    made = make_environment(
+        reset, Partial(_move, _neighbors(size)), Partial(_see, views, np.zeros(shape, np.float32),
+                                                         np.arange(count + 1, dtype=np.int8)),
+        actions=4, labels=Partial(_labels, np.arange(count, dtype=np.int8)), propositions=names,
+        observations=box(0, 1, shape, np.float32))
+    return made if horizon is None else with_time_limit(made, horizon)
+
+
+def _names(letters: int | Sequence[str]) -> tuple[str, ...]:
+    if not isinstance(letters, int | np.integer):
+        return tuple(letters)
+    if not 1 <= letters <= len(_NAMES):
+        raise ValueError(f"letters={letters}; it must be 1 to {len(_NAMES)}, or their names.")
+    return tuple(_NAMES[:letters])
+
+
+def _given(
+    layout: str | ArrayLike, names: tuple[str, ...], letters: Any
+) -> tuple[np.ndarray, int, tuple[str, ...]]:
+    """The letters of a given map's cells, its size, and their names."""
+    if isinstance(layout, str):
+        cells = parse_map(layout)
+        found = [str(x) for x in np.unique(cells) if x != "."]
+        for name in found:
+            if name not in names:
+                raise ValueError(
+                    f"layout: {name!r} is none of the letters {list(names)}; name it in letters=.")
+        number = {".": len(names)} | {name: i for i, name in enumerate(names)}
+        table = np.array([[number[str(x)] for x in row] for row in cells])
+    else:
+        table = np.asarray(layout)
+        if table.dtype.kind not in "iu" or table.ndim != 2 or (
+                table.size and not -1 <= table.min() <= table.max() < len(names)):
+            raise ValueError(
+                f"layout: give a text, or integers [size, size] from -1 to {len(names) - 1}.")
+        table = np.where(table < 0, len(names), table)
+    if len(set(table.shape)) != 1 or len(table) < 2:
+        raise ValueError(f"layout has {' x '.join(map(str, table.shape))} cells; it must be square "
+                         "and have at least 2 x 2.")
+    return table.ravel().astype(np.int8), len(table), names
+
+
+# --- maps -----------------------------------------------------------------------------------------
+
+
+def connected_cells(size: int, used: int, count: int, seed: int = 0) -> np.ndarray:
+    """``bool[count, C]``: uniform sets of `used` cells that leave every cell within reach.
+
+    From any cell that is not in the set every cell of the torus is reached through such cells;
+    those of the set are where ways may end.
+
+    Raises:
+      ValueError: such sets are so rare that they are not found.
+    """
+    random, found, tries = np.random.default_rng(seed), [np.zeros((0, size * size), bool)], 0
+    while (have := sum(map(len, found))) < count:
+        if (tries := tries + 1) > 200 + 200 * have:
+            raise ValueError(
+                f"letter_world: connected maps of {size} x {size} cells, {used} of them with "
+                "letters, are too rare; take fewer letters, or connected=False.")
+        some = random.permuted(np.tile(np.arange(size * size) < used, (8192, 1)), axis=1)
+        found.append(some[is_connected(some.reshape(-1, size, size))])
+    return np.concatenate(found)[:count]
+
+
+def is_connected(used: np.ndarray) -> np.ndarray:
+    """``bool[N]`` of sets of cells ``bool[N, size, size]``, see :func:`connected_cells`."""
+    def beside(x: np.ndarray) -> np.ndarray:
+        return np.roll(x, 1, 1) | np.roll(x, -1, 1) | np.roll(x, 1, 2) | np.roll(x, -1, 2)
+
+    empty = ~used
+    reached = np.zeros_like(empty)
+    first = empty.reshape(len(empty), -1).argmax(axis=1)
+    reached.reshape(len(empty), -1)[np.arange(len(empty)), first] = True
+    reached &= empty
+    while not np.array_equal(more := reached | (beside(reached) & empty), reached):
+        reached = more
+    return (reached | beside(reached)).all(axis=(1, 2))
+
+
+def _orders(maps: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Turned and reflected: which letter stands in a cell (the last number: none), and all empty
+    cells."""
+    grids = maps.reshape(-1, size, size)
+    turned = [np.rot90(grids, k, (1, 2)) for k in range(4)]
+    every = np.concatenate(turned + [x.transpose(0, 2, 1) for x in turned]).reshape(-1, size * size)
+    used = maps[0].sum()
+    slot = np.where(every, np.cumsum(every, axis=1) - 1, used)
+    empty = np.nonzero(~every)[1].reshape(len(every), -1)
+    return slot.astype(np.uint8), empty.astype(np.uint8)
+
+
+def _neighbors(size: int) -> np.ndarray:
+    row, column = np.divmod(np.arange(size * size), size)
+    return np.stack([(row + i) % size * size + (column + j) % size for i, j in _MOVES],
+                    axis=1).astype(np.int32)
+
+
+def _views(size: int) -> np.ndarray:
+    """Of each place, which cell is seen where, as ``uint8[C, C]`` or ``int32``."""
+    row, column = np.divmod(np.arange(size * size), size)
+    here = row[:, None] + row - size // 2, column[:, None] + column - size // 2
+    return (here[0] % size * size + here[1] % size).astype(np.int32)
+
+
+# --- of one trajectory ----------------------------------------------------------------------------
+
+
+def _draw_connected(
+    slot: chex.Array, empty: chex.Array, each: chex.Array, key: chex.PRNGKey
+) -> LetterState:
+    copies, count = each.shape
+    bits = jax.random.bits(key, copies * count + 2, jnp.uint32)
+    # The rank of random numbers is a uniform permutation; comparing all is faster than sorting.
+    rank = (bits[2:, None] > bits[2:]).sum(axis=1, dtype=jnp.int8)
+    ties = (bits[2:, None] == bits[2:]) & np.tri(copies * count, k=-1, dtype=bool)
+    shuffled = (rank + ties.sum(axis=1, dtype=jnp.int8)) // jnp.int8(copies)
+    drawn, place = bits[0] % np.uint32(slot.shape[0]), bits[1] % np.uint32(empty.shape[1])
+    letter = jnp.append(shuffled, jnp.int8(count))[jnp.asarray(slot)[drawn]]
+    return LetterState(letter, jnp.asarray(empty)[drawn, place].astype(jnp.int32))
+
+
+def _draw_any(cells: chex.Array, each: chex.Array, key: chex.PRNGKey) -> LetterState:
+    copies, count = each.shape
+    order = jax.random.permutation(key, cells.size)
+    letter = jnp.where(order < copies * count, order // copies, count).astype(jnp.int8)
+    # Of a uniform permutation, the cell of the last number is a uniform empty one.
+    return LetterState(letter, jnp.argmax(order).astype(jnp.int32))
+
+
+def _begin(letter: chex.Array, places: chex.Array, key: chex.PRNGKey) -> LetterState:
+    place = jax.random.choice(key, jnp.asarray(places))
+    return LetterState(jnp.asarray(letter), place)
+
+
+def _move(neighbors: chex.Array, world: LetterState, action: Any, key: chex.PRNGKey) -> Timestep:
+    del key
+    place = jnp.asarray(neighbors)[world.place, action]
+    return Timestep(world._replace(place=place), reward=0.0, terminated=False)
+
+
+def _see(
+    views: chex.Array, shape: chex.Array, numbers: chex.Array, world: LetterState
+) -> jax.Array:
+    seen = world.letter[jnp.asarray(views)[world.place]]
+    cells, count = views.shape[0], numbers.shape[0] - 1
+    planes = seen[:, None] == numbers
+    size = round(cells ** 0.5)
+    middle = jnp.arange(cells) == size // 2 * (size + 1)
+    planes = planes.at[:, count].set(middle)
+    return planes.astype(jnp.float32).reshape(shape.shape)
+
+
+def _labels(numbers: chex.Array, world: LetterState) -> jax.Array:
+    return world.letter[world.place] == numbers
