@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.sparse import HostMDP
+from jaxltl.core.models.interval import interval_rows
 
 
 def vertices(lower, upper):
@@ -18,6 +19,38 @@ def vertices(lower, upper):
             p[i], rest = p[i] + given, rest - given
         found.add(tuple(p))
     return [np.array(p) for p in found]
+
+
+def ball_vertices(lower, upper, center, radius):
+    """The extreme distributions of a row in a ball, from all sets of constraints that may bind."""
+    k = len(lower)
+    signs = np.array(list(itertools.product((1.0, -1.0), repeat=k)))
+    rows = np.concatenate([-np.eye(k), np.eye(k), signs])
+    ends = np.concatenate([-lower, upper, signs @ center + radius])
+    found = set()
+    for binds in itertools.combinations(range(len(rows)), k - 1):
+        system = np.concatenate([rows[list(binds)], np.ones((1, k))])
+        if abs(np.linalg.det(system)) < 1e-9:
+            continue
+        p = np.linalg.solve(system, np.append(ends[list(binds)], 1))
+        if (rows @ p <= ends + 1e-12).all():
+            found.add(tuple(np.round(p, 12)))
+    return [np.array(p) for p in found]
+
+
+def with_ball(rng, model, unit=8):
+    """The same with random centers and radii, all multiples of 1 / unit."""
+    center = []
+    for first, last in itertools.pairwise(model.mdp.entry_start):
+        low, high = (np.round(x[first:last] * unit).astype(int) for x in (model.lower, model.upper))
+        while low.sum() < unit:
+            low[rng.choice(np.flatnonzero(low < high))] += 1
+        center += list(low / unit)
+    radius = rng.choice([0.0, 0.25, 0.5, 0.75, 1.0, 2.0], model.mdp.num_rows)
+    mdp = model.mdp
+    return interval_rows(
+        mdp.row_start, mdp.entry_start, mdp.successor, model.lower, model.upper,
+        center=center, radius=radius).host
 
 
 def random_model(rng, num_states=4, most_rows=2, width=3, unit=8):
@@ -53,7 +86,10 @@ def chains(model, goal):
     for r in range(mdp.num_rows):
         of = slice(mdp.entry_start[r], mdp.entry_start[r + 1])
         rows = np.zeros((0, mdp.num_states))
-        for p in vertices(model.lower[of], model.upper[of]):
+        ends = model.lower[of], model.upper[of]
+        ball = model.ball
+        for p in vertices(*ends) if ball is None else ball_vertices(
+                *ends, ball.center[of], 2 * ball.most[r]):
             row = np.zeros((1, mdp.num_states))
             row[0, mdp.successor[of]] = p
             rows = np.concatenate([rows, row])

@@ -19,6 +19,7 @@ from jaxltl.core.host.accepting import accepting_region
 from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.interval_graph import joint_accepting
 from jaxltl.core.host.interval_values import Robust, gains, terms
+from jaxltl.core.host.optimal_face import face_of
 from jaxltl.core.host.rows import Booleans, Integers
 from jaxltl.core.host.sparse import Floats
 
@@ -108,16 +109,8 @@ def _tight(model: HostInterval, value: Floats, gain: Floats) -> _Game:
     label = np.empty(value.size, np.int64)
     label[order] = jump.cumsum()
     ahead = label[mdp.successor]
-    # Mass goes to lesser classes first; of the last one that gets any, how is free.
-    p = model.nature(ahead.astype(np.float64), maximize=False)
-    loose = model.lower < model.upper
-    some = loose & (p > model.lower)
-    last = np.maximum.reduceat(np.where(some, ahead, -1), mdp.entry_start[:-1])[mdp.row]
-    free = loose & (ahead == last)
-    face = HostInterval(
-        mdp, np.where(free, model.lower, p), np.where(free, model.upper, p))
     inside = ahead == label[mdp.state[mdp.row]]
-    return _Game(face, gain >= -_CLASS, inside)
+    return _Game(face_of(model, ahead), gain >= -_CLASS, inside)
 
 
 class Winning(NamedTuple):

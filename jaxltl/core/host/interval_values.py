@@ -160,8 +160,11 @@ def total_reward(
         found = _led_by_policy(part, _surely_soon(part, ends, solve), solve, -1)
     value, lower, upper = (
         np.where(finite, x, np.inf) for x in (found.value, found.lower, found.upper))
-    chance = halted.mdp.probability.copy()
-    chance[entry] = found.probability
+    # Where it is infinite, and of rows that are not taken, nature is anything.
+    taken, open_ = np.zeros(halted.mdp.num_rows, bool), finite[part.mdp.state]
+    taken[origin[open_]] = True
+    chance = np.where(taken[halted.mdp.row], 0, halted.mdp.probability)
+    chance[entry[open_[part.mdp.row]]] = found.probability[open_[part.mdp.row]]
     found = found._replace(
         value=value, lower=lower, upper=upper, row=origin[found.row], probability=chance)
     return _unhalted(model, halted, row, target, found)

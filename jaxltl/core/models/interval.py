@@ -1,4 +1,4 @@
-"""Models whose probabilities are known to lie in intervals only."""
+"""Models whose probabilities are known to lie in intervals, or in a ball, only."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from flax import struct
 
+from jaxltl.core.host.ball import Ball
 from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.rows import starts_of
 from jaxltl.core.host.sparse import HostMDP
@@ -24,26 +25,34 @@ from jaxltl.core.models.sparse import (
 )
 
 NEAR = 1e-6  # how far a row may miss a distribution and still be scaled to one
-_ENDS = "\0lower", "\0upper"  # names under which ends travel with the entries
+# Names under which numbers of entries travel with the entries, and radii with the rows.
+_ENTRIES = {"lower": "\0lower", "upper": "\0upper", "center": "\0center"}
+_RADIUS = "\0radius"
 
 
 @struct.dataclass
 class IntervalMDP:
     """A labelled decision process with an interval for each probability.
 
-    A row stands for all distributions p with ``lower <= p <= upper``. Each time that it is taken,
-    nature picks one of them, to make a value small or large (`nature="min"`, `"max"`). Build one
-    with :func:`make_interval` or :func:`interval_rows`, which check it.
+    A row stands for all distributions p with ``lower <= p <= upper`` and, where there is a radius,
+    ``sum_t |p_t - center_t| <= radius``. Each time that it is taken, nature picks one of them, to
+    make a value small or large (`nature="min"`, `"max"`). Build one with :func:`make_interval` or
+    :func:`interval_rows`, which check it.
 
     Attributes:
       nominal: the graph, labels, rewards and names; its probabilities are one distribution of
         each row, positive wherever nature may put any mass.
       lower, upper: ``float64[T]``, one for each entry of `nominal`.
+      center: ``float64[T]``, a distribution between them in each row; None without a radius.
+      radius: ``float64[R]``, how far from it a row may be in the L1 norm; None: as far as the ends
+        allow.
     """
 
     nominal: SparseMDP
     lower: Array
     upper: Array
+    center: Array | None = None
+    radius: Array | None = None
 
     @property
     def num_states(self) -> int:
@@ -91,7 +100,9 @@ class IntervalMDP:
     def host(self) -> HostInterval:
         """The transitions as the host engine takes them."""
         lower, upper = (np.asarray(x, np.float64) for x in (self.lower, self.upper))
-        return HostInterval(self.nominal.host, lower, upper)
+        ball = None if self.radius is None or self.center is None else Ball(
+            np.asarray(self.center, np.float64), np.asarray(self.radius, np.float64) / 2)
+        return HostInterval(self.nominal.host, lower, upper, ball)
 
     def states_where(self, proposition: str) -> Array:
         """``bool[S]``, where a proposition holds.
@@ -103,26 +114,44 @@ class IntervalMDP:
 
     def changed(self, change: Callable[[SparseMDP], SparseMDP]) -> IntervalMDP:
         """The model after a change that drops, repeats or moves entries, but adds up none."""
-        ends = {name: Rewards(transition=x)
-                for name, x in zip(_ENDS, (self.lower, self.upper), strict=True)}
+        ends = _travelling(self.lower, self.upper, self.center, self.radius)
         return _taken_apart(
             change(self.nominal.replace(rewards=self.rewards | ends)))  # type: ignore[attr-defined]
 
 
+def _travelling(lower: Any, upper: Any, center: Any, radius: Any) -> dict[str, Rewards]:
+    found = {_ENTRIES["lower"]: Rewards(transition=lower),
+             _ENTRIES["upper"]: Rewards(transition=upper)}
+    if radius is None:
+        return found
+    return found | {
+        _ENTRIES["center"]: Rewards(transition=center), _RADIUS: Rewards(choice=radius)}
+
+
 def _taken_apart(model: SparseMDP) -> IntervalMDP:
-    rewards = dict(model.rewards)
-    lower, upper = (np.asarray(rewards.pop(name).transition) for name in _ENDS)
+    rewards, ball = dict(model.rewards), {}
+    if _RADIUS in rewards:
+        ball = {"radius": np.asarray(rewards.pop(_RADIUS).choice)}
+    ends = {name: np.asarray(rewards.pop(key).transition)
+            for name, key in _ENTRIES.items() if key in rewards}
     nominal = model.replace(rewards=rewards)  # type: ignore[attr-defined]
-    return IntervalMDP(nominal=nominal, lower=lower, upper=upper)
+    return IntervalMDP(nominal=nominal, **ends, **ball)
 
 
-def make_interval(model: MDP | SparseMDP, lower: Array, upper: Array) -> IntervalMDP:
-    """A model whose probabilities are replaced by intervals.
+def make_interval(
+    model: MDP | SparseMDP, lower: Array, upper: Array, *, center: Array | None = None,
+    radius: Array | None = None,
+) -> IntervalMDP:
+    """A model whose probabilities are replaced by intervals, and by a ball in each row.
 
     Args:
       model: its graph, labels, rewards, names and initial distribution count, its probabilities
         do not. A successor in the padding of an MDP, with an upper end above 0, counts.
       lower, upper: shaped as ``model.probability``: ``float[T]``, or ``float[S, A, K]``.
+      center: of the same shape, a distribution between them in each row.
+      radius: ``float[R]``, or ``float[S, A]``: nature's distribution is no farther from `center`
+        than that, in the L1 norm (``sum_t |p_t - center_t|``, at most 2). Default: as far as the
+        ends allow. Of a ball alone the ends are 0 and 1.
 
     Returns:
       :class:`IntervalMDP`. Entries to which nature cannot give any mass, up to the rounding of a
@@ -131,7 +160,8 @@ def make_interval(model: MDP | SparseMDP, lower: Array, upper: Array) -> Interva
 
     Raises:
       ValueError: naming the state and the choice: ends that are crossed, negative or above 1, or
-        between which there is no distribution.
+        between which there is no distribution; a center that is none, or not between the ends; a
+        radius that is negative or no number; only one of center and radius.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
@@ -139,36 +169,47 @@ def make_interval(model: MDP | SparseMDP, lower: Array, upper: Array) -> Interva
       >>> model = make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
       >>> model.lower.tolist(), model.upper.tolist()
       ([0.4, 0.3, 1.0, 1.0], [0.7, 0.6, 1.0, 1.0])
+      >>> ball = make_interval(coin, [0, 0, 0, 0], [1, 1, 1, 1], center=[0.5, 0.5, 1, 1],
+      ...                      radius=[0.5, 0, 0])
+      >>> ball.lower.tolist(), ball.upper.tolist()
+      ([0.25, 0.25, 1.0, 1.0], [0.75, 0.75, 1.0, 1.0])
     """
     if not isinstance(model, MDP | SparseMDP):
         raise ValueError(f"{type(model).__name__} takes no intervals; give an MDP or a SparseMDP "
                          "(of an interval model, its nominal one).")
     lower, upper = (np.asarray(x, np.float64) for x in (lower, upper))
     shape = np.shape(model.probability)
-    for name, ends in (("lower", lower), ("upper", upper)):
-        if ends.shape != shape:
-            raise ValueError(f"{name} has shape {ends.shape}; expected {shape}, an end for each "
+    for name, ends in (("lower", lower), ("upper", upper), ("center", center)):
+        if ends is not None and np.shape(ends) != shape:
+            raise ValueError(f"{name} has shape {np.shape(ends)}; expected {shape}, one for each "
                              "probability of the model.")
     if isinstance(model, SparseMDP):
         return interval_rows(
             model.row_start, model.entry_start, model.successor, lower, upper,
-            initial=model.initial, label=model.label, propositions=model.propositions,
+            center=center, radius=radius, initial=model.initial,
+            label=model.label, propositions=model.propositions,
             rewards=model.rewards, action=model.action, action_names=model.action_names,
             valuation=model.valuation)
     available = np.asarray(model.available)
+    if radius is not None and np.shape(radius) != available.shape:
+        raise ValueError(f"radius has shape {np.shape(radius)}; expected {available.shape}, one "
+                         "for each action of a state.")
     used = available[..., None] & ~((lower == 0) & (upper == 0))
     state, action = np.nonzero(available)
     initial = np.asarray(model.initial, np.float64)
     return interval_rows(
         starts_of(available.sum(-1)), starts_of(used.sum(-1)[state, action]),
         np.asarray(model.successor)[used], lower[used], upper[used],
+        center=None if center is None else np.asarray(center)[used],
+        radius=None if radius is None else np.asarray(radius)[available],
         initial=initial / initial.sum(), label=np.asarray(model.label),
         propositions=model.propositions, action=action)
 
 
 def interval_rows(
     row_start: Array | None, entry_start: Array, successor: Array, lower: Array, upper: Array,
-    *, rewards: Mapping[str, Rewards] | None = None, **rest: Any,
+    *, center: Array | None = None, radius: Array | None = None,
+    rewards: Mapping[str, Rewards] | None = None, **rest: Any,
 ) -> IntervalMDP:
     """A checked :class:`IntervalMDP` from arrays, on the host.
 
@@ -178,6 +219,8 @@ def interval_rows(
     Args:
       row_start, entry_start, successor: as of :func:`~jaxltl.core.models.sparse.make_sparse`.
       lower, upper: ``float[T]``.
+      center, radius: ``float[T]`` and ``float[R]``, a ball in each row, as of
+        :func:`make_interval`.
       rewards: named structures.
       rest: `initial`, `label`, `propositions`, `action`, `action_names` and `valuation` of
         :func:`~jaxltl.core.models.sparse.make_sparse`.
@@ -187,6 +230,7 @@ def interval_rows(
     """
     entry_start, successor = np.asarray(entry_start), np.asarray(successor)
     lower, upper = (np.asarray(x, np.float64) for x in (lower, upper))
+    ball = _ball(center, radius, successor.shape, entry_start.size - 1)
     if not lower.shape == upper.shape == successor.shape:
         raise ValueError(f"successor has shape {successor.shape}, lower {lower.shape} and upper "
                          f"{upper.shape}; all must be [transitions].")
@@ -203,17 +247,80 @@ def interval_rows(
     rewards = dict(rewards or {})
     place = row * np.int64(starts.size) + successor.astype(np.int64)
     if not (place[1:] > place[:-1]).all() and np.unique(place).size < place.size:
-        row, successor, lower, upper, rewards = _merged(row, successor, lower, upper, rewards)
+        numbers = [lower, upper] if ball is None else [lower, upper, ball[0]]
+        row, successor, numbers, rewards = _merged(row, successor, numbers, rewards)
         entry_start = starts_of(np.bincount(row, minlength=entry_start.size - 1))
+        (lower, upper), inner = numbers[:2], numbers[2:]
+        ball = None if ball is None else (inner[0], ball[1])
     lower, upper = _scaled(starts, entry_start, row, lower, upper)
+    if ball is not None:
+        _check_ball(starts, entry_start, row, lower, upper, *ball)
+        lower, upper, ball = _around(entry_start, row, lower, upper, *ball)
     states: Any = np.zeros(entry_start.size, np.int64)  # the host's rows need no states here
-    ends = HostInterval(HostMDP(states, entry_start, successor, lower), lower, upper)
+    ends = HostInterval(
+        HostMDP(states, entry_start, successor, lower), lower, upper,
+        None if ball is None else Ball(ball[0], ball[1] / 2))
     # Nature has nothing left to give where lower ends add up to one.
     possible = (upper > 0) & ((lower > 0) | (ends.rest > ends.rounding)[row])
-    centre = np.where(possible, ends.within(possible), 0)
-    extra = {name: Rewards(transition=x) for name, x in zip(_ENDS, (lower, upper), strict=True)}
+    nominal = np.where(possible, ends.within(possible), 0)
+    extra = _travelling(lower, upper, *(ball or (None, None)))
     return _taken_apart(make_sparse(
-        row_start, entry_start, successor, centre, rewards=rewards | extra, **rest))
+        row_start, entry_start, successor, nominal, rewards=rewards | extra, **rest))
+
+
+def _ball(
+    center: Any, radius: Any, entries: tuple[int, ...], num_rows: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """A center and a radius as numbers, of the right shape; None if both are left out."""
+    if center is None and radius is None:
+        return None
+    if center is None or radius is None:
+        given = "radius" if center is None else "center"
+        raise ValueError(f"{given} is given alone; a ball has a center and a radius.")
+    center, radius = (np.asarray(x, np.float64) for x in (center, radius))
+    if center.shape != entries or radius.shape != (num_rows,):
+        raise ValueError(f"center has shape {center.shape} and radius {radius.shape}; expected "
+                         f"{entries} and ({num_rows},), one for each transition and each choice.")
+    return center, radius
+
+
+def _check_ball(
+    row_start: np.ndarray, entry_start: np.ndarray, row: np.ndarray, lower: np.ndarray,
+    upper: np.ndarray, center: np.ndarray, radius: np.ndarray,
+) -> None:
+    total = np.add.reduceat(center, entry_start[:-1])
+    bad = ~((radius >= 0) & (radius < np.inf))
+    if bad.any():
+        r = int(np.argmax(bad))
+        raise ValueError(f"{placed(row_start, r)}: the radius is {radius[r]}; it must be a number "
+                         "of at least 0.")
+    bad = ~(np.abs(total - 1) <= NEAR)
+    if bad.any():
+        r = int(np.argmax(bad))
+        raise ValueError(f"{placed(row_start, r)}: the center sums to {total[r]:.9g}; it must be "
+                         "a distribution.")
+    bad = ~((lower - NEAR <= center) & (center <= upper + NEAR) & (center >= 0))
+    if bad.any():
+        e = int(np.argmax(bad))
+        raise ValueError(
+            f"{placed(row_start, int(row[e]))}: the center has {center[e]:.9g} where the interval "
+            f"is [{lower[e]:.9g}, {upper[e]:.9g}]; the center must lie between the ends.")
+
+
+def _around(
+    entry_start: np.ndarray, row: np.ndarray, lower: np.ndarray, upper: np.ndarray,
+    center: np.ndarray, radius: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """The ends that a ball leaves, and the ball, whose center is between them."""
+    total = np.add.reduceat(center, entry_start[:-1])
+    rounding = (np.diff(entry_start) + 2) * np.finfo(np.float64).eps
+    center = np.where((np.abs(total - 1) > rounding)[row], center / total[row], center)
+    lower, upper = np.minimum(lower, center), np.maximum(upper, center)
+    radius = np.minimum(radius, 2)
+    half = (radius / 2)[row]
+    least = center - half
+    least = np.where((half > 0) & (least <= 4 * rounding[row]), 0, least)
+    return np.maximum(lower, least), np.minimum(upper, center + half), (center, radius)
 
 
 def _check_ends(
@@ -247,10 +354,10 @@ def _scaled(
 
 
 def _merged(
-    row: np.ndarray, successor: np.ndarray, lower: np.ndarray, upper: np.ndarray,
+    row: np.ndarray, successor: np.ndarray, numbers: list[np.ndarray],
     rewards: dict[str, Rewards],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Rewards]]:
-    """Entries of one row with one successor as one, if they earn the same."""
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], dict[str, Rewards]]:
+    """Entries of one row with one successor as one, with sums, if they earn the same."""
     order = np.lexsort((successor, row))
     row, successor = row[order], successor[order]
     new = np.append(True, (row[1:] != row[:-1]) | (successor[1:] != successor[:-1]))
@@ -269,5 +376,5 @@ def _merged(
                 "one entry for each state.")
         rewards = rewards | {name: reward.replace(  # type: ignore[attr-defined]
             transition=earned[start])}
-    lower, upper = (np.add.reduceat(x[order], start) for x in (lower, upper))
-    return row[start], successor[start], lower, np.minimum(upper, 1), rewards
+    lower, upper, *rest = (np.add.reduceat(x[order], start) for x in numbers)
+    return row[start], successor[start], [lower, np.minimum(upper, 1), *rest], rewards
