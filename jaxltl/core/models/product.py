@@ -27,14 +27,14 @@ from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.trajectories import Trajectories, require_states
 
 
-class _Names:
+class Names:
     """The texts of an automaton. All are equal to a compiled program, which reads none of them."""
 
     def __init__(self, *texts: Any) -> None:
         self.texts = texts
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Names)
+        return isinstance(other, Names)
 
     def __hash__(self) -> int:
         return 0
@@ -44,7 +44,7 @@ _TABLES = ("delta", "initial", "priority", "letters")
 
 
 def _tables(automaton: Automaton) -> tuple[list[Any], Any]:
-    names = _Names(automaton.propositions, automaton.state_names)
+    names = Names(automaton.propositions, automaton.state_names)
     return [getattr(automaton, name) for name in _TABLES], (automaton.acceptance, names)
 
 
