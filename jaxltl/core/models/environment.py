@@ -8,6 +8,8 @@ state of their own::
     observe(world) -> observation, an array or a tree of arrays
     labels(world) -> bool[P], which propositions hold
     allowed(world) -> bool[A], which of finitely many actions may be taken (optional)
+    starts() -> (worlds, float[N]), all that reset draws, and how likely each is (optional)
+    outcomes(world, action) -> (Timestep, float[K]), the same of a step (optional)
 
 ``world`` is any tree of arrays. Many trajectories are a ``vmap``. Two ways in which an episode ends
 are told apart: it is *terminated* if nothing comes after it, and *truncated* if something would,
@@ -133,6 +135,8 @@ class Environment:
       observations: a tree of :class:`Box`, as `observe` returns arrays.
       propositions: names of the P labels; static.
       horizon: after how many steps every episode has ended; None: not known; static.
+      starts, outcomes: what may be drawn, or None: not told; the worlds and the fields of the
+        Timestep have a first axis. Of a step that draws nothing they may be left out.
     """
 
     reset: Callable[..., Any]
@@ -144,6 +148,8 @@ class Environment:
     observations: Any
     propositions: tuple[str, ...] = struct.field(pytree_node=False)
     horizon: int | None = struct.field(pytree_node=False, default=None)
+    starts: Callable[..., Any] | None = None
+    outcomes: Callable[..., Any] | None = None
 
 
 def make_environment(
@@ -157,6 +163,8 @@ def make_environment(
     allowed: Callable[..., jax.Array] | None = None,
     observations: Any = None,
     horizon: int | None = None,
+    starts: Callable[..., Any] | None = None,
+    outcomes: Callable[..., Any] | None = None,
 ) -> Environment:
     """A checked :class:`Environment`.
 
@@ -169,6 +177,7 @@ def make_environment(
       allowed: ``world -> bool[A]``, for finitely many actions.
       observations: a tree of :class:`Box`; default: without bounds.
       horizon: after how many steps every episode has ended, if that is known.
+      starts, outcomes: see the module's text; for :func:`~jaxltl.core.models.tabulate.tabulate`.
 
     Raises:
       ValueError: a function that returns something of another shape, that is not pure (it keeps
@@ -206,7 +215,9 @@ def make_environment(
     made = Environment(
         reset=as_partial(reset), step=as_partial(step), observe=as_partial(observe),
         labels=as_partial(labels), allowed=None if allowed is None else as_partial(allowed),
-        actions=actions, observations=observations, propositions=names, horizon=horizon)
+        actions=actions, observations=observations, propositions=names, horizon=horizon,
+        starts=None if starts is None else as_partial(starts),
+        outcomes=None if outcomes is None else as_partial(outcomes))
     seen = _check_functions(made)
     if observations is None:
         def free(x: Any) -> Box:
@@ -268,7 +279,20 @@ def with_time_limit(environment: Environment, num_steps: int) -> Environment:
         step=Partial(_step_clock, inner.step, np.int32(num_steps)),
         observe=Partial(_of_first, inner.observe), labels=Partial(_of_first, inner.labels),
         allowed=None if inner.allowed is None else Partial(_of_first, inner.allowed),
-        horizon=min(num_steps, inner.horizon or num_steps))
+        horizon=min(num_steps, inner.horizon or num_steps),
+        starts=None if inner.starts is None else Partial(_start_clock, inner.starts),
+        outcomes=None if inner.outcomes is None else Partial(
+            _clocked, inner.outcomes, np.int32(num_steps)))
+
+
+def without_time_limit(environment: Environment) -> tuple[Environment, int | None]:
+    """The world inside :func:`with_time_limit`, and the limit; any other as it is, and None."""
+    timed: Any = environment
+    if timed.step.func is not _step_clock:
+        return environment, None
+    parts = {name: part and part.args[0] for name in ("reset", "step", "observe", "labels",
+             "allowed", "starts", "outcomes") for part in [getattr(timed, name)]}
+    return replace(environment, horizon=None, **parts), int(timed.step.args[1])
 
 
 def _reset_clock(reset: Callable[..., Any], key: chex.PRNGKey) -> Any:
@@ -281,6 +305,22 @@ def _step_clock(
     found, time = Timestep(*step(timed[0], action, key)), timed[1] + 1
     return found._replace(
         world=(found.world, time), truncated=jnp.asarray(found.truncated, bool) | (time >= limit))
+
+
+def _start_clock(starts: Callable[..., Any]) -> Any:
+    worlds, probability = starts()
+    return (worlds, jnp.zeros(jnp.shape(probability), jnp.int32)), probability
+
+
+def _clocked(
+    outcomes: Callable[..., Any], limit: jax.Array, timed: Any, action: Any
+) -> tuple[Timestep, jax.Array]:
+    found, probability = outcomes(timed[0], action)
+    found, time = Timestep(*found), timed[1] + 1
+    times = jnp.full(jnp.shape(probability), time)
+    return found._replace(
+        world=(found.world, times),
+        truncated=jnp.asarray(found.truncated, bool) | (time >= limit)), probability
 
 
 def _of_first(function: Callable[..., Any], timed: Any) -> Any:
@@ -364,36 +404,83 @@ def run_episode(
     """
     if num_steps < 1:
         raise ValueError(f"num_steps={num_steps}; it must be at least 1.")
-    start, path = jax.random.split(key)
-    world = environment.reset(start)
-    begin = world, agent.memory, jnp.bool_(False), jnp.bool_(False)
+    begin, path = begin_episode(key, environment, agent)
 
-    def move(carry: Any, key: chex.PRNGKey) -> Any:
-        world, memory, terminated, truncated = carry
-        active = ~(terminated | truncated)
-        act_key, step_key = jax.random.split(key)
-        observation, allowed = environment.observe(world), allowed_in(environment, world)
-        action, memory = agent.act(memory, observation, allowed, act_key)
-        found = Timestep(*environment.step(world, action, step_key))
-        reward, cost = (jnp.where(active, x, 0.0) for x in (found.reward, found.cost))
-        after = jax.tree.map(lambda x, y: jnp.where(active, x, y), found.world, world)
-        discount = jnp.where(active, found.discount, 1.0)
-        label = environment.labels(world)
-        row = world, observation, action, reward, cost, label, active, discount
-        ended = (t | (active & jnp.asarray(f, bool)) for t, f in (
-            (terminated, found.terminated), (truncated, found.truncated)))
-        return (after, memory, *ended), row
+    def move(now: Underway, time: jax.Array) -> tuple[Underway, Move]:
+        return continue_episode(now, environment, agent, jax.random.fold_in(path, time))
 
-    (last, _, terminated, truncated), rows = lax.scan(
-        move, begin, jax.random.split(path, num_steps))
-    worlds, observation, action, reward, cost, label, valid, discount = rows
+    end, made = lax.scan(move, begin, jnp.arange(num_steps))
 
     def append(row: Any, end: Any) -> Any:
         return jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), row, end)
 
     return Episode(
-        append(worlds, last), observation, action, reward, cost,
-        append(label, environment.labels(last)), valid, terminated, truncated, discount)
+        append(made.world, end.world), made.observation, made.action, made.reward, made.cost,
+        append(made.label, environment.labels(end.world)), made.valid, end.terminated,
+        end.truncated, made.discount)
+
+
+class Underway(NamedTuple):
+    """An episode that goes on unless it is terminated or truncated."""
+
+    world: Any
+    memory: Any
+    terminated: jax.Array
+    truncated: jax.Array
+
+
+class Move(NamedTuple):
+    """One row of an :class:`Episode`: what was there before a step, and what the step gave."""
+
+    world: Any
+    observation: Any
+    action: Any
+    reward: jax.Array
+    cost: jax.Array
+    label: jax.Array
+    valid: jax.Array
+    discount: jax.Array
+
+
+def begin_episode(
+    key: chex.PRNGKey, environment: Environment, agent: Agent
+) -> tuple[Underway, chex.PRNGKey]:
+    """The first world, and the key into which the number of each step is folded."""
+    start, path = jax.random.split(key)
+    no = jnp.bool_(False)
+    return Underway(environment.reset(start), agent.memory, no, no), path
+
+
+def continue_episode(
+    now: Underway, environment: Environment, agent: Agent, key: chex.PRNGKey
+) -> tuple[Underway, Move]:
+    """One step of an episode that goes on; one that is over stays as it is, for nothing."""
+    world, active = now.world, ~(now.terminated | now.truncated)
+    act_key, step_key = jax.random.split(key)
+    observation, allowed = environment.observe(world), allowed_in(environment, world)
+    action, memory = agent.act(now.memory, observation, allowed, act_key)
+    found = Timestep(*environment.step(world, action, step_key))
+    reward, cost = (jnp.where(active, x, 0.0) for x in (found.reward, found.cost))
+    discount = jnp.where(active, found.discount, 1.0)
+    after = jax.tree.map(lambda x, y: jnp.where(active, x, y), found.world, world)
+    terminated, truncated = (t | (active & jnp.asarray(f, bool)) for t, f in (
+        (now.terminated, found.terminated), (now.truncated, found.truncated)))
+    label = environment.labels(world)
+    return Underway(after, memory, terminated, truncated), Move(
+        world, observation, action, reward, cost, label, active, discount)
+
+
+def flat_observation(observation: Any) -> jax.Array:
+    """What is observed as one vector ``float[O]``, the arrays of a tree one after the other.
+
+    Example:
+      >>> flat_observation({"at": jnp.array([1.5, 2.5]), "open": jnp.bool_(True)}).tolist()
+      [1.5, 2.5, 1.0]
+    """
+    leaves = [jnp.asarray(x) for x in jax.tree.leaves(observation)]
+    floats = [x.dtype for x in leaves if jnp.issubdtype(x.dtype, jnp.floating)]
+    kind = jnp.result_type(*floats) if floats else jnp.result_type(float)
+    return jnp.concatenate([jnp.ravel(x).astype(kind) for x in leaves])
 
 
 def allowed_in(environment: Environment, world: Any) -> jax.Array | None:
