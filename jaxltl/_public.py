@@ -26,6 +26,20 @@ from jaxltl.core.logic.ltl import Formula, holds_on_lasso, parse_ltl
 from jaxltl.core.models.batch import lift_memory, stack_products
 from jaxltl.core.models.convert import to_padded, to_sparse
 from jaxltl.core.models.counts import TransitionCounts, counted_model, counts_on, make_counts
+from jaxltl.core.models.environment import (
+    Agent,
+    Box,
+    Environment,
+    Episode,
+    Finite,
+    Timestep,
+    agent_of,
+    box,
+    make_environment,
+    run_episode,
+    step_or_reset,
+    with_time_limit,
+)
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows, make_interval
 from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp, to_dense
@@ -49,7 +63,15 @@ from jaxltl.core.models.product import (
     project_trajectories,
 )
 from jaxltl.core.models.restrict import restrict, with_allowed
+from jaxltl.core.models.simulated_model import environment_of
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse, row_reward
+from jaxltl.core.models.task_environment import (
+    TaskObservation,
+    TaskWorld,
+    stack_tasks,
+    task_environment,
+    what_is_left,
+)
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, rollout
 from jaxltl.core.types import NotConverged, Solution, Status, check
 from jaxltl.core.values.answer import answer
@@ -113,10 +135,15 @@ def _(value: Automaton) -> str:
 __all__ = [
     "GR1",
     "MDP",
+    "Agent",
     "Automaton",
+    "Box",
     "ConfidenceSets",
     "DataGuarantee",
     "DenseMDP",
+    "Environment",
+    "Episode",
+    "Finite",
     "FiniteMemoryPolicy",
     "Formula",
     "Game",
@@ -135,12 +162,16 @@ __all__ = [
     "Solution",
     "SparseMDP",
     "Status",
+    "TaskObservation",
+    "TaskWorld",
+    "Timestep",
     "Trajectories",
     "TransitionCounts",
     "Verdict",
     "Verification",
     "Winning",
     "achievable",
+    "agent_of",
     "almost_sure_buchi",
     "almost_surely_reaching",
     "answer",
@@ -151,6 +182,7 @@ __all__ = [
     "boltzmann_fixed_points",
     "boltzmann_value",
     "bounded_reachability",
+    "box",
     "buchi",
     "check",
     "cobuchi",
@@ -159,6 +191,7 @@ __all__ = [
     "counts_on",
     "cumulative_reward",
     "end_components",
+    "environment_of",
     "exists_successor",
     "expectation",
     "feature_expectation",
@@ -185,6 +218,7 @@ __all__ = [
     "machine_reward",
     "make_automaton",
     "make_counts",
+    "make_environment",
     "make_game",
     "make_interval",
     "make_mdp",
@@ -232,6 +266,7 @@ __all__ = [
     "robust_sensitivity",
     "rollout",
     "row_reward",
+    "run_episode",
     "safety",
     "sample_successor",
     "satisfaction_probability",
@@ -241,9 +276,12 @@ __all__ = [
     "solve_prepared",
     "sparse_satisfaction",
     "stack_products",
+    "stack_tasks",
     "states_where",
+    "step_or_reset",
     "strategy_value",
     "synchronize",
+    "task_environment",
     "task_performance",
     "task_performances",
     "to_automaton",
@@ -254,8 +292,10 @@ __all__ = [
     "total_reward",
     "verdict",
     "verify",
+    "what_is_left",
     "winning_region",
     "with_allowed",
+    "with_time_limit",
     "write_hoa",
     "write_model",
 ]
