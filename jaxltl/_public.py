@@ -38,7 +38,6 @@ from jaxltl.core.models.environment import (
     make_environment,
     run_episode,
     step_or_reset,
-    with_time_limit,
 )
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows, make_interval
@@ -72,6 +71,7 @@ from jaxltl.core.models.task_environment import (
     task_environment,
     what_is_left,
 )
+from jaxltl.core.models.time_limit import with_time_limit
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, rollout
 from jaxltl.core.types import NotConverged, Solution, Status, check
 from jaxltl.core.values.answer import answer

@@ -29,8 +29,8 @@ from jaxltl.core.models.environment import (
     Timestep,
     box,
     make_environment,
-    with_time_limit,
 )
+from jaxltl.core.models.time_limit import with_time_limit
 from jaxltl.envs.text_map import parse_map
 
 ACTIONS = ("up", "down", "left", "right")

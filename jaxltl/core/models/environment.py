@@ -95,9 +95,9 @@ def box(
         place = np.argwhere(least > most)[0].tolist()
         raise ValueError(f"box: low is above high at {place}; exchange them.")
     kind = jnp.dtype(dtype or jnp.result_type(float))
-    if kind.kind in "iu":  # an infinite bound of integers is that of their type
-        ends = jnp.iinfo(kind)
-        least, most = (np.clip(x.astype(float), ends.min, ends.max) for x in (least, most))
+    if kind.kind in "biu":  # an infinite bound is that of the type
+        ends = (0, 1) if kind.kind == "b" else (jnp.iinfo(kind).min, jnp.iinfo(kind).max)
+        least, most = (np.clip(x.astype(float), *ends) for x in (least, most))
     return Box(least.astype(kind), most.astype(kind), full, kind.name)
 
 
@@ -223,7 +223,7 @@ def make_environment(
         def free(x: Any) -> Box:
             return box(-np.inf, np.inf, x.shape, x.dtype)
         made = replace(made, observations=jax.tree.map(free, seen))
-    elif (found := _described(_as_arrays(observations))) != _described(seen):
+    elif not _alike(found := _described(_as_arrays(observations)), _described(seen)):
         raise ValueError(f"observe returns {_described(seen)}, but observations is of {found}.")
     return made
 
@@ -262,69 +262,9 @@ def random_action(
     return jnp.where(bounded, inside, jnp.clip(normal, low, high))
 
 
-def with_time_limit(environment: Environment, num_steps: int) -> Environment:
-    """The same world, whose episodes are truncated after so many steps.
-
-    Its worlds are pairs ``(world, time)``. What is observed is as before: where the best thing to
-    do depends on the time that is left, tell it in `observe`.
-
-    Raises:
-      ValueError: a number below 1.
-    """
-    if num_steps < 1:
-        raise ValueError(f"num_steps={num_steps}; it must be at least 1.")
-    inner = environment
-    return replace(
-        inner, reset=Partial(_reset_clock, inner.reset),
-        step=Partial(_step_clock, inner.step, np.int32(num_steps)),
-        observe=Partial(_of_first, inner.observe), labels=Partial(_of_first, inner.labels),
-        allowed=None if inner.allowed is None else Partial(_of_first, inner.allowed),
-        horizon=min(num_steps, inner.horizon or num_steps),
-        starts=None if inner.starts is None else Partial(_start_clock, inner.starts),
-        outcomes=None if inner.outcomes is None else Partial(
-            _clocked, inner.outcomes, np.int32(num_steps)))
-
-
-def without_time_limit(environment: Environment) -> tuple[Environment, int | None]:
-    """The world inside :func:`with_time_limit`, and the limit; any other as it is, and None."""
-    timed: Any = environment
-    if timed.step.func is not _step_clock:
-        return environment, None
-    parts = {name: part and part.args[0] for name in ("reset", "step", "observe", "labels",
-             "allowed", "starts", "outcomes") for part in [getattr(timed, name)]}
-    return replace(environment, horizon=None, **parts), int(timed.step.args[1])
-
-
-def _reset_clock(reset: Callable[..., Any], key: chex.PRNGKey) -> Any:
-    return reset(key), jnp.int32(0)
-
-
-def _step_clock(
-    step: Callable[..., Timestep], limit: jax.Array, timed: Any, action: Any, key: chex.PRNGKey
-) -> Timestep:
-    found, time = Timestep(*step(timed[0], action, key)), timed[1] + 1
-    return found._replace(
-        world=(found.world, time), truncated=jnp.asarray(found.truncated, bool) | (time >= limit))
-
-
-def _start_clock(starts: Callable[..., Any]) -> Any:
-    worlds, probability = starts()
-    return (worlds, jnp.zeros(jnp.shape(probability), jnp.int32)), probability
-
-
-def _clocked(
-    outcomes: Callable[..., Any], limit: jax.Array, timed: Any, action: Any
-) -> tuple[Timestep, jax.Array]:
-    found, probability = outcomes(timed[0], action)
-    found, time = Timestep(*found), timed[1] + 1
-    times = jnp.full(jnp.shape(probability), time)
-    return found._replace(
-        world=(found.world, times),
-        truncated=jnp.asarray(found.truncated, bool) | (time >= limit)), probability
-
-
-def _of_first(function: Callable[..., Any], timed: Any) -> Any:
-    return function(timed[0])
+def clipped_action(actions: Box, action: chex.Array) -> jax.Array:
+    """The action of a box that is nearest to an array of its shape."""
+    return jnp.clip(action, actions.low, actions.high)
 
 
 # --- episodes -------------------------------------------------------------------------------------
@@ -529,7 +469,7 @@ def _check_functions(made: Environment) -> Any:
         if not _is_bool(getattr(found, name)):
             raise ValueError(f"step returns {name} as {getattr(found, name).dtype}; return a "
                              "Boolean.")
-    if (after := _described(found.world)) != (before := _described(world)):
+    if not _alike(after := _described(found.world), before := _described(world)):
         raise ValueError(f"step returns the world {after}, but reset {before}; both must have the "
                          "same structure, shapes and dtypes.")
     require_labels(_traced("labels", made.labels, world), made.propositions)
@@ -591,6 +531,12 @@ def _is_bool(x: Any) -> bool:
 def _as_arrays(observations: Any) -> Any:
     return jax.tree.map(lambda b: jax.ShapeDtypeStruct(b.shape, jnp.dtype(b.dtype)), observations,
                         is_leaf=lambda b: isinstance(b, Box))
+
+
+def _alike(described: Any, other: Any) -> bool:
+    """Whether two trees are the same; classes of nodes may have an idea of their own of ``==``."""
+    return jax.tree.structure(described) == jax.tree.structure(other) and (
+        jax.tree.leaves(described) == jax.tree.leaves(other))
 
 
 def _described(tree: Any) -> Any:
