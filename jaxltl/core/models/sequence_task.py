@@ -60,13 +60,13 @@ class SequenceWorld(NamedTuple):
     Attributes:
       world: the inner one.
       sequence: what was asked for.
-      index: ``int32[]``, the steps that are done.
+      stage: ``int32[]``, the steps that are done.
       verdict: ``int32[]``, a :class:`~jaxltl.Verdict`.
     """
 
     world: Any
     sequence: Sequence
-    index: jax.Array
+    stage: jax.Array
     verdict: jax.Array
 
 
@@ -234,7 +234,7 @@ def _reset(
     # An episode has a first step: what is over at once is asked for again.
     over = found.verdict != Verdict.UNDECIDED
     return found._replace(
-        index=jnp.where(over, 0, found.index),
+        stage=jnp.where(over, 0, found.stage),
         verdict=jnp.where(over, Verdict.UNDECIDED, found.verdict).astype(jnp.int32))
 
 
@@ -243,11 +243,11 @@ def _step(
     key: chex.PRNGKey,
 ) -> Timestep:
     found = Timestep(*inner.step(state.world, action, key))
-    after = _read(inner, events, found.world, state.sequence, state.index)
+    after = _read(inner, events, found.world, state.sequence, state.stage)
     violation, progress = numbers
     reward = (
         (after.verdict == Verdict.SATISFIED) + violation * (after.verdict == Verdict.VIOLATED)
-        + progress * (after.index - state.index) / state.sequence.length)
+        + progress * (after.stage - state.stage) / state.sequence.length)
     decided = after.verdict != Verdict.UNDECIDED
     return Timestep(
         world=after, reward=reward.astype(jnp.result_type(float)),
@@ -257,7 +257,7 @@ def _step(
 
 def _observe(inner: Environment, state: SequenceWorld) -> SequenceObservation:
     return SequenceObservation(
-        inner.observe(state.world), remaining(state.sequence, state.index))
+        inner.observe(state.world), remaining(state.sequence, state.stage))
 
 
 def _labels(inner: Environment, state: SequenceWorld) -> jax.Array:

@@ -48,7 +48,7 @@ def test_episodes_are_what_a_slow_reading_says(episodes):
     world = episodes.world
     for n in range(200):
         reach, avoid = world.sequence.reach[n, 0], world.sequence.avoid[n, 0]
-        length, index = int(world.sequence.length[n, 0]), int(world.index[n, 0])
+        length, index = int(world.sequence.length[n, 0]), int(world.stage[n, 0])
         verdict = Verdict.UNDECIDED
         for t in range(STEPS):
             over = verdict != Verdict.UNDECIDED
@@ -63,7 +63,7 @@ def test_episodes_are_what_a_slow_reading_says(episodes):
                 if index == length:
                     verdict, earned = Verdict.SATISFIED, earned + 1
             assert episodes.reward[n, t] == pytest.approx(earned)
-            assert (world.index[n, t + 1], world.verdict[n, t + 1]) == (index, verdict)
+            assert (world.stage[n, t + 1], world.verdict[n, t + 1]) == (index, verdict)
         assert episodes.terminated[n] == (verdict != Verdict.UNDECIDED)
     assert {0, 1, 2} == set(world.verdict[:, -1].tolist())
 
@@ -71,7 +71,7 @@ def test_episodes_are_what_a_slow_reading_says(episodes):
 def test_what_is_observed_is_what_is_left(episodes):
     seen, world = episodes.observation.sequence, episodes.world
     for n, t in np.argwhere(episodes.valid):
-        index = world.index[n, t]
+        index = world.stage[n, t]
         assert (seen.reach[n, t, : 3 - index] == world.sequence.reach[n, 0, index:]).all()
         assert not seen.reach[n, t, 3 - index:].any()
         assert seen.length[n, t] == world.sequence.length[n, 0] - index
