@@ -29,6 +29,27 @@ class Polynomial:
     offset: jax.Array | float = 0.0
 
 
+@struct.dataclass
+class Linear:
+    """From `first` in the first step in a straight line to `last` after `num_steps` steps.
+
+    Then it stays there. Numbers are traced.
+
+    Example:
+      >>> [float(at(Linear(1.0, 0.0, 4), step)) for step in range(6)]
+      [1.0, 0.75, 0.5, 0.25, 0.0, 0.0]
+    """
+
+    first: jax.Array | float
+    last: jax.Array | float
+    num_steps: jax.Array | int
+
+    def __call__(self, l: jax.Array | int) -> jax.Array:  # noqa: E741
+        """The number in step l = 1, 2, ..."""
+        share = jnp.clip((jnp.asarray(l) - 1) / jnp.asarray(self.num_steps), 0, 1)
+        return self.first + (self.last - self.first) * share
+
+
 Schedule = Any  # a number, a Polynomial, or a pytree that is called with l = 1, 2, ...
 
 

@@ -1,0 +1,89 @@
+"""Distributions of actions: categorical among those allowed, or Gaussian within a box.
+
+All functions are of one action. What is drawn is *raw*: the number of the action, or what a
+Gaussian draws, in units in which a box that has both bounds is ``[-1, 1]``. The environment is
+handed :func:`as_action` of it: clipped, or squashed by a hyperbolic tangent.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.core.models.environment import Box, Finite
+
+Actions = Finite | Box
+
+# Abscissas and weights that integrate against the standard normal density.
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(16)
+_WEIGHTS = _WEIGHTS / np.sqrt(2 * np.pi)
+
+
+def noise(key: chex.PRNGKey, shape: tuple[int, ...], actions: Actions, dtype: Any) -> jax.Array:
+    """What chance adds to so many actions, drawn all at once."""
+    if isinstance(actions, Finite):
+        return jax.random.gumbel(key, (*shape, actions.num), dtype)
+    return jax.random.normal(key, (*shape, *actions.shape), dtype)
+
+
+def drawn(actions: Actions, parameters: Any, allowed: Any, noise: jax.Array | None) -> jax.Array:
+    """A raw action; without noise the most likely one."""
+    if isinstance(actions, Finite):
+        scores = _masked(parameters, allowed)
+        return jnp.argmax(scores if noise is None else scores + noise).astype(jnp.int32)
+    mean, log_deviation = parameters
+    return mean if noise is None else mean + jnp.exp(log_deviation) * noise
+
+
+def as_action(actions: Actions, raw: jax.Array, squash: str) -> jax.Array:
+    """What the environment is handed."""
+    if isinstance(actions, Finite):
+        return raw
+    low, high = (jnp.broadcast_to(x, actions.shape) for x in (actions.low, actions.high))
+    bounded = jnp.isfinite(low) & jnp.isfinite(high)
+    middle, half = jnp.where(bounded, (low + high) / 2, 0), jnp.where(bounded, (high - low) / 2, 1)
+    inside = jnp.where(bounded, jnp.tanh(raw), raw) if squash == "tanh" else raw
+    return jnp.clip(middle + half * inside, low, high).astype(actions.dtype)
+
+
+def log_density(actions: Actions, parameters: Any, allowed: Any, raw: jax.Array) -> jax.Array:
+    """Of a raw action; that of the action itself differs by what parameters do not change."""
+    if isinstance(actions, Finite):
+        return jax.nn.log_softmax(_masked(parameters, allowed))[raw]
+    mean, log_deviation = parameters
+    scaled = (raw - mean) * jnp.exp(-log_deviation)
+    return -jnp.sum(scaled**2 / 2 + log_deviation + np.log(2 * np.pi) / 2)
+
+
+def entropy(actions: Actions, parameters: Any, allowed: Any, squash: str) -> jax.Array:
+    """Of one action's distribution, over those that are allowed.
+
+    Of a squashed Gaussian, by Gauss-Hermite quadrature; of one that is clipped, the Gaussian's.
+    """
+    if isinstance(actions, Finite):
+        log = jax.nn.log_softmax(_masked(parameters, allowed))
+        log = log if allowed is None else jnp.where(allowed, log, 0)
+        mass = jnp.exp(log) if allowed is None else jnp.where(allowed, jnp.exp(log), 0)
+        return -jnp.sum(mass * log)
+    mean, log_deviation = parameters
+    own = log_deviation + (1 + np.log(2 * np.pi)) / 2
+    if squash != "tanh":
+        return jnp.sum(own)
+    nodes = jnp.asarray(_NODES, mean.dtype).reshape(-1, *[1] * mean.ndim)
+    points = mean + jnp.exp(log_deviation) * nodes
+    slope = 2 * (np.log(2) - points - jax.nn.softplus(-2 * points))  # log(1 - tanh^2)
+    stretch = jnp.tensordot(jnp.asarray(_WEIGHTS, mean.dtype), slope, 1)
+    bounded = jnp.isfinite(actions.low) & jnp.isfinite(actions.high)
+    return jnp.sum(own + jnp.where(bounded, stretch, 0))
+
+
+def _masked(logits: jax.Array, allowed: Any) -> jax.Array:
+    """Scores of which those of forbidden actions are infinitely worse, whatever they are."""
+    if allowed is None:
+        return logits
+    # An infinitely bad one that is allowed must still be better than all that are not.
+    return jnp.where(allowed, jnp.maximum(logits, jnp.finfo(logits.dtype).min / 2), -jnp.inf)

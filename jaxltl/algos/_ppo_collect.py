@@ -1,0 +1,306 @@
+"""Steps of many environments side by side, and the advantages that are estimated from them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+
+from jaxltl.algos import _ppo_actions as actions_of
+from jaxltl.algos import learner
+from jaxltl.algos._ppo_networks import Output, evaluated
+from jaxltl.core.models.environment import Timestep, allowed_in
+
+
+@struct.dataclass
+class Moments:
+    """Of numbers so far: how many, their mean, and summed squares around it."""
+
+    count: jax.Array
+    mean: jax.Array
+    squares: jax.Array
+
+
+@struct.dataclass
+class Walkers:
+    """N environments on their way; all have a first axis of N.
+
+    Attributes:
+      world: where each is.
+      memory: of the network.
+      episode_return, episode_length: of the episode so far.
+      discounted: its rewards so far, each discounted to the present.
+    """
+
+    world: Any
+    memory: Any
+    episode_return: jax.Array
+    episode_length: jax.Array
+    discounted: jax.Array
+
+
+class Rows(NamedTuple):
+    """Steps that were made: ``[T, N, ...]``, or flattened, or some of them.
+
+    Attributes:
+      observation: before the step, as the network reads it.
+      start: whether an episode begins with it, so that the memory is the initial one.
+      allowed: ``bool[A]``, or None.
+      raw: the action that was drawn.
+      log_density: of it, when it was drawn.
+      value: that was expected.
+      advantage: of the action.
+    """
+
+    observation: Any
+    start: jax.Array
+    allowed: Any
+    raw: jax.Array
+    log_density: jax.Array
+    value: jax.Array
+    advantage: jax.Array
+
+
+class Told(NamedTuple):
+    """Figures of a collection, as in ``Metrics``."""
+
+    reward: jax.Array
+    episodes: jax.Array
+    episode_return: jax.Array
+    episode_length: jax.Array
+    explained_variance: jax.Array
+    permitted: jax.Array
+    finite: jax.Array
+
+
+def no_moments(shape: tuple[int, ...]) -> Moments:
+    """Of nothing, in the default precision."""
+    zeros = jnp.zeros(shape, jnp.result_type(float))
+    return Moments(jnp.zeros_like(zeros, shape=()), zeros, zeros)
+
+
+def updated(moments: Moments, x: jax.Array) -> Moments:
+    """With numbers ``[..., *shape]`` taken in (Chan et al. 1979); unless one is not finite."""
+    x = x.reshape(-1, *moments.mean.shape).astype(moments.mean.dtype)
+    mean = x.mean(0)
+    squares = jnp.sum((x - mean) ** 2, 0)
+    shift, total = mean - moments.mean, moments.count + len(x)
+    new = Moments(
+        total, moments.mean + shift * (len(x) / total),
+        moments.squares + squares + shift**2 * (moments.count * len(x) / total))
+    fine = jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(squares))
+    return learner.choose(fine, new, moments)
+
+
+def scale_of(moments: Moments) -> jax.Array:
+    """The standard deviation; 1 where nothing has varied."""
+    spread = jnp.sqrt(moments.squares / jnp.maximum(moments.count, 1))
+    noise = 8 * jnp.finfo(spread.dtype).eps * jnp.abs(moments.mean)
+    return jnp.where(spread > noise, spread, 1)
+
+
+def normalized(moments: Any, observation: Any) -> Any:
+    """Floats centred, scaled and clipped to ten deviations; other leaves as they are."""
+    if moments is None:
+        return observation
+
+    def one(x: jax.Array, m: Moments) -> jax.Array:
+        if not jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating):
+            return x
+        return jnp.clip((x - m.mean) / scale_of(m), -10, 10).astype(x.dtype)
+
+    return jax.tree.map(one, observation, moments)
+
+
+def advantages(
+    reward: jax.Array, value: jax.Array, following: jax.Array, discount: jax.Array,
+    ended: jax.Array, gae_lambda: chex.Numeric,
+) -> jax.Array:
+    """Generalised advantages (Schulman et al. 2016) of episodes one after the other::
+
+        A_t = d_t + discount_t lambda A_{t+1} (unless the episode ends with t),
+        d_t = r_t + discount_t V'_t - V_t.
+
+    Args:
+      reward, value: ``float[T, ...]``.
+      following: ``float[T, ...]``, V' of the world that the step led to, the last of an episode
+        included; zero where nothing comes after it.
+      discount: ``float[T, ...]``, of what comes after each step.
+      ended: ``bool[T, ...]``, whether an episode ended with the step, either way.
+      gae_lambda: in [0, 1].
+
+    Returns:
+      ``float[T, ...]``.
+    """
+    error = reward + discount * following - value
+    kept = jnp.where(ended, 0, discount * gae_lambda)
+
+    def back(later: jax.Array, row: Any) -> tuple[jax.Array, jax.Array]:
+        error, kept = row
+        now = error + kept * later
+        return now, now
+
+    return lax.scan(back, jnp.zeros_like(error[0]), (error, kept), reverse=True, unroll=16)[1]
+
+
+class _Path(NamedTuple):
+    """What is kept of each step, ``[T, N, ...]``."""
+
+    observation: Any
+    memory: Any
+    start: jax.Array
+    allowed: Any
+    raw: jax.Array
+    log_density: jax.Array
+    reward: jax.Array
+    discount: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    last: Any
+    episode_return: jax.Array
+    episode_length: jax.Array
+
+
+def collected(
+    key: chex.PRNGKey, state: Any, problem: Any, hparams: Any
+) -> tuple[Any, Any, Rows, Told]:
+    """T steps of N environments: the state after them, what they began from, and what they tell."""
+    walkers, path = _walked(key, state, problem, hparams)
+    dtype = walkers.discounted.dtype
+    seen = normalized(state.moments, path.observation)
+    every = _evaluated_all(problem, state.parameters, path.memory, seen, 2)
+    end = jax.vmap(problem.environment.observe)(walkers.world)
+    final = _evaluated_all(
+        problem, state.parameters, walkers.memory, normalized(state.moments, end), 1)
+    value, last = every.value.astype(dtype), final.value.astype(dtype)
+    following = jnp.concatenate([value[1:], last[None]])
+    cut = path.truncated & ~path.terminated
+    following = _at_ends(cut, following, problem, state, every.memory, path.last)
+    following = jnp.where(path.terminated, 0, following)
+    discount = jnp.asarray(hparams.discount, dtype) * path.discount.astype(dtype)
+    reward, ended = path.reward.astype(dtype), path.terminated | path.truncated
+    moments, returns = state.moments, state.return_moments
+    if returns is not None:
+        sums, walkers = _discounted_sums(walkers, reward, discount, ended)
+        returns = updated(returns, sums)
+        reward = jnp.clip(reward / scale_of(returns), -10, 10)
+    if moments is not None:
+        moments = jax.tree.map(
+            lambda x, m: updated(m, x), path.observation, moments)
+    found = advantages(reward, value, following, discount, ended, hparams.gae_lambda)
+    rows = Rows(seen, path.start, path.allowed, path.raw, path.log_density, value, found)
+    number = ended.sum()
+    mean_of = jnp.where(number > 0, 1 / jnp.maximum(number, 1), jnp.nan).astype(dtype)
+    target = found + value
+    spread = jnp.var(target)
+    told = Told(
+        reward=path.reward.astype(dtype).mean(), episodes=number.astype(jnp.int32),
+        episode_return=jnp.sum(jnp.where(ended, path.episode_return, 0)) * mean_of,
+        episode_length=jnp.sum(jnp.where(ended, path.episode_length, 0)) * mean_of,
+        explained_variance=jnp.where(
+            spread > 0, 1 - jnp.var(found) / jnp.where(spread > 0, spread, 1), jnp.nan),
+        permitted=jnp.bool_(True) if path.allowed is None else path.allowed.any(-1).all(),
+        finite=jnp.all(jnp.isfinite(found)))
+    after = replace(state, walkers=walkers, moments=moments, return_moments=returns)
+    return after, state.walkers.memory, rows, told
+
+
+def _discounted_sums(
+    walkers: Walkers, reward: jax.Array, discount: jax.Array, ended: jax.Array
+) -> tuple[jax.Array, Walkers]:
+    """``float[T, N]``, rewards of each episode so far, and the walkers who keep the last."""
+    def on(before: jax.Array, row: Any) -> tuple[jax.Array, jax.Array]:
+        reward, discount, ended = row
+        now = before + reward
+        return jnp.where(ended, 0, discount * now), now
+
+    last, sums = lax.scan(on, walkers.discounted, (reward, discount, ended))
+    return sums, replace(walkers, discounted=last)
+
+
+def _walked(key: chex.PRNGKey, state: Any, problem: Any, hparams: Any) -> tuple[Walkers, _Path]:
+    environment, size = problem.environment, (hparams.num_steps, hparams.num_envs)
+    noise_key, move_key, reset_key = jax.random.split(key, 3)
+    dtype = state.walkers.discounted.dtype
+    noise = actions_of.noise(noise_key, size, environment.actions, dtype)
+    keys = jax.random.split(move_key, size)
+    # All at once, for a few numbers at a time take as long as many.
+    starts = jax.random.split(reset_key, size)
+    if hparams.resets_ahead:
+        starts = jax.vmap(jax.vmap(environment.reset))(starts)
+
+    def one(walker: Walkers, start: Any, noise: jax.Array, key: chex.PRNGKey) -> Any:
+        observation = environment.observe(walker.world)
+        allowed = allowed_in(environment, walker.world)
+        seen = normalized(state.moments, observation)
+        said = evaluated(problem, state.parameters, walker.memory, seen)
+        raw = actions_of.drawn(environment.actions, said.action, allowed, noise)
+        density = actions_of.log_density(environment.actions, said.action, allowed, raw)
+        action = actions_of.as_action(environment.actions, raw, hparams.squash)
+        found = Timestep(*environment.step(walker.world, action, key))
+        terminated, truncated = (
+            jnp.asarray(x, bool) for x in (found.terminated, found.truncated))
+        ended = terminated | truncated
+        fresh = start if hparams.resets_ahead else environment.reset(start)
+        total = walker.episode_return + found.reward
+        length = walker.episode_length + 1
+        row = _Path(
+            observation, walker.memory, walker.episode_length == 0, allowed, raw, density,
+            jnp.asarray(found.reward), jnp.asarray(found.discount), terminated, truncated,
+            environment.observe(found.world), total, length)
+        world, memory = learner.choose(
+            ended, (fresh, problem.memory), (found.world, said.memory))
+        after = Walkers(
+            world, memory, jnp.where(ended, 0, total), jnp.where(ended, 0, length),
+            walker.discounted)
+        return after, row
+
+    walkers, path = lax.scan(
+        lambda walkers, given: jax.vmap(one)(walkers, *given), state.walkers,
+        (starts, noise, keys))
+    return learner.strong(walkers), path
+
+
+def _evaluated_all(
+    problem: Any, parameters: Any, memory: Any, observation: Any, num_axes: int
+) -> Output:
+    """Of observations with so many leading axes, each with its memory."""
+    function: Any = partial(evaluated, problem, parameters)
+    for _ in range(num_axes):
+        function = jax.vmap(function)
+    return function(memory, observation)
+
+
+def _at_ends(
+    cut: jax.Array, following: jax.Array, problem: Any, state: Any, memory: Any, last: Any
+) -> jax.Array:
+    """Values that follow, with those of the worlds where episodes were cut off put in.
+
+    They are few, so that only they are evaluated, some at a time.
+    """
+    size, some = cut.size, min(cut.size, max(cut.shape[1], 32))
+    flat = jax.tree.map(lambda x: x.reshape(size, *x.shape[2:]), (memory, last))
+    place = jnp.nonzero(cut.ravel(), size=size, fill_value=size)[0]
+    place = jnp.concatenate([place, jnp.full(some, size, place.dtype)])
+
+    def active(carry: Any, given: Any) -> jax.Array:
+        return carry[0] * some < given[0]
+
+    def body(carry: Any, given: Any) -> Any:
+        turn, values = carry
+        _, place, (memory, last), moments, parameters = given
+        chosen = lax.dynamic_slice(place, (turn * some,), (some,))
+        rows = jax.tree.map(lambda x: x[jnp.minimum(chosen, size - 1)], (memory, last))
+        found = _evaluated_all(problem, parameters, rows[0], normalized(moments, rows[1]), 1)
+        values = values.at[chosen].set(found.value.astype(values.dtype), mode="drop")
+        return turn + active(carry, given), values
+
+    given = cut.sum(), place, flat, state.moments, state.parameters
+    _, values = learner.while_active(active, body, (jnp.int32(0), following.ravel()), given)
+    return values.reshape(following.shape)

@@ -1,0 +1,184 @@
+"""Networks that act and judge: what a policy of PPO is made of, and how any such one is called."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.core.models.environment import Finite
+
+
+class Output(NamedTuple):
+    """What a network says of one observation.
+
+    Attributes:
+      memory: after it; ``()`` for a network without.
+      action: the parameters of the distribution of actions: ``float[A]``, logits, where there are
+        finitely many; of a box a pair of arrays of an action's shape, mean and logarithm of the
+        standard deviation.
+      value: ``float[]``.
+    """
+
+    memory: Any
+    action: Any
+    value: jax.Array
+
+
+def flat_observation(observation: Any) -> jax.Array:
+    """A tree of arrays as one vector of floats, leaf after leaf."""
+    kind = jnp.result_type(float)
+    leaves = [jnp.ravel(jnp.asarray(x)).astype(kind) for x in jax.tree.leaves(observation)]
+    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
+
+
+def _dense(width: int, scale: float, name: str) -> nn.Dense:
+    start = nn.initializers.orthogonal(scale)
+    return nn.Dense(width, kernel_init=start, param_dtype=jnp.result_type(float), name=name)
+
+
+class _Layers(nn.Module):
+    """Dense layers and a last one without activation, orthogonal at the start."""
+
+    hidden: Sequence[int]
+    outputs: int
+    last_scale: float
+    activation: str
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        for i, width in enumerate(self.hidden):
+            x = getattr(nn, self.activation)(_dense(width, np.sqrt(2), f"hidden_{i}")(x))
+        return _dense(self.outputs, self.last_scale, "out")(x)
+
+
+def _heads(module: Any, x: jax.Array) -> tuple[Any, jax.Array]:
+    """Parameters of the actions and the value, by two networks of which neither reads the other."""
+    hidden = tuple(module.hidden)
+    outputs = module.num_actions or int(np.prod(module.shape))
+    scores = _Layers(hidden, outputs, 0.01, module.activation, name="actor")(x)
+    value = _Layers(hidden, 1, 1.0, module.activation, name="critic")(x)[0]
+    if module.num_actions:
+        return scores, value
+    start = nn.initializers.constant(np.log(module.initial_deviation))
+    spread = module.param("log_deviation", start, tuple(module.shape), x.dtype)
+    return (scores.reshape(module.shape), spread), value
+
+
+class ActorCritic(nn.Module):
+    """Two multilayer perceptrons on the flattened observation: one acts, the other judges.
+
+    Orthogonal at the start: of scale sqrt(2) in between, .01 where it acts, so that all actions are
+    alike at first, and 1 where it judges (Huang et al. 2022, details 2 and 3).
+
+    Attributes:
+      num_actions: A, if there are finitely many; else 0.
+      shape: of an action, if it is of a box. The standard deviation is a parameter of its own that
+        does not depend on the observation.
+      hidden: widths of the hidden layers of each.
+      activation: by its name in ``flax.linen``.
+      initial_deviation: of a box's actions, in units of half its width where it has bounds.
+    """
+
+    num_actions: int = 0
+    shape: Sequence[int] = ()
+    hidden: Sequence[int] = (64, 64)
+    activation: str = "tanh"
+    initial_deviation: float = 1.0
+
+    @nn.compact
+    def __call__(self, observation: Any) -> tuple[Any, jax.Array]:
+        return _heads(self, flat_observation(observation))
+
+
+class RecurrentActorCritic(nn.Module):
+    """A dense layer and a gated recurrent unit, whose memory an :class:`ActorCritic`'s heads read.
+
+    Attributes:
+      num_actions, shape, hidden, activation, initial_deviation: as there.
+      memory: the size of the memory.
+    """
+
+    num_actions: int = 0
+    shape: Sequence[int] = ()
+    hidden: Sequence[int] = (64,)
+    memory: int = 64
+    activation: str = "tanh"
+    initial_deviation: float = 1.0
+
+    def initial_memory(self) -> jax.Array:
+        """``float[memory]``, zeros."""
+        return jnp.zeros(self.memory, jnp.result_type(float))
+
+    @nn.compact
+    def __call__(self, memory: jax.Array, observation: Any) -> tuple[jax.Array, Any]:
+        x = _dense(self.memory, np.sqrt(2), "input")(flat_observation(observation))
+        x = getattr(nn, self.activation)(x)
+        cell = nn.GRUCell(self.memory, param_dtype=jnp.result_type(float), name="cell")
+        memory, x = cell(memory, x)
+        return memory, _heads(self, x)
+
+
+def default_network(actions: Any) -> ActorCritic:
+    """An :class:`ActorCritic` for some actions."""
+    if isinstance(actions, Finite):
+        return ActorCritic(num_actions=actions.num)
+    return ActorCritic(shape=actions.shape)
+
+
+def has_memory(problem: Any) -> bool:
+    """Whether the problem's network is recurrent."""
+    return bool(jax.tree.leaves(problem.memory))
+
+
+def evaluated(problem: Any, parameters: Any, memory: Any, observation: Any) -> Output:
+    """What the problem's network says of one observation."""
+    variables = {"params": parameters}
+    if has_memory(problem):
+        memory, (action, value) = problem.network.apply(variables, memory, observation)
+    else:
+        action, value = problem.network.apply(variables, observation)
+    return Output(memory, action, value)
+
+
+def fresh_parameters(key: Any, network: nn.Module, memory: Any, observation: Any) -> Any:
+    """A network's parameters at its own random start."""
+    given = (memory, observation) if jax.tree.leaves(memory) else (observation,)
+    return network.init(key, *given).get("params", {})
+
+
+def require_network(network: Any, memory: Any, observation: Any, space: Any, finite: bool) -> None:
+    """Refuses a network that does not return what is to be returned.
+
+    Args:
+      network: the user's.
+      memory, observation: shapes of what it reads.
+      space: shape and type of one action; of finitely many, of the logits.
+      finite: whether there are finitely many.
+    """
+    recurrent = bool(jax.tree.leaves(memory))
+    given = (memory, observation) if recurrent else (observation,)
+    wanted = "logits float[A]" if finite else "(mean, log_deviation)"
+    form = f"(memory, ({wanted}, value))" if recurrent else f"({wanted}, value)"
+    found, variables = jax.eval_shape(
+        lambda *x: network.init_with_output(jax.random.key(0), *x), *given)
+    if set(variables) - {"params"}:
+        raise ValueError(
+            f"network keeps {sorted(set(variables) - {'params'})} beside its parameters; leave out "
+            "what is not learned by gradients.")
+
+    def shapes(tree: Any) -> Any:
+        return jax.tree.map(lambda x: x.shape, tree)
+
+    action = space.shape if finite else (space.shape, space.shape)
+    expected: Any = (action, ())
+    if recurrent:
+        expected = (shapes(memory), expected)
+    if shapes(found) != expected:
+        raise ValueError(
+            f"network returns shapes {shapes(found)} for one observation; expected {expected}, "
+            f"{form}. It reads a single observation: many are a vmap.")

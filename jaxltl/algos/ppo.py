@@ -1,0 +1,367 @@
+"""Proximal policy optimisation: a policy and a value, improved on what the policy itself did.
+
+A step draws T steps of N environments with the policy of that moment, estimates generalised
+advantages, and makes some epochs of minibatches of Adam on the clipped surrogate (Schulman et al.
+2017). Environments are those of :mod:`jaxltl.core.models.environment`; an episode that is cut off
+is worth what the value network expects of the world in which it was cut off, one that is over
+nothing more. Where the environment allows only some actions, no other is ever taken, and the
+entropy is that over those allowed: a network learns inside what a shield leaves.
+
+What published implementations list (Huang et al. 2022, Andrychowicz et al. 2021) is here by name
+in :class:`Hparams`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any
+
+import chex
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.tree_util import Partial
+
+from jaxltl.algos import _ppo_actions as actions_of
+from jaxltl.algos import learner
+from jaxltl.algos._ppo_collect import Moments, Walkers, collected, no_moments, normalized
+from jaxltl.algos._ppo_networks import ActorCritic as ActorCritic
+from jaxltl.algos._ppo_networks import RecurrentActorCritic as RecurrentActorCritic
+from jaxltl.algos._ppo_networks import (
+    default_network,
+    evaluated,
+    fresh_parameters,
+    has_memory,
+    require_network,
+)
+from jaxltl.algos._ppo_update import descent, improved
+from jaxltl.algos.schedules import Schedule
+from jaxltl.algos.schedules import at as _at
+from jaxltl.core.models.environment import Agent, Box, Environment, Finite
+from jaxltl.core.types import Status
+
+SQUASHES = ("clip", "tanh")
+
+
+@struct.dataclass
+class Problem:
+    """An environment and a network, made by :func:`make_problem`.
+
+    Attributes:
+      environment: where to act.
+      memory: of the network before it has seen anything; ``()`` for one without.
+      network: a ``flax.linen`` module; static.
+    """
+
+    environment: Environment
+    memory: Any
+    network: nn.Module = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class Hparams:
+    """How to learn. Numbers are traced, so new values do not recompile; None is static.
+
+    A *schedule* is a number, or changes from step to step: ``schedules.Linear(first, last,
+    num_steps)``, ``schedules.Polynomial``, or ``Partial(function)`` of the number of the step from
+    1, as optax's schedules are functions.
+
+    Attributes:
+      discount: of rewards, in [0, 1]; times what the environment says of each step.
+      gae_lambda: of the generalised advantages: 1 has no bias, 0 least variance.
+      learning_rate: of Adam; a schedule.
+      clip: how far the ratio of probabilities may move before it is worth nothing; a schedule.
+      value_clip: the same of values, in their units; a schedule; None: they are not clipped.
+      value_weight: of the value's squared error, halved.
+      entropy_weight: of the entropy of the actions.
+      max_gradient_norm: gradients are shortened to it; None: they are not.
+      target_kl: no further updates in a step once a minibatch's estimated divergence from the
+        policy that acted exceeds it; None: all are made.
+      adam_epsilon: of Adam.
+      num_envs: N, environments side by side; static.
+      num_steps: T, of each of them in a step of the learner; static.
+      num_epochs: passes over what was collected; static.
+      num_minibatches: of each pass; with a recurrent network, each has whole environments; static.
+      normalize_advantage: whether advantages are centred and scaled in each minibatch; static.
+      normalize_observation: whether the network reads observations (their floats) centred and
+        scaled by their moments up to the step before, clipped to ten deviations; static.
+      normalize_reward: whether rewards are divided by the standard deviation of discounted sums of
+        rewards so far, and clipped to ten; static.
+      squash: how a Gaussian action gets into its box: ``"clip"``, or ``"tanh"`` along axes that
+        have both bounds; static. Either way the network speaks in units in which such axes are
+        [-1, 1].
+      resets_ahead: whether the worlds in which episodes begin are drawn all at once before a step's
+        T steps, T N of them, which is faster but takes memory; static.
+    """
+
+    discount: jax.Array | float
+    gae_lambda: jax.Array | float = 0.95
+    learning_rate: Schedule = 2.5e-4
+    clip: Schedule = 0.2
+    value_clip: Schedule | None = None
+    value_weight: jax.Array | float = 0.5
+    entropy_weight: jax.Array | float = 0.01
+    max_gradient_norm: jax.Array | float | None = 0.5
+    target_kl: jax.Array | float | None = None
+    adam_epsilon: jax.Array | float = 1e-5
+    num_envs: int = struct.field(pytree_node=False, default=8)
+    num_steps: int = struct.field(pytree_node=False, default=128)
+    num_epochs: int = struct.field(pytree_node=False, default=4)
+    num_minibatches: int = struct.field(pytree_node=False, default=4)
+    normalize_advantage: bool = struct.field(pytree_node=False, default=True)
+    normalize_observation: bool = struct.field(pytree_node=False, default=False)
+    normalize_reward: bool = struct.field(pytree_node=False, default=False)
+    squash: str = struct.field(pytree_node=False, default="clip")
+    resets_ahead: bool = struct.field(pytree_node=False, default=True)
+
+
+@struct.dataclass
+class State:
+    """A policy on its way.
+
+    Attributes:
+      key: of the whole run.
+      step: steps of the learner made.
+      parameters: of the network.
+      optimizer: optax's state.
+      walkers: the N environments.
+      moments: of the observation, a tree as it is, of its float leaves; None: not asked for.
+      return_moments: of discounted sums of rewards; None: not asked for.
+      transitions: steps of environments made; at most 2^31 - 1 are counted.
+    """
+
+    key: jax.Array
+    step: jax.Array
+    parameters: Any
+    optimizer: Any
+    walkers: Walkers
+    moments: Any
+    return_moments: Moments | None
+    transitions: jax.Array
+
+
+@struct.dataclass
+class Metrics:
+    """Figures of a step. Those of episodes are of the policy before it.
+
+    Attributes:
+      transitions: steps of environments made so far, this step's included.
+      reward: mean of a step of an environment.
+      episodes: how many ended in this step.
+      episode_return, episode_length: their mean sum of rewards, without discount, and mean number
+        of steps; NaN if there is none.
+      policy_loss, value_loss, entropy: mean parts of the loss over the updates that were made.
+      kl: mean estimate of the divergence from the policy that acted, ``mean(r - 1 - log r)``.
+      clip_fraction: share of ratios that were clipped.
+      gradient_norm: mean, before it is shortened.
+      explained_variance: share of the variance of the values' targets that they explained.
+      learning_rate: of this step.
+      updates: minibatches that changed the parameters.
+      nonfinite: minibatches left out because a number of theirs was not finite.
+      status: CONVERGED; NONFINITE if `nonfinite` is positive or an advantage was not finite;
+        INVALID if somewhere no action was allowed (the first is taken there, and parameters stay).
+    """
+
+    transitions: jax.Array
+    reward: jax.Array
+    episodes: jax.Array
+    episode_return: jax.Array
+    episode_length: jax.Array
+    policy_loss: jax.Array
+    value_loss: jax.Array
+    entropy: jax.Array
+    kl: jax.Array
+    clip_fraction: jax.Array
+    gradient_norm: jax.Array
+    explained_variance: jax.Array
+    learning_rate: jax.Array
+    updates: jax.Array
+    nonfinite: jax.Array
+    status: jax.Array
+
+
+def make_problem(
+    environment: Environment, *, network: nn.Module | None = None, memory: Any = None
+) -> Problem:
+    """A checked :class:`Problem`.
+
+    Args:
+      environment: its actions are finitely many, or a box of floats.
+      network: a ``flax.linen`` module, called with one observation, ``network(observation) ->
+        (action parameters, value)``; with a memory ``network(memory, observation) -> (memory,
+        (action parameters, value))``. Of finitely many actions the parameters are logits
+        ``float[A]``, of a box ``(mean, log_deviation)``, both of an action's shape; the value is a
+        scalar. Default :class:`ActorCritic`.
+      memory: of a recurrent network before it has seen anything; default what its method
+        ``initial_memory()`` returns, if it has one.
+
+    Raises:
+      ValueError: a network that returns something else, or keeps more than parameters; a box of
+        integers; no environment.
+
+    Example:
+      >>> from jaxltl.core.models.environment import Timestep, make_environment
+      >>> def go(place, action, key):
+      ...     place = place + 2 * action - 1
+      ...     return Timestep(place, reward=1.0 * (place == 3), terminated=abs(place) == 3)
+      >>> corridor = make_environment(
+      ...     lambda key: jnp.int32(0), go, lambda place: place[None] / 3, actions=2)
+      >>> problem = make_problem(corridor)
+      >>> problem.network.num_actions
+      2
+
+      Then ``state, metrics = train(key, problem, Hparams(discount=0.99), num_steps=100)``.
+    """
+    if not isinstance(environment, Environment):
+        raise ValueError(
+            f"environment is {type(environment).__name__}; give one of make_environment.")
+    actions = environment.actions
+    if isinstance(actions, Box) and not jnp.issubdtype(jnp.dtype(actions.dtype), jnp.floating):
+        raise ValueError(
+            f"environment.actions is a box of {actions.dtype}; number what is in it, Finite(n).")
+    network = default_network(actions) if network is None else network
+    if not isinstance(network, nn.Module):
+        raise ValueError(f"network is {type(network).__name__}; give a flax.linen.Module.")
+    if memory is None:
+        begin = getattr(network, "initial_memory", tuple)
+        memory = begin()
+    memory = learner.strong(jax.tree.map(jnp.asarray, memory))
+    seen = jax.eval_shape(lambda key: environment.observe(environment.reset(key)),
+                          jax.random.key(0))
+    space = (jax.ShapeDtypeStruct((actions.num,), jnp.result_type(float))
+             if isinstance(actions, Finite)
+             else jax.ShapeDtypeStruct(actions.shape, jnp.dtype(actions.dtype)))
+    require_network(network, memory, seen, space, isinstance(actions, Finite))
+    return Problem(environment=environment, memory=memory, network=network)
+
+
+_RANGES = {
+    "discount": (0, 1), "gae_lambda": (0, 1), "value_weight": (0, np.inf),
+    "entropy_weight": (0, np.inf), "max_gradient_norm": (0, np.inf), "target_kl": (0, np.inf),
+    "adam_epsilon": (0, np.inf), "learning_rate": (0, np.inf), "clip": (0, np.inf),
+    "value_clip": (0, np.inf),
+}
+
+
+def _check(problem: Problem, hparams: Hparams) -> None:
+    for name in ("num_envs", "num_steps", "num_epochs", "num_minibatches"):
+        if getattr(hparams, name) < 1:
+            raise ValueError(f"{name}={getattr(hparams, name)}; it must be at least 1.")
+    if hparams.squash not in SQUASHES:
+        raise ValueError(f'squash={hparams.squash!r}; choose "clip" or "tanh".')
+    recurrent = has_memory(problem)
+    size = hparams.num_envs * (1 if recurrent else hparams.num_steps)
+    if size % hparams.num_minibatches:
+        what = "environments" if recurrent else "num_envs times num_steps"
+        raise ValueError(
+            f"num_minibatches={hparams.num_minibatches} does not divide {size}, the number of "
+            f"{what}; choose a divisor.")
+    for name, (low, high) in _RANGES.items():
+        number = getattr(hparams, name)
+        if isinstance(number, jax.core.Tracer) or not isinstance(
+                number, float | int | np.ndarray | np.generic | jax.Array):
+            continue
+        if not ((np.asarray(number) >= low) & (np.asarray(number) <= high)).all():
+            raise ValueError(f"{name}={number}; it must lie in [{low}, {high}].")
+
+
+# --- what was learned -----------------------------------------------------------------------------
+
+
+def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
+    """What was learned, an :class:`~jaxltl.core.models.environment.Agent` that draws its actions.
+
+    Never one that is not allowed. For :func:`~jaxltl.core.models.environment.run_episode`.
+    """
+    return _agent(state, problem, hparams, True)
+
+
+def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
+    """The same, taking the most likely action each time; of a box the Gaussian's mean."""
+    return _agent(state, problem, hparams, False)
+
+
+def _agent(state: State, problem: Problem, hparams: Hparams, sampled: bool) -> Agent:
+    act = Partial(_actor(sampled, hparams.squash), problem, state.parameters, state.moments)
+    return Agent(act, problem.memory)
+
+
+@cache  # the same function each time, so that what runs an agent is compiled once
+def _actor(sampled: bool, squash: str) -> Callable[..., Any]:
+    return partial(_act, sampled=sampled, squash=squash)
+
+
+def _act(
+    problem: Problem, parameters: Any, moments: Any, memory: Any, observation: Any, allowed: Any,
+    key: chex.PRNGKey, *, sampled: bool, squash: str,
+) -> tuple[jax.Array, Any]:
+    actions = problem.environment.actions
+    said = evaluated(problem, parameters, memory, normalized(moments, observation))
+    noise = actions_of.noise(key, (), actions, said.value.dtype) if sampled else None
+    raw = actions_of.drawn(actions, said.action, allowed, noise)
+    return actions_of.as_action(actions, raw, squash), said.memory
+
+
+# --- learning -------------------------------------------------------------------------------------
+
+
+def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """The network at its own random start, and N environments at theirs."""
+    _check(problem, hparams)
+    return _begun(key, problem, hparams)
+
+
+@jax.jit
+def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    network_key, world_key = jax.random.split(learner.init_key(key))
+    size = hparams.num_envs
+    worlds = jax.vmap(problem.environment.reset)(jax.random.split(world_key, size))
+    first = jax.tree.map(lambda x: x[0], jax.vmap(problem.environment.observe)(worlds))
+    parameters = fresh_parameters(network_key, problem.network, problem.memory, first)
+    said = jax.eval_shape(partial(evaluated, problem), parameters, problem.memory, first)
+    zeros = jnp.zeros(size, said.value.dtype)
+    reward = jnp.zeros(size, jnp.result_type(float))
+    walkers = Walkers(
+        world=worlds, memory=jax.tree.map(
+            lambda x: jnp.broadcast_to(x, (size, *x.shape)), problem.memory),
+        episode_return=reward, episode_length=jnp.zeros(size, jnp.int32), discounted=zeros)
+    moments = None
+    if hparams.normalize_observation:
+        moments = jax.tree.map(lambda x: no_moments(x.shape), first)
+    return learner.strong(State(
+        key=key, step=jnp.int32(0), parameters=parameters,
+        optimizer=descent(hparams).init(parameters), walkers=walkers, moments=moments,
+        return_moments=no_moments(()) if hparams.normalize_reward else None,
+        transitions=jnp.int32(0)))
+
+
+def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """T steps of N environments, and some epochs of minibatches of what they tell."""
+    _check(problem, hparams)
+    collect_key, update_key = jax.random.split(learner.step_key(state))
+    after, begun, rows, told = collected(collect_key, state, problem, hparams)
+    parameters, optimizer, figures, updates, nonfinite = improved(
+        update_key, state, rows, begun, problem, hparams)
+    parameters, optimizer = learner.choose(
+        told.permitted, (parameters, optimizer), (state.parameters, state.optimizer))
+    status = jnp.where(
+        (nonfinite > 0) | ~told.finite, Status.NONFINITE, Status.CONVERGED)
+    status = jnp.where(told.permitted, status, Status.INVALID).astype(jnp.int32)
+    new = replace(
+        after, step=state.step + 1, parameters=parameters, optimizer=optimizer,
+        transitions=learner.count(state.transitions, hparams.num_envs * hparams.num_steps))
+    return new, Metrics(
+        transitions=new.transitions, reward=told.reward, episodes=told.episodes,
+        episode_return=told.episode_return, episode_length=told.episode_length,
+        policy_loss=figures.policy_loss, value_loss=figures.value_loss, entropy=figures.entropy,
+        kl=figures.kl, clip_fraction=figures.clipped, gradient_norm=figures.gradient_norm,
+        explained_variance=told.explained_variance,
+        learning_rate=jnp.asarray(_at(hparams.learning_rate, state.step), figures.kl.dtype),
+        updates=updates, nonfinite=nonfinite, status=status)
+
+
+run, train, run_until, train_until = learner.bind(init, step)
