@@ -17,6 +17,7 @@ from jaxltl.core.games.objective import (
     states_where,
 )
 from jaxltl.core.games.permissive import Permissive, apply_strategy, permissive_strategy, shield
+from jaxltl.core.games.shielded_environment import ShieldedWorld, shielded
 from jaxltl.core.games.verify import Verification, verify
 from jaxltl.core.games.winning import Winning, almost_sure_buchi, winning_region
 from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor, avoidable
@@ -159,6 +160,7 @@ __all__ = [
     "PreparedInterval",
     "Product",
     "Rewards",
+    "ShieldedWorld",
     "Solution",
     "SparseMDP",
     "Status",
@@ -271,6 +273,7 @@ __all__ = [
     "sample_successor",
     "satisfaction_probability",
     "shield",
+    "shielded",
     "soft_value",
     "solve_interval",
     "solve_prepared",

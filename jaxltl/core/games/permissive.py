@@ -123,7 +123,7 @@ def permissive_strategy(
     arena = _Arena(game, graph, objective)
     region = _region(arena)
     _require_start(game, region)
-    stay = _staying(graph, region)
+    stay = staying(graph, region)
     maximal = _always_wins(arena, region, stay)
     if method == "auto":
         method = _choose(objective, maximal, bound)
@@ -223,7 +223,8 @@ def _region(arena: _Arena) -> np.ndarray:
     return solve(arena.graph, arena.game.system, arena.objective).region
 
 
-def _staying(graph: HostGraph, region: np.ndarray) -> np.ndarray:
+def staying(graph: HostGraph, region: np.ndarray) -> np.ndarray:
+    """``bool[S, A]``: the moves that surely stay in a region."""
     return graph.available & region[..., None] & graph.forall(region)
 
 
@@ -374,7 +375,7 @@ def _by_layers(arena: _Arena, region, stay) -> Permissive:
     game, graph, objective = arena
     layers: Any = gr1_layers(graph, game.system, objective)
     region = layers.region
-    stay = _staying(graph, region)
+    stay = staying(graph, region)
     num_goals, num_assumptions = layers.round.shape[:2]
     masks = []
     for j in range(num_goals):
@@ -513,4 +514,4 @@ def _safe_beside(
             f"bound={bound} is too small: the system wins, but not surely within it from any "
             "initial state; raise it."
         )
-    return _on(joint, region, _staying(graph, region), False, reason, origin)
+    return _on(joint, region, staying(graph, region), False, reason, origin)

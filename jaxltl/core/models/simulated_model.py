@@ -1,4 +1,4 @@
-"""A finite model as a world that is simulated: its states are the worlds."""
+"""Finite models and games as worlds that are simulated: their states are the worlds."""
 
 from __future__ import annotations
 
@@ -13,33 +13,39 @@ from numpy.typing import ArrayLike
 
 from jaxltl.core.models.convert import to_padded
 from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
+from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.operators import sample_successor
 from jaxltl.core.models.sparse import SparseMDP
 
 
 def environment_of(
-    model: MDP | DenseMDP | SparseMDP,
+    model: MDP | DenseMDP | SparseMDP | Game,
     *,
     reward: ArrayLike | None = None,
     observe: Any = None,
+    opponent: ArrayLike | None = None,
 ) -> Environment:
-    """The world that a finite Markov decision process is.
+    """The world that a finite Markov decision process is, or a game against a given opponent.
 
     Worlds are states, ``int32[]``; labels are the model's; the actions that may be taken are the
-    available ones. Nothing ends an episode.
+    available ones. Nothing ends an episode. In a game every move is a step; where it is the
+    opponent's turn, what it draws is done instead of the action.
 
     Args:
-      model: an MDP, a DenseMDP, or a SparseMDP, which is padded.
+      model: an MDP, a DenseMDP, a SparseMDP, which is padded, or a Game on one of them.
       reward: ``float[S]``, of the state that a step enters, or ``float[S, A]``, of an action;
         default zero.
       observe: ``state -> observation``; default one-hot, ``float[S]``.
+      opponent: ``float[S, A]``, the policy of a game's environment; default uniform among its
+        moves.
 
     Returns:
       An :class:`~jaxltl.core.models.environment.Environment`.
 
     Raises:
-      ValueError: rewards of another shape.
+      ValueError: rewards or an opponent of another shape, a product (simulate its world, and give
+        the task to ``task_environment``), or an opponent without a game.
 
     Example:
       >>> from jaxltl.core.models.mdp import from_dense
@@ -48,8 +54,14 @@ def environment_of(
       >>> coin.actions.num, coin.observations.shape, coin.labels(1).tolist()
       (1, (2,), [True])
     """
+    owner = model.system if isinstance(model, Game) else None
+    model = model.mdp if isinstance(model, Game) else model
     if isinstance(model, SparseMDP):
         model = to_padded(model)
+    if not isinstance(model, MDP | DenseMDP):
+        raise ValueError(
+            f"environment_of: {type(model).__name__} is no world; simulate the MDP under it, and "
+            "give the task to task_environment.")
     size, num_actions = model.num_states, model.num_actions
     table = np.zeros(size) if reward is None else np.asarray(reward)
     if table.shape not in ((size,), (size, num_actions)) or table.dtype.kind not in "biuf":
@@ -57,9 +69,14 @@ def environment_of(
             f"reward has shape {list(table.shape)} and type {table.dtype}; give numbers [{size}], "
             f"of states, or [{size}, {num_actions}], of their actions.")
     table = table.astype(jnp.result_type(float))
+    step = Partial(_step, model, table)
+    if owner is not None:
+        step = Partial(_step_of_two, _opponent(model, opponent), owner, step)
+    elif opponent is not None:
+        raise ValueError("opponent is for games; make_game tells whose turn it is in a state.")
     spaces = box(0, 1, (size,)) if observe is None else None
     return make_environment(
-        Partial(_reset, model.initial), Partial(_step, model, table),
+        Partial(_reset, model.initial), step,
         Partial(_one_hot, model.initial) if observe is None else observe,
         actions=num_actions, labels=Partial(_labels, model.label), propositions=model.propositions,
         allowed=Partial(_available, model.available), observations=spaces)
@@ -77,6 +94,27 @@ def _step(
     table = jnp.asarray(reward)
     earned = table[after] if table.ndim == 1 else table[state, action]
     return Timestep(after, earned, terminated=jnp.bool_(False))
+
+
+def _opponent(model: MDP | DenseMDP, policy: ArrayLike | None) -> np.ndarray:
+    available = np.asarray(model.available)
+    given = available.astype(float) if policy is None else np.asarray(policy, float)
+    if given.shape != available.shape or not np.isfinite(given).all() or (given < 0).any():
+        raise ValueError(f"opponent has shape {list(given.shape)}; give weights "
+                         f"{list(available.shape)}, of each action in each state.")
+    with np.errstate(divide="ignore"):
+        return np.log(np.where(available, given, 0)).astype(jnp.result_type(float))
+
+
+def _step_of_two(
+    opponent: jax.Array, system: jax.Array, step: Any, state: jax.Array, action: jax.Array,
+    key: chex.PRNGKey,
+) -> Timestep:
+    key, other = jax.random.split(key)
+    reply = jax.random.categorical(other, jnp.asarray(opponent)[state])
+    mine = jnp.asarray(system)[state]
+    found: Timestep = step(state, jnp.where(mine, action, reply).astype(jnp.int32), key)
+    return found
 
 
 def _one_hot(initial: jax.Array, state: jax.Array) -> jax.Array:

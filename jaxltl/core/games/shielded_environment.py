@@ -1,0 +1,223 @@
+"""A simulated world in which only those actions may be taken that are sure to keep a task.
+
+What a finite model of the world says of a task, a permissive strategy, becomes the mask of allowed
+actions. A learner that takes none but allowed actions is right from its first step on, whatever
+its network holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.tree_util import Partial
+from numpy.typing import ArrayLike
+
+from jaxltl.core.games.permissive import Permissive, apply_strategy, staying
+from jaxltl.core.games.winning import Winning
+from jaxltl.core.graphs.graph import graph_of
+from jaxltl.core.host.graph import HostGraph
+from jaxltl.core.models.environment import (
+    Environment,
+    Finite,
+    Timestep,
+    as_partial,
+    make_environment,
+)
+from jaxltl.core.models.mdp import MDP
+
+
+class ShieldedWorld(NamedTuple):
+    """A world beside the state of the strategy that shields it.
+
+    Attributes:
+      world: the inner one.
+      state: ``int32[]``, the state that the strategy is in, -1 where it has lost its way: the run
+        began outside of the region where it wins, or did what it does not allow.
+    """
+
+    world: Any
+    state: jax.Array
+
+
+@struct.dataclass
+class _Guide:
+    """A permissive strategy as tables over its G reachable states.
+
+    Attributes:
+      base: ``int32[G]``, the state of the world's model.
+      initial: ``bool[G]``.
+      after: ``int32[G, N]``, the states to which its moves may lead; -1 is padding.
+      allowed: ``bool[G, A]``.
+    """
+
+    base: Any
+    initial: Any
+    after: Any
+    allowed: Any
+
+
+def shielded(
+    environment: Environment,
+    strategy: Permissive | Winning | ArrayLike,
+    state_of: Callable[..., Any] | None = None,
+) -> Environment:
+    """The same world, with the mask of what a strategy of a model of it allows.
+
+    With a :class:`~jaxltl.core.games.permissive.Permissive` strategy its worlds are
+    :class:`ShieldedWorld`: what the strategy remembers runs beside the world, whichever automaton
+    or counter that is. A :class:`~jaxltl.core.games.winning.Winning` region allows whatever surely
+    stays in it, from where winning remains possible; for safety that is enough to win. A mask is
+    looked up and changes no world.
+
+    The mask binds those who look at it, as ``allowed(world)``. Where the strategy allows nothing
+    (outside of the region where it wins) all that the world allows may be done, and the state is
+    -1.
+
+    Args:
+      environment: the world, with finitely many actions, those of the model.
+      strategy: of a model or a game of which every step of the world is one move; or a mask
+        ``bool[S, A]``, or ``bool[S, Q, A]``.
+      state_of: ``world -> int``, the model's state of a world; of a mask with more axes a tuple of
+        them. Default: the world itself, as for
+        :func:`~jaxltl.core.models.simulated_model.environment_of`.
+
+    Returns:
+      The environment.
+
+    Raises:
+      ValueError: actions of a box, another number of actions, a mask that is not Boolean, a
+        strategy on a world without successor lists, or `state_of` that does not return integers.
+
+    Example:
+      >>> from jaxltl.core.games.permissive import permissive_strategy
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl.core.models.simulated_model import environment_of
+      >>> model = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]],
+      ...                    label=[[0], [1]], propositions=["crash"], initial=[1, 0])
+      >>> safe = shielded(environment_of(model), permissive_strategy(model, "G !crash"))
+      >>> safe.allowed(safe.reset(jax.random.key(0))).tolist()
+      [True, False]
+    """
+    if not isinstance(environment.actions, Finite):
+        raise ValueError("a shield is for finitely many actions; this world's are of a box.")
+    place = Partial(_itself) if state_of is None else as_partial(state_of)
+    if isinstance(strategy, Permissive | Winning):
+        guide = _guide(strategy)
+        _require_actions(guide.allowed, environment.actions.num)
+        _require_places(environment, place, 1)
+        made = replace(
+            environment, reset=Partial(_reset, guide, place, environment.reset),
+            step=Partial(_step, guide, place, environment.step),
+            observe=Partial(_of_world, environment.observe),
+            labels=Partial(_of_world, environment.labels),
+            allowed=Partial(_allowed, guide, environment.allowed))
+    else:
+        mask = np.asarray(strategy)
+        if mask.dtype != bool or mask.ndim < 2:
+            raise ValueError(f"the mask is {mask.dtype}{list(mask.shape)}; give bool[S, A], or "
+                             "bool[S, Q, A].")
+        _require_actions(mask, environment.actions.num)
+        _require_places(environment, place, mask.ndim - 1)
+        made = replace(
+            environment, allowed=Partial(_looked_up, mask, place, environment.allowed))
+    return make_environment(
+        made.reset, made.step, made.observe, actions=made.actions, labels=made.labels,
+        propositions=made.propositions, allowed=made.allowed, observations=made.observations,
+        horizon=made.horizon)
+
+
+def _require_actions(mask: Any, num_actions: int) -> None:
+    if mask.shape[-1] != num_actions:
+        raise ValueError(f"the shield is of {mask.shape[-1]} actions, and the world has "
+                         f"{num_actions}; they must be the same ones.")
+
+
+def _require_places(environment: Environment, place: Callable[..., Any], count: int) -> None:
+    found = jax.eval_shape(lambda key: place(environment.reset(key)), jax.random.key(0))
+    parts = found if isinstance(found, tuple) else (found,)
+    if len(parts) != count or any(
+            not hasattr(x, "dtype") or x.shape != () or x.dtype.kind not in "iu" for x in parts):
+        raise ValueError(
+            f"state_of returns {found}; return {'an integer' if count == 1 else 'a tuple of '}"
+            f"{'' if count == 1 else f'{count} integers'}, the state of the model that a world is.")
+
+
+def _guide(strategy: Permissive | Winning) -> _Guide:
+    """The strategy on what it reaches, with every move of every player there."""
+    if isinstance(strategy, Winning):
+        graph = graph_of(strategy.game)
+        assert isinstance(graph, HostGraph)
+        region = np.asarray(strategy.region)
+        every: Any = np.arange(strategy.game.state_shape[0], dtype=np.int32)
+        allowed: Any = staying(graph, region)
+        strategy = Permissive(
+            strategy.game, strategy.region, allowed, every, every, False, "what stays")
+    found = apply_strategy(strategy)
+    game = found.model
+    if not isinstance(game.mdp, MDP):
+        raise ValueError("a shield needs successor lists; convert the world by to_padded.")
+    used = np.asarray(game.mdp.successor_probability) > 0
+    successor = np.asarray(game.mdp.successor)
+    base = np.asarray(strategy.base_state)[np.asarray(found.base_state)]
+    after = np.where(used, successor, -1).reshape(len(base), -1)
+    after = -np.sort(-after, axis=1)  # padding to the end
+    return _Guide(
+        base=base.astype(np.int32), initial=np.asarray(game.initial) > 0,
+        after=after[:, :max(int((after >= 0).sum(1).max()), 1)].astype(np.int32),
+        allowed=np.asarray(game.available))
+
+
+def _itself(world: Any) -> Any:
+    return world
+
+
+def _reset(
+    guide: _Guide, place: Callable[..., Any], reset: Callable[..., Any], key: chex.PRNGKey
+) -> ShieldedWorld:
+    world = reset(key)
+    fits = jnp.asarray(guide.initial) & (jnp.asarray(guide.base) == place(world))
+    return ShieldedWorld(world, _some(fits, jnp.arange(len(guide.base))))
+
+
+def _step(
+    guide: _Guide, place: Callable[..., Any], step: Callable[..., Timestep],
+    before: ShieldedWorld, action: Any, key: chex.PRNGKey,
+) -> Timestep:
+    found = Timestep(*step(before.world, action, key))
+    # What is remembered follows from the state that is left and that of the world: any move that
+    # leads there leads to the same.
+    after = jnp.asarray(guide.after)[jnp.maximum(before.state, 0)]
+    fits = (after >= 0) & (jnp.asarray(guide.base)[after] == place(found.world))
+    state = _some(fits & (before.state >= 0), after)
+    return found._replace(world=ShieldedWorld(found.world, state))
+
+
+def _some(fits: jax.Array, states: jax.Array) -> jax.Array:
+    return jnp.where(fits.any(), states[jnp.argmax(fits)], -1).astype(jnp.int32)
+
+
+def _allowed(guide: _Guide, inner: Callable[..., Any] | None, shielded: ShieldedWorld) -> Any:
+    sure = jnp.asarray(guide.allowed)[jnp.maximum(shielded.state, 0)] & (shielded.state >= 0)
+    return _within(sure, inner, shielded.world)
+
+
+def _looked_up(
+    mask: jax.Array, place: Callable[..., Any], inner: Callable[..., Any] | None, world: Any
+) -> Any:
+    return _within(jnp.asarray(mask)[place(world)], inner, world)
+
+
+def _within(sure: jax.Array, inner: Callable[..., Any] | None, world: Any) -> jax.Array:
+    every = jnp.ones_like(sure) if inner is None else inner(world)
+    return jnp.where((sure & every).any(), sure & every, every)
+
+
+def _of_world(function: Callable[..., Any], shielded: ShieldedWorld) -> Any:
+    return function(shielded.world)
