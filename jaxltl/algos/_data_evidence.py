@@ -63,7 +63,8 @@ def data_evidence(
     sets = intervals_from_counts(count, confidence, method=method, entry_start=start)
     model = interval_rows(
         starts_of(moves.sum(-1)[state]), start, number[np.asarray(mdp.successor)[used]],
-        sets.lower, sets.upper, rewards={"reward": Rewards(transition=earned[used])})
+        sets.lower, sets.upper, center=None if sets.radius is None else sets.center,
+        radius=sets.radius, rewards={"reward": Rewards(transition=earned[used])})
     system: Any = np.asarray(game.system)[state]
     within = Game(model, system)
     weight = np.asarray(play, np.float64)[s, a]

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.models.interval import NEAR, IntervalMDP
+from jaxltl.core.models.interval import NEAR, IntervalMDP, refuse_ball
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.io._tokens import Block, Floats, Integers, Text, as_double, bytes_of
 
@@ -176,6 +176,7 @@ def value_texts(model: SparseMDP | IntervalMDP, comma: str) -> Callable[[slice],
     if not isinstance(model, IntervalMDP):
         probability = model.host.probability
         return lambda part: list(map(repr, probability[part].tolist()))
+    refuse_ball(model, "the format holds intervals")
     lower, upper, form = model.host.lower, model.host.upper, f"[%r{comma}%r]"
     return lambda part: [
         form % ends for ends in zip(lower[part].tolist(), upper[part].tolist(), strict=True)

@@ -41,8 +41,16 @@ _SHARED = {
     "system": _TRUTH,
 }
 _ENDS = {"lower": _NUMBERS, "upper": _NUMBERS}  # of interval models
-_PADDED = {"transition": _NUMBERS, "available": _TRUTH, **_SHARED, **_ENDS}
-_SPARSE = {"row_start": _WHOLE, "entry_start": _WHOLE, "action": _WHOLE, **_SHARED, **_ENDS}
+_BALL = {"center": _NUMBERS, "radius": _NUMBERS}  # of those with a ball besides
+_OF_INTERVALS = {**_ENDS, **_BALL}
+_PADDED = {"transition": _NUMBERS, "available": _TRUTH, **_SHARED, **_OF_INTERVALS}
+_SPARSE = {
+    "row_start": _WHOLE,
+    "entry_start": _WHOLE,
+    "action": _WHOLE,
+    **_SHARED,
+    **_OF_INTERVALS,
+}
 _VALUES = ("biufUS", "truth values, numbers and texts")
 _REWARD, _VARIABLE = "reward:", "variable:"
 _PARTS = ("state", "choice", "transition")
@@ -184,6 +192,14 @@ def _padded_interval(arrays: Arrays) -> tuple[IntervalMDP, int]:
     used &= available[..., None]
     state, action = np.nonzero(available)
     options: dict[str, Any] = {k: arrays[k] for k in ("initial", "label") if k in arrays}
+    for key, kept in (("center", used), ("radius", available)):
+        if key in arrays:
+            if arrays[key].shape != kept.shape:
+                raise ValueError(
+                    f"{key} has shape {arrays[key].shape}; expected {kept.shape}, as of "
+                    f"{'lower' if key == 'center' else 'available'}."
+                )
+            options[key] = arrays[key][kept]
     found = interval_rows(
         starts_of(available.sum(-1)),
         starts_of(used.sum(-1)[state, action]),
@@ -204,12 +220,13 @@ def _propositions(arrays: Arrays) -> list[str]:
 def sparse_model(arrays: Arrays) -> SparseMDP | IntervalMDP:
     """The model of the arrays row_start, entry_start, successor and probability.
 
-    With the arrays lower and upper it is an interval model, whose probability is passed over.
+    With the arrays lower and upper it is an interval model, whose probability is passed over, and
+    with center and radius one with a ball besides.
 
     Raises:
       ValueError: an array is missing or wrong.
     """
-    is_interval = bool(set(arrays) & set(_ENDS))
+    is_interval = bool(set(arrays) & set(_OF_INTERVALS))
     chances = tuple(_ENDS) if is_interval else ("probability",)
     missing = {"row_start", "entry_start", "successor", *chances} - set(arrays)
     if missing:
@@ -225,6 +242,7 @@ def sparse_model(arrays: Arrays) -> SparseMDP | IntervalMDP:
                 )
             rewards.setdefault(reward, {})[part] = array
     options: dict[str, Any] = {k: arrays[k] for k in ("initial", "label", "action") if k in arrays}
+    options |= {k: arrays[k] for k in _BALL if k in arrays}
     options["propositions"] = _propositions(arrays)
     if "actions" in arrays:
         options["action_names"] = [str(x) for x in arrays["actions"].ravel()]
@@ -253,7 +271,8 @@ def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
     A padded file has the array ``transition``, ``[S, A, S]``, or ``successor`` and ``probability``,
     ``[S, A, K]``; a sparse one, such as :func:`write_npz` writes, the fields of
     :class:`~jaxltl.core.models.sparse.SparseMDP`. With an array ``system`` it is a game, with
-    ``lower`` and ``upper`` in place of ``probability`` an interval model.
+    ``lower`` and ``upper`` in place of ``probability`` an interval model, and with ``center`` and
+    ``radius`` besides one with a ball.
 
     Raises:
       ValueError: naming the file and the array that is unknown, missing or wrong.
@@ -262,7 +281,7 @@ def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
     try:
         arrays = parse_arrays(raw_bytes(path), name, ("system",))
         with _errors_in(name):
-            if set(arrays) & set(_ENDS) and "system" in arrays:
+            if set(arrays) & set(_OF_INTERVALS) and "system" in arrays:
                 raise ValueError(
                     "the probabilities of this game are intervals; chains and "
                     "decision processes are read with them."
@@ -270,7 +289,7 @@ def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
             model: Any
             if _is_sparse(arrays):
                 model = sparse_model(arrays)
-            elif set(arrays) & set(_ENDS):
+            elif set(arrays) & set(_OF_INTERVALS):
                 model, num_actions = _padded_interval(arrays)
                 named = replace(
                     model.nominal, action_names=_action_names(arrays, num_actions) or ()
@@ -304,7 +323,8 @@ def write_npz(path: str | os.PathLike[str], model: Any) -> None:
     keys = ["row_start", "entry_start", "successor", "probability", "initial", "label"]
     if isinstance(model, IntervalMDP):
         keys.remove("probability")
-        arrays |= {k: np.asarray(getattr(model, k), np.float64) for k in _ENDS}
+        ends = _ENDS if model.radius is None else _OF_INTERVALS
+        arrays |= {k: np.asarray(getattr(model, k), np.float64) for k in ends}
     sparse = to_sparse(exact_part(model))
     for key in keys:
         arrays[key] = np.asarray(getattr(sparse, key))

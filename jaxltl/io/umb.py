@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.game import Game, make_game
-from jaxltl.core.models.interval import IntervalMDP, interval_rows
+from jaxltl.core.models.interval import IntervalMDP, interval_rows, refuse_ball
 from jaxltl.core.models.mdp import checked_initial
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.io._files import Compression, compression_by_name, pieces, raw_bytes, write_bytes
@@ -390,6 +390,7 @@ def _contents(model: Any, place: str) -> list[tuple[str, Any]]:
     if isinstance(model, Game):
         model, system = model.mdp, np.asarray(model.system, bool).ravel()
     if isinstance(model, IntervalMDP):
+        refuse_ball(model, "the format holds intervals")
         interval, model = model.host, model.nominal
     sparse = to_sparse(model)
     host, initial = sparse.host, np.asarray(sparse.initial, np.float64)

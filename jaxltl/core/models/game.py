@@ -15,6 +15,7 @@ from flax import struct
 from jaxltl.core.models import operators
 from jaxltl.core.models.choices import choice_shape, choices
 from jaxltl.core.models.concrete import namespace, to_jax
+from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import support
 from jaxltl.core.models.padded import to_padded
 from jaxltl.core.models.sparse import SparseMDP
@@ -82,7 +83,7 @@ def make_game(model: Any, system: Sequence[bool] | chex.Array) -> Game:
     """A checked :class:`Game`, on the host.
 
     Args:
-      model: an MDP, a DenseMDP, a SparseMDP or a Product.
+      model: an MDP, a DenseMDP, a SparseMDP, an IntervalMDP or a Product.
       system: whose turn it is in each state: True the system's, False the environment's.
 
     Returns:
@@ -98,7 +99,7 @@ def make_game(model: Any, system: Sequence[bool] | chex.Array) -> Game:
       [True, False]
     """
     owner = _owners(system, model.state_shape)
-    if not isinstance(model, SparseMDP):  # whose every state has a choice
+    if not isinstance(model, SparseMDP | IntervalMDP):  # whose every state has a choice
         check_moves(np.asarray(model.available), owner)
     return Game(model, to_jax(owner))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -104,6 +105,11 @@ class IntervalMDP:
             np.asarray(self.center, np.float64), np.asarray(self.radius, np.float64) / 2)
         return HostInterval(self.nominal.host, lower, upper, ball)
 
+    @property
+    def box(self) -> IntervalMDP:
+        """The ends alone, the smallest that hold the ball: no less is possible within them."""
+        return replace(self, center=None, radius=None)
+
     def states_where(self, proposition: str) -> Array:
         """``bool[S]``, where a proposition holds.
 
@@ -117,6 +123,14 @@ class IntervalMDP:
         ends = _travelling(self.lower, self.upper, self.center, self.radius)
         return _taken_apart(
             change(self.nominal.replace(rewards=self.rewards | ends)))  # type: ignore[attr-defined]
+
+
+def refuse_ball(model: IntervalMDP, why: str) -> None:
+    """Raises ValueError if a model has a radius, where only ends are understood."""
+    if isinstance(model, IntervalMDP) and model.radius is not None:
+        raise ValueError(f"the model has a radius, and {why}; give its smallest intervals, "
+                         "model.box, or ask the solvers that take a radius (robust_reachability, "
+                         "robust_total_reward, robust_discounted_value, robust_satisfaction).")
 
 
 def _travelling(lower: Any, upper: Any, center: Any, radius: Any) -> dict[str, Rewards]:

@@ -54,7 +54,7 @@ def learn_guarantee(
     Sets that hold all probabilities at once with the confidence
     (:func:`~jaxltl.core.host.confidence.intervals_from_counts`) make an interval model; its worst
     case over nature is at most (for ``"min"`` at least) the truth for every policy, so it may be
-    optimised over the same data. Of a ball the smallest intervals around it count.
+    optimised over the same data. A ball is taken as it is.
 
     Args:
       model: its graph, labels and initial distribution count; its probabilities do not. See
@@ -109,7 +109,8 @@ def learn_guarantee(
 
 def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.ndarray]:
     """The model with intervals; all entries are kept, which are those that it had."""
-    found = make_interval(model, sets.lower, sets.upper)
+    ball = {} if sets.radius is None else {"center": sets.center, "radius": sets.radius}
+    found = make_interval(model, sets.lower, sets.upper, **ball)
     if found.num_transitions == model.num_transitions:
         return found, np.ones(model.num_transitions, bool)
     code = [np.asarray(x.host.row, np.int64) * model.num_states + x.successor

@@ -16,7 +16,7 @@ from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.interval_plan import IntervalPlan, plan_reachability, plan_total_reward
 from jaxltl.core.host.rows import spans
 from jaxltl.core.models.concrete import is_traced, to_jax
-from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.interval import IntervalMDP, refuse_ball
 from jaxltl.core.models.operators import is_deterministic, row_weights
 from jaxltl.core.types import Method, Solution, Status, require_shape, status_code
 from jaxltl.core.values.bounded import states
@@ -115,8 +115,8 @@ def prepare_interval(
       nature may drop wherever that decides what is worth 0, 1 or infinity.
 
     Raises:
-      ValueError: a shape or a direction is wrong, a reward is negative, not finite or depends on
-        nature, there is `stay` with a reward, or something is traced.
+      ValueError: a shape or a direction is wrong, the model has a radius, a reward is negative, not
+        finite or depends on nature, there is `stay` with a reward, or something is traced.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
@@ -131,6 +131,7 @@ def prepare_interval(
     if is_traced((model, target, stay, reward, policy)):
         raise ValueError("prepare_interval reads its model, so it works on concrete arrays only; "
                          "call it before jit, and solve_interval inside.")
+    refuse_ball(model, "prepare_interval has no rule for its derivatives")
     if stay is not None and reward is not None:
         raise ValueError("expected rewards are until the target alone: leave stay out.")
     nature = require_direction(nature, objective)

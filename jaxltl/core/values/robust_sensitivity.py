@@ -9,7 +9,7 @@ import numpy as np
 from jaxltl.core.host.rows import Booleans, Integers
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import reaching
-from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.interval import IntervalMDP, refuse_ball
 from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.types import Solution
 from jaxltl.core.values.bounded import states
@@ -48,8 +48,8 @@ def robust_sensitivity(
       ``upper * (model.upper - p) + lower * (model.lower - p)`` estimates by how much.
 
     Raises:
-      ValueError: shapes, a direction, a policy of weights, or an infinite value from the initial
-        states.
+      ValueError: shapes, a direction, a policy of weights, a model with a radius, or an infinite
+        value from the initial states.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
@@ -64,6 +64,7 @@ def robust_sensitivity(
       ([0.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0])
     """
     require_direction(nature, "max")
+    refuse_ball(model, "robust_sensitivity is about ends")
     goal = states(model.nominal, target, "target")
     passed = np.ones(goal.size, bool) if stay is None else states(model.nominal, stay, "stay")
     weight = np.asarray(model.initial if initial is None else initial, np.float64)
