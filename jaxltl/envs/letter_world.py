@@ -98,7 +98,7 @@ def letter_world(
       >>> world.propositions[:3], world.observations.shape, world.horizon
       (('a', 'b', 'c'), (7, 7, 13), 75)
     """
-    names = _names(letters)
+    names, starts = _names(letters), None
     if layout is None:
         if start is not None:
             raise ValueError(f"start={start} is for a given layout; leave it out.")
@@ -120,14 +120,14 @@ def letter_world(
         if start is not None and not 0 <= start < size * size:
             raise ValueError(f"start={start}; the cells are 0 to {size * size - 1}.")
         places = (empty if start is None else np.array([start])).astype(np.int32)
-        reset = Partial(_begin, letter, places)
+        reset, starts = Partial(_begin, letter, places), Partial(_starts, letter, places)
     views, count = _views(size), len(names)
     shape = (size * size * (count + 1),) if flat else (size, size, count + 1)
     made = make_environment(
         reset, Partial(_move, _neighbors(size)), Partial(_see, views, np.zeros(shape, np.float32),
                                                          np.arange(count + 1, dtype=np.int8)),
         actions=4, labels=Partial(_labels, np.arange(count, dtype=np.int8)), propositions=names,
-        observations=box(0, 1, shape, np.float32))
+        observations=box(0, 1, shape, np.float32), starts=starts)
     return made if horizon is None else with_time_limit(made, horizon)
 
 
@@ -256,6 +256,12 @@ def _draw_any(cells: chex.Array, each: chex.Array, key: chex.PRNGKey) -> LetterS
 def _begin(letter: chex.Array, places: chex.Array, key: chex.PRNGKey) -> LetterState:
     place = jax.random.choice(key, jnp.asarray(places))
     return LetterState(jnp.asarray(letter), place)
+
+
+def _starts(letter: chex.Array, places: chex.Array) -> tuple[LetterState, jax.Array]:
+    count = len(places)
+    every = jnp.broadcast_to(jnp.asarray(letter), (count, *letter.shape))
+    return LetterState(every, jnp.asarray(places)), jnp.full(count, 1 / count)
 
 
 def _move(neighbors: chex.Array, world: LetterState, action: Any, key: chex.PRNGKey) -> Timestep:
