@@ -520,7 +520,7 @@ def _same(first: Any, again: Any) -> bool:
     constants = zip(first.consts, again.consts, strict=False)
     return len(first.consts) == len(again.consts) and str(first.jaxpr) == str(again.jaxpr) and all(
         np.array_equal(np.asarray(x), np.asarray(y), equal_nan=np.asarray(x).dtype.kind == "f")
-        for x, y in constants if not jax.dtypes.issubdtype(
+        for x, y in constants if not isinstance(x, jax.core.Tracer) and not jax.dtypes.issubdtype(
             getattr(x, "dtype", np.dtype(float)), jax.dtypes.prng_key))
 
 

@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike
 
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.environment import (
     Environment,
@@ -143,8 +144,10 @@ def make_task_tables(
     if ending not in ENDINGS:
         raise ValueError(f"ending={ending!r}; choose one of {', '.join(ENDINGS)}.")
     automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
-    reading = make_finite_task(
-        automaton if isinstance(formula, Automaton) else formula, propositions)
+    if not isinstance(formula, Automaton):
+        require_known(automaton.propositions, propositions, f"the formula {str(formula)!r}")
+    with jax.ensure_compile_time_eval():  # tables are made on the host wherever it is called
+        reading = make_finite_task(automaton, propositions)
     decisions = verdicts(automaton)
     pay: Pay = pay_of(
         automaton, decisions, reward=reward, discount=discount, ratio=ratio, shaping=shaping,

@@ -73,12 +73,12 @@ def pay_of(
       has the limit P as g goes to 1 with ``(1 - h) / (1 - g)``, the argument `ratio`, to 0. All
       steps discount, so that values are bounded in any world and shaping is sound.
     - ``"parity"``, for any automaton: reading priority p stops with probability
-      ``e_p = (1 - g) ratio^p``, which wins if p is even (Hahn, Perez, Schewe, Somenzi, Trivedi &
-      Wojtczak 2020, "Model-free reinforcement learning for stochastic parity games"). In
-      expectation: r = e_p at even priorities and 0 at odd ones, d = 1 - e_p; with two priorities
-      that is ``"two-discount"``. The value has the limit P as g goes to 1 and `ratio` to 0: among
-      the priorities that recur the least one then stops first. Neighbouring priorities of one
-      parity are taken as one.
+      ``e_p = (1 - g) ratio^(p - p_0)``, p_0 the least, which wins if p is even (Hahn, Perez,
+      Schewe, Somenzi, Trivedi & Wojtczak 2020, "Model-free reinforcement learning for stochastic
+      parity games"). In expectation: r = e_p at even priorities and 0 at odd ones, d = 1 - e_p;
+      with two priorities that is ``"two-discount"``. The value has the limit P as g goes to 1 and
+      `ratio` to 0: among the priorities that recur the least one then stops first. Neighbouring
+      priorities of one parity are taken as one.
 
     The last three earn 1 and end where the verdict becomes satisfied, and 0 where violated, which
     is what P is there.
@@ -163,7 +163,7 @@ def _stopping(
     ratio = 1 - discount if ratio is None else ratio
     if not 0 < ratio < 1:
         raise ValueError(f"ratio={ratio}; it must be above 0 and below 1, and goes to 0.")
-    stops = (1 - discount) * ratio ** rank
+    stops = (1 - discount) * ratio ** (rank - rank.min())
     if name == "eventual":
         stops = np.where(rank == 0, stops, 0)
     number = jnp.dtype(jnp.result_type(float))
