@@ -16,6 +16,8 @@ from jaxltl.core.host.rows import Integers
 from jaxltl.core.host.sparse import Floats
 
 _SMALL = 3000  # states of a component up to which it may be filled
+_LARGE = 3000  # states of a component from which
+_NARROW = 40  # and mean bandwidth beyond which it fills less to begin with those of least degree
 _SPREAD = 8  # how many times its mean bandwidth a larger one must have states
 _MOST = 2**28  # entries that may be filled, 12 bytes each
 _MOST_BETWEEN = 10**7  # of these, between components that are eliminated together
@@ -194,13 +196,32 @@ def _block(
         inner = inner[:, order]
     if swept or _too_much(inner, label[order]):
         return _Block(order, inner, outer, None, 0)
+    # In one large component those of least degree may go first (Liu 1985).
+    most = np.bincount(label[order]).max(initial=0)
+    wide = most > max(order.size / 2, _LARGE) and _bandwidth(inner) > _NARROW
     try:
         factor = linalg.splu(
-            _minus(inner).T, permc_spec="NATURAL", diag_pivot_thresh=0,
-            options={"SymmetricMode": True})
+            _minus(inner).T, permc_spec="MMD_AT_PLUS_A" if wide else "NATURAL",
+            diag_pivot_thresh=0, options={"SymmetricMode": True})
     except (RuntimeError, MemoryError):
         return None
     return _Block(order, inner, outer, factor, int(factor.nnz))
+
+
+def _bandwidth(matrix: Any) -> float:
+    """How far the first entries of rows and columns stand from the diagonal, in the mean."""
+    size = matrix.shape[0]
+    source = np.repeat(np.arange(size), np.diff(matrix.indptr))
+    left, top = _first_entries(source, matrix.indices, size)
+    return float((2 * np.arange(size) - left - top).mean()) / 2
+
+
+def _first_entries(source: Integers, target: Integers, size: int) -> tuple[Integers, Integers]:
+    """Where the first entry of each row, and of each column, stands; at most at the diagonal."""
+    left, top = np.arange(size), np.arange(size)
+    np.minimum.at(left, source, target)
+    np.minimum.at(top, target, source)
+    return left, top
 
 
 def _too_much(matrix: Any, label: Integers) -> bool:
@@ -224,9 +245,7 @@ def _too_much(matrix: Any, label: Integers) -> bool:
     first = np.minimum(source[between], target[between])
     allowed = _MOST - size - int((last[label[first]] - first).sum())
     source, target = source[~between], target[~between]
-    left, top = np.arange(size), np.arange(size)
-    np.minimum.at(left, source, target)
-    np.minimum.at(top, target, source)
+    left, top = _first_entries(source, target, size)
     if int((2 * np.arange(size) - left - top).sum()) <= allowed:
         return False
     return allowed <= 0 or 2 * _counted(source, target, size) > allowed

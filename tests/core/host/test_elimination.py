@@ -24,8 +24,11 @@ def random_rows(rng, size, components):
     return matrix, components_in_order(Edges(every.indptr, every.indices))
 
 
-@pytest.mark.parametrize("way", ("together", "apart", "swept", "some swept"))
+@pytest.mark.parametrize("way", ("together", "by degree", "apart", "swept", "some swept"))
 def test_solutions(way, monkeypatch):
+    if way == "by degree":
+        monkeypatch.setattr(elimination, "_LARGE", 0)
+        monkeypatch.setattr(elimination, "_NARROW", -1)
     if way == "apart":
         monkeypatch.setattr(elimination, "_MOST_BETWEEN", -1)
         monkeypatch.setattr(elimination, "_APART", 2)
@@ -45,8 +48,8 @@ def test_solutions(way, monkeypatch):
             np.testing.assert_allclose(found.solve(b), expected, rtol=1e-10)
             seen.add((found.method.removeprefix("policy iteration by "), len(found.blocks) > 1))
     methods, several = zip(*seen, strict=True)
-    assert any(several) == (way != "together")
-    assert {"together": "elimination", "apart": "elimination", "swept": "sweeps",
+    assert any(several) == (way not in ("together", "by degree"))
+    assert {"together": "elimination", "by degree": "elimination", "apart": "elimination", "swept": "sweeps",
             "some swept": "elimination and sweeps"}[way] in methods
 
 
