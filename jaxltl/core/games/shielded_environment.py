@@ -117,7 +117,11 @@ def shielded(
             step=Partial(_step, guide, place, environment.step),
             observe=Partial(_of_world, environment.observe),
             labels=Partial(_of_world, environment.labels),
-            allowed=Partial(_allowed, guide, environment.allowed))
+            allowed=Partial(_allowed, guide, environment.allowed),
+            starts=None if environment.starts is None else Partial(
+                _starts, guide, place, environment.starts),
+            outcomes=None if environment.outcomes is None else Partial(
+                _outcomes, guide, place, environment.outcomes))
     else:
         mask = np.asarray(strategy)
         if mask.dtype != bool or mask.ndim < 2:
@@ -130,7 +134,7 @@ def shielded(
     return make_environment(
         made.reset, made.step, made.observe, actions=made.actions, labels=made.labels,
         propositions=made.propositions, allowed=made.allowed, observations=made.observations,
-        horizon=made.horizon)
+        horizon=made.horizon, starts=made.starts, outcomes=made.outcomes)
 
 
 def _require_actions(mask: Any, num_actions: int) -> None:
@@ -181,7 +185,17 @@ def _itself(world: Any) -> Any:
 def _reset(
     guide: _Guide, place: Callable[..., Any], reset: Callable[..., Any], key: chex.PRNGKey
 ) -> ShieldedWorld:
-    world = reset(key)
+    return _begin(guide, place, reset(key))
+
+
+def _starts(
+    guide: _Guide, place: Callable[..., Any], starts: Callable[..., Any]
+) -> tuple[ShieldedWorld, jax.Array]:
+    worlds, probability = starts()
+    return jax.vmap(lambda world: _begin(guide, place, world))(worlds), probability
+
+
+def _begin(guide: _Guide, place: Callable[..., Any], world: Any) -> ShieldedWorld:
     fits = jnp.asarray(guide.initial) & (jnp.asarray(guide.base) == place(world))
     return ShieldedWorld(world, _some(fits, jnp.arange(len(guide.base))))
 
@@ -191,12 +205,26 @@ def _step(
     before: ShieldedWorld, action: Any, key: chex.PRNGKey,
 ) -> Timestep:
     found = Timestep(*step(before.world, action, key))
+    return found._replace(world=_follow(guide, place, before.state, found.world))
+
+
+def _outcomes(
+    guide: _Guide, place: Callable[..., Any], outcomes: Callable[..., Any],
+    before: ShieldedWorld, action: Any,
+) -> tuple[Timestep, jax.Array]:
+    found, probability = outcomes(before.world, action)
+    worlds = jax.vmap(lambda world: _follow(guide, place, before.state, world))(found[0])
+    return Timestep(*found)._replace(world=worlds), probability
+
+
+def _follow(
+    guide: _Guide, place: Callable[..., Any], state: jax.Array, world: Any
+) -> ShieldedWorld:
     # What is remembered follows from the state that is left and that of the world: any move that
     # leads there leads to the same.
-    after = jnp.asarray(guide.after)[jnp.maximum(before.state, 0)]
-    fits = (after >= 0) & (jnp.asarray(guide.base)[after] == place(found.world))
-    state = _some(fits & (before.state >= 0), after)
-    return found._replace(world=ShieldedWorld(found.world, state))
+    after = jnp.asarray(guide.after)[jnp.maximum(state, 0)]
+    fits = (after >= 0) & (jnp.asarray(guide.base)[after] == place(world)) & (state >= 0)
+    return ShieldedWorld(world, _some(fits, after))
 
 
 def _some(fits: jax.Array, states: jax.Array) -> jax.Array:

@@ -97,8 +97,14 @@ def box(
     kind = jnp.dtype(dtype or jnp.result_type(float))
     if kind.kind in "biu":  # an infinite bound is that of the type
         ends = (0, 1) if kind.kind == "b" else (jnp.iinfo(kind).min, jnp.iinfo(kind).max)
-        least, most = (np.clip(x.astype(float), *ends) for x in (least, most))
+        least, most = (_clipped(x.astype(float), *ends).astype(kind) for x in (least, most))
     return Box(least.astype(kind), most.astype(kind), full, kind.name)
+
+
+def _clipped(x: np.ndarray, least: int, most: int) -> np.ndarray:
+    """In integers, since the greatest of 64 bits is no floating-point number."""
+    inside = (x > least) & (x < most)
+    return np.where(inside, np.where(inside, x, 0).astype(int), np.where(x > least, most, least))
 
 
 class Timestep(NamedTuple):

@@ -69,9 +69,11 @@ def environment_of(
             f"reward has shape {list(table.shape)} and type {table.dtype}; give numbers [{size}], "
             f"of states, or [{size}, {num_actions}], of their actions.")
     table = table.astype(jnp.result_type(float))
-    step = Partial(_step, model, table)
+    step, outcomes = Partial(_step, model, table), Partial(_outcomes, model, table)
     if owner is not None:
-        step = Partial(_step_of_two, _opponent(model, opponent), owner, step)
+        other = _opponent(model, opponent)
+        step = Partial(_step_of_two, other, owner, step)
+        outcomes = Partial(_outcomes_of_two, other, owner, outcomes)
     elif opponent is not None:
         raise ValueError("opponent is for games; make_game tells whose turn it is in a state.")
     spaces = box(0, 1, (size,)) if observe is None else None
@@ -79,7 +81,12 @@ def environment_of(
         Partial(_reset, model.initial), step,
         Partial(_one_hot, model.initial) if observe is None else observe,
         actions=num_actions, labels=Partial(_labels, model.label), propositions=model.propositions,
-        allowed=Partial(_available, model.available), observations=spaces)
+        allowed=Partial(_available, model.available), observations=spaces,
+        starts=Partial(_starts, model.initial), outcomes=outcomes)
+
+
+def _starts(initial: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return jnp.arange(len(initial), dtype=jnp.int32), jnp.asarray(initial)
 
 
 def _reset(initial: jax.Array, key: chex.PRNGKey) -> jax.Array:
@@ -91,9 +98,26 @@ def _step(
     key: chex.PRNGKey,
 ) -> Timestep:
     after = sample_successor(model, key, state, action).astype(jnp.int32)
+    return Timestep(after, _earned(reward, state, action, after), terminated=jnp.bool_(False))
+
+
+def _outcomes(
+    model: MDP | DenseMDP, reward: jax.Array, state: jax.Array, action: jax.Array
+) -> tuple[Timestep, jax.Array]:
+    probability = model.successor_probability[state, action]
+    if isinstance(model, MDP):
+        after = jnp.asarray(model.successor)[state, action].astype(jnp.int32)
+    else:
+        after = jnp.arange(model.num_states, dtype=jnp.int32)
+    earned = jax.vmap(lambda t: _earned(reward, state, action, t))(after)
+    return Timestep(after, earned, terminated=jnp.bool_(False)), probability
+
+
+def _earned(
+    reward: jax.Array, state: jax.Array, action: jax.Array, after: jax.Array
+) -> jax.Array:
     table = jnp.asarray(reward)
-    earned = table[after] if table.ndim == 1 else table[state, action]
-    return Timestep(after, earned, terminated=jnp.bool_(False))
+    return table[after] if table.ndim == 1 else table[state, action]
 
 
 def _opponent(model: MDP | DenseMDP, policy: ArrayLike | None) -> np.ndarray:
@@ -115,6 +139,17 @@ def _step_of_two(
     mine = jnp.asarray(system)[state]
     found: Timestep = step(state, jnp.where(mine, action, reply).astype(jnp.int32), key)
     return found
+
+
+def _outcomes_of_two(
+    opponent: jax.Array, system: jax.Array, outcomes: Any, state: jax.Array, action: jax.Array
+) -> tuple[Timestep, jax.Array]:
+    weight = jax.nn.softmax(jnp.asarray(opponent)[state])
+    mine = jnp.arange(len(weight)) == action
+    weight = jnp.where(jnp.asarray(system)[state], mine, weight)
+    found, probability = jax.vmap(lambda a: outcomes(state, a))(jnp.arange(len(weight)))
+    found = Timestep(found.world.ravel(), found.reward.ravel(), terminated=jnp.bool_(False))
+    return found, (weight[:, None] * probability).ravel()
 
 
 def _one_hot(initial: jax.Array, state: jax.Array) -> jax.Array:

@@ -259,7 +259,7 @@ def task_environment(
         environment.reset, environment.step, environment.observe, actions=environment.actions,
         labels=environment.labels if labels is None else labels, propositions=names,
         allowed=environment.allowed, observations=environment.observations,
-        horizon=environment.horizon)
+        horizon=environment.horizon, starts=environment.starts, outcomes=environment.outcomes)
     tables = formula if isinstance(formula, TaskTables) else make_task_tables(
         formula, names, reward=reward, discount=discount, ratio=ratio, shaping=shaping,
         learner_discount=learner_discount, ending=ending, embedding=embedding)
@@ -277,13 +277,12 @@ def with_tables(environment: Environment, tables: TaskTables) -> Environment:
       environment: from :func:`task_environment`.
       tables: of the other task, over the same propositions.
     """
-    _, reset, labels = environment.reset.args  # type: ignore[attr-defined]
-    inner = environment
-    return _beside(replace(
-        inner, reset=reset, step=inner.step.args[1], labels=labels,  # type: ignore[attr-defined]
-        observe=inner.observe.args[1],  # type: ignore[attr-defined]
-        allowed=None if inner.allowed is None else inner.allowed.args[0],  # type: ignore[attr-defined]
-        observations=inner.observations.world), tables)
+    task_tables(environment)
+    made: Any = environment
+    parts: Any = {
+        name: None if (part := getattr(made, name)) is None else part.args[-1]
+        for name in ("reset", "step", "observe", "labels", "allowed", "starts", "outcomes")}
+    return _beside(replace(environment, **parts, observations=made.observations.world), tables)
 
 
 def task_tables(environment: Environment) -> TaskTables:
@@ -391,11 +390,15 @@ def _beside(inner: Environment, tables: TaskTables) -> Environment:
         memory = box(-np.inf, np.inf, tables.embedding.shape[1:])
     spaces: Any = TaskObservation(inner.observations, memory)  # type: ignore[arg-type]
     return replace(
-        inner, reset=Partial(_reset, tables, inner.reset, inner.labels),
-        step=Partial(_step, tables, inner.step, inner.labels),
+        inner, reset=Partial(_reset, tables, inner.labels, inner.reset),
+        step=Partial(_step, tables, inner.labels, inner.step),
         observe=Partial(_observe, tables, inner.observe),
         labels=Partial(_of_world, inner.labels),
         allowed=None if inner.allowed is None else Partial(_of_world, inner.allowed),
+        starts=None if inner.starts is None else Partial(
+            _starts, tables, inner.labels, inner.starts),
+        outcomes=None if inner.outcomes is None else Partial(
+            _outcomes, tables, inner.labels, inner.outcomes),
         observations=spaces)
 
 
@@ -406,9 +409,21 @@ def _read(tables: TaskTables, label: jax.Array) -> jax.Array:
 
 
 def _reset(
-    tables: TaskTables, reset: Callable[..., Any], labels: Callable[..., Any], key: chex.PRNGKey
+    tables: TaskTables, labels: Callable[..., Any], reset: Callable[..., Any], key: chex.PRNGKey
 ) -> TaskWorld:
-    world, tables = reset(key), jax.tree.map(jnp.asarray, tables)
+    return _begin(tables, labels, reset(key))
+
+
+def _starts(
+    tables: TaskTables, labels: Callable[..., Any], starts: Callable[..., Any]
+) -> tuple[TaskWorld, jax.Array]:
+    worlds, probability = starts()
+    return jax.vmap(lambda world: _begin(tables, labels, world))(worlds), probability
+
+
+def _begin(tables: TaskTables, labels: Callable[..., Any], world: Any) -> TaskWorld:
+    """Before the first step: one label is read."""
+    tables = jax.tree.map(jnp.asarray, tables)
     letter = _read(tables, labels(world))
     memory = tables.delta[tables.initial, letter]
     accepted = tables.accepting[tables.initial, letter]
@@ -416,10 +431,28 @@ def _reset(
 
 
 def _step(
-    tables: TaskTables, step: Callable[..., Timestep], labels: Callable[..., Any],
+    tables: TaskTables, labels: Callable[..., Any], step: Callable[..., Timestep],
     before: TaskWorld, action: Any, key: chex.PRNGKey,
 ) -> Timestep:
-    found, tables = Timestep(*step(before.world, action, key)), jax.tree.map(jnp.asarray, tables)
+    return _read_on(tables, labels, before, Timestep(*step(before.world, action, key)))
+
+
+def _outcomes(
+    tables: TaskTables, labels: Callable[..., Any], outcomes: Callable[..., Any],
+    before: TaskWorld, action: Any,
+) -> tuple[Timestep, jax.Array]:
+    told, probability = outcomes(before.world, action)
+    told = Timestep(*told)
+    rest = (jnp.broadcast_to(jnp.asarray(x), jnp.shape(probability)) for x in told[1:])
+    return jax.vmap(lambda found: _read_on(tables, labels, before, found))(
+        Timestep(told.world, *rest)), probability
+
+
+def _read_on(
+    tables: TaskTables, labels: Callable[..., Any], before: TaskWorld, found: Timestep
+) -> Timestep:
+    """A step of the joint world, from that of the inner one."""
+    tables = jax.tree.map(jnp.asarray, tables)
     reading = before.memory, _read(tables, labels(found.world))
     memory, accepted = tables.delta[reading], tables.accepting[reading]
     over, verdict = jnp.asarray(found.terminated, bool), tables.verdict[memory]

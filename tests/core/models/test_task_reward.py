@@ -97,10 +97,10 @@ def all_tables(options):
 @jax.jit
 def every_step(tables, successor, ends, label):
     environment = with_tables(some_environment(), tables)
-    _, step, labels = environment.step.args
+    _, labels, step = environment.step.args
     inner_labels = Partial(labels.func, label)
     inner_step = Partial(step.func, successor, ends, label)
-    step = Partial(environment.step.func, tables, inner_step, inner_labels)
+    step = Partial(environment.step.func, tables, inner_labels, inner_step)
 
     def one(state, memory, action):
         world = TaskWorld(
