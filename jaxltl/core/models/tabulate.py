@@ -111,7 +111,7 @@ def tabulate(
     if not isinstance(inner.actions, Finite):
         raise ValueError("tabulate: the actions are a box; only finitely many can be listed.")
     keys = jax.random.split(jax.random.key(0) if key is None else key, max(num_keys, 2))
-    kind = _Kind(inner, as_partial(distinct or _itself), keys)
+    kind = _Kind(inner, as_partial(distinct or _itself), keys, inner.reset(keys[0]))
     begun, probability, evidence = _begin(kind, environment, worlds)
     listed = _search(kind, begun, max_states)
     if evidence == "keys" or listed.evidence == "keys":
@@ -133,11 +133,12 @@ def _itself(world: Any) -> Any:
 
 
 class _Kind(NamedTuple):
-    """What is listed: the environment, what tells its worlds apart, and the keys to try."""
+    """What is listed: the environment, what tells its worlds apart, keys to try, and a world."""
 
     environment: Environment
     distinct: Callable[[Any], Any]
     keys: Any
+    like: Any
 
 
 # --- worlds as bytes ------------------------------------------------------------------------------
@@ -155,13 +156,11 @@ def _plain(world: Any) -> Any:
 
 def _typed(kind: _Kind, plain: Any) -> Any:
     """What :func:`_plain` was made of."""
-    like = jax.eval_shape(kind.environment.reset, kind.keys[0])
-
     def back(x: Any, y: Any) -> Any:
         return jax.random.wrap_key_data(jnp.asarray(x), impl=jax.random.key_impl(y)) if (
             _is_key(y)) else x
 
-    return jax.tree.map(back, plain, like)
+    return jax.tree.map(back, plain, kind.like)
 
 
 def _bytes(world: Any) -> jax.Array:
@@ -375,7 +374,7 @@ def _followers(draws: int, kind: _Kind, plain: Any) -> _Followers:
 def _search(kind: _Kind, begun: Any, max_states: int) -> _Listed:
     """Breadth first, batch after batch."""
     environment = kind.environment
-    shape = jax.eval_shape(environment.reset, kind.keys[0])
+    shape = kind.like
     action = jax.ShapeDtypeStruct((), jnp.int32)
     told = environment.outcomes is not None
     keyless = not told and not reads_key(environment.step, shape, action, kind.keys[0])
@@ -400,14 +399,14 @@ def _search(kind: _Kind, begun: Any, max_states: int) -> _Listed:
             _check(found, sum(len(x.allowed) for x in parts), told)
             real = found.allowed[..., None] & (found.probability > 0)
             after, before = _rows(found.seen), len(ended)
-            # What never happens is given the number of something that does.
-            after = np.where(real, after, after.ravel()[np.argmax(real)])
-            places, first = _numbered(after.ravel(), number, ended)
+            places, first = np.zeros(real.shape, np.int64), np.flatnonzero(real)
+            places[real], new_ones = _numbered(after[real], number, ended)
+            first = first[new_ones]
             if len(ended) > max_states:
                 raise ValueError(
                     f"tabulate: there are more than max_states={max_states} worlds. Allow more, "
                     "take less into a world, or say by distinct= what of it matters.")
-            successor.append(places.reshape(after.shape))
+            successor.append(places)
             parts.append(found._replace(world=None, seen=None, drawn=None))
             listed.append(jax.tree.map(
                 lambda x, n=after.shape, f=first: x.reshape(-1, *x.shape[len(n):])[f],
