@@ -9,7 +9,7 @@ import pytest
 
 from jaxltl.algos import trust_region as tr
 from jaxltl.envs import navigation as nav
-from jaxltl.envs.navigation_steps import stepwise
+from jaxltl.envs.navigation_steps import as_environment
 from jaxltl.reproduce import cce
 
 
@@ -64,30 +64,29 @@ def test_a_penalty_changes_what_is_learned():
 def test_steps_add_up_to_the_scores(task):
     """The rewards and costs of steps are those of whole trajectories, from the same robot."""
     world = nav.navigation(start=((-1.5, 0.0), (2.0, 1.5)))
-    steps = stepwise(world, task)
+    steps = as_environment(world, task)
     key, noise = jax.random.split(jax.random.key(task))
     places = jax.jit(jax.vmap(steps.reset))(jax.random.split(key, 50))
     actions = jax.random.uniform(noise, (world.horizon, 50, 2), minval=-1, maxval=1)
 
     def move(places, action):
-        following, *paid = jax.vmap(lambda p, a: steps.step(p, a, None))(places, action)
-        return following, (places.state, *paid)
+        found = jax.vmap(lambda p, a: steps.step(p, a, None))(places, action)
+        return found.world, (places.state, found.reward, found.cost, found.terminated)
 
     _, (state, reward, cost, done) = jax.lax.scan(move, places, actions)
     objective, total = nav.scores(world, jax.tree.map(jnp.transpose, state), task)
     np.testing.assert_allclose(reward.sum(0), objective, atol=1e-9)
     np.testing.assert_allclose(cost.sum(0), total, atol=1e-12)
-    assert len(np.unique(total)) > 1 and not done.any()
+    assert len(np.unique(total)) > 1 and not done[:-1].any() and done[-1].all()
     if task == 1:  # once in the goal, never out of it
         inside = nav.labels(world, state)[..., 0]
         assert (inside[:-1] <= inside[1:]).all() and inside.any()
     with pytest.raises(ValueError, match="task=5"):
-        stepwise(world, 5)
+        as_environment(world, 5)
 
 
 def test_steps_fit_the_trust_region_learner_and_its_precision():
-    steps = stepwise(nav.navigation(), 3, dtype=jnp.float32)
-    problem = tr.make_problem(*steps, num_actions=2, horizon=30, limit=-5.0)
+    problem = tr.make_problem(as_environment(nav.navigation(), 3, dtype=jnp.float32), limit=-5.0)
     batch = jax.eval_shape(
         lambda key: tr.rollout(
             key, tr.init(key, problem, tr.Hparams(discount=0.9)), problem,

@@ -85,6 +85,15 @@ def value_inputs(inputs: jax.Array) -> jax.Array:
     return jnp.concatenate([inputs, time], -1)
 
 
+def inputs_at(inputs: jax.Array, time: jax.Array, horizon: int) -> jax.Array:
+    """``float[N, O + 1]``: inputs beside some times ``int[N]`` of a horizon.
+
+    The last step's is also that of later ones, for which nothing is fitted.
+    """
+    times = jnp.linspace(-1, 1, horizon, dtype=inputs.dtype)
+    return jnp.concatenate([inputs, times[jnp.minimum(time, horizon - 1)][:, None]], -1)
+
+
 
 
 def normalized(moments: Moments, hparams: Any, observation: jax.Array) -> jax.Array:

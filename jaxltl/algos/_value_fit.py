@@ -21,18 +21,22 @@ def advantages(
     valid: jax.Array,
     discount: chex.Numeric,
     gae_lambda: chex.Numeric,
+    after: chex.Numeric = 0.0,
 ) -> jax.Array:
     """Generalised advantages (Schulman et al. 2016, equation 16) of finite trajectories::
 
-        A_t = sum_l (discount lambda)^l d_{t+l},    d_t = r_t + discount V_{t+1} - V_t,
+        A_t = d_t + discount_t lambda A_{t+1},    d_t = r_t + discount_t V_{t+1} - V_t,
 
-    with V = 0 after the last step.
+    with A = 0 after the last step, and V = `after`.
 
     Args:
       signal: ``float[T, ...]``, rewards or costs.
       value: ``float[T, ...]``, V of the states where they are earned.
       valid: ``bool[T, ...]``, whether the step was made; true up to the end of a trajectory.
-      discount, gae_lambda: in [0, 1].
+      discount: in [0, 1]; one number, or ``float[T, ...]`` of what comes after each step.
+      gae_lambda: in [0, 1].
+      after: ``float[...]``, V of what comes after a trajectory that was truncated; zero where
+        nothing does.
 
     Returns:
       ``float[T, ...]``, zero where `valid` is false.
@@ -44,13 +48,17 @@ def advantages(
     """
     value = jnp.where(valid, value, 0)
     following = jnp.concatenate([value[1:], jnp.zeros_like(value[:1])])
+    goes_on = jnp.concatenate([valid[1:], jnp.zeros_like(valid[:1])])
+    following = jnp.where(goes_on, following, after)
     error = jnp.where(valid, signal + discount * following - value, 0)
+    kept = jnp.broadcast_to(discount * gae_lambda, error.shape)
 
-    def back(later: jax.Array, error: jax.Array) -> tuple[jax.Array, jax.Array]:
-        now = error + discount * gae_lambda * later
+    def back(later: jax.Array, row: Any) -> tuple[jax.Array, jax.Array]:
+        error, kept = row
+        now = error + kept * later
         return now, now
 
-    return lax.scan(back, jnp.zeros_like(error[0]), error, reverse=True)[1]
+    return lax.scan(back, jnp.zeros_like(error[0]), (error, kept), reverse=True)[1]
 
 
 def fitted(

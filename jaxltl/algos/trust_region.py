@@ -12,22 +12,18 @@ mean ``KL(old || new)``, and ``c = J_C - limit``. TRPO (Schulman et al. 2015) fo
 the problem gives in closed form, :func:`cpo_dual`. A line search then makes the step short
 enough for the true divergence, and for the gains as far as the sample tells them.
 
-A world is three pure functions of one trajectory::
-
-    reset(key) -> world
-    step(world, action, key) -> (world, reward, cost, done)
-    observe(world) -> float[O]
-
-Plain functions are accepted; ``jax.tree_util.Partial(function, *arrays)`` hands over arrays as
-arguments, so that new ones do not recompile; a new function, as each evaluation of a ``lambda``
-makes, does. ``world`` is any pytree. A trajectory ends when it
-is done, or after ``horizon`` steps: what would come later does not count.
+A trajectory is an episode of an :class:`~jaxltl.core.models.environment.Environment` with a box of
+actions. It ends where the environment terminates or truncates it, or after ``horizon`` steps. After
+a termination nothing comes, and what would come after the horizon does not count: both are the end
+of a sum of rewards. Where the environment truncates an episode something would come, and what it
+would be worth is added, as the value network expects it of the last observation. Costs are limited
+as they are drawn: what would come after a trajectory never counts in them.
 """
 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -45,6 +41,7 @@ from jaxltl.algos import learner
 from jaxltl.algos._policy_networks import (
     Moments,
     gaussian,
+    inputs_at,
     kl_divergence,
     mean_network,
     normalized,
@@ -56,6 +53,15 @@ from jaxltl.algos._policy_networks import (
 )
 from jaxltl.algos._trust_step import Surrogate, direction, fisher_product, line_search, surrogate
 from jaxltl.algos._value_fit import advantages, fitted, positive, weighted_variance
+from jaxltl.core.models.environment import (
+    Agent,
+    Box,
+    Environment,
+    Timestep,
+    clipped_action,
+    flat_observation,
+    some_action,
+)
 from jaxltl.core.types import require_shape, status_code
 
 METHODS = ("trpo", "cpo")
@@ -66,18 +72,13 @@ class Problem:
     """A world, made by :func:`make_problem`.
 
     Attributes:
-      reset, step, observe: see the module's text.
+      environment: whose actions are a box. Those that are drawn outside of it are clipped.
       limit: on the expected cost of a trajectory; None: there is none.
-      num_actions: A, the length of an action ``float[A]``; static. Actions are not bounded:
-        a world with bounds clips them.
       horizon: T; static.
     """
 
-    reset: Callable[..., Any]
-    step: Callable[..., Any]
-    observe: Callable[..., jax.Array]
+    environment: Environment
     limit: Any
-    num_actions: int = struct.field(pytree_node=False)
     horizon: int = struct.field(pytree_node=False)
 
 
@@ -86,7 +87,7 @@ class Hparams:
     """How to learn. Numbers are traced, so new values do not recompile; None is static.
 
     Attributes:
-      discount: of rewards, in [0, 1].
+      discount: of rewards, in [0, 1], times that of each step of the environment.
       cost_discount: of costs; 1 limits the expected sum of a trajectory's costs.
       gae_lambda: of the generalised advantage of rewards: 1 has no bias, 0 least variance.
       cost_gae_lambda: the same of costs. Costs that come late need a value near 1.
@@ -203,92 +204,92 @@ class Batch(NamedTuple):
     """Trajectories side by side, zero where they are over or left out.
 
     Attributes:
-      observation: ``float[T, N, O]``.
-      action: ``float[T, N, A]``.
+      observation: ``float[T, N, O]``, in one vector each.
+      action: ``float[T, N, A]``, as drawn, in one vector each, before they are clipped.
       reward, cost: ``float[T, N]``.
+      discount: ``float[T, N]``, the environment's of what comes after each step.
       valid: ``bool[T, N]``, whether the step was made.
       finite: ``bool[N]``; others are left out, so that all of their steps are not valid.
+      last: ``float[N, O]``, the observation after the last step.
+      truncated: ``bool[N]``, whether the environment cut it off, and it was not over.
     """
 
     observation: jax.Array
     action: jax.Array
     reward: jax.Array
     cost: jax.Array
+    discount: jax.Array
     valid: jax.Array
     finite: jax.Array
+    last: jax.Array
+    truncated: jax.Array
 
 
 # --- problems -------------------------------------------------------------------------------
 
 
 def make_problem(
-    reset: Callable[..., Any],
-    step: Callable[..., Any],
-    observe: Callable[..., jax.Array],
-    *,
-    num_actions: int,
-    horizon: int,
-    limit: chex.Numeric | None = None,
+    environment: Environment, *, horizon: int | None = None, limit: chex.Numeric | None = None
 ) -> Problem:
     """A checked :class:`Problem`.
 
     Args:
-      reset, step, observe: see the module's text; functions or ``Partial`` objects.
-      num_actions: A.
-      horizon: T, at least 1.
+      environment: with a box of floating-point actions.
+      horizon: T, at least 1; default the environment's.
       limit: on the expected cost of a trajectory; may be negative. CPO needs it.
 
     Raises:
-      ValueError: a number below 1, a limit that is no number, or a world whose functions
-        return something of another shape.
+      ValueError: finitely many actions, episodes that never end, a horizon below 1, or a limit
+        that is no number.
 
     Example:
+      >>> from jaxltl.core.models.environment import box, make_environment
       >>> def reset(key):
       ...     return jax.random.uniform(key, (1,))
       >>> def move(place, action, key):
       ...     place = place + jnp.clip(action, -1, 1)
-      ...     return place, -abs(place[0]), action[0] ** 2, place[0] > 9
-      >>> problem = make_problem(reset, move, lambda place: place, num_actions=1, horizon=5,
-      ...                        limit=1.0)
+      ...     return Timestep(place, -abs(place[0]), place[0] > 9, cost=action[0] ** 2)
+      >>> world = make_environment(
+      ...     reset, move, lambda place: place, actions=box(-jnp.inf, jnp.inf, (1,)))
+      >>> problem = make_problem(world, horizon=5, limit=1.0)
       >>> float(problem.limit)
       1.0
 
       Then ``state, metrics = train(key, problem, Hparams(discount=0.99), num_steps=100)``.
     """
-    for name, number in {"num_actions": num_actions, "horizon": horizon}.items():
-        if number < 1:
-            raise ValueError(f"{name}={number}; it must be at least 1.")
+    actions = environment.actions
+    if not isinstance(actions, Box) or not jnp.issubdtype(jnp.dtype(actions.dtype), jnp.floating):
+        raise ValueError(
+            f"the environment's actions are {actions}; trust-region search draws from a Gaussian: "
+            "give a box of floats, or learn finitely many actions with ppo.")
+    if horizon is None:
+        horizon = environment.horizon
+    if horizon is None:
+        raise ValueError(
+            "episodes that never end: neither the environment nor horizon says after how many "
+            "steps; give horizon, or with_time_limit(environment, num_steps).")
+    if horizon < 1:
+        raise ValueError(f"horizon={horizon}; it must be at least 1.")
     if limit is not None:
         limit = jnp.asarray(limit, jnp.result_type(float))
         require_shape("limit", limit, ())
-    reset, step, observe = (f if isinstance(f, Partial) else Partial(f)
-                            for f in (reset, step, observe))
-    problem = Problem(reset=reset, step=step, observe=observe, limit=limit,
-                      num_actions=num_actions, horizon=horizon)
-    key = jax.random.key(0)
-    world = jax.eval_shape(reset, key)
-    seen = jax.eval_shape(observe, world)
-    if not isinstance(seen, jax.ShapeDtypeStruct) or len(seen.shape) != 1 or not jnp.issubdtype(
-        seen.dtype, jnp.floating
-    ):
-        raise ValueError(f"observe returns {seen}; it must return floats of one axis.")
-    action = jax.ShapeDtypeStruct((num_actions,), seen.dtype)
-    found = jax.eval_shape(step, world, action, key)
-    if not isinstance(found, tuple) or len(found) != 4:
-        raise ValueError("step must return (world, reward, cost, done).")
-    for name, number in zip(("reward", "cost", "done"), found[1:], strict=True):
-        if getattr(number, "shape", None) != ():
-            raise ValueError(f"step returns {name} = {number}; it must be a scalar.")
-    if _described(found[0]) != _described(world):
-        raise ValueError(
-            f"step returns the world {_described(found[0])}, but reset {_described(world)}; "
-            "both must have the same structure, shapes and dtypes."
-        )
-    return problem
+    return Problem(environment=environment, limit=limit, horizon=int(horizon))
 
 
-def _described(world: Any) -> Any:
-    return jax.tree.map(lambda x: f"{x.dtype}{list(x.shape)}", world)
+def _observed(problem: Problem, world: Any) -> jax.Array:
+    """``float[O]``."""
+    return flat_observation(problem.environment.observe(world))
+
+
+def _num_actions(problem: Problem) -> int:
+    """A, the length of an action as one vector."""
+    return math.prod(some_action(problem.environment.actions).shape)
+
+
+def _as_action(problem: Problem, action: jax.Array) -> jax.Array:
+    """An action of the box, of a vector ``float[A]``."""
+    actions: Any = problem.environment.actions
+    return clipped_action(actions, action.reshape(actions.shape).astype(actions.dtype))
 
 
 def _check(problem: Problem, hparams: Hparams) -> None:
@@ -306,14 +307,35 @@ def _check(problem: Problem, hparams: Hparams) -> None:
         raise ValueError(f"value_batches={hparams.value_batches} of {samples} samples; use fewer.")
 
 
-def policy(state: State, problem: Problem, hparams: Hparams) -> Partial:
-    """What was learned, as a function of the observation: :func:`act` of the state.
+def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
+    """What was learned, an :class:`~jaxltl.core.models.environment.Agent` that draws its actions.
 
-    ``policy(state, problem, hparams)(observation)`` are mean and standard deviation of the action;
-    a pytree.
+    :func:`act` tells the distribution that they are drawn from.
     """
-    del problem
-    return Partial(act, state, hparams)
+    return Agent(Partial(_drawn, state, problem, hparams))
+
+
+def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
+    """The same, taking the mean of the actions each time."""
+    return Agent(Partial(_mean, state, problem, hparams))
+
+
+def _drawn(
+    state: State, problem: Problem, hparams: Hparams, memory: Any, observation: Any, allowed: Any,
+    key: chex.PRNGKey,
+) -> tuple[jax.Array, Any]:
+    del allowed
+    mean, deviation = act(state, hparams, flat_observation(observation))
+    noise = jax.random.normal(key, mean.shape, mean.dtype)
+    return _as_action(problem, mean + deviation * noise), memory
+
+
+def _mean(
+    state: State, problem: Problem, hparams: Hparams, memory: Any, observation: Any, allowed: Any,
+    key: chex.PRNGKey,
+) -> tuple[jax.Array, Any]:
+    del allowed, key
+    return _as_action(problem, act(state, hparams, flat_observation(observation))[0]), memory
 
 
 def act(state: State, hparams: Hparams, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -351,39 +373,46 @@ def rollout(
       :class:`Batch`. Sums over its first axis are those of trajectories.
     """
     start, path = jax.random.split(key)
-    worlds = jax.vmap(problem.reset)(jax.random.split(start, num_trajectories))
+    worlds = jax.vmap(problem.environment.reset)(jax.random.split(start, num_trajectories))
+
+    def taken(world: Any, action: jax.Array, key: chex.PRNGKey) -> Timestep:
+        return Timestep(*problem.environment.step(world, _as_action(problem, action), key))
 
     def move(carry: Any, key: chex.PRNGKey) -> Any:
-        worlds, active = carry
+        worlds, active, cut = carry
         action_key, world_key = jax.random.split(key)
-        observation = jax.vmap(problem.observe)(worlds)
+        observation = jax.vmap(partial(_observed, problem))(worlds)
         mean, deviation = act(state, hparams, observation)
         action = mean
         if sampled:
             action += deviation * jax.random.normal(action_key, mean.shape, mean.dtype)
-        keys = jax.random.split(world_key, num_trajectories)
-        after, reward, cost, done = jax.vmap(problem.step)(worlds, action, keys)
+        found = jax.vmap(taken)(worlds, action, jax.random.split(world_key, num_trajectories))
 
         def held(x: jax.Array, y: jax.Array) -> jax.Array:
             return jnp.where(active.reshape(-1, *[1] * (x.ndim - 1)), x, y)
 
-        row = (observation, action, reward, cost, active)
-        return (jax.tree.map(held, after, worlds), active & ~done.astype(bool)), row
+        row = (observation, action, found.reward, found.cost, found.discount, active)
+        after = jax.tree.map(held, found.world, worlds)
+        cut |= active & found.truncated & ~found.terminated
+        return (after, active & ~(found.terminated | found.truncated), cut), row
 
     active = jnp.ones(num_trajectories, bool)
-    _, (observation, action, reward, cost, valid) = lax.scan(
-        move, (worlds, active), jax.random.split(path, problem.horizon)
+    (worlds, _, truncated), (observation, action, reward, cost, discount, valid) = lax.scan(
+        move, (worlds, active, ~active), jax.random.split(path, problem.horizon)
     )
-    dtype = observation.dtype
-    parts = (observation, action, reward[..., None], cost[..., None])
+    last, dtype = jax.vmap(partial(_observed, problem))(worlds), observation.dtype
+    parts = (observation, action, reward[..., None], cost[..., None], discount[..., None])
     finite = jnp.array([
         jnp.all(jnp.all(jnp.isfinite(x), -1) | ~valid, 0) for x in parts
-    ]).all(0)
+    ]).all(0) & (jnp.all(jnp.isfinite(last), -1) | ~truncated)
     valid &= finite
-    observation, action, reward, cost = (
+    truncated &= finite
+    observation, action, reward, cost, discount = (
         jnp.where(valid[..., None], x, 0).astype(dtype) for x in parts
     )
-    return Batch(observation, action, reward[..., 0], cost[..., 0], valid, finite)
+    return Batch(
+        observation, action, reward[..., 0], cost[..., 0], discount[..., 0], valid, finite,
+        jnp.where(truncated[:, None], last, 0), truncated)
 
 
 @partial(jax.jit)
@@ -395,11 +424,12 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
       ValueError: a method that does not fit the problem, or a number below 1.
     """
     _check(problem, hparams)
-    seen = jax.eval_shape(problem.observe, jax.eval_shape(problem.reset, key))
+    seen = jax.eval_shape(lambda k: _observed(problem, problem.environment.reset(k)), key)
+    num_actions = _num_actions(problem)
     dtype, (size,), num_values = seen.dtype, seen.shape, 1 + (hparams.method == "cpo")
     mean_key, value_key, first_key = jax.random.split(learner.init_key(key), 3)
-    mean = mean_network(hparams, problem.num_actions, dtype).init(mean_key, jnp.zeros(size, dtype))
-    log_deviation = jnp.full(problem.num_actions, jnp.log(hparams.initial_deviation), dtype)
+    mean = mean_network(hparams, num_actions, dtype).init(mean_key, jnp.zeros(size, dtype))
+    log_deviation = jnp.full(num_actions, jnp.log(hparams.initial_deviation), dtype)
     keys = jax.vmap(partial(jax.random.fold_in, value_key))(jnp.arange(num_values))
     values = jax.vmap(lambda k: value_network(hparams, dtype).init(
         k, jnp.zeros(size + 1, dtype)))(keys)["params"]
@@ -468,10 +498,15 @@ def _estimated(
     mean, deviation = state.value_moments[..., None, None]
     value = values_at(state.values, hparams, value_inputs(inputs)) * deviation + mean
     value = jnp.where(batch.valid, value, 0)
+    length = batch.valid.sum(0)
+    ending = normalized(state.moments, hparams, batch.last)
+    ending = values_at(state.values, hparams, inputs_at(ending, length, batch.valid.shape[0]))
+    after = jnp.where(batch.truncated, ending[0] * deviation[0, 0] + mean[0, 0], 0)
     reward = batch.reward
     if hparams.penalty is not None:
         reward = reward - hparams.penalty * batch.cost
-    parts = [advantages(reward, value[0], batch.valid, hparams.discount, hparams.gae_lambda)]
+    discount = hparams.discount * batch.discount
+    parts = [advantages(reward, value[0], batch.valid, discount, hparams.gae_lambda, after)]
     if hparams.method == "cpo":
         parts.append(advantages(
             batch.cost, value[1], batch.valid, hparams.cost_discount, hparams.cost_gae_lambda

@@ -1,4 +1,4 @@
-"""The navigation tasks one step at a time, for learners that are paid by the step.
+"""The navigation tasks as environments, for learners that are paid by the step.
 
 :mod:`~jaxltl.envs.navigation` scores whole trajectories. Here each step pays what its state adds:
 rewards and costs are the increments of J and Z along the trajectory, so that their sums are J and
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
 from jaxltl.envs import navigation as nav
 from jaxltl.envs.navigation import Navigation, State
 
@@ -28,6 +29,7 @@ class Place(NamedTuple):
       first: whether it is the first state.
       nearest: the least distance from the obstacle before it.
       goal, obstacle: whether they were visited before it.
+      time: steps made.
     """
 
     state: State
@@ -35,20 +37,7 @@ class Place(NamedTuple):
     nearest: jax.Array
     goal: jax.Array
     obstacle: jax.Array
-
-
-class Steps(NamedTuple):
-    """A world of steps: three pytrees that are called.
-
-    Attributes:
-      reset: ``key -> place``.
-      step: ``(place, action float[2], key) -> (place, reward, cost, done)``; the key is not read.
-      observe: ``place -> float[M + 2]``.
-    """
-
-    reset: Any
-    step: Any
-    observe: Any
+    time: jax.Array
 
 
 @struct.dataclass
@@ -60,14 +49,16 @@ class _Settings:
     dtype: Any = struct.field(pytree_node=False)
 
 
-def stepwise(
+def as_environment(
     world: Navigation, task: int, *, absorbing: bool | None = None, dtype: Any = None
-) -> Steps:
-    """One of the four tasks by steps; a trajectory takes ``world.horizon`` of them.
+) -> Environment:
+    """One of the four tasks as an environment; an episode takes ``world.horizon`` steps.
 
     A step pays for the state that it leaves, so that N steps pay for the N states that
     :func:`~jaxltl.envs.navigation.scores` counts, the first included; the last action has no
-    effect. A trajectory is never done before.
+    effect. Nothing comes after: an episode is terminated then, and never before. What is read is
+    as for :func:`~jaxltl.envs.navigation.observe`, actions are speed and turn as shares of the
+    largest, and the propositions are goal and obstacle.
 
     Args:
       world: from :func:`~jaxltl.envs.navigation.navigation`, which travels as an argument.
@@ -79,11 +70,11 @@ def stepwise(
       ValueError: an unknown task.
 
     Example:
-      >>> steps = stepwise(nav.navigation(start=((2, 1.5), (2, 1.5))), 2)
-      >>> place = steps.reset(jax.random.key(0))
+      >>> task = as_environment(nav.navigation(start=((2, 1.5), (2, 1.5))), 2)
+      >>> place = task.reset(jax.random.key(0))
       >>> total = []
       >>> for _ in range(3):
-      ...     place, reward, cost, _ = steps.step(place, jnp.zeros(2), None)
+      ...     place, reward, _, _, cost, _ = task.step(place, jnp.zeros(2), None)
       ...     total.append((float(reward), float(cost)))
       >>> total
       [(30.0, -1.0), (0.0, 0.0), (0.0, 0.0)]
@@ -93,14 +84,21 @@ def stepwise(
     stays = task == 1 if absorbing is None else absorbing
     settings = _Settings(
         jnp.int32(task), jnp.bool_(stays), np.dtype(dtype or jnp.result_type(float)))
-    return Steps(*(
-        jax.tree_util.Partial(f, settings, world) for f in (_reset, _step, _observe)))
+    reset, step, observe, labels = (
+        jax.tree_util.Partial(f, settings, world) for f in (_reset, _step, _observe, _labels))
+    return make_environment(
+        reset, step, observe, actions=box(-1, 1, (2,), settings.dtype), labels=labels,
+        propositions=nav.PROPOSITIONS, horizon=world.horizon)
 
 
 def _reset(settings: _Settings, world: Navigation, key: chex.PRNGKey) -> Place:
     state = nav.start_states(world, key, dtype=settings.dtype)
     no = jnp.bool_(False)
-    return Place(state, jnp.bool_(True), jnp.zeros((), settings.dtype), no, no)
+    return Place(state, jnp.bool_(True), jnp.zeros((), settings.dtype), no, no, jnp.int32(0))
+
+
+def _labels(settings: _Settings, world: Navigation, place: Place) -> jax.Array:
+    return nav.labels(world, place.state)
 
 
 def _observe(settings: _Settings, world: Navigation, place: Place) -> jax.Array:
@@ -109,7 +107,7 @@ def _observe(settings: _Settings, world: Navigation, place: Place) -> jax.Array:
 
 def _step(
     settings: _Settings, world: Navigation, place: Place, action: jax.Array, key: Any
-) -> tuple[Place, jax.Array, jax.Array, jax.Array]:
+) -> Timestep:
     del key
     task, dtype = settings.task, settings.dtype
     in_goal, in_obstacle = nav.labels(world, place.state)
@@ -127,5 +125,7 @@ def _step(
     following = nav.move(world, place.state, action.astype(dtype))
     stays = settings.absorbing & in_goal
     following = jax.tree.map(lambda x, y: jnp.where(stays, x, y), place.state, following)
-    place = Place(following, jnp.bool_(False), nearest, goal, obstacle)
-    return place, reward.astype(dtype), 0 - cost.astype(dtype), jnp.bool_(False)  # no -0
+    place = Place(following, jnp.bool_(False), nearest, goal, obstacle, place.time + 1)
+    return Timestep(
+        place, reward.astype(dtype), place.time >= world.horizon,
+        cost=0 - cost.astype(dtype))  # no -0

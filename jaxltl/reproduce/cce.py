@@ -17,9 +17,10 @@ from jaxltl.algos import cce
 from jaxltl.algos import exponential_family as families
 from jaxltl.algos import trust_region as tr
 from jaxltl.app.job import plain
+from jaxltl.core.models.environment import Environment, Timestep
 from jaxltl.envs import lqr
 from jaxltl.envs import navigation as nav
-from jaxltl.envs.navigation_steps import Steps, stepwise
+from jaxltl.envs.navigation_steps import as_environment
 from jaxltl.envs.networks import apply, make_network
 
 NETWORKS = ("2-2-1", "2-10-1", "2-10-10-1", "2-50-1")
@@ -189,7 +190,7 @@ class Robot(NamedTuple):
     world: nav.Navigation
     problem: cce.Problem
     hparams: cce.Hparams
-    steps: Steps
+    environment: Environment
     stepwise: tr.Problem
 
 
@@ -233,10 +234,9 @@ def _robot(task: int) -> Robot:
     problem = cce.make_problem(evaluate, family, limit=nav.LIMITS[task])
     hparams = cce.Hparams(
         rate=0.8, temperature=30.0, margin=0.5 if task == 3 else 0.1, population=100, rho=0.2)
-    steps = stepwise(world, task, dtype=jnp.float32)
-    by_steps = tr.make_problem(
-        *steps, num_actions=2, horizon=world.horizon, limit=nav.LIMITS[task])
-    return Robot(task, world, problem, hparams, steps, by_steps)
+    environment = as_environment(world, task, dtype=jnp.float32)
+    by_steps = tr.make_problem(environment, limit=nav.LIMITS[task])
+    return Robot(task, world, problem, hparams, environment, by_steps)
 
 
 def _scores(task: jax.Array, world: nav.Navigation, run: nav.Run) -> tuple[jax.Array, jax.Array]:
@@ -316,7 +316,7 @@ def _taught(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: Any) 
 
     def teach(state: tr.State, family: Any) -> tr.State:
         policy = families.center(family)
-        seen, _, _ = _drive(robot.steps, partial(_by_network, network, policy),
+        seen, _, _ = _drive(robot.environment, partial(_by_network, network, policy),
                             state.key, 200, robot.world.horizon)
         seen = seen.reshape(-1, seen.shape[-1])
         wanted = apply(network, policy, seen)
@@ -357,17 +357,18 @@ def _drawn(
 
 
 def _drive(
-    steps: Steps, act: Callable[..., jax.Array], key: jax.Array, number: int, horizon: int
+    environment: Environment, act: Callable[..., jax.Array], key: jax.Array, number: int,
+    horizon: int,
 ) -> tuple[jax.Array, Any, tuple[jax.Array, jax.Array]]:
     """Observations ``[T, M, O]``, places ``[T, M]``, and J and Z ``[M]`` of trajectories."""
     starts, noise = jax.random.split(key)
-    places = jax.vmap(steps.reset)(jax.random.split(starts, number))
+    places = jax.vmap(environment.reset)(jax.random.split(starts, number))
 
     def move(places: Any, key: jax.Array) -> Any:
-        seen = jax.vmap(steps.observe)(places)
+        seen = jax.vmap(environment.observe)(places)
         action = act(seen, key)
-        following, reward, cost, _ = jax.vmap(lambda p, a: steps.step(p, a, None))(places, action)
-        return following, (seen, places, reward, cost)
+        found: Timestep = jax.vmap(lambda p, a: environment.step(p, a, None))(places, action)
+        return found.world, (seen, places, found.reward, found.cost)
 
     _, (seen, path, reward, cost) = jax.lax.scan(
         move, places, jax.random.split(noise, horizon))
@@ -375,12 +376,14 @@ def _drive(
 
 
 @partial(jax.jit, static_argnums=(2, 3))
-def _driven(steps: Steps, policy: Any, number: int, horizon: int, key: jax.Array) -> Any:
+def _driven(
+    environment: Environment, policy: Any, number: int, horizon: int, key: jax.Array
+) -> Any:
     if isinstance(policy, tuple):
         act = partial(_drawn, *policy)
     else:
         act = partial(_by_network, nav.policy_network(nav.navigation()), policy)
-    _, path, scores = _drive(steps, act, key, number, horizon)
+    _, path, scores = _drive(environment, act, key, number, horizon)
     return path.state, scores
 
 
@@ -413,7 +416,7 @@ def _judged(
     objective, cost, interval = [], [], []
     for policy in policies:
         state, (j, z) = _driven(
-            robot.steps, policy, plan.fresh, robot.world.horizon, jax.random.key(10**6))
+            robot.environment, policy, plan.fresh, robot.world.horizon, jax.random.key(10**6))
         path = state if path is None else path
         objective.append(float(j.mean()))
         cost.append(float(z.mean()))

@@ -34,6 +34,7 @@ from jaxltl.algos import (
     trust_region,
 )
 from jaxltl.algos.exponential_family import diagonal_gaussian
+from jaxltl.core.models.environment import Timestep, box, make_environment
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.parametric import make_parametric
@@ -182,7 +183,8 @@ def choice_reset(key):
 def choice_step(world, action, key):
     """A point pushed about; the reward is for being near, the cost is the push."""
     place = world + 0.3 * action
-    return place, -jnp.sum(place**2), jnp.sum(action**2), jnp.abs(place).max() > 4
+    return Timestep(
+        place, -jnp.sum(place**2), jnp.abs(place).max() > 4, cost=jnp.sum(action**2))
 
 
 def choice_observe(world):
@@ -194,9 +196,9 @@ def trust(method, **networks):
         trust_region.Hparams, method=method, num_trajectories=6, value_hidden=(), cg_steps=3,
         value_epochs=1, value_batches=2, **networks,
     )
-    problem = trust_region.make_problem(
-        choice_reset, choice_step, choice_observe, num_actions=2, horizon=4, limit=6.0
-    )
+    world = make_environment(
+        choice_reset, choice_step, choice_observe, actions=box(-jnp.inf, jnp.inf, (2,)))
+    problem = trust_region.make_problem(world, horizon=4, limit=6.0)
     return Case(
         trust_region, problem, setting(discount=0.9),
         setting(discount=0.8, delta=0.02, cost_discount=0.9, value_rate=0.1),

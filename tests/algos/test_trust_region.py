@@ -20,6 +20,13 @@ from jaxltl.algos._policy_networks import Moments
 from jaxltl.algos._trust_step import fisher_product, surrogate
 from jaxltl.algos._value_fit import advantages
 from jaxltl.algos.trust_region import Hparams
+from jaxltl.core.models.environment import (
+    Timestep,
+    box,
+    make_environment,
+    run_episode,
+)
+from jaxltl.core.models.time_limit import with_time_limit
 from jaxltl.core.types import Status
 from tests.support import counted_traces
 
@@ -50,14 +57,18 @@ def circle_step(world, action, key):
     radius = jnp.linalg.norm(place)
     turn = place[0] * velocity[1] - place[1] * velocity[0]
     reward = 2 * turn / (radius + 1e-6) / (1 + jnp.abs(radius - RADIUS))
-    return Point(place, velocity), reward, jnp.abs(place[0]) > WALL, False
+    return Timestep(Point(place, velocity), reward, False, cost=jnp.abs(place[0]) > WALL)
+
+
+def free(reset, step, observe, num_actions):
+    """An environment whose actions have no bounds."""
+    return make_environment(
+        reset, step, observe, actions=box(-np.inf, np.inf, (num_actions,)))
 
 
 def circle(limit=5.0):
-    return trust_region.make_problem(
-        circle_reset, circle_step, jnp.concatenate, num_actions=2, horizon=50,
-        limit=limit,
-    )
+    world = free(circle_reset, circle_step, jnp.concatenate, 2)
+    return trust_region.make_problem(world, horizon=50, limit=limit)
 
 
 def pendulum_reset(key):
@@ -71,7 +82,7 @@ def pendulum_step(world, action, key):
     wrapped = (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
     reward = -(wrapped**2 + 0.1 * speed**2 + 0.001 * torque**2)
     speed = jnp.clip(speed + (15 * jnp.sin(angle) + 3 * torque) * 0.05, -8, 8)
-    return jnp.stack([angle + 0.05 * speed, speed]), reward, 0.0, False
+    return Timestep(jnp.stack([angle + 0.05 * speed, speed]), reward, False)
 
 
 def pendulum_observe(world):
@@ -89,7 +100,7 @@ def lq_step(world, action, key):
     """A cart that drifts; the reward is quadratic."""
     reward = -(world @ world + 0.5 * action[0] ** 2)
     noise = NOISE * jax.random.normal(key, (2,))
-    return jnp.asarray(A) @ world + jnp.asarray(B) * action[0] + noise, reward, 0.0, False
+    return Timestep(jnp.asarray(A) @ world + jnp.asarray(B) * action[0] + noise, reward, False)
 
 
 def lq_optimum(horizon):
@@ -109,13 +120,12 @@ def one_reset(key):
 
 def one_step(world, action, key):
     """One choice: the best is 2, and the cost is what is chosen."""
-    return world, -((action[0] - 2) ** 2), action[0], True
+    return Timestep(world, -((action[0] - 2) ** 2), True, cost=action[0])
 
 
 def one_choice(limit=None):
-    return trust_region.make_problem(
-        one_reset, one_step, identity, num_actions=1, horizon=1, limit=limit
-    )
+    world = free(one_reset, one_step, identity, 1)
+    return trust_region.make_problem(world, horizon=1, limit=limit)
 
 
 ONE = Hparams(
@@ -133,14 +143,13 @@ def counted_step(last, poison, world, action, key):
     time, luck = world
     bad = (time >= last) | ((luck < poison) & (time == 1))
     reward = jnp.where(bad, jnp.nan, 1 + 0.1 * action[0])
-    return jnp.stack([time + 1, luck]), reward, 2.0, time + 1 >= last
+    return Timestep(jnp.stack([time + 1, luck]), reward, time + 1 >= last, cost=2.0)
 
 
 def counted(last=3.0, poison=0.0, horizon=5, limit=100.0):
-    return trust_region.make_problem(
-        counted_reset, Partial(counted_step, jnp.asarray(last), jnp.asarray(poison)), identity,
-        num_actions=1, horizon=horizon, limit=limit,
-    )
+    step = Partial(counted_step, jnp.asarray(last), jnp.asarray(poison))
+    world = free(counted_reset, step, identity, 1)
+    return trust_region.make_problem(world, horizon=horizon, limit=limit)
 
 
 SMALL = Hparams(
@@ -419,13 +428,14 @@ def test_divergence_and_density_are_those_of_gaussians():
     np.testing.assert_allclose(one - two, exact[0] - exact[1], atol=1e-9)
 
 
-def plain_advantages(signal, value, length, discount, gae_lambda):
+def plain_advantages(signal, value, length, discount, gae_lambda, after):
     found = np.zeros_like(signal)
     for t in range(length):
+        weight = 1.0
         for k in range(t, length):
-            after = value[k + 1] if k + 1 < length else 0.0
-            error = signal[k] + discount * after - value[k]
-            found[t] += (discount * gae_lambda) ** (k - t) * error
+            following = value[k + 1] if k + 1 < length else after
+            found[t] += weight * (signal[k] + discount[k] * following - value[k])
+            weight *= discount[k] * gae_lambda
     return found
 
 
@@ -433,14 +443,18 @@ def plain_advantages(signal, value, length, discount, gae_lambda):
 def test_advantages_are_their_sums(discount, gae_lambda):
     rng = np.random.default_rng(0)
     signal, value = rng.normal(size=(2, 6, 4))
-    lengths = [6, 1, 3, 0]
+    own = discount * rng.uniform(size=(6, 4))  # each step's
+    lengths, after = [6, 1, 3, 0], np.array([2.0, 0.0, -3.0, 5.0])
     valid = np.arange(6)[:, None] < np.array(lengths)
-    found = advantages(
-        jnp.where(valid, signal, 0), jnp.asarray(value), jnp.asarray(valid), discount, gae_lambda
-    )
+    one, several = (advantages(
+        jnp.where(valid, signal, 0), jnp.asarray(value), jnp.asarray(valid), *given)
+        for given in ((discount, gae_lambda), (own, gae_lambda, after)))
     for i, length in enumerate(lengths):
-        plain = plain_advantages(signal[:, i], value[:, i], length, discount, gae_lambda)
-        np.testing.assert_allclose(found[:, i], plain, atol=1e-12)
+        plain = plain_advantages(signal[:, i], value[:, i], length, [discount] * 6, gae_lambda, 0)
+        np.testing.assert_allclose(one[:, i], plain, atol=1e-12)
+        plain = plain_advantages(
+            signal[:, i], value[:, i], length, own[:, i], gae_lambda, after[i])
+        np.testing.assert_allclose(several[:, i], plain, atol=1e-12)
 
 
 # --- observations -------------------------------------------------------------------------------
@@ -509,6 +523,123 @@ def test_figures_are_those_of_the_trajectories():
     np.testing.assert_allclose(metrics.reward, 4, atol=0.3)
     np.testing.assert_array_equal(metrics.trajectories, [80, 120])
     assert state.trajectories == 120
+
+
+# --- ends of episodes -----------------------------------------------------------------------------
+
+
+def tree_observe(world):
+    return {"time": world[0], "late": world[0] > 1, "luck": world[1:]}
+
+
+def test_a_policy_runs_as_an_agent_on_trees_within_the_box():
+    """Observations become one vector, and actions are those of the box."""
+    def step(world, action, key):
+        counted_step(9.0, 0.0, world, action[0], key)
+        out = jnp.abs(action).max() > 0.5
+        return Timestep(world.at[0].add(1), -jnp.sum(action), world[0] >= 3, cost=1.0 * out)
+
+    world = make_environment(
+        counted_reset, step, tree_observe, actions=box([[-0.5], [-0.25]], 0.25), horizon=4)
+    problem = trust_region.make_problem(world, limit=1.0)
+    assert problem.horizon == 4
+    hparams = SMALL.replace(initial_deviation=2.0)
+    state = trust_region.init(jax.random.key(0), problem, hparams)
+    batch = trust_region.rollout(
+        jax.random.key(1), state, problem, hparams, num_trajectories=6)
+    assert batch.observation.shape == (4, 6, 3) and batch.action.shape == (4, 6, 2)
+    late, _, time = batch.observation[:, 0].T
+    np.testing.assert_array_equal([late, time], [[0, 0, 1, 1], [0, 1, 2, 3]])
+    assert jnp.abs(batch.action).max() > 1 and not batch.cost.any()
+    clipped = jnp.clip(batch.action, jnp.array([-0.5, -0.25]), 0.25)
+    np.testing.assert_allclose(batch.reward, -clipped.sum(-1), atol=1e-12)
+    mean, deviation = trust_region.act(state, hparams, jnp.array([1.0, 0.0, 2.0]))
+    now = tree_observe(jnp.array([2.0, 0.0]))
+    keys = jax.random.split(jax.random.key(3), 4000)
+    drawn = {}
+    for make in (trust_region.policy, trust_region.greedy):
+        agent = make(state, problem, hparams)
+        drawn[make] = jax.vmap(lambda k, a=agent: a.act((), now, None, k)[0])(keys)
+        assert drawn[make].shape == (4000, 2, 1)
+    fits = jnp.clip(mean, jnp.array([-0.5, -0.25]), 0.25).reshape(2, 1)
+    np.testing.assert_allclose(
+        drawn[trust_region.greedy], jnp.broadcast_to(fits, (4000, 2, 1)), atol=1e-12)
+    share = scipy.stats.norm(mean[1], deviation[1]).cdf(-0.25)
+    assert abs((drawn[trust_region.policy][:, 1, 0] == -0.25).mean() - share) < 0.04
+    episode = jax.jit(partial(run_episode, num_steps=5))(jax.random.key(2), world, agent)
+    assert episode.terminated and episode.action.shape == (5, 2, 1)
+
+
+def ticking_reset(key):
+    return jnp.zeros(1)
+
+
+def ticking_step(world, action, key):
+    """Pays and costs 1 for ever."""
+    return Timestep(world + 1, 1.0, False, cost=1.0)
+
+
+def ended_step(ends, world, action, key):
+    """Pays 1 + the action, costs 2, and is then worth half; `ends` is when it is over, and cut."""
+    time = world[0] + 1
+    return Timestep(
+        world + 1, 1.0 + action[0], time >= ends[0], time >= ends[1], 2.0, discount=0.5)
+
+
+@pytest.mark.parametrize(("ends", "length", "bootstrapped"), [
+    ((9, 9), 5, False), ((3, 9), 3, False), ((9, 3), 3, True), ((3, 3), 3, False),
+    ((9, 5), 5, True), ((5, 9), 5, False),
+])
+def test_truncation_is_bootstrapped_and_termination_and_the_horizon_are_not(
+        ends, length, bootstrapped):
+    step = Partial(ended_step, jnp.array(ends))
+    problem = trust_region.make_problem(
+        free(ticking_reset, step, identity, 1), horizon=5, limit=9.0)
+    state = trust_region.init(jax.random.key(0), problem, SMALL)
+    state = state.replace(value_moments=jnp.array([[3.0, 4.0], [2.0, 5.0]]))
+    batch = rollout(state, problem)
+    np.testing.assert_array_equal(batch.valid.T, [np.arange(5) < length] * 6)
+    np.testing.assert_array_equal(batch.truncated, bootstrapped)
+    np.testing.assert_array_equal(batch.discount, 0.5 * batch.valid)
+    inputs = nets.normalized(state.moments, SMALL, batch.observation)
+    value, found = trust_region._estimated(state, batch, inputs, SMALL)
+
+    def worth(time):
+        """What the networks say of the observation after so many steps, on the host."""
+        seen = nets.normalized(state.moments, SMALL, jnp.array([float(time)]))
+        said = nets.values_at(
+            state.values, SMALL, jnp.append(seen, np.linspace(-1, 1, 5)[min(time, 4)]))
+        return np.asarray(said) * [2, 5] + [3, 4]
+
+    values = np.array([worth(t) for t in range(length)])
+    np.testing.assert_allclose(value[:, :length, 0].T, values, atol=1e-9)
+    after = worth(length)[0] if bootstrapped else 0.0
+    signals = np.asarray(batch.reward[:, 0]), np.asarray(batch.cost[:, 0])
+    given = [([0.9 * 0.5] * 5, SMALL.gae_lambda, after), ([1.0] * 5, SMALL.cost_gae_lambda, 0.0)]
+    for i, (signal, (discount, gae_lambda, end)) in enumerate(zip(signals, given, strict=True)):
+        plain = plain_advantages(signal, values[:, i], length, discount, gae_lambda, end)
+        np.testing.assert_allclose(found[i, :, 0], plain, atol=1e-9)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize(("time_limit", "horizon", "values"), [
+    (None, 4, [15 / 8, 7 / 4, 3 / 2, 1]), (4, None, [2, 2, 2, 2]),
+])
+def test_values_of_what_is_cut_off_are_those_of_what_goes_on(time_limit, horizon, values):
+    """Of 1 in each step at a discount of 1/2: less than 2 only if there are four."""
+    world = free(ticking_reset, ticking_step, identity, 1)
+    world = world if time_limit is None else with_time_limit(world, time_limit)
+    problem = trust_region.make_problem(world, limit=9.0, horizon=horizon)
+    hparams = Hparams(
+        discount=0.5, num_trajectories=16, hidden=(), value_hidden=(16,), value_epochs=20,
+        value_rate=0.02, gae_lambda=0.5, cost_discount=0.5, cost_gae_lambda=1.0)
+    state, metrics = trust_region.train(jax.random.key(0), problem, hparams, num_steps=60)
+    inputs = nets.normalized(state.moments, hparams, jnp.arange(4.0)[:, None, None])
+    mean, deviation = state.value_moments[..., None, None]
+    found = nets.values_at(state.values, hparams, nets.value_inputs(inputs)) * deviation + mean
+    np.testing.assert_allclose(found[0, :, 0], values, atol=0.05)
+    np.testing.assert_allclose(found[1, :, 0], [15 / 8, 7 / 4, 3 / 2, 1], atol=0.05)
+    np.testing.assert_allclose(metrics.cost, 15 / 8, rtol=1e-6)
 
 
 # --- numbers that are not finite ------------------------------------------------------------------
@@ -588,9 +719,7 @@ def assert_promises(metrics, limit, delta):
 
 
 def lq_gap(hparams, num_steps):
-    problem = trust_region.make_problem(
-        lq_reset, lq_step, identity, num_actions=1, horizon=20
-    )
+    problem = trust_region.make_problem(free(lq_reset, lq_step, identity, 1), horizon=20)
     start = trust_region.init(jax.random.key(0), problem, hparams)
     state, _ = trust_region.run(start, problem, hparams, num_steps=num_steps)
     best = lq_optimum(20)
@@ -657,9 +786,8 @@ def test_a_circle_from_several_seeds(method, low, high, reward):
 @pytest.mark.exhaustive
 def test_the_pendulum_swings_up():
     """Gymnasium's Pendulum-v1: about -1200 at random; -150 to -200 if it is solved."""
-    problem = trust_region.make_problem(
-        pendulum_reset, pendulum_step, pendulum_observe, num_actions=1, horizon=200
-    )
+    world = free(pendulum_reset, pendulum_step, pendulum_observe, 1)
+    problem = trust_region.make_problem(world, horizon=200)
     hparams = Hparams(
         discount=0.99, method="trpo", num_trajectories=32, delta=0.02, gae_lambda=0.95)
     with jax.enable_x64(False):
@@ -703,18 +831,22 @@ def test_a_limit_is_needed():
         trust_region.init(jax.random.key(0), counted(limit=None), SMALL)
 
 
-@pytest.mark.parametrize(("world", "message"), [
-    ({"observe": lambda w: w[0]}, "observe returns .* of one axis"),
-    ({"observe": lambda w: w > 0}, "observe returns .* of one axis"),
-    ({"step": lambda w, a, k: (w, 0.0, 0.0)}, "must return"),
-    ({"step": lambda w, a, k: (w, a, 0.0, True)}, "returns reward = .* scalar"),
-    ({"step": lambda w, a, k: (w[:1], 0.0, 0.0, True)}, "must have the same structure"),
+@pytest.mark.parametrize(("change", "message"), [
     ({"horizon": 0}, "horizon=0; it must be at least 1"),
-    ({"num_actions": 0}, "num_actions=0"),
+    ({"horizon": None}, "episodes that never end: .* give horizon"),
     ({"limit": [1.0, 2.0]}, r"limit has shape \(2,\); expected \(\)"),
 ])
-def test_worlds_that_do_not_fit_are_refused(world, message):
-    given = {"reset": lq_reset, "step": lq_step, "observe": lambda w: w, "num_actions": 1,
-             "horizon": 3} | world
+def test_problems_that_do_not_fit_are_refused(change, message):
+    world = free(lq_reset, lq_step, identity, 1)
     with pytest.raises(ValueError, match=message):
-        trust_region.make_problem(**given)
+        trust_region.make_problem(world, **{"horizon": 3, **change})
+
+
+@pytest.mark.parametrize("actions", [2, box(0, 3, (1,), jnp.int32)])
+def test_actions_that_a_gaussian_cannot_draw_are_refused(actions):
+    def step(world, action, key):
+        return Timestep(world, 0.0, False)
+
+    world = make_environment(lq_reset, step, identity, actions=actions)
+    with pytest.raises(ValueError, match="give a box of floats"):
+        trust_region.make_problem(world, horizon=3)
