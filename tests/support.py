@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxltl.core.automata.automaton import make_automaton
 from jaxltl.core.models.mdp import MDP, DenseMDP, make_mdp, to_dense
@@ -17,6 +18,12 @@ from jaxltl.core.models.product import Product, product
 from tests import reference
 
 REPRESENTATIONS = ("sparse", "dense", "product")
+
+
+def counts(few: int, many: int) -> pytest.MarkDecorator:
+    """A law of random cases, given as ``count``: few by default, many with the exhaustive ones."""
+    return pytest.mark.parametrize(
+        "count", [few, pytest.param(many, marks=pytest.mark.exhaustive)])
 
 
 def as_mdp(model: reference.Model, **labels: Any) -> MDP:

@@ -12,6 +12,7 @@ from jaxltl.core.values.performance import infeasible_starts
 from jaxltl.envs import temporal_gridworld as tg
 from jaxltl.envs.cell_kinds import many_objects
 from jaxltl.io.colored_world import load_world, read_world, save_world
+from tests import support
 
 PLAN = {
     "o1": [(1, 7)], "o2": [(7, 1)], "o3": [(10, 10)],
@@ -162,8 +163,9 @@ def test_random_worlds_are_drawn_until_a_task_without_end_can_be_done():
         tg.random_world(0, "G F (o1 & ob)", max_tries=5, **options)
 
 
-def test_a_thousand_random_worlds():
-    for world in tg.random_worlds(range(1000)):
+@support.counts(150, 1000)
+def test_hundreds_of_random_worlds(count):
+    for world in tg.random_worlds(range(count)):
         check_random(world, KINDS, 5, 3)
 
 

@@ -18,6 +18,7 @@ from jaxltl.core.automata.minimal import equivalence_classes, minimize
 from jaxltl.core.automata.text import from_dict, guards, to_dict, to_dot, to_text
 from jaxltl.core.automata.translate import to_automaton
 from tests.reference_logic import random_formula, random_lasso, subsets, unmergeable
+from tests.support import counts
 
 GOOD = {
     "delta": [[0, 1], [1, 1]],
@@ -118,10 +119,11 @@ def test_lasso_needs_several_laps():
     assert not accepts_lasso(automaton, [{"a"}] * 5, [set()])
 
 
-def test_minimize_keeps_the_language_and_is_minimal():
+@counts(80, 300)
+def test_minimize_keeps_the_language_and_is_minimal(count):
     rng = random.Random(30)
     shrunk = 0
-    for _ in range(300):
+    for _ in range(count):
         automaton = random_automaton(rng, states=rng.randint(1, 12))
         small = minimize(automaton)
         assert unmergeable(small)
@@ -133,7 +135,7 @@ def test_minimize_keeps_the_language_and_is_minimal():
             states, small_states = run(automaton, lasso[0]), run(small, lasso[0])
             assert np.array_equal(automaton.final[states], small.final[small_states])
             assert np.array_equal(equivalence_classes(automaton)[states], small_states)
-    assert shrunk > 50
+    assert shrunk > count / 6
 
 
 def test_minimal_tables_do_not_depend_on_the_numbering():

@@ -17,6 +17,7 @@ from jaxltl.core.logic.ltl import (
     subformulas,
 )
 from tests.reference_logic import holds_by_definition, random_formula, random_lasso, subsets
+from tests.support import counts
 
 NAMES = ("a", "b", "c", "d")
 
@@ -100,10 +101,11 @@ def test_parse_by_hand(text):
         assert tree(parse_ltl(text)) == EXPANSIONS[text]
 
 
-def test_printer_round_trip():
+@counts(800, 3000)
+def test_printer_round_trip(count):
     rng = random.Random(1)
     odd = ["a", "U", "Foo", "F1", 'q"\\', "two words", "true", "é", "1st", ".x", "line\nbreak"]
-    for _ in range(3000):
+    for _ in range(count):
         formula = random_formula(rng, rng.randint(1, 25), rng.choice([NAMES, odd]))
         again = parse_ltl(str(formula))
         assert again == formula and tree(again) == tree(formula), str(formula)
