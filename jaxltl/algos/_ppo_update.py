@@ -130,7 +130,7 @@ def improved(
         memory = jax.tree.map(lambda x: x[chosen], begun) if recurrent else ()
         (_, told), slope = jax.value_and_grad(loss, has_aux=True)(
             going.parameters, some, memory, problem, hparams, limits)
-        norm = optax.global_norm(slope)
+        norm = jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(slope)))
         told = told._replace(gradient_norm=norm)
         stopped = going.stopped
         if hparams.target_kl is not None:

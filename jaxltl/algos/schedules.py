@@ -46,7 +46,8 @@ class Linear:
 
     def __call__(self, l: jax.Array | int) -> jax.Array:  # noqa: E741
         """The number in step l = 1, 2, ..."""
-        share = jnp.clip((jnp.asarray(l) - 1) / jnp.asarray(self.num_steps), 0, 1)
+        made = jnp.asarray(l, jnp.result_type(float)) - 1
+        share = jnp.clip(made / jnp.asarray(self.num_steps), 0, 1)
         return self.first + (self.last - self.first) * share
 
 
