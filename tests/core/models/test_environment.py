@@ -79,7 +79,7 @@ def test_what_is_made():
     bare = made()
     assert bare.labels(jnp.int32(0)).shape == (0,) and allowed_in(bare, 0) is None
     assert made(actions=box(-1, 1, [2]), step=lambda place, action, key: Timestep(
-        place + action.sum().astype(int), 0.0, False)).actions.shape == (2,)
+        place + action.sum().astype(jnp.int32), 0.0, False)).actions.shape == (2,)
 
 
 # --- bad input ------------------------------------------------------------------------------------
