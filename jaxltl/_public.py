@@ -65,6 +65,7 @@ from jaxltl.core.models.product import (
 from jaxltl.core.models.restrict import restrict, with_allowed
 from jaxltl.core.models.simulated_model import environment_of
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse, row_reward
+from jaxltl.core.models.tabulate import Table, tabulate
 from jaxltl.core.models.task_environment import (
     TaskObservation,
     TaskWorld,
@@ -93,6 +94,7 @@ from jaxltl.core.values.multi_objective import achievable, multi, pareto
 from jaxltl.core.values.objectives import Objective
 from jaxltl.core.values.occupancy import feature_expectation, occupancy_measure
 from jaxltl.core.values.optimal_actions import OptimalActions, optimal_actions
+from jaxltl.core.values.optimality_gap import OptimalityGap, optimality_gap, tabulate_policy
 from jaxltl.core.values.performance import task_performance, task_performances
 from jaxltl.core.values.prepared import Prepared, prepare, solve_prepared
 from jaxltl.core.values.prepared_interval import (
@@ -153,6 +155,7 @@ __all__ = [
     "NotConverged",
     "Objective",
     "OptimalActions",
+    "OptimalityGap",
     "ParametricMDP",
     "Parity",
     "Permissive",
@@ -164,6 +167,7 @@ __all__ = [
     "Solution",
     "SparseMDP",
     "Status",
+    "Table",
     "TaskObservation",
     "TaskWorld",
     "Timestep",
@@ -237,6 +241,7 @@ __all__ = [
     "optimal_actions",
     "optimal_satisfaction",
     "optimal_value",
+    "optimality_gap",
     "pareto",
     "parity",
     "parse_ltl",
@@ -284,6 +289,8 @@ __all__ = [
     "step_or_reset",
     "strategy_value",
     "synchronize",
+    "tabulate",
+    "tabulate_policy",
     "task_environment",
     "task_performance",
     "task_performances",
