@@ -71,7 +71,7 @@ def environment_of(
     table = table.astype(jnp.result_type(float))
     step, outcomes = Partial(_step, model, table), Partial(_outcomes, model, table)
     if owner is not None:
-        other = _opponent(model, opponent)
+        other = _opponent(model, np.asarray(owner), opponent)
         step = Partial(_step_of_two, other, owner, step)
         outcomes = Partial(_outcomes_of_two, other, owner, outcomes)
     elif opponent is not None:
@@ -120,14 +120,22 @@ def _earned(
     return table[after] if table.ndim == 1 else table[state, action]
 
 
-def _opponent(model: MDP | DenseMDP, policy: ArrayLike | None) -> np.ndarray:
+def _opponent(
+    model: MDP | DenseMDP, system: np.ndarray, policy: ArrayLike | None
+) -> np.ndarray:
+    """The logarithm of what it plays."""
     available = np.asarray(model.available)
     given = available.astype(float) if policy is None else np.asarray(policy, float)
     if given.shape != available.shape or not np.isfinite(given).all() or (given < 0).any():
         raise ValueError(f"opponent has shape {list(given.shape)}; give weights "
                          f"{list(available.shape)}, of each action in each state.")
+    weight = np.where(available, given, 0)
+    for state in np.flatnonzero(~system & ~weight.any(1))[:1]:
+        raise ValueError(f"opponent: it moves in state {state}, but has no weight on what is "
+                         "available there; give some.")
     with np.errstate(divide="ignore"):
-        return np.log(np.where(available, given, 0)).astype(jnp.result_type(float))
+        weight[system] = 1
+        return np.log(weight).astype(jnp.result_type(float))
 
 
 def _step_of_two(
