@@ -71,6 +71,7 @@ class Told(NamedTuple):
     """Figures of a collection, as in ``Metrics``."""
 
     reward: jax.Array
+    cost: jax.Array
     episodes: jax.Array
     episode_return: jax.Array
     episode_length: jax.Array
@@ -159,6 +160,7 @@ class _Path(NamedTuple):
     raw: jax.Array
     log_density: jax.Array
     reward: jax.Array
+    cost: jax.Array
     discount: jax.Array
     terminated: jax.Array
     truncated: jax.Array
@@ -200,7 +202,8 @@ def collected(
     target = found + value
     spread = jnp.var(target)
     told = Told(
-        reward=path.reward.astype(dtype).mean(), episodes=number.astype(jnp.int32),
+        reward=path.reward.astype(dtype).mean(), cost=path.cost.astype(dtype).mean(),
+        episodes=number.astype(jnp.int32),
         episode_return=jnp.sum(jnp.where(ended, path.episode_return, 0)) * mean_of,
         episode_length=jnp.sum(jnp.where(ended, path.episode_length, 0)) * mean_of,
         explained_variance=jnp.where(
@@ -252,8 +255,8 @@ def _walked(key: chex.PRNGKey, state: Any, problem: Any, hparams: Any) -> tuple[
         length = walker.episode_length + 1
         row = _Path(
             observation, walker.memory, walker.episode_length == 0, allowed, raw, density,
-            jnp.asarray(found.reward), jnp.asarray(found.discount), terminated, truncated,
-            environment.observe(found.world), total, length)
+            jnp.asarray(found.reward), jnp.asarray(found.cost), jnp.asarray(found.discount),
+            terminated, truncated, environment.observe(found.world), total, length)
         world, memory = learner.choose(
             ended, (fresh, problem.memory), (found.world, said.memory))
         after = Walkers(

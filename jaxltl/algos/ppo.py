@@ -150,7 +150,7 @@ class Metrics:
 
     Attributes:
       transitions: steps of environments made so far, this step's included.
-      reward: mean of a step of an environment.
+      reward, cost: mean of a step of an environment.
       episodes: how many ended in this step.
       episode_return, episode_length: their mean sum of rewards, without discount, and mean number
         of steps; NaN if there is none.
@@ -168,6 +168,7 @@ class Metrics:
 
     transitions: jax.Array
     reward: jax.Array
+    cost: jax.Array
     episodes: jax.Array
     episode_return: jax.Array
     episode_length: jax.Array
@@ -355,8 +356,9 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
         after, step=state.step + 1, parameters=parameters, optimizer=optimizer,
         transitions=learner.count(state.transitions, hparams.num_envs * hparams.num_steps))
     return new, Metrics(
-        transitions=new.transitions, reward=told.reward, episodes=told.episodes,
-        episode_return=told.episode_return, episode_length=told.episode_length,
+        transitions=new.transitions, reward=told.reward, cost=told.cost,
+        episodes=told.episodes, episode_return=told.episode_return,
+        episode_length=told.episode_length,
         policy_loss=figures.policy_loss, value_loss=figures.value_loss, entropy=figures.entropy,
         kl=figures.kl, clip_fraction=figures.clipped, gradient_norm=figures.gradient_norm,
         explained_variance=told.explained_variance,

@@ -29,6 +29,7 @@ from jaxltl.algos import (
     learner,
     maximin_q,
     mlirl,
+    ppo,
     rmax,
     todirl,
     trust_region,
@@ -205,6 +206,44 @@ def trust(method, **networks):
     )
 
 
+def corridor_reset(width, key):
+    return jnp.int32(0)
+
+
+def corridor_step(width, place, action, key):
+    """To the end and back, now and then cut off; there and back earns most."""
+    place = place + jnp.array([1, -1, 0], jnp.int32)[action]
+    return Timestep(place, reward=place / width, terminated=place < 0,
+                    truncated=jax.random.bernoulli(key, 0.1))
+
+
+def corridor_observe(width, place):
+    return {"place": place / width, "end": place == 3}
+
+
+def corridor_allowed(width, place):
+    return jnp.array([place < 3, True, True])
+
+
+def proximal(squash="clip", **options):
+    width = np.array(3.0)
+    if squash == "tanh":
+        world = make_environment(
+            choice_reset, choice_step, choice_observe, actions=box(-1, 1, (2,)))
+        network = ppo.RecurrentActorCritic(shape=(2,), hidden=(), memory=2)
+        problem = ppo.make_problem(world, network=network, memory=np.array([0.1, 0.2]))
+    else:
+        world = make_environment(
+            *(Partial(f, width) for f in (corridor_reset, corridor_step, corridor_observe)),
+            actions=3, allowed=Partial(corridor_allowed, width))
+        problem = ppo.make_problem(world, network=ppo.ActorCritic(3, hidden=()))
+    setting = partial(
+        ppo.Hparams, num_envs=4, num_steps=6, num_epochs=1, num_minibatches=2, squash=squash,
+        **options)
+    return Case(ppo, problem, setting(discount=0.9, learning_rate=0.01),
+                setting(discount=0.8, learning_rate=0.02, clip=0.1, gae_lambda=0.5))
+
+
 def cloning():
     mdp, demonstrations = world()
     network = behavioral_cloning.DensePolicy(num_actions=2, hidden=(4,))
@@ -246,6 +285,8 @@ LEARNERS = {
     "rmax": pac_learning,
     "trpo": partial(trust, "trpo", hidden=(), normalize=False),
     "cpo": partial(trust, "cpo", hidden=(3,)),
+    "ppo": partial(proximal, normalize_observation=True, normalize_reward=True),
+    "ppo-memory": partial(proximal, "tanh", resets_ahead=False),
     "cce": cross_entropy,
     "cloning": cloning,
     "feasible": parameters,
