@@ -64,6 +64,15 @@ def test_the_page_on_intervals_runs(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out == "0.4 [0.4 0.6 1.  1. ]\n[0.7]\n"
 
 
+def test_the_page_on_tasks_in_environments_runs(capsys):
+    page = (ROOT / "docs" / "tasks-in-environments.md").read_text()
+    names: dict = {}
+    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(compile(code, "tasks-in-environments.md", "exec"), names)
+    promised = re.findall(r"print\(.*\)\s+# ([^:\n]*)", page)
+    assert len(promised) == 4 and capsys.readouterr().out.splitlines() == promised
+
+
 def test_the_page_on_data_shows_what_the_command_prints(tmp_path, monkeypatch):
     """And the log of the example is what the script on the page writes."""
     monkeypatch.chdir(tmp_path)
