@@ -118,6 +118,19 @@ def test_world_and_automaton_step_together(ending):
     assert len(seen) == {"repeat": 5, "violated": 4, "undecided": 4}[ending]
 
 
+def test_the_last_letter_repeats_for_ever():
+    rng = np.random.default_rng(6)
+    letters = [[False], [True]]
+    for _ in range(20):
+        delta, priority = rng.integers(7, size=(7, 2)), rng.integers(4, size=(7, 2))
+        automaton = make_automaton(delta, 0, letters, ["a"], priority=priority)
+        found = make_task_tables(automaton, NAMES, discount=.5).repeated
+        for state, letter in np.ndindex(7, 2):
+            start = make_automaton(delta, state, letters, ["a"], priority=priority)
+            accepts = accepts_lasso(start, [], [{"a"} if letter else {}])
+            assert found[state, letter] == (Verdict.SATISFIED if accepts else Verdict.VIOLATED)
+
+
 def test_resets_are_joint():
     task = task_environment(walk(), "F (a & X b)")
     keys = jax.random.split(jax.random.key(1), 30)
