@@ -116,6 +116,13 @@ from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_p
 from jaxltl.core.values.soft import soft_value
 from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
 from jaxltl.core.values.total_reward import total_reward
+from jaxltl.envs.adapters.brax import from_brax
+from jaxltl.envs.adapters.craftax import from_craftax
+from jaxltl.envs.adapters.gymnax import from_gymnax
+from jaxltl.envs.adapters.jumanji import from_jumanji
+from jaxltl.envs.adapters.navix import from_navix
+from jaxltl.envs.adapters.pgx import from_pgx
+from jaxltl.envs.adapters.xminigrid import from_xminigrid
 from jaxltl.envs.gridworld import gridworld
 from jaxltl.envs.gymnasium_tables import from_gymnasium
 from jaxltl.envs.robots import grid_game
@@ -203,9 +210,16 @@ __all__ = [
     "feature_expectation",
     "find_difference",
     "forall_successor",
+    "from_brax",
+    "from_craftax",
     "from_dense",
     "from_gymnasium",
+    "from_gymnax",
+    "from_jumanji",
+    "from_navix",
+    "from_pgx",
     "from_stormpy",
+    "from_xminigrid",
     "generalized_buchi",
     "gr1",
     "grid_game",

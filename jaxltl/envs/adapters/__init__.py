@@ -1,0 +1,1 @@
+"""Environments of other packages as :class:`~jaxltl.core.models.environment.Environment`."""

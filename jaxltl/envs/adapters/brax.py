@@ -1,0 +1,80 @@
+"""Environments of the package brax."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+
+from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
+from jaxltl.envs.adapters.common import (
+    Held,
+    arrays,
+    copied,
+    package,
+    refuse_wrappers,
+    require_environment,
+    timestep,
+)
+
+
+def from_brax(
+    env: Any,
+    *,
+    labels: Callable[..., jax.Array] | None = None,
+    propositions: Sequence[str] = (),
+) -> Environment:
+    """A Brax environment, without the wrappers that start anew or make batches.
+
+    Its ``done`` terminates. Brax limits the length of episodes by its ``EpisodeWrapper`` alone:
+    ``with_time_limit(from_brax(env), 1000)`` does, or that wrapper, whose ``info["truncation"]``
+    is what is truncated then. A world is Brax's ``State``; all that is drawn is drawn at the reset.
+
+    Args:
+      env: as ``brax.envs.get_environment(name)`` returns it. Actions are in [-1, 1], as Brax's
+        environments scale them.
+      labels: ``state -> bool[P]``, of Brax's ``State`` (`obs`, `pipeline_state`).
+      propositions: the names of the labels.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Environment`.
+
+    Raises:
+      ValueError: no environment of Brax, one that starts anew by itself, or a batch; labels that
+        are not ``bool[P]``.
+      ImportError: brax is not installed.
+    """
+    envs, training = package("brax.envs"), package("brax.envs.wrappers.training")
+    make = "give brax.envs.get_environment(name), and limit its episodes by with_time_limit"
+    require_environment("brax", env, envs.Env, "brax.envs.get_environment(name)")
+    refuse_wrappers(
+        "brax", env, "env",
+        (training.AutoResetWrapper, training.VmapWrapper, training.DomainRandomizationVmapWrapper),
+        make)
+    held, size = Held(env), int(env.action_size)
+    length, repeat = getattr(env, "episode_length", None), getattr(env, "action_repeat", 1)
+    return make_environment(
+        Partial(_reset, held), Partial(_step, held), Partial(_observe),
+        actions=box(-1.0, 1.0, (size,), np.float32), labels=labels, propositions=propositions,
+        horizon=None if length is None else -(-int(length) // int(repeat)))
+
+
+def _reset(held: Held, key: chex.PRNGKey) -> Any:
+    return arrays(held.it.reset(key))
+
+
+def _step(held: Held, world: Any, action: Any, key: chex.PRNGKey) -> Timestep:
+    del key
+    found = held.it.step(copied(world), action)
+    done = found.done > 0
+    truncated = found.info.get("truncation", jnp.zeros_like(found.done)) > 0
+    return timestep(found, world, found.reward, done & ~truncated, truncated)
+
+
+def _observe(world: Any) -> Any:
+    return world.obs

@@ -1,0 +1,135 @@
+"""What the adapters of other packages' environments share."""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.tree_util import Partial
+
+from jaxltl.core.models.environment import Timestep, as_partial
+
+
+@jax.tree_util.register_static
+class Held:
+    """An object of a package within a tree: no arrays, and the same where it is the same object.
+
+    Attributes:
+      it: the object; many are not hashable, or compare by arrays.
+    """
+
+    def __init__(self, it: Any) -> None:
+        self.it = it
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Held) and other.it is self.it
+
+    def __hash__(self) -> int:
+        return id(self.it)
+
+
+class Seen(NamedTuple):
+    """A world of a package that returns its observations beside its state.
+
+    Attributes:
+      state: the package's.
+      observation: what was returned with it.
+    """
+
+    state: Any
+    observation: Any
+
+
+def package(name: str) -> Any:
+    """A module of another package, imported.
+
+    Raises:
+      ImportError: it cannot be; with the command that installs it.
+    """
+    root = name.partition(".")[0]
+    try:
+        with warnings.catch_warnings():  # of what it imports itself
+            warnings.simplefilter("ignore", DeprecationWarning)
+            return importlib.import_module(name)
+    except ImportError as problem:
+        raise ImportError(
+            f'from_{root} needs the package {root} ({problem}); pip install "jaxltl[{root}]".',
+            name=problem.name) from problem
+
+
+def require_environment(root: str, env: Any, kinds: Any, remedy: str) -> None:
+    """Refuses what is no environment of a package."""
+    if not isinstance(env, kinds):
+        kind = type(env)
+        raise ValueError(
+            f"from_{root}: env is a {kind.__module__}.{kind.__qualname__}, no environment of "
+            f"{root}; give {remedy}.")
+
+
+def refuse_wrappers(root: str, env: Any, attribute: str, kinds: Any, remedy: str) -> None:
+    """Refuses an environment that starts anew by itself, or is a batch, in any of its layers."""
+    for layer in layers(env, attribute):
+        if isinstance(layer, kinds):
+            raise ValueError(
+                f"from_{root}: env is wrapped in {type(layer).__name__}; {remedy}. Episodes are "
+                "started anew by those who draw them, and many of them are a vmap.")
+
+
+def layers(env: Any, attribute: str) -> Iterator[Any]:
+    """An environment, what it wraps, and so on."""
+    while env is not None:
+        yield env
+        env = vars(env).get(attribute) if hasattr(env, "__dict__") else None
+
+
+def copied(tree: Any) -> Any:
+    """The same tree in new containers: some packages write into those that they are given."""
+    return jax.tree.map(lambda x: x, tree)
+
+
+def arrays(tree: Any, like: Any = None) -> Any:
+    """The leaves as arrays whose types are not weak: of another tree, or their own.
+
+    A tree of another structure is returned as it is, for the checks to tell.
+    """
+    like = tree if like is None else like
+    alike = jax.tree.structure(tree) == jax.tree.structure(like)
+    if not alike:
+        return tree
+
+    def typed(x: Any, y: Any) -> Any:
+        kind = jnp.result_type(y)
+        return x if jnp.issubdtype(kind, jax.dtypes.extended) else lax.convert_element_type(x, kind)
+
+    return jax.tree.map(typed, tree, like)
+
+
+def timestep(world: Any, before: Any, reward: Any, terminated: Any, truncated: Any) -> Timestep:
+    """A :class:`Timestep` of the types that the protocol asks for; costs are zero."""
+    return Timestep(
+        arrays(world, before), jnp.asarray(reward, jnp.result_type(float)),
+        jnp.asarray(terminated, bool), jnp.asarray(truncated, bool), jnp.zeros(()))
+
+
+def labels_of_state(labels: Callable[..., jax.Array] | None) -> Partial | None:
+    """Labels of a world by those of the package's state in it."""
+    return None if labels is None else Partial(_label_state, as_partial(labels))
+
+
+def _label_state(labels: Callable[..., jax.Array], world: Any) -> jax.Array:
+    return labels(world.state)
+
+
+def observation_of(world: Any) -> Any:
+    """What a world holds as its observation."""
+    return world.observation
+
+
+def some_allowed(mask: jax.Array) -> jax.Array:
+    """A mask; where nothing is allowed, which is where an episode has ended, everything is."""
+    return mask | ~mask.any()

@@ -1,0 +1,83 @@
+"""Environments of the package craftax."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+from jax.tree_util import Partial
+
+from jaxltl.core.models.environment import Environment, Timestep, make_environment
+from jaxltl.envs.adapters.common import (
+    Held,
+    arrays,
+    copied,
+    package,
+    require_environment,
+    timestep,
+)
+from jaxltl.envs.adapters.gymnax import space_of_actions
+
+
+def from_craftax(
+    env: Any,
+    params: Any = None,
+    *,
+    labels: Callable[..., jax.Array] | None = None,
+    propositions: Sequence[str] = (),
+) -> Environment:
+    """A Craftax environment, by its ``step_env``, which does not start anew.
+
+    Craftax has one ``done`` for both ends of an episode. Here it is truncated at
+    ``params.max_timesteps``, and terminated if it would be over without that limit. A world is
+    Craftax's state.
+
+    Args:
+      env: as ``make_craftax_env_from_name(name, auto_reset=False)`` returns it.
+      params: default the environment's own; arrays of the result.
+      labels: ``state -> bool[P]``, of Craftax's state.
+      propositions: the names of the labels.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Environment`.
+
+    Raises:
+      ValueError: no environment of Craftax, or one that starts anew by itself; labels that are not
+        ``bool[P]``.
+      ImportError: craftax is not installed.
+    """
+    bases = package("craftax.environment_base.environment_bases")
+    make = "craftax_env.make_craftax_env_from_name(name, auto_reset=False)"
+    require_environment(
+        "craftax", env, (bases.EnvironmentNoAutoReset, bases.EnvironmentAutoReset), make)
+    if isinstance(env, bases.EnvironmentAutoReset):
+        raise ValueError(
+            f"from_craftax: {type(env).__name__} starts anew by itself; give {make}.")
+    if params is None:
+        params = env.default_params
+    held, limit = Held(env), params.max_timesteps
+    return make_environment(
+        Partial(_reset, held, params), Partial(_step, held, params), Partial(_observe, held),
+        actions=space_of_actions("craftax", env.action_space(params)), labels=labels,
+        propositions=propositions, horizon=limit if isinstance(limit, int) else None)
+
+
+def _reset(held: Held, params: Any, key: chex.PRNGKey) -> Any:
+    _, state = held.it.reset_env(key, params)
+    return arrays(state)
+
+
+def _step(held: Held, params: Any, world: Any, action: Any, key: chex.PRNGKey) -> Timestep:
+    env = held.it
+    _, state, reward, _, _ = env.step_env(key, copied(world), action, params)
+    endless = params.replace(max_timesteps=jnp.iinfo(jnp.int32).max)
+    return timestep(
+        state, world, reward, env.is_terminal(state, endless),
+        state.timestep >= params.max_timesteps)
+
+
+def _observe(held: Held, world: Any) -> Any:
+    return held.it.get_obs(world)

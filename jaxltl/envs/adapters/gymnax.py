@@ -1,0 +1,93 @@
+"""Environments of the package gymnax."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import chex
+import jax
+from jax.tree_util import Partial
+
+from jaxltl.core.models.environment import (
+    Box,
+    Environment,
+    Finite,
+    Timestep,
+    box,
+    make_environment,
+)
+from jaxltl.envs.adapters.common import (
+    Held,
+    Seen,
+    arrays,
+    copied,
+    labels_of_state,
+    observation_of,
+    package,
+    require_environment,
+    timestep,
+)
+
+
+def from_gymnax(
+    env: Any,
+    params: Any = None,
+    *,
+    labels: Callable[..., jax.Array] | None = None,
+    propositions: Sequence[str] = (),
+) -> Environment:
+    """A gymnax environment, by its ``step_env``, which does not start anew.
+
+    An episode is terminated where ``step_env`` says so, and truncated where ``is_truncated`` does.
+    A world is a pair of gymnax's ``state`` and ``observation``.
+
+    Args:
+      env, params: as ``gymnax.make(name)`` returns them; `params` (default the environment's own)
+        are arrays of the result: other ones do not recompile, and many are a ``vmap``.
+      labels: ``state -> bool[P]``, of gymnax's state.
+      propositions: the names of the labels.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Environment`.
+
+    Raises:
+      ValueError: no environment of gymnax, or one in a wrapper; actions that are neither finite
+        nor in a box; labels that are not ``bool[P]``.
+      ImportError: gymnax is not installed.
+    """
+    module = package("gymnax.environments.environment")
+    require_environment(
+        "gymnax", env, module.Environment,
+        "gymnax.make(name)[0], without wrappers, which start anew by themselves")
+    if params is None:
+        params = env.default_params
+    held, limit = Held(env), getattr(params, "max_steps_in_episode", None)
+    known = type(env).is_truncated is module.Environment.is_truncated and isinstance(limit, int)
+    return make_environment(
+        Partial(_reset, held, params), Partial(_step, held, params), Partial(observation_of),
+        actions=space_of_actions("gymnax", env.action_space(params)),
+        labels=labels_of_state(labels), propositions=propositions,
+        horizon=limit if known else None)
+
+
+def space_of_actions(root: str, space: Any) -> Finite | Box:
+    """The actions of a space of gymnax's kind."""
+    if hasattr(space, "n"):
+        return Finite(int(space.n))
+    if hasattr(space, "low") and hasattr(space, "high"):
+        return box(space.low, space.high, space.shape, space.dtype)
+    raise ValueError(f"from_{root}: actions are {space!r}; they must be finite or in a box.")
+
+
+def _reset(held: Held, params: Any, key: chex.PRNGKey) -> Seen:
+    observation, state = held.it.reset(key, params)
+    return arrays(Seen(state, observation))
+
+
+def _step(held: Held, params: Any, world: Seen, action: Any, key: chex.PRNGKey) -> Timestep:
+    env = held.it
+    observation, state, reward, terminated, _ = env.step_env(
+        key, copied(world.state), action, params)
+    return timestep(
+        Seen(state, observation), world, reward, terminated, env.is_truncated(state, params))

@@ -1,0 +1,167 @@
+"""Environments of the package jumanji."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+
+from jaxltl.core.models.environment import (
+    Box,
+    Environment,
+    Finite,
+    Timestep,
+    box,
+    make_environment,
+)
+from jaxltl.envs.adapters.common import (
+    Held,
+    Seen,
+    arrays,
+    copied,
+    labels_of_state,
+    layers,
+    observation_of,
+    package,
+    refuse_wrappers,
+    require_environment,
+    some_allowed,
+    timestep,
+)
+
+# More are learned part by part, and a mask of all their combinations would fill the memory.
+_MOST_ACTIONS = 2**20
+
+
+def from_jumanji(
+    env: Any,
+    *,
+    labels: Callable[..., jax.Array] | None = None,
+    propositions: Sequence[str] = (),
+) -> Environment:
+    """A Jumanji environment.
+
+    Most of Jumanji's environments say at their limit of steps that the episode is terminated (a
+    discount of 0). Here it is terminated if it would be over without the limit (`env.time_limit`),
+    and truncated otherwise, as it is where Jumanji's discount is not 0. A world is a pair of
+    Jumanji's ``state`` and ``observation``; the state has the key that it draws from, and the key
+    of a step is not used.
+
+    Args:
+      env: as ``jumanji.make(name)`` returns it. Where an action has several parts, the actions here
+        are all combinations, numbered with the last part fastest. An `action_mask` in what is
+        observed is what is `allowed`; of parts, where all of them are.
+      labels: ``state -> bool[P]``, of Jumanji's state.
+      propositions: the names of the labels.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Environment`.
+
+    Raises:
+      ValueError: no environment of Jumanji, one that starts anew by itself, or a batch; a reward
+        for each of several agents; actions that are neither finite nor in a box; labels that are
+        not ``bool[P]``.
+      ImportError: jumanji is not installed.
+    """
+    jumanji, wrappers = package("jumanji"), package("jumanji.wrappers")
+    require_environment("jumanji", env, jumanji.Environment, "jumanji.make(name)")
+    refuse_wrappers(
+        "jumanji", env, "_env",
+        (wrappers.AutoResetWrapper, wrappers.VmapWrapper, wrappers.VmapAutoResetWrapper),
+        "give what is in it")
+    if env.reward_spec.shape != ():
+        raise ValueError(
+            f"from_jumanji: {type(env).__name__} has rewards of shape {env.reward_spec.shape}, "
+            "one for each agent; wrap it in jumanji.wrappers.MultiToSingleWrapper.")
+    held, endless, parts = Held(env), Held(_without_limit(env)), _parts(env.action_spec)
+    limit = next((x.time_limit for x in layers(env, "_env") if "time_limit" in vars(x)), None)
+    return make_environment(
+        Partial(_reset, held), Partial(_step, held, endless, Held(parts)),
+        Partial(observation_of), actions=_actions(env.action_spec, parts),
+        labels=labels_of_state(labels), propositions=propositions,
+        allowed=_mask(env, parts), horizon=None if limit is None else int(limit))
+
+
+def _without_limit(env: Any) -> Any:
+    """A copy of an environment, and of what it wraps, that never runs out of time."""
+    endless = copy.copy(env)
+    for name, found in vars(env).items():
+        if name == "_env":
+            setattr(endless, name, _without_limit(found))
+        elif name == "time_limit":
+            setattr(endless, name, np.iinfo(np.int32).max)
+    return endless
+
+
+def _parts(spec: Any) -> tuple[int, ...] | None:
+    """How many values each part of an action has: () for an action that is a number itself."""
+    if not hasattr(spec, "num_values"):
+        return None
+    return tuple(np.atleast_1d(spec.num_values).ravel().tolist()) if spec.shape else ()
+
+
+def _actions(spec: Any, parts: tuple[int, ...] | None) -> Finite | Box:
+    if parts is not None:
+        count = math.prod(parts) if spec.shape else int(spec.num_values)
+        if count > _MOST_ACTIONS:
+            raise ValueError(
+                f"from_jumanji: parts of {list(parts)} values make {count} actions; at most "
+                f"{_MOST_ACTIONS} are numbered. Take fewer agents or a smaller board.")
+        return Finite(count)
+    if not (hasattr(spec, "minimum") and jnp.issubdtype(spec.dtype, jnp.floating)):
+        raise ValueError(f"from_jumanji: actions are {spec!r}; they must be finite or in a box.")
+    return box(spec.minimum, spec.maximum, spec.shape, spec.dtype)
+
+
+def _mask(env: Any, parts: tuple[int, ...] | None) -> Partial | None:
+    """What is allowed, if the environment shows a mask."""
+    if parts is None:
+        return None
+    seen = jax.eval_shape(lambda key: env.reset(key)[1].observation, jax.random.key(0))
+    mask = getattr(seen, "action_mask", None)
+    if mask is None:
+        return None
+    together = tuple(mask.shape) == parts or (not parts and len(mask.shape) == 1)
+    apart = len(mask.shape) == 2 and mask.shape[0] == len(parts) and mask.shape[1] >= max(parts)
+    if not (together or apart):
+        raise ValueError(
+            f"from_jumanji: action_mask has the shape {list(mask.shape)}, for actions of "
+            f"{list(parts)} values.")
+    return Partial(_allowed_together) if together else Partial(_allowed_apart, Held(parts))
+
+
+def _allowed_together(world: Seen) -> jax.Array:
+    return some_allowed(world.observation.action_mask.ravel())
+
+
+def _allowed_apart(parts: Held, world: Seen) -> jax.Array:
+    mask, found = world.observation.action_mask, jnp.ones(1, bool)
+    for row, count in enumerate(parts.it):
+        found = (found[:, None] & mask[row, :count]).ravel()
+    return some_allowed(found)
+
+
+def _reset(held: Held, key: chex.PRNGKey) -> Seen:
+    state, found = held.it.reset(key)
+    return arrays(Seen(state, found.observation))
+
+
+def _step(
+    held: Held, endless: Held, parts: Held, world: Seen, action: Any, key: chex.PRNGKey
+) -> Timestep:
+    del key  # the state has one
+    if parts.it:
+        action = jnp.stack(jnp.unravel_index(action, parts.it)).astype(jnp.int32)
+    state, found = held.it.step(copied(world.state), action)
+    _, further = endless.it.step(copied(world.state), action)
+    terminated = further.last() & (further.discount == 0)
+    return timestep(
+        Seen(state, found.observation), world, found.reward, terminated,
+        found.last() & ~terminated)

@@ -1,0 +1,69 @@
+"""Environments of the package navix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+from jax.tree_util import Partial
+
+from jaxltl.core.models.environment import Environment, Timestep, make_environment
+from jaxltl.envs.adapters.common import (
+    Held,
+    arrays,
+    copied,
+    labels_of_state,
+    observation_of,
+    package,
+    require_environment,
+    timestep,
+)
+
+
+def from_navix(
+    env: Any,
+    *,
+    labels: Callable[..., jax.Array] | None = None,
+    propositions: Sequence[str] = (),
+) -> Environment:
+    """A Navix environment.
+
+    Of its step types, termination and truncation are told apart; where both hold, it is terminated.
+    Its own ``step`` starts anew from the last timestep of an episode; here that is never so. A
+    world is Navix's timestep, whose state has the key that it draws from; the key of a step is not
+    used.
+
+    Args:
+      env: as ``navix.make(name)`` returns it.
+      labels: ``state -> bool[P]``, of Navix's state; its events, like ``goal_reached``, are those
+        of the step that led to it.
+      propositions: the names of the labels.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Environment`.
+
+    Raises:
+      ValueError: no environment of Navix; labels that are not ``bool[P]``.
+      ImportError: navix is not installed.
+    """
+    navix = package("navix")
+    require_environment("navix", env, navix.Environment, "navix.make(name)")
+    held = Held(env)
+    return make_environment(
+        Partial(_reset, held), Partial(_step, held), Partial(observation_of),
+        actions=len(env.action_set), labels=labels_of_state(labels), propositions=propositions,
+        horizon=int(env.max_steps))
+
+
+def _reset(held: Held, key: chex.PRNGKey) -> Any:
+    return arrays(held.it.reset(key))
+
+
+def _step(held: Held, world: Any, action: Any, key: chex.PRNGKey) -> Timestep:
+    del key  # the state has one
+    running = copied(world).replace(step_type=jnp.zeros_like(world.step_type))
+    found = held.it.step(running, action)
+    return timestep(found, world, found.reward, found.is_termination(), found.is_truncation())

@@ -1,0 +1,139 @@
+"""Games of the package pgx, for one player against a policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.tree_util import Partial
+
+from jaxltl.core.models.environment import Environment, Timestep, as_partial, make_environment
+from jaxltl.envs.adapters.common import (
+    Held,
+    arrays,
+    copied,
+    labels_of_state,
+    package,
+    require_environment,
+    some_allowed,
+    timestep,
+)
+
+
+class Turn(NamedTuple):
+    """A world of a game: the player is to move, or the game is over.
+
+    Attributes:
+      state: Pgx's.
+      owed: what the player earned by moves of others before the first of their own.
+    """
+
+    state: Any
+    owed: jax.Array
+
+
+def from_pgx(
+    env: Any,
+    opponent: Callable[..., Any] | None = None,
+    player: int = 0,
+    *,
+    labels: Callable[..., jax.Array] | None = None,
+    propositions: Sequence[str] = (),
+) -> Environment:
+    """A Pgx game as one player's world, in which all others act by a policy.
+
+    A step is a move of the player and those of the others until it is the player's turn again, or
+    the game is over; its reward is what the player earns by all of them. Legal actions are
+    `allowed`; one that is not ends the game with the package's penalty. What is observed is the
+    player's view, also of a game that another one's turn was next in when it ended.
+
+    Args:
+      env: as ``pgx.make(name)`` returns it.
+      opponent: ``(state, key) -> action``, of Pgx's state, which holds the view (`observation`) and
+        the `legal_action_mask` of whose turn it is; a function, or a ``Partial`` that hands over
+        arrays, such as weights: new ones do not recompile. None for games of one player.
+      player: whom the steps are of. Who begins may be drawn at the reset.
+      labels: ``state -> bool[P]``, of Pgx's state when it is the player's turn.
+      propositions: the names of the labels.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Environment`; its worlds are pairs of Pgx's ``state``
+      and what is ``owed`` for moves before the player's first.
+
+    Raises:
+      ValueError: no environment of Pgx; no opponent, or no such player; labels that are not
+        ``bool[P]``.
+      ImportError: pgx is not installed.
+    """
+    pgx = package("pgx")
+    require_environment("pgx", env, pgx.Env, "pgx.make(name)")
+    if not (isinstance(player, int | np.integer) and 0 <= player < env.num_players):
+        raise ValueError(
+            f"from_pgx: player={player!r}; {env.id} has the players 0 to {env.num_players - 1}.")
+    if (opponent is None) != (env.num_players == 1):
+        raise ValueError(
+            f"from_pgx: {env.id} is for {env.num_players} players; give an opponent, "
+            "(state, key) -> action, where there are several, and None where there is one.")
+    others = None if opponent is None else as_partial(opponent)
+    game = Held(env), int(player), others
+    return make_environment(
+        Partial(_reset, *game), Partial(_step, *game), Partial(_observe, *game[:2]),
+        actions=int(env.num_actions), labels=labels_of_state(labels), propositions=propositions,
+        allowed=Partial(_allowed))
+
+
+def _reset(held: Held, player: Any, opponent: Any, key: chex.PRNGKey) -> Turn:
+    start, others = jax.random.split(key)
+    state = arrays(held.it.init(start))
+    return Turn(*_await_turn(held, player, opponent, state, jnp.zeros(()), others))
+
+
+def _step(
+    held: Held, player: Any, opponent: Any, world: Turn, action: Any, key: chex.PRNGKey
+) -> Timestep:
+    own, others = jax.random.split(key)
+    state = arrays(held.it.step(copied(world.state), action, own), world.state)
+    earned = world.owed + state.rewards[player]
+    state, earned = _await_turn(held, player, opponent, state, earned, others)
+    after = Turn(state, jnp.zeros_like(world.owed))
+    return timestep(after, world, earned, state.terminated, state.truncated)
+
+
+def _await_turn(
+    held: Held, player: Any, opponent: Any, state: Any, earned: jax.Array, key: chex.PRNGKey
+) -> tuple[Any, jax.Array]:
+    """The state in which the player is to move or the game is over, and all that is earned."""
+    if opponent is None:
+        return state, earned
+
+    def waits(carry: Any) -> jax.Array:
+        state = carry[0]
+        return ~(state.terminated | state.truncated) & (state.current_player != player)
+
+    def move(carry: Any) -> Any:
+        state, earned, key = carry
+        key, choose, go = jax.random.split(key, 3)
+        action = jnp.asarray(opponent(copied(state), choose))
+        if action.shape or action.dtype.kind not in "iu":
+            raise ValueError(
+                f"opponent returns {action.dtype}{list(action.shape)}; it must return the number "
+                "of one action.")
+        after = arrays(held.it.step(copied(state), action, go), state)
+        return after, earned + after.rewards[player].astype(earned.dtype), key
+
+    state, earned, _ = lax.while_loop(waits, move, (state, earned, key))
+    return state, earned
+
+
+def _observe(held: Held, player: Any, world: Turn) -> Any:
+    # Its public name shows whose turn it is next alone, who is another where a game has ended.
+    return lax.stop_gradient(held.it._observe(world.state, player))
+
+
+def _allowed(world: Turn) -> jax.Array:
+    return some_allowed(world.state.legal_action_mask)

@@ -1,0 +1,78 @@
+"""Environments of the package xminigrid (XLand-MiniGrid)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import chex
+import jax
+from jax.tree_util import Partial
+
+from jaxltl.core.models.environment import Environment, Timestep, make_environment
+from jaxltl.envs.adapters.common import (
+    Held,
+    arrays,
+    copied,
+    labels_of_state,
+    observation_of,
+    package,
+    refuse_wrappers,
+    require_environment,
+    timestep,
+)
+
+
+def from_xminigrid(
+    env: Any,
+    params: Any = None,
+    *,
+    labels: Callable[..., jax.Array] | None = None,
+    propositions: Sequence[str] = (),
+) -> Environment:
+    """An XLand-MiniGrid environment.
+
+    The last timestep of an episode is terminated if its discount is 0, truncated otherwise. A world
+    is the package's timestep; all that is drawn is drawn at the reset.
+
+    Args:
+      env, params: as ``xminigrid.make(name)`` returns them; a ruleset in `params` is arrays of the
+        result: other ones do not recompile.
+      labels: ``state -> bool[P]``, of the package's state.
+      propositions: the names of the labels.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Environment`.
+
+    Raises:
+      ValueError: no environment of xminigrid, or one that starts anew by itself; no limit of steps
+        in `params`; labels that are not ``bool[P]``.
+      ImportError: xminigrid is not installed.
+    """
+    module = package("xminigrid.environment")
+    wrappers = package("xminigrid.wrappers")
+    require_environment("xminigrid", env, module.Environment, "xminigrid.make(name)[0]")
+    refuse_wrappers(
+        "xminigrid", env, "_env",
+        (wrappers.GymAutoResetWrapper, wrappers.DmEnvAutoResetWrapper), "give what is in it")
+    if params is None:
+        params = env.default_params()
+    if params.max_steps is None:
+        raise ValueError(
+            "from_xminigrid: params.max_steps is None; give params.replace(max_steps=...).")
+    held = Held(env)
+    return make_environment(
+        Partial(_reset, held, params), Partial(_step, held, params), Partial(observation_of),
+        actions=int(env.num_actions(params)), labels=labels_of_state(labels),
+        propositions=propositions, horizon=int(params.max_steps))
+
+
+def _reset(held: Held, params: Any, key: chex.PRNGKey) -> Any:
+    return arrays(held.it.reset(params, key))
+
+
+def _step(held: Held, params: Any, world: Any, action: Any, key: chex.PRNGKey) -> Timestep:
+    del key
+    found = held.it.step(params, copied(world), action)
+    over = found.discount == 0
+    return timestep(found, world, found.reward, found.last() & over, found.last() & ~over)

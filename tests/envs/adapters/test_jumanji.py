@@ -1,0 +1,84 @@
+"""Jumanji's environments, against jumanji."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxltl import from_jumanji
+from jaxltl.core.models.environment import Finite
+from tests.envs.adapters.harness import (  # noqa: F401
+    both_ends,
+    load,
+    same_as_own,
+    single_precision,
+)
+
+
+@pytest.fixture(scope="module")
+def jumanji():
+    return load("jumanji")
+
+
+def at_target(state):
+    return (state.agent_position == state.target_position)[None]
+
+
+def test_a_thousand_steps_are_jumanjis_own(jumanji):
+    """But that its limit of steps is a truncation, which it calls a termination."""
+    generator = load("jumanji.environments.routing.maze.generator").RandomGenerator(4, 4)
+    own = jumanji.environments.Maze(generator, time_limit=9)
+    env = from_jumanji(own, labels=at_target, propositions=["target"])
+    assert env.actions == Finite(4) and env.horizon == 9
+
+    def reset(key):
+        state, start = own.reset(key)
+        return state, start.observation
+
+    def step(state, action, key):
+        after, found = own.step(state, action)
+        reached = at_target(after)[0]
+        cut = found.last() & ~reached
+        return after, found.observation, found.reward, found.last() & reached, cut
+
+    found = same_as_own(env, reset, step)
+    both_ends(found)
+    seen, action, reward, terminated, truncated, last = found
+    assert seen.action_mask[np.arange(1000), action].all()
+    assert (last.step_count[truncated] == 9).all() and (reward[terminated] == 1).all()
+
+
+@pytest.mark.parametrize(("name", "apart"), [("Minesweeper-v0", False), ("Cleaner-v0", True)])
+def test_actions_of_several_parts_are_numbered(jumanji, name, apart):
+    own = jumanji.make(name)
+    env = from_jumanji(own)
+    world = jax.jit(env.reset)(jax.random.key(0))
+    mask = np.asarray(world.observation.action_mask)
+    counts = own.action_spec.num_values.tolist()
+    actions = list(itertools.product(*map(range, counts)))
+    allowed = [all(mask[i, a] for i, a in enumerate(x)) if apart else mask[x] for x in actions]
+    assert env.actions == Finite(len(actions))
+    assert env.allowed(world).tolist() == allowed
+    number = np.flatnonzero(allowed)[-1]
+    found = jax.jit(env.step)(world, jnp.int32(number), jax.random.key(1))
+    _, theirs = jax.jit(own.step)(world.state, jnp.array(actions[number]))
+    for x, y in zip(
+            jax.tree.leaves(found.world.observation), jax.tree.leaves(theirs.observation),
+            strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_what_is_not_jumanjis_is_named(jumanji):
+    wrappers = load("jumanji.wrappers")
+    snake = jumanji.make("Snake-v1")
+    for wrapper in (wrappers.AutoResetWrapper, wrappers.VmapWrapper, wrappers.VmapAutoResetWrapper):
+        with pytest.raises(ValueError, match=f"wrapped in {wrapper.__name__}; give what is in it"):
+            from_jumanji(wrapper(snake))
+    with pytest.raises(ValueError, match=r"from_jumanji: env is a .*no environment of jumanji"):
+        from_jumanji(jnp)
+    with pytest.raises(ValueError, match="make 16679880978201 actions; at most"):
+        from_jumanji(jumanji.make("JobShop-v0"))
+    with pytest.raises(ValueError, match=r"one for each agent; wrap it in .*MultiToSingleWrapper"):
+        from_jumanji(jumanji.make("Connector-v3"))
