@@ -20,6 +20,7 @@ from flax import struct
 from jax import lax
 from numpy.typing import ArrayLike
 
+from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
 from jaxltl.envs.networks import Network, apply_lanes, make_network, weighted
 
 
@@ -248,13 +249,20 @@ def _step(
     network: Network, world: LQR, parameters: jax.Array, carry: tuple[jax.Array, ...]
 ) -> tuple[tuple[jax.Array, ...], jax.Array]:
     state, total, violation = carry
-    beside = (1,) * (parameters.ndim - 1)
     control = apply_lanes(network, parameters, state)
+    return _after(world, state, control, total, violation), control
+
+
+def _after(
+    world: LQR, state: jax.Array, control: jax.Array, total: jax.Array, violation: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The next state, J so far, and the largest violation so far."""
+    beside = (1,) * (control.ndim - 1)
     state = _times(world.dynamics, state) + _times(world.control, control)
     total = total + _square(world.state_cost, state) + _square(world.control_cost, control)
     low, high = world.low.reshape(-1, *beside), world.high.reshape(-1, *beside)
     over = jnp.maximum(low - control, control - high).max(axis=0)
-    return (state, total, jnp.maximum(violation, over)), control
+    return state, total, jnp.maximum(violation, over)
 
 
 def _times(matrix: jax.Array, x: jax.Array) -> jax.Array:
@@ -288,6 +296,61 @@ def _lanes_last(
     parameters = jnp.moveaxis(parameters, 0, -1).reshape(parameters.shape[1], -1)
     found = _scores(network, world, parameters)
     return tuple(jnp.moveaxis(x.reshape(*lanes, size), -1, 0) for x in found), (True, True)
+
+
+# --- by steps ---------------------------------------------------------------------------------
+
+
+class Plant(NamedTuple):
+    """A regulator on its way: its state, the largest violation so far, and steps made."""
+
+    state: jax.Array
+    violation: jax.Array
+    time: jax.Array
+
+
+def as_environment(world: LQR, dtype: Any = None) -> Environment:
+    """The regulator as an environment, whose episodes terminate after N controls.
+
+    Rewards add up to -J, and costs, by how much each step raises the largest violation of the
+    bounds, to the largest violation. Controls are not bounded otherwise, and states are observed.
+
+    Args:
+      world: from :func:`lqr`, which travels as an argument.
+      dtype: of all numbers; default JAX's.
+
+    Example:
+      >>> plant = as_environment(lqr())
+      >>> found = plant.step(plant.reset(None), jnp.array([-0.5]), None)
+      >>> found.world.state.tolist(), round(float(found.reward), 4), round(float(found.cost), 4)
+      ([-0.5, -1.5], -0.325, 0.3)
+    """
+    dtype = jnp.dtype(dtype or jnp.result_type(float))
+    world = jax.tree.map(lambda x: np.asarray(x, dtype), world)
+    reset, step = (jax.tree_util.Partial(f, world) for f in (_first_state, _controlled))
+    return make_environment(
+        reset, step, _observed, actions=box(-np.inf, np.inf, world.control.shape[-1:], dtype),
+        horizon=world.horizon)
+
+
+def _first_state(world: LQR, key: Any) -> Plant:
+    del key
+    start = jnp.asarray(world.start)
+    return Plant(start, jnp.zeros((), start.dtype), jnp.int32(0))
+
+
+def _observed(plant: Plant) -> jax.Array:
+    return plant.state
+
+
+def _controlled(world: LQR, plant: Plant, control: jax.Array, key: Any) -> Timestep:
+    del key
+    world = jax.tree.map(jnp.asarray, world)
+    none = jnp.zeros_like(plant.violation)
+    state, total, violation = _after(world, plant.state, control, none, plant.violation)
+    after = Plant(state, violation, plant.time + 1)
+    return Timestep(
+        after, -total, after.time >= world.horizon, cost=violation - plant.violation)
 
 
 # --- the best controls, on the host -----------------------------------------------------------

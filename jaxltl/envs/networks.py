@@ -8,12 +8,25 @@ last, for networks of a few nodes, where whole rows of lanes are far faster than
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.tree_util import Partial
+
+from jaxltl.core.models.environment import (
+    Agent,
+    Box,
+    Environment,
+    Finite,
+    clipped_action,
+    flat_observation,
+)
 
 ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "relu": lambda x: jnp.maximum(x, 0),
@@ -263,3 +276,59 @@ def weighted(weight: jax.Array, inputs: jax.Array) -> jax.Array:
     while len(terms) > 1:  # pairwise, which is also more exact
         terms = [sum(terms[i + 1 : i + 2], start=terms[i]) for i in range(0, len(terms), 2)]
     return terms[0]
+
+
+# --- as agents ------------------------------------------------------------------------------------
+
+
+def network_agent(network: Network, environment: Environment) -> Partial:
+    """``parameters float[D] -> Agent``: the policies of a network in an environment.
+
+    A network reads the observation as one vector. Its outputs are the action where that is a box,
+    the nearest one in it; else one number for each action, of which the largest of those that are
+    allowed is taken.
+
+    Args:
+      network: from :func:`make_network`.
+      environment: what it is to act in.
+
+    Raises:
+      ValueError: other inputs than the environment observes, or outputs than it has actions.
+
+    Example:
+      >>> from jaxltl.core.models.environment import Timestep, make_environment
+      >>> world = make_environment(
+      ...     lambda key: jnp.ones(2), lambda x, a, key: Timestep(x, 0.0, False), lambda x: x,
+      ...     actions=3)
+      >>> agent = network_agent(make_network("2-3", biases=False), world)
+      >>> act = agent(jnp.array([1.0, 2.0, 0.0, 0.0, 1.0, 0.0])).act
+      >>> act((), jnp.ones(2), None, None)[0].tolist()
+      1
+    """
+    actions, shown = environment.actions, environment.observations
+    inputs = sum(math.prod(x.shape) for x in jax.tree.leaves(
+        shown, is_leaf=lambda x: isinstance(x, Box)))
+    outputs = actions.num if isinstance(actions, Finite) else math.prod(actions.shape)
+    if (network.sizes[0], network.sizes[-1]) != (inputs, outputs):
+        raise ValueError(
+            f"the network has the sizes {network.sizes}; the environment has {inputs} "
+            f"observations, its inputs, and its actions take {outputs} outputs.")
+    return Partial(_agent, network, actions)
+
+
+def _agent(network: Network, actions: Finite | Box, parameters: jax.Array) -> Agent:
+    # Taken apart here, for inside of a loop over steps it would be in every pass.
+    parts = padded(layers(network, parameters))
+    return Agent(Partial(_act, network, actions, parts))
+
+
+def _act(
+    network: Network, actions: Finite | Box, parts: Layers, memory: Any, observation: Any,
+    allowed: Any, key: chex.PRNGKey,
+) -> tuple[jax.Array, Any]:
+    del key
+    said = apply_layers(network, parts, flat_observation(observation).astype(parts[0][0].dtype))
+    if isinstance(actions, Box):
+        return clipped_action(actions, said.reshape(actions.shape).astype(actions.dtype)), memory
+    best = jnp.argmax(said if allowed is None else jnp.where(allowed, said, -jnp.inf))
+    return best.astype(jnp.int32), memory

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from jaxltl.envs.lqr import evaluator, lqr, optimum, simulate
-from jaxltl.envs.networks import apply, make_network
+from jaxltl.core.models.environment import run_episode
+from jaxltl.core.values.episode_scores import episode_evaluator
+from jaxltl.envs.lqr import as_environment, evaluator, lqr, optimum, simulate
+from jaxltl.envs.networks import apply, make_network, network_agent
 from tests.support import counted_traces
 
 RNG = np.random.default_rng(1)
@@ -243,3 +245,24 @@ def test_networks_that_do_not_fit_are_refused():
             make(lqr(), "3-2-1")
     with pytest.raises(ValueError, match="has 9 parameters"):
         evaluator(lqr(), "2-2-1")(jnp.zeros(8), None)
+
+
+@pytest.mark.parametrize("world", [lqr(), other_world()])
+def test_the_environment_is_the_run(world):
+    """Episodes of a network add up to what the evaluation of its run says."""
+    n, m = world.control.shape
+    network = make_network((n, 3, m))
+    environment = as_environment(world)
+    parameters = jnp.asarray(RNG.normal(size=(4, network.num_parameters)))
+    agent = network_agent(network, environment)
+    evaluate = episode_evaluator(environment, agent, costs="cost", num_episodes=1)
+    reward, cost = jax.vmap(evaluate, (0, None))(parameters, jax.random.key(0))
+    objective, violation = jax.vmap(evaluator(world, network), (0, None))(parameters, None)
+    np.testing.assert_allclose(reward / world.scale, objective, rtol=1e-9)
+    np.testing.assert_allclose(cost, violation, rtol=1e-9)
+    episode = run_episode(
+        jax.random.key(0), environment, agent(parameters[0]), num_steps=world.horizon + 2)
+    run = simulate(world, network, parameters[0])
+    assert episode.valid.sum() == world.horizon and episode.terminated
+    np.testing.assert_allclose(episode.world.state[: world.horizon + 1], run.state, rtol=1e-9)
+    np.testing.assert_allclose(episode.action[: world.horizon], run.control, rtol=1e-9)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxltl.core.models.environment import Timestep, box, make_environment
 from jaxltl.envs.networks import (
     ACTIVATIONS,
     apply,
@@ -12,6 +13,7 @@ from jaxltl.envs.networks import (
     apply_layers,
     layers,
     make_network,
+    network_agent,
     num_parameters,
     weighted,
 )
@@ -109,3 +111,29 @@ def test_shapes_that_do_not_fit_are_refused():
     for inputs in ((3, 4), (2,), (2, 5)):
         with pytest.raises(ValueError, match=r"ends in the lanes \[4\]"):
             apply_lanes(network, jnp.zeros((9, 4)), jnp.zeros(inputs))
+
+
+def world_of(actions, **more):
+    return make_environment(
+        lambda key: jnp.zeros(2), lambda world, action, key: Timestep(world, 0.0, False),
+        lambda world: {"a": world, "b": world > 0}, actions=actions, **more)
+
+
+def test_networks_act():
+    """The nearest action of a box, or the best that is allowed."""
+    parameters = jnp.asarray(np.random.default_rng(0).normal(size=20))
+    seen = {"a": jnp.array([0.4, -0.3]), "b": jnp.array([True, False])}
+    said = np.array([0.4, -0.3, 1.0, 0.0]) @ np.asarray(parameters[:16]).reshape(4, 4)
+    said += np.asarray(parameters[16:])
+    network = make_network("4-4")
+    agent = network_agent(network, world_of(box(-0.5, 0.5, (2, 2))))(parameters)
+    action, memory = agent.act((), seen, None, None)
+    np.testing.assert_allclose(action, np.clip(said, -0.5, 0.5).reshape(2, 2))
+    assert memory == () and np.abs(action).max() == 0.5
+    agent = network_agent(network, world_of(4))(parameters)
+    assert agent.act((), seen, None, None)[0] == said.argmax()
+    allowed = np.arange(4) != said.argmax()
+    assert agent.act((), seen, jnp.asarray(allowed), None)[0] == np.where(
+        allowed, said, -np.inf).argmax()
+    with pytest.raises(ValueError, match="4 observations, its inputs, and its actions take 3"):
+        network_agent(network, world_of(3))

@@ -24,6 +24,7 @@ from jaxltl.core.host.bounded_mean import bounded_mean
 from jaxltl.core.models.environment import (
     Agent,
     Environment,
+    allowed_in,
     as_partial,
     begin_episode,
     continue_episode,
@@ -274,11 +275,10 @@ def evaluate(
       >>> print(str(found).rpartition("\\n")[2].strip())
       success is not at least 0.8
     """
-    num_steps = _checked_steps(environment, num_steps)
+    num_steps = checked_steps(environment, num_steps)
     _check_numbers(num_episodes, batch, confidence, threshold, discount)
-    agent = _checked_agent(agent, environment)
-    counted = jax.eval_shape(environment.reset, key)
-    if threshold is not None and task_world(counted) is None:
+    agent, world = _checked_agent(agent, environment)
+    if threshold is not None and task_world(world) is None:
         raise ValueError(
             f"threshold={threshold}, but the environment has no task; make one with "
             "task_environment.")
@@ -401,7 +401,8 @@ def _mean_error(x: Any) -> tuple[float, float]:
 # --- checks ---------------------------------------------------------------------------------------
 
 
-def _checked_steps(environment: Environment, num_steps: int | None) -> int:
+def checked_steps(environment: Environment, num_steps: int | None) -> int:
+    """After how many steps episodes are cut off; refused if nothing tells."""
     steps = environment.horizon if num_steps is None else num_steps
     if steps is None:
         raise ValueError(
@@ -425,8 +426,8 @@ def _check_numbers(
             raise ValueError(f"{name}={share}; it must be between 0 and 1, and neither.")
 
 
-def _checked_agent(agent: Any, environment: Environment) -> Agent:
-    """An agent as a tree of arrays, whose actions are the environment's."""
+def _checked_agent(agent: Any, environment: Environment) -> tuple[Agent, Any]:
+    """An agent as a tree of arrays, whose actions are the environment's; and the world's shapes."""
     if not isinstance(agent, Agent):
         raise ValueError(
             f"agent is {type(agent).__name__}; give an Agent, such as ppo.policy(state, problem, "
@@ -434,16 +435,16 @@ def _checked_agent(agent: Any, environment: Environment) -> Agent:
     agent = replace(agent, act=as_partial(agent.act))
 
     def first(key: chex.PRNGKey) -> Any:
-        now, path = begin_episode(key, environment, agent)
-        world, allowed = now.world, environment.allowed
-        mask = None if allowed is None else allowed(world)
-        return agent.act(agent.memory, environment.observe(world), mask, path)[0]
+        world = environment.reset(key)
+        seen, mask = environment.observe(world), allowed_in(environment, world)
+        return agent.act(agent.memory, seen, mask, key)[0], world
 
-    found, space = jax.eval_shape(first, jax.random.key(0)), some_action(environment.actions)
+    found, world = jax.eval_shape(first, jax.random.key(0))
+    space = some_action(environment.actions)
     whole = jnp.issubdtype(space.dtype, jnp.integer)
     if getattr(found, "shape", None) != space.shape or (
             whole and not jnp.issubdtype(found.dtype, jnp.integer)):
         raise ValueError(
             f"the agent's action is {found}; the environment takes {space.dtype}"
             f"{list(space.shape)}.")
-    return agent
+    return agent, world
