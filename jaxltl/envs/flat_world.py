@@ -1,0 +1,168 @@
+"""FlatWorld: a point among coloured discs on a square (Voloshin, Verma and Yue 2023).
+
+As the authors' program and that of Jackermeier and Abate (2025) have it: nine discs of seven
+colours in ``[-2, 2]^2``, some of which overlap, so that several colours may hold at once; a
+velocity in ``[-1, 1]^2`` moves the point by .08 of it, and whoever leaves the square has ended the
+episode, with a reward of -1. Only the position is seen, which by itself tells where the discs are,
+since they never move. Episodes begin anywhere outside of all discs, at one of very many places that
+were drawn so beforehand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.tree_util import Partial
+
+from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
+from jaxltl.core.models.time_limit import with_time_limit, without_time_limit
+
+# Colour, place and radius of each disc.
+DISCS = (
+    ("red", -1.4, 0.55, 0.4), ("magenta", -1.1, 1.1, 0.5), ("yellow", -1.0, -1.2, 0.3),
+    ("orange", -1.53, -0.5, 0.32), ("blue", 0.1, 0.0, 0.8), ("red", 0.5, -1.3, 0.35),
+    ("green", 0.7, 0.7, 0.5), ("green", 1.5, -0.75, 0.4), ("aqua", 0.8, 0.2, 0.3),
+)
+_ROOT = 0.5 ** 0.5
+_MOVES = ((0, 1), (1, 0), (0, -1), (-1, 0), (_ROOT, _ROOT), (_ROOT, -_ROOT), (-_ROOT, _ROOT),
+          (-_ROOT, -_ROOT), (0, 0))
+
+
+class FlatState(NamedTuple):
+    """Where one is: `place` is ``float32[2]``."""
+
+    place: Any
+
+
+@struct.dataclass
+class Discs:
+    """Discs and their colours.
+
+    Attributes:
+      center: ``float32[D, 2]``.
+      radius: ``float32[D]``.
+      color: ``bool[D, P]``, the colour of each, as one of the propositions.
+    """
+
+    center: Any
+    radius: Any
+    color: Any
+
+
+def flat_world(
+    *,
+    discs: Sequence[tuple[str, float, float, float]] = DISCS,
+    extent: float = 2.0,
+    time_step: float = 0.08,
+    horizon: int | None = 500,
+    discrete: bool = False,
+    start: Sequence[float] | None = None,
+    num_starts: int = 2**16,
+    seed: int = 0,
+) -> Environment:
+    """The flat world.
+
+    Args:
+      discs: ``(colour, x, y, radius)`` of each; the colours, sorted, are the propositions.
+      extent: half a side of the square.
+      time_step: how far a velocity of one goes.
+      horizon: after how many steps an episode is truncated; None: never.
+      discrete: nine actions: up, right, down, left, the four diagonals, each with velocity one,
+        and rest; instead of a box.
+      start: where episodes begin; default uniform outside of all discs.
+      num_starts, seed: how many places are drawn for that, and from what.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Environment`, whose worlds are :class:`FlatState`,
+      or with a horizon pairs of one and the time. Observations are ``float32[2]``.
+
+    Raises:
+      ValueError: no disc, or one without a radius; numbers that are not positive; a start outside
+        of the square; or discs that hardly leave a place to begin.
+
+    Example:
+      >>> world = flat_world()
+      >>> world.propositions
+      ('aqua', 'blue', 'green', 'magenta', 'orange', 'red', 'yellow')
+      >>> here = world.reset(jax.random.key(0))
+      >>> world.labels(here).tolist()
+      [False, False, False, False, False, False, False]
+    """
+    names = tuple(sorted({name for name, *_ in discs}))
+    numbers = np.array([rest for _, *rest in discs], np.float32).reshape(-1, 3)
+    if not len(numbers) or not np.isfinite(numbers).all() or not (numbers[:, 2] > 0).all():
+        raise ValueError("flat_world: discs are (colour, x, y, radius), at least one, with radii "
+                         "above zero.")
+    if not (extent > 0 and time_step > 0):
+        raise ValueError(f"extent={extent}, time_step={time_step}; both must be positive.")
+    if start is not None and not (np.shape(start) == (2,) and np.abs(start).max() <= extent):
+        raise ValueError(f"start={start!r}; give a place (x, y) within {extent} of the middle.")
+    color = np.array([[name == one for one in names] for name, *_ in discs])
+    scene = Discs(numbers[:, :2], numbers[:, 2], color)
+    number = np.array([extent, time_step], np.float32)
+    if start is not None:
+        reset = Partial(_begin_at, np.asarray(start, np.float32))
+    else:
+        reset = Partial(_begin, _free_places(scene, extent, num_starts, seed))
+    velocity: Any = 9 if discrete else box(-1, 1, (2,), np.float32)
+    most = extent + time_step  # of the step that leaves the square the place outside is seen
+    world = make_environment(
+        reset, Partial(_move, number, np.array(_MOVES, np.float32) if discrete else None), _see,
+        actions=velocity, labels=Partial(_labels, scene), propositions=names,
+        observations=box(-most, most, (2,), np.float32))
+    return world if horizon is None else with_time_limit(world, horizon)
+
+
+def discs_of(environment: Environment) -> Discs:
+    """The discs of a flat world."""
+    return without_time_limit(environment)[0].labels.args[0]  # type: ignore[attr-defined]
+
+
+def _free_places(scene: Discs, extent: float, count: int, seed: int) -> np.ndarray:
+    """``float32[count, 2]``, uniform outside of all discs."""
+    if count < 1:
+        raise ValueError(f"num_starts={count}; it must be at least 1.")
+    random, found, rounds = np.random.default_rng(seed), [np.zeros((0, 2), np.float32)], 0
+    while (have := sum(map(len, found))) < count:
+        if (rounds := rounds + 1) > 20 and have < 0.01 * rounds * count:
+            raise ValueError("flat_world: the discs hardly leave a place to begin; give start.")
+        places = random.uniform(-extent, extent, (count, 2)).astype(np.float32)
+        apart = ((places[:, None] - scene.center) ** 2).sum(axis=-1)
+        found.append(places[(apart >= scene.radius**2).all(axis=1)])
+    return np.concatenate(found)[:count]
+
+
+def _begin(places: chex.Array, key: chex.PRNGKey) -> FlatState:
+    drawn = jax.random.bits(key, (), jnp.uint32) % np.uint32(places.shape[0])
+    return FlatState(jnp.asarray(places)[drawn])
+
+
+def _begin_at(place: chex.Array, key: chex.PRNGKey) -> FlatState:
+    del key
+    return FlatState(jnp.asarray(place))
+
+
+def _move(
+    number: chex.Array, moves: chex.Array | None, world: FlatState, action: Any, key: chex.PRNGKey
+) -> Timestep:
+    del key
+    velocity = jnp.clip(action, -1, 1) if moves is None else jnp.asarray(moves)[action]
+    place = (world.place + number[1] * velocity).astype(jnp.float32)
+    left = (jnp.abs(place) > number[0]).any()
+    return Timestep(FlatState(place), jnp.where(left, -1.0, 0.0), left)
+
+
+def _see(world: FlatState) -> jax.Array:
+    return world.place
+
+
+def _labels(scene: Discs, world: FlatState) -> jax.Array:
+    apart = jnp.sum((world.place - scene.center) ** 2, axis=-1)
+    inside = apart < scene.radius**2
+    return (scene.color & inside[:, None]).any(axis=0)

@@ -1,0 +1,232 @@
+"""A point robot among coloured zones (Vaezipoor et al. 2021, section 5.1, "ZoneEnv").
+
+Two zones of each of four colours lie in a walled square of 5 x 5; the robot accelerates and turns,
+and sees how near the zones are in each of 16 directions. Zones and robot are placed anew for each
+episode, apart from one another. Sizes, sensors and colours are those of Jackermeier and Abate
+(2025), whose robot, like the first one, is the point of Safety Gym, simulated by MuJoCo.
+
+The robot here is that point as a formula. Its thrust is limited to ``.3 * .05``, against a
+damping of .01 and its mass, ``4/3 pi .1^3 + .1^3`` at a density of one: it tends to 1.5 units a
+second with a time constant of .52 seconds. Its turning adapts within 6 milliseconds, which is taken
+for at once: ``3.16 * turn`` radians a second, at most 3. A step is .02 seconds, integrated exactly
+but for the turn, whose middle is taken. Readings: walls stop what runs into them, without
+bouncing; their four sensors read how near they are; and sensors that never change are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.tree_util import Partial
+
+from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
+from jaxltl.core.models.time_limit import with_time_limit
+
+COLORS = ("green", "yellow", "blue", "magenta")
+_MASS = 4 / 3 * np.pi * 0.1**3 + 0.1**3
+_KEEPOUT = 0.55, 0.4  # of a zone and of the robot: how near others may come, together
+_ROBOT = 0.1  # its radius
+_BINS = 16
+
+
+class ZoneState(NamedTuple):
+    """A robot among zones.
+
+    Attributes:
+      place, velocity: ``float32[2]``, in the frame of the walls.
+      heading: ``float32[]``, radians.
+      acceleration: ``float32[2]``, that of the last step.
+      turning: ``float32[]``, radians a second, of the last step.
+      zone: ``float32[P, N, 2]``, the places of each colour's zones.
+    """
+
+    place: Any
+    velocity: Any
+    heading: Any
+    acceleration: Any
+    turning: Any
+    zone: Any
+
+
+@struct.dataclass
+class _Numbers:
+    radius: Any
+    extent: Any
+    time_step: Any
+    thrust: Any  # the acceleration
+    saturation: Any  # the action from which on it is that
+    drag: Any  # what a second leaves of a velocity is exp(-drag)
+    turn: Any
+    most_turn: Any
+    gain: Any
+
+
+def zone_world(
+    *,
+    colors: Sequence[str] = COLORS,
+    zones: int = 2,
+    radius: float = 0.4,
+    extent: float = 2.5,
+    horizon: int | None = 1000,
+    saturation: float = 0.05,
+    num_maps: int = 1024,
+    seed: int = 0,
+) -> Environment:
+    """The zone world.
+
+    Actions are ``float32[2]`` in [-1, 1], thrust and turn. Observations are ``float32[16 P + 11]``:
+    for each colour how near the nearest zone is in each direction, ``exp(-d / 2)``, counted from
+    the robot's front and shared between neighbouring directions; then acceleration and velocity in
+    the robot's frame, its turning, its heading as cosine and sine, and how near the walls are, in
+    the order east, north, west, south.
+
+    Args:
+      colors: the propositions, each true in the zones of its colour.
+      zones: how many of each colour.
+      radius: of a zone.
+      extent: half a side.
+      horizon: after how many steps an episode is truncated; None: never.
+      saturation: the thrust from which on more has no effect; as published, .05, a thrust is
+        nearly always full, forwards or backwards.
+      num_maps: how many placements are drawn beforehand. Each has eight turns and reflections, and
+        its zones get their colours anew.
+      seed: of that drawing.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Environment`, whose worlds are :class:`ZoneState`, or
+      with a horizon pairs of one and the time.
+
+    Raises:
+      ValueError: numbers that are not positive, a colour twice, or zones that do not fit apart from
+        one another.
+
+    Example:
+      >>> world = zone_world(num_maps=8)
+      >>> world.propositions, world.observations.shape, world.actions.shape
+      (('green', 'yellow', 'blue', 'magenta'), (75,), (2,))
+    """
+    names = tuple(colors)
+    for name, number in (("radius", radius), ("extent", extent), ("saturation", saturation),
+                         ("zones", zones), ("num_maps", num_maps), ("colors", len(names))):
+        if not number > 0:
+            raise ValueError(f"zone_world: {name}={number}; it must be positive.")
+    places = draw_places(len(names) * zones, extent, num_maps, seed)
+    numbers = _Numbers(*(np.float32(x) for x in (
+        radius, extent, 0.02, 0.3 * 0.05 / _MASS, saturation, 0.01 / _MASS, 0.3 / 0.095, 3.0, 0.5)))
+    count = len(names) * _BINS + 11
+    world = make_environment(
+        Partial(_begin, places.astype(np.float32), np.zeros((zones, len(names)))),
+        Partial(_move, numbers), Partial(_see, numbers), actions=box(-1, 1, (2,), np.float32),
+        labels=Partial(_labels, numbers), propositions=names,
+        observations=box(-np.inf, np.inf, (count,), np.float32))
+    return world if horizon is None else with_time_limit(world, horizon)
+
+
+def draw_places(count: int, extent: float, num_maps: int, seed: int = 0) -> np.ndarray:
+    """``float64[M, count + 1, 2]``: zones, and the robot last, drawn one after the other.
+
+    Each is uniform in the square but for its keepout (.55 of a zone, .4 of the robot), and tried
+    again where it is nearer to an earlier one than both keepouts; a map on which something finds no
+    place is given up.
+
+    Raises:
+      ValueError: hardly any map is completed.
+    """
+    random, found, rounds = np.random.default_rng(seed), [np.zeros((0, count + 1, 2))], 0
+    while (have := sum(map(len, found))) < num_maps:
+        rounds += 1
+        too_many = count * _KEEPOUT[0] ** 2 * np.pi > 4 * extent**2
+        if (rounds > 4 and have < 2 * rounds) or too_many or extent <= _KEEPOUT[0]:
+            raise ValueError(f"zone_world: {count} zones hardly fit into a square of {2 * extent} "
+                             "a side, apart from one another; take fewer, or a larger extent.")
+        maps, good = np.zeros((512, count + 1, 2)), np.ones(512, bool)
+        for i in range(count + 1):
+            own = _KEEPOUT[i == count]
+            tries = random.uniform(own - extent, extent - own, (512, 100, 1, 2))
+            apart = np.linalg.norm(tries - maps[:, None, :i], axis=-1)
+            free = (apart >= own + _KEEPOUT[0]).all(axis=-1)
+            maps[:, i] = tries[np.arange(512), free.argmax(axis=1), 0]
+            good &= free.any(axis=1)
+        found.append(maps[good])
+    return np.concatenate(found)[:num_maps]
+
+
+# --- of one trajectory ----------------------------------------------------------------------------
+
+
+def _begin(places: chex.Array, each: chex.Array, key: chex.PRNGKey) -> ZoneState:
+    zones, colors = each.shape
+    bits = jax.random.bits(key, zones * colors + 3, jnp.uint32)
+    drawn = jnp.asarray(places)[bits[0] % np.uint32(places.shape[0])]
+    flip = (bits[1] >> np.arange(3, dtype=np.uint32)) & 1
+    drawn = drawn * jnp.where(flip[:2], -1, 1)
+    drawn = jnp.where(flip[2], drawn[:, ::-1], drawn).astype(jnp.float32)
+    rank = (bits[3:, None] > bits[3:]).sum(axis=1)
+    rank += ((bits[3:, None] == bits[3:]) & np.tri(zones * colors, k=-1, dtype=bool)).sum(axis=1)
+    zone = drawn[:-1][rank].reshape(colors, zones, 2)
+    heading = bits[2].astype(jnp.float32) * np.float32(2 * np.pi / 2**32)
+    zero = jnp.zeros(2, jnp.float32)
+    return ZoneState(drawn[-1], zero, heading, zero, jnp.float32(0), zone)
+
+
+def _ahead(heading: jax.Array) -> jax.Array:
+    return jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+
+
+def _move(n: _Numbers, world: ZoneState, action: Any, key: chex.PRNGKey) -> Timestep:
+    del key
+    action = jnp.clip(action, -1, 1).astype(jnp.float32)
+    turning = jnp.clip(n.turn * action[1], -n.most_turn, n.most_turn)
+    heading = world.heading + turning * n.time_step
+    thrust = n.thrust * jnp.clip(action[0] / n.saturation, -1, 1)
+    toward = thrust / n.drag * _ahead(world.heading + turning * n.time_step / 2)
+    kept = jnp.exp(-n.drag * n.time_step)
+    velocity = toward + kept * (world.velocity - toward)
+    place = world.place + n.time_step * toward + (
+        (1 - kept) / n.drag * (world.velocity - toward))
+    most = n.extent - _ROBOT
+    stopped = jnp.abs(place) > most
+    velocity = jnp.where(stopped, 0, velocity)
+    place = jnp.clip(place, -most, most)
+    acceleration = (velocity - world.velocity) / n.time_step
+    heading = heading % np.float32(2 * np.pi)
+    return Timestep(ZoneState(place, velocity, heading, acceleration, turning, world.zone), 0.0,
+                    jnp.bool_(False))
+
+
+def _own_frame(heading: jax.Array, vector: jax.Array) -> jax.Array:
+    """``float[..., 2]`` as parts ahead and to the left."""
+    x, y = _ahead(heading)
+    return jnp.stack([vector[..., 0] * x + vector[..., 1] * y,
+                      vector[..., 1] * x - vector[..., 0] * y], axis=-1)
+
+
+def _lidar(n: _Numbers, world: ZoneState) -> jax.Array:
+    """``float32[P, 16]``: bin i is the front's i-th sixteenth of a turn to the left."""
+    seen = _own_frame(world.heading, world.zone - world.place)
+    near = jnp.exp(-n.gain * jnp.linalg.norm(seen, axis=-1))
+    turn = jnp.arctan2(seen[..., 1], seen[..., 0]) / (2 * np.pi) * _BINS % _BINS
+    bin_, bins = jnp.floor(turn), jnp.arange(_BINS)
+    rest = (turn - bin_)[..., None]
+    at = (bins - bin_[..., None]) % _BINS
+    share = jnp.where(at == 0, 1, jnp.where(at == 1, rest, jnp.where(at == _BINS - 1, 1 - rest, 0)))
+    return (near[..., None] * share).max(axis=-2).astype(jnp.float32)
+
+
+def _see(n: _Numbers, world: ZoneState) -> jax.Array:
+    walls = jnp.exp(-n.gain * jnp.concatenate([n.extent - world.place, n.extent + world.place]))
+    return jnp.concatenate([
+        _lidar(n, world).ravel(), _own_frame(world.heading, world.acceleration),
+        _own_frame(world.heading, world.velocity), world.turning[None], _ahead(world.heading),
+        walls]).astype(jnp.float32)
+
+
+def _labels(n: _Numbers, world: ZoneState) -> jax.Array:
+    apart = jnp.sum((world.zone - world.place) ** 2, axis=-1)
+    return (apart <= n.radius ** 2).any(axis=-1)
