@@ -557,7 +557,8 @@ def _as_arrays(observations: Any) -> Any:
 
 def _alike(described: Any, other: Any) -> bool:
     """Whether two trees are the same; classes of nodes may have an idea of their own of ``==``."""
-    return jax.tree.structure(described) == jax.tree.structure(other) and (
+    same: Any = jax.tree.structure(described)
+    return same == jax.tree.structure(other) and (
         jax.tree.leaves(described) == jax.tree.leaves(other))
 
 

@@ -98,13 +98,15 @@ def arrays(tree: Any, like: Any = None) -> Any:
     A tree of another structure is returned as it is, for the checks to tell.
     """
     like = tree if like is None else like
-    alike = jax.tree.structure(tree) == jax.tree.structure(like)
-    if not alike:
+    kind: Any = jax.tree.structure(like)
+    if kind != jax.tree.structure(tree):
         return tree
 
     def typed(x: Any, y: Any) -> Any:
-        kind = jnp.result_type(y)
-        return x if jnp.issubdtype(kind, jax.dtypes.extended) else lax.convert_element_type(x, kind)
+        dtype = jnp.result_type(y)
+        if jnp.issubdtype(dtype, jax.dtypes.extended):  # a key
+            return x
+        return lax.convert_element_type(x, dtype)
 
     return jax.tree.map(typed, tree, like)
 
