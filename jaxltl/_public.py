@@ -88,6 +88,8 @@ from jaxltl.core.values.bounded import (
 )
 from jaxltl.core.values.data_guarantee import DataGuarantee, guarantee_curve, learn_guarantee
 from jaxltl.core.values.discounted import optimal_value, policy_value
+from jaxltl.core.values.episode_scores import episode_evaluator
+from jaxltl.core.values.evaluation import Estimate, Evaluation, evaluate
 from jaxltl.core.values.mean_payoff import mean_payoff
 from jaxltl.core.values.minimax import minimax_value, strategy_value
 from jaxltl.core.values.multi_objective import achievable, multi, pareto
@@ -153,6 +155,8 @@ __all__ = [
     "DenseMDP",
     "Environment",
     "Episode",
+    "Estimate",
+    "Evaluation",
     "Finite",
     "FiniteMemoryPolicy",
     "Formula",
@@ -205,6 +209,8 @@ __all__ = [
     "cumulative_reward",
     "end_components",
     "environment_of",
+    "episode_evaluator",
+    "evaluate",
     "exists_successor",
     "expectation",
     "feature_expectation",

@@ -28,23 +28,24 @@ STOREYS = (
 )
 # What a private helper helps is one learner; these serve several.
 SHARED_BY_LEARNERS = (
-    "checkpoint", "early_stopping", "exponential_family", "learner", "pac", "play", "schedules",
-    "splitmix",
+    "advantages", "checkpoint", "early_stopping", "exponential_family", "learner", "moments", "pac",
+    "play", "schedules", "splitmix",
 )
 NO_JAX = ("core.logic", "core.host", "core.automata")
 
 
 PUBLIC = [
     "GR1", "MDP", "Agent", "Automaton", "Box", "ConfidenceSets", "DataGuarantee", "DenseMDP",
-    "Environment", "Episode", "Finite", "FiniteMemoryPolicy", "Formula", "Game", "IntervalMDP",
-    "Monitor", "NotConverged", "Objective", "OptimalActions", "OptimalityGap", "ParametricMDP",
-    "Parity", "Permissive", "Prepared", "PreparedInterval", "Product", "Rewards", "ShieldedWorld",
-    "Solution", "SparseMDP", "Status", "Table", "TaskObservation", "TaskWorld", "Timestep",
-    "Trajectories", "TransitionCounts", "Verdict", "Verification", "Winning", "achievable",
-    "agent_of", "almost_sure_buchi", "almost_surely_reaching", "answer", "apply_strategy",
-    "attractor", "average_reward", "avoidable", "boltzmann_fixed_points", "boltzmann_value",
-    "bounded_reachability", "box", "buchi", "check", "cobuchi", "complement", "counted_model",
-    "counts_on", "cumulative_reward", "end_components", "environment_of", "exists_successor",
+    "Environment", "Episode", "Estimate", "Evaluation", "Finite", "FiniteMemoryPolicy", "Formula",
+    "Game", "IntervalMDP", "Monitor", "NotConverged", "Objective", "OptimalActions",
+    "OptimalityGap", "ParametricMDP", "Parity", "Permissive", "Prepared", "PreparedInterval",
+    "Product", "Rewards", "ShieldedWorld", "Solution", "SparseMDP", "Status", "Table",
+    "TaskObservation", "TaskWorld", "Timestep", "Trajectories", "TransitionCounts", "Verdict",
+    "Verification", "Winning", "achievable", "agent_of", "almost_sure_buchi",
+    "almost_surely_reaching", "answer", "apply_strategy", "attractor", "average_reward",
+    "avoidable", "boltzmann_fixed_points", "boltzmann_value", "bounded_reachability", "box",
+    "buchi", "check", "cobuchi", "complement", "counted_model", "counts_on", "cumulative_reward",
+    "end_components", "environment_of", "episode_evaluator", "evaluate", "exists_successor",
     "expectation", "feature_expectation", "find_difference", "forall_successor", "from_brax",
     "from_craftax", "from_dense", "from_gymnasium", "from_gymnax", "from_jumanji", "from_navix",
     "from_pgx", "from_stormpy", "from_xminigrid", "generalized_buchi", "gr1", "grid_game",
