@@ -18,6 +18,7 @@ from tests import reference
 from tests.support import as_mdp
 
 S, A, K = 6, 2, 3
+COUNT = 4000
 MODEL = reference.random_model(np.random.default_rng(1), S, A, K, certainty=0)
 LABEL = np.random.default_rng(3).random((S, 2)) < .4
 
@@ -50,17 +51,22 @@ def test_what_is_told_is_the_model(kind):
         assert environment.observe(states[s]).tolist() == np.eye(S)[s].tolist()
 
 
-def test_what_is_drawn_is_as_likely_as_told():
-    environment, count = environment_of(world()), 4000
-    keys = jax.random.split(jax.random.key(0), count)
+def drawn_and_told(environment, told):
+    """How far the shares of what is drawn are from ``float[S, A, S]``, at most."""
+    keys = jax.random.split(jax.random.key(0), COUNT)
     states, actions = np.argwhere(MODEL.available).T
     draw = jax.jit(jax.vmap(jax.vmap(
         lambda s, a, key: environment.step(s, a, key).world, (None, None, 0)), (0, 0, None)))
     drawn = np.asarray(draw(states, actions, keys))
     share = (drawn[..., None] == np.arange(S)).mean(1)
-    assert np.abs(share - MODEL.transition[states, actions]).max() < 4 * .5 / np.sqrt(count)
-    first = np.asarray(jax.vmap(environment.reset)(keys))
-    assert np.abs(np.bincount(first, minlength=S) / count - MODEL.initial).max() < .04
+    return np.abs(share - told[states, actions]).max()
+
+
+def test_what_is_drawn_is_as_likely_as_told():
+    environment = environment_of(world())
+    assert drawn_and_told(environment, MODEL.transition) < 4 * .5 / np.sqrt(COUNT)
+    first = np.asarray(jax.vmap(environment.reset)(jax.random.split(jax.random.key(0), COUNT)))
+    assert np.abs(np.bincount(first, minlength=S) / COUNT - MODEL.initial).max() < .04
 
 
 def test_rewards_are_of_states_or_actions():
@@ -126,12 +132,7 @@ def test_a_game_is_played_against_its_opponent():
         for s, a in np.ndindex(S, A):
             np.testing.assert_allclose(
                 told[s, a], MODEL.transition[s, a] if system[s] else replies[s], atol=1e-12)
-    state, count = 1, 4000
-    keys = jax.random.split(jax.random.key(0), count)
-    drawn = np.asarray(jax.jit(jax.vmap(
-        lambda key: environment.step(jnp.int32(state), jnp.int32(0), key).world))(keys))
-    share = np.bincount(drawn, minlength=S) / count
-    assert np.abs(share - told[state, 0]).max() < 4 * .5 / np.sqrt(count)
+    assert drawn_and_told(environment, told) < 4 * .5 / np.sqrt(COUNT)
 
 
 @pytest.mark.parametrize(("model", "options", "text"), [
