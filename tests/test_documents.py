@@ -3,8 +3,10 @@
 import os
 import re
 import shlex
+import warnings
 from pathlib import Path
 
+import jax
 import nbformat
 import pytest
 from click.testing import CliRunner
@@ -71,6 +73,23 @@ def test_the_page_on_tasks_in_environments_runs(capsys):
         exec(compile(code, "tasks-in-environments.md", "exec"), names)
     promised = re.findall(r"print\(.*\)\s+# ([^:\n]*)", page)
     assert len(promised) == 4 and capsys.readouterr().out.splitlines() == promised
+
+
+@pytest.mark.parametrize(
+    "name", ["brax", "craftax", "gymnax", "jumanji", "navix", "pgx", "xminigrid"])
+@pytest.mark.filterwarnings("ignore:Brax System:UserWarning")
+def test_the_page_on_environments_runs(name, capsys):
+    page = (ROOT / "docs" / "environments.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (code,) = (x for x in blocks if re.search(rf"^(import|from) {name}\b", x, re.MULTILINE))
+    assert len(blocks) == 7
+    with jax.enable_x64(False), warnings.catch_warnings():  # as the packages are imported
+        warnings.simplefilter("ignore", DeprecationWarning)
+        pytest.importorskip(name)
+        capsys.readouterr()
+        exec(compile(code, "environments.md", "exec"), {})
+    (promised,) = re.findall(r"print\(.*\)\s+# (.*)", code)
+    assert capsys.readouterr().out.splitlines() == [promised]
 
 
 def test_the_page_on_data_shows_what_the_command_prints(tmp_path, monkeypatch):
