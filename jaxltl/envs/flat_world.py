@@ -48,11 +48,13 @@ class Discs:
       center: ``float32[D, 2]``.
       radius: ``float32[D]``.
       color: ``bool[D, P]``, the colour of each, as one of the propositions.
+      extent: half a side of the square.
     """
 
     center: Any
     radius: Any
     color: Any
+    extent: Any
 
 
 def flat_world(
@@ -104,7 +106,7 @@ def flat_world(
     if start is not None and not (np.shape(start) == (2,) and np.abs(start).max() <= extent):
         raise ValueError(f"start={start!r}; give a place (x, y) within {extent} of the middle.")
     color = np.array([[name == one for one in names] for name, *_ in discs])
-    scene = Discs(numbers[:, :2], numbers[:, 2], color)
+    scene = Discs(numbers[:, :2], numbers[:, 2], color, np.float32(extent))
     number = np.array([extent, time_step], np.float32)
     if start is not None:
         reset = Partial(_begin_at, np.asarray(start, np.float32))
