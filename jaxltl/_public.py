@@ -125,9 +125,12 @@ from jaxltl.envs.adapters.jumanji import from_jumanji
 from jaxltl.envs.adapters.navix import from_navix
 from jaxltl.envs.adapters.pgx import from_pgx
 from jaxltl.envs.adapters.xminigrid import from_xminigrid
+from jaxltl.envs.flat_world import flat_world
 from jaxltl.envs.gridworld import gridworld
 from jaxltl.envs.gymnasium_tables import from_gymnasium
+from jaxltl.envs.letter_world import letter_world
 from jaxltl.envs.robots import grid_game
+from jaxltl.envs.zone_world import zone_world
 from jaxltl.io.hoa import read_hoa, write_hoa
 from jaxltl.io.log import read_labels, read_log
 from jaxltl.io.model_files import read_model, write_model
@@ -215,6 +218,7 @@ __all__ = [
     "expectation",
     "feature_expectation",
     "find_difference",
+    "flat_world",
     "forall_successor",
     "from_brax",
     "from_craftax",
@@ -237,6 +241,7 @@ __all__ = [
     "intervals_from_counts",
     "is_equivalent",
     "learn_guarantee",
+    "letter_world",
     "letters",
     "lift_memory",
     "lift_policy",
@@ -328,4 +333,5 @@ __all__ = [
     "with_time_limit",
     "write_hoa",
     "write_model",
+    "zone_world",
 ]
