@@ -44,7 +44,7 @@ def replaced(text: str, *replacements: tuple[str, str]) -> str:
 
 def stack(trees: Sequence[Any]) -> Any:
     """Trees of one shape as a batch."""
-    return jax.tree.map(lambda *x: jnp.asarray(np.stack([np.asarray(y) for y in x])), *trees)
+    return jax.device_put(jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *trees))
 
 
 def lane(tree: Any, i: int) -> Any:
@@ -55,7 +55,7 @@ def lane(tree: Any, i: int) -> Any:
             return x[i]
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
             return jax.random.wrap_key_data(np.asarray(jax.random.key_data(x))[i])
-        return jnp.asarray(np.asarray(x)[i])
+        return jax.device_put(np.asarray(x)[i])
 
     return jax.tree.map(one, tree)
 

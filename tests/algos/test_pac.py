@@ -11,13 +11,18 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.algos import pac
+from jaxltl.core.models import operators
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, from_dense, to_dense
-from jaxltl.core.models.operators import expectation, forall_successor
+from jaxltl.core.models.operators import expectation
 from tests.reference_games import buchi, random_game
 from tests.support import as_mdp, counted_traces
 
 SINGLE, DOUBLE = np.float32, np.float64
+
+# Compiled as wholes, which takes less long than operation by operation.
+forall_successor, hat_game, hat_strategy, recover_hat_strategy = map(jax.jit, (
+    operators.forall_successor, pac.hat_game, pac.hat_strategy, pac.recover_hat_strategy))
 
 
 # --- constants -----------------------------------------------------------------------------------
@@ -228,8 +233,9 @@ def test_states_that_are_proved_to_be_epsilon_optimal():
 
 def some_near(rng, game):
     """A random choice of moves, at least one of those available in each state."""
-    near = game.available & (rng.random(game.available.shape) < 0.5)
-    return near | (game.available & ~near.any(axis=1, keepdims=True))
+    available = np.asarray(game.available)
+    near = available & (rng.random(available.shape) < 0.5)
+    return near | (available & ~near.any(axis=1, keepdims=True))
 
 
 def library(play):
@@ -241,7 +247,8 @@ def test_the_hat_game_by_a_plain_reading():
     for _ in range(6):
         game = library(random_game(rng, 4, num_actions=3))
         near, p = some_near(rng, game), rng.random()
-        hat = pac.hat_game(game, near, p)
+        hat = jax.tree.map(np.asarray, hat_game(game, near, p))
+        game = jax.tree.map(np.asarray, game)
         count, old = game.num_states, np.asarray(to_dense(game.mdp).transition)
         new = np.asarray(to_dense(hat.mdp).transition)
         assert hat.num_states == 3 * count
@@ -293,6 +300,7 @@ def test_the_hat_game_is_one_that_may_be_built_and_compiled():
 
 
 def uniform(moves):
+    moves = np.asarray(moves)
     return moves / moves.sum(axis=1, keepdims=True)
 
 
@@ -301,14 +309,15 @@ def test_the_uniform_strategy_of_the_hat_game():
     for _ in range(20):
         game = library(random_game(rng, 5, num_actions=4))
         near, p = some_near(rng, game), rng.random()
-        hat = pac.hat_game(game, near, p)
-        found = pac.recover_hat_strategy(hat, uniform(hat.available))
-        expected = pac.hat_strategy(near, game.available, p)
+        hat = hat_game(game, near, p)
+        found = np.asarray(recover_hat_strategy(hat, uniform(hat.available)))
+        expected = np.asarray(hat_strategy(near, game.available, p))
         system = np.asarray(game.system)
         np.testing.assert_allclose(found[system], expected[system], rtol=1e-14)
         np.testing.assert_allclose(found[~system], uniform(game.available)[~system])
 
 
+@jax.jit
 def played(game, strategy):
     """The game in which the system's moves are drawn by a strategy, as its single move."""
     dense = to_dense(game.mdp)
@@ -351,12 +360,12 @@ def staying(play, accepting):
     """A game without the moves that leave where the system wins, and that region."""
     region = buchi(play, accepting, np.ones(len(accepting), bool))
     game = library(play)
-    leaves = region[:, None] & ~np.asarray(forall_successor(game, jnp.asarray(region)))
-    available = game.available & ~leaves
-    probability = game.mdp.probability * available[..., None]
+    leaves = region[:, None] & ~np.asarray(forall_successor(game, region))
+    available = np.asarray(game.available) & ~leaves
+    probability = np.asarray(game.mdp.probability) * available[..., None]
     model = replace(game.mdp, available=available, probability=probability)
     # Whether something was cut, where the system wins in some places and not in others.
-    cut = 0 < region.sum() < region.size and (game.available & leaves).any()
+    cut = 0 < region.sum() < region.size and (np.asarray(game.available) & leaves).any()
     return replace(game, mdp=model), region, bool(cut)
 
 
@@ -367,7 +376,7 @@ def test_the_hat_game_is_won_where_the_game_is():  # lemma 9
         accepting = rng.random(5) < 0.4
         game, region, cut = staying(random_game(rng, 5), accepting)
         np.testing.assert_array_equal(wins(game, accepting), region)
-        hat = pac.hat_game(game, some_near(rng, game), 0.3)
+        hat = hat_game(game, some_near(rng, game), 0.3)
         none = np.zeros(5, bool)
         found = wins(hat, np.concatenate([accepting, none, none]))
         # Whatever moves count as nearly best: those that win need not be among them.
@@ -386,7 +395,7 @@ def test_every_move_that_stays_in_the_region_is_enough():  # lemma 6
     for _ in range(50):
         accepting = rng.random(5) < 0.4
         game, region, cut = staying(random_game(rng, 5), accepting)
-        strategy = pac.hat_strategy(some_near(rng, game), game.available, 0.01)
+        strategy = hat_strategy(some_near(rng, game), game.available, 0.01)
         # Nowhere else can any strategy win, so this one wins where the system can.
         np.testing.assert_array_equal(wins(played(game, strategy), accepting), region)
         cuts += cut

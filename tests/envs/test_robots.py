@@ -30,9 +30,10 @@ UNAVAILABLE = {}
 
 def safe_part(game):
     """What is reachable where the system keeps from colliding for ever, all its safe moves free."""
-    collision = game.label[:, game.propositions.index("collision")]
-    region = ~attractor(game, collision, rule=~game.system).region
-    allowed = game.available & operators.forall_successor(game, region) & region[:, None]
+    collision = np.asarray(game.label)[:, game.propositions.index("collision")]
+    region = ~np.asarray(attractor(game, collision, rule=~np.asarray(game.system)).region)
+    stays = jax.jit(operators.forall_successor)(game, region)
+    allowed = np.asarray(game.available) & np.asarray(stays) & region[:, None]
     return restrict(game, allowed=allowed).model
 
 

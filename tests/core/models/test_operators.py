@@ -11,9 +11,19 @@ from tests import reference
 from tests.sparse_models import random_sparse
 from tests.support import REPRESENTATIONS, assert_gradients, mass_preserving, random_representation
 
-# Compiled as a whole, which takes less long than operation by operation.
+
+def whole(function):
+    """Compiled as a whole, which takes less long than operation by operation; for the host."""
+    compiled = jax.jit(function)
+    return lambda *arguments: jax.tree.map(np.asarray, compiled(*arguments))
+
+
 expectation, pushforward, exists_successor, forall_successor = map(
-    jax.jit, (jl.expectation, jl.pushforward, jl.exists_successor, jl.forall_successor))
+    whole, (jl.expectation, jl.pushforward, jl.exists_successor, jl.forall_successor))
+least_successor, transition_matrix, induced_chain, action_argmax, action_max = map(whole, (
+    operators.least_successor, operators.transition_matrix, operators.induced_chain,
+    operators.action_argmax, operators.action_max))
+following = whole(lambda model, policy, value: operators.following(model, policy)(value))
 
 
 @pytest.mark.parametrize("kind", REPRESENTATIONS)
@@ -66,12 +76,12 @@ def test_products_with_few_and_many_memory_states(label_on, num_memory):
 @pytest.mark.parametrize("kind", REPRESENTATIONS)
 def test_padding_and_unavailable_actions(kind):
     model, _ = random_representation(np.random.default_rng(3), kind)
-    nowhere, everywhere = jnp.zeros(model.state_shape, bool), jnp.ones(model.state_shape, bool)
-    closed = ~model.available
+    nowhere, everywhere = np.zeros(model.state_shape, bool), np.ones(model.state_shape, bool)
+    closed = ~np.asarray(model.available)
     assert closed.any(), "the example has an unavailable action"
     assert forall_successor(model, nowhere)[closed].all()
     assert not exists_successor(model, everywhere)[closed].any()
-    assert not expectation(model, jnp.ones(model.state_shape))[closed].any()
+    assert not expectation(model, np.ones(model.state_shape))[closed].any()
 
 
 @pytest.mark.parametrize("kind", REPRESENTATIONS)
@@ -90,8 +100,8 @@ def test_pushforward_is_the_transpose_of_expectation(kind):
     model, _ = random_representation(rng, kind)
     value = rng.normal(size=model.state_shape)
     mass = rng.normal(size=(*model.state_shape, model.num_actions))
-    left = jnp.vdot(expectation(model, jnp.asarray(value)), mass)
-    right = jnp.vdot(value, pushforward(model, jnp.asarray(mass)))
+    left = np.vdot(expectation(model, value), mass)
+    right = np.vdot(value, pushforward(model, mass))
     np.testing.assert_allclose(left, right, rtol=1e-13)
 
 
@@ -100,11 +110,11 @@ def test_induced_chain_follows_the_policy(kind):
     rng = np.random.default_rng(5)
     model, explicit = random_representation(rng, kind)
     policy = explicit.available.argmax(axis=1)
-    chain = operators.induced_chain(model, jnp.asarray(policy).reshape(model.state_shape))
+    chain = induced_chain(model, policy.reshape(model.state_shape))
     value = rng.normal(size=explicit.num_states)
     expected = reference.expectation(explicit, value)[np.arange(policy.size), policy]
     np.testing.assert_allclose(
-        expectation(chain, jnp.asarray(value))[:, 0], expected, atol=1e-14
+        expectation(chain, value)[:, 0], expected, atol=1e-14
     )
     np.testing.assert_array_equal(chain.initial, explicit.initial)
 
@@ -135,7 +145,7 @@ def test_expectation_and_pushforward_are_differentiable(kind):
     def both(x):
         changed = world.replace(**{field: x["probability"]})
         changed = model.replace(mdp=changed) if kind == "product" else changed
-        return expectation(changed, x["value"]), pushforward(changed, x["mass"])
+        return jl.expectation(changed, x["value"]), jl.pushforward(changed, x["mass"])
 
     assert_gradients(
         both,
@@ -156,11 +166,11 @@ def test_actions_maximum_for_few_and_many_actions():
         available = rng.random(quantity.shape) < 0.6
         available[:, -1] = True
         masked = np.where(available, quantity, -np.inf)
-        best, action = operators.action_argmax(jnp.asarray(quantity), jnp.asarray(available))
+        best, action = action_argmax(quantity, available)
         np.testing.assert_array_equal(best, masked.max(axis=1))
         np.testing.assert_array_equal(action, masked.argmax(axis=1))
         np.testing.assert_array_equal(
-            operators.action_max(jnp.asarray(quantity), jnp.asarray(available)), best
+            action_max(quantity, available), best
         )
 
 
@@ -208,15 +218,15 @@ def test_primitives_of_rows_equal_those_of_the_padded_model():
         np.testing.assert_allclose(
             pushforward(model, mass), pushforward(padded, wide), rtol=0, atol=1e-14)
         np.testing.assert_allclose(
-            operators.transition_matrix(model, mass), operators.transition_matrix(padded, wide),
+            transition_matrix(model, mass), transition_matrix(padded, wide),
             rtol=0, atol=1e-14)
         for primitive, x in ((exists_successor, region), (forall_successor, region),
-                             (operators.least_successor, value)):
+                             (least_successor, value)):
             np.testing.assert_array_equal(primitive(model, x), primitive(padded, x)[place])
         assert not exists_successor(model.replace(probability=0 * model.probability), region).any()
         rows = np.asarray(model.row_start[1:] - 1)
         np.testing.assert_allclose(
-            operators.following(model, rows)(value), expectation(model, value)[rows])
+            following(model, rows, value), expectation(model, value)[rows])
 
 
 def test_expectation_of_rows_is_differentiable():
@@ -224,7 +234,7 @@ def test_expectation_of_rows_is_differentiable():
     model = random_sparse(rng, 5, most=3, width=4)
     point = {"probability": model.probability, "value": rng.normal(size=5)}
     assert_gradients(
-        lambda x: expectation(model.replace(probability=x["probability"]), x["value"]), point,
+        lambda x: jl.expectation(model.replace(probability=x["probability"]), x["value"]), point,
         {name: rng.normal(size=x.shape) for name, x in point.items()})
 
 
