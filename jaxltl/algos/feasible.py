@@ -29,6 +29,7 @@ from jax.tree_util import Partial
 from jaxltl.algos import learner
 from jaxltl.algos.schedules import Schedule, at
 from jaxltl.core.host import optimal
+from jaxltl.core.host.given import number, one_of, shown, whole
 from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.parametric import Ends, ParametricMDP
 from jaxltl.core.models.sparse import row_reward
@@ -36,6 +37,7 @@ from jaxltl.core.types import Status, require_shape
 from jaxltl.core.values.mixture import safe_mean
 from jaxltl.core.values.prepared import Prepared, prepare, solve_prepared
 from jaxltl.core.values.prepared_chain import evaluate_prepared, is_direct
+from jaxltl.core.values.robust import width_asked
 
 _FINEST = 1e-12  # the width asked for where the one that was asked for does not tell
 
@@ -165,18 +167,19 @@ def make_problem(
       ValueError: an unknown bound, objective, reward or label, or a shape that does not fit; or
         the reward is infinite at every point, as the target is not reached almost surely.
     """
-    if bound not in (">=", "<="):
-        raise ValueError(f'bound={bound!r}; it must be ">=" or "<=".')
-    if objective not in ("max", "min"):
-        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    one_of("bound", bound, (">=", "<="))
+    one_of("objective", objective, ("max", "min"))
+    if reward is not None and not isinstance(reward, str):
+        raise ValueError(f"reward is {shown(reward)}; give the name of a reward of the model.")
     if not isinstance(model, ParametricMDP):
         raise ValueError(
             f"{type(model).__name__} has no box of parameters; give what "
             "make_parametric makes, or read_parametric(path).over(low, high)."
         )
     here = model.model
-    target = here.states_where(target) if isinstance(target, str) else np.asarray(target, bool)
+    target = here.states_where(target) if isinstance(target, str) else np.asarray(target)
     require_shape("target", target, (here.num_states,))
+    target = target.astype(bool)
     if here.is_chain:
         objective = "max"  # with it a reward may become zero
     if reward is not None:
@@ -206,7 +209,14 @@ def within(problem: Problem, low: Ends, high: Ends) -> Problem:
     Raises:
       ValueError: the box is none, or reaches out of the problem's.
     """
+    require_problem(problem)
     return _rounded_inward(replace(problem, model=problem.model.within(low, high)))
+
+
+def require_problem(problem: Any) -> None:
+    """Raises ValueError unless a problem is one."""
+    if not isinstance(problem, Problem):
+        raise ValueError(f"problem is {shown(problem)}; give what make_problem returns.")
 
 
 def _rounded_inward(problem: Problem) -> Problem:
@@ -443,20 +453,23 @@ def feasible(
       >>> feasible(problem, 0.2501, starts=4).feasible.any().item()
       False
     """
-    if not np.isfinite(threshold):
-        raise ValueError(f"threshold={threshold}; give a finite number.")
+    require_problem(problem)
+    threshold = number("threshold", threshold)
+    tolerance = width_asked(tolerance)
     hparams = Hparams() if hparams is None else hparams
+    if not isinstance(hparams, Hparams):
+        raise ValueError(f"hparams is {shown(hparams)}; give Hparams.")
     key = jax.random.key(0) if key is None else key
     # A little further, so that rounding does not decide.
     beyond = 1e3 * float(jnp.finfo(problem.low.dtype).eps) * abs(threshold)
     goal = np.asarray(threshold + problem.sign * beyond, problem.low.dtype)
-    most = np.int32(_positive("num_steps", num_steps))
-    enough = None if enough is None else _positive("enough", enough)
+    most = np.int32(whole("num_steps", num_steps, least=1, most=learner.MOST))
+    enough = None if enough is None else whole("enough", enough, least=1)
     points = None
     if np.ndim(starts) == 0:
-        keys = jax.random.split(key, _positive("starts", int(starts)))
+        keys = jax.random.split(key, whole("starts", starts, least=1, most=learner.MOST))
     else:
-        points = _checked_starts(problem, np.asarray(starts))
+        points = problem.model.inside_of("start", starts).astype(problem.low.dtype)
         keys = jax.random.split(key, len(points))
     # Which model is proven is of no concern to the search.
     numbers = ParametricMDP(None, problem.model.numbers, None, None, None, ())
@@ -552,7 +565,8 @@ def certify(
     Raises:
       ValueError: the point is not in the box, or the functions are no model there.
     """
-    return _bounds(problem, problem.model.at(parameters), tolerance)
+    require_problem(problem)
+    return _bounds(problem, problem.model.at(parameters), width_asked(tolerance))
 
 
 def _bounds(problem: Problem, model: Any, tolerance: float) -> tuple[float, float]:
@@ -575,26 +589,3 @@ def _bounds(problem: Problem, model: Any, tolerance: float) -> tuple[float, floa
         for x, up in ((found.lower, False), (found.upper, True))
     )
     return low, high
-
-
-def _positive(name: str, number: int) -> int:
-    if number < 1:
-        raise ValueError(f"{name}={number}; it must be at least 1.")
-    return number
-
-
-def _checked_starts(problem: Problem, starts: np.ndarray) -> np.ndarray:
-    names, model = problem.model.parameters, problem.model
-    if starts.ndim != 2 or starts.shape[1] != len(names) or not len(starts):
-        raise ValueError(
-            f"starts has shape {starts.shape}; expected (N, {len(names)}), a number "
-            f"for each of {', '.join(names)}."
-        )
-    out = ~((starts >= model.low) & (starts <= model.high))
-    if out.any():
-        n, d = (int(i) for i in np.argwhere(out)[0])
-        raise ValueError(
-            f"start {n} has {names[d]} = {starts[n, d]:.9g}; its interval is "
-            f"[{model.low[d]:.9g}, {model.high[d]:.9g}]."
-        )
-    return starts.astype(problem.low.dtype)

@@ -28,6 +28,7 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.algos import checkpoint as files
+from jaxltl.core.host.given import whole
 from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.types import Status, worst
 
@@ -58,8 +59,13 @@ def run(
     step: Step, state: Any, problem: Any, hparams: Any, *, num_steps: int, max_rows: int = 1000
 ) -> tuple[Any, Any]:
     """`num_steps` steps of a learner's `step`; the rest is as for the ``run`` of :func:`bind`."""
+    num_steps, max_rows = (
+        x if isinstance(x, int) else whole(name, x, least=1)
+        for name, x in (("num_steps", num_steps), ("max_rows", max_rows)))
     if num_steps < 1 or max_rows < 1:
         raise ValueError(f"num_steps={num_steps}, max_rows={max_rows}; both must be at least 1.")
+    if num_steps > MOST:
+        raise ValueError(f"num_steps={num_steps}; at most {MOST} are made at once.")
     stride = -(-num_steps // max_rows)
     # The first block is the short one, so that every row ends a full stride.
     lengths = np.full(-(-num_steps // stride), stride, np.int32)
@@ -136,8 +142,8 @@ def run_until(
     if idle and (check_every, keep) != (1, "after"):
         raise ValueError('idle=True goes with check_every=1 and keep="after".')
     for name, number in {"num_steps": num_steps, "check_every": check_every}.items():
-        if not isinstance(number, jax.Array) and number < 1:
-            raise ValueError(f"{name}={number}; it must be at least 1.")
+        if not isinstance(number, jax.Array):
+            whole(name, number, least=1, most=MOST)
     until = until if isinstance(until, Partial) else Partial(until)
     most = jnp.asarray(num_steps, jnp.int32)
     return _run_until(step, state, problem, hparams, until, most, check_every, keep, idle)

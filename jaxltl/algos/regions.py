@@ -14,7 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxltl.algos.feasible import require_problem
 from jaxltl.core.host import interval_values
+from jaxltl.core.host.given import numbers, shown
+from jaxltl.core.host.given import whole as count
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.parametric import box_of
 from jaxltl.core.values.mixture import safe_mean
@@ -74,8 +77,8 @@ def enclose(problem: Problem, low: Any = None, high: Any = None) -> tuple[float,
       >>> [round(x, 6) for x in enclose(coin, 0.25, 0.75)]
       [0.25, 0.75]
     """
-    model = problem.model
     low, high = _box(problem, low, high)
+    model = problem.model
     if not hasattr(model.numbers, "ranges"):
         raise ValueError("the ranges of this model's functions over a box are not known; regions "
                          "are proven for models that read_parametric reads.")
@@ -87,6 +90,7 @@ def enclose(problem: Problem, low: Any = None, high: Any = None) -> tuple[float,
 
 
 def _box(problem: Problem, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
+    require_problem(problem)
     model = problem.model
     low, high = (whole if x is None else x for x, whole in ((low, model.low), (high, model.high)))
     low, high = box_of(low, high, model.parameters)
@@ -148,10 +152,7 @@ def prove_regions(
     Raises:
       ValueError: as :func:`enclose`; the threshold is NaN, or `max_boxes` below 1.
     """
-    if np.isnan(threshold):
-        raise ValueError("the threshold is NaN; give a number.")
-    if max_boxes < 1:
-        raise ValueError(f"max_boxes={max_boxes}; it must be at least 1.")
+    threshold, max_boxes = _limit(threshold), count("max_boxes", max_boxes, least=1)
     low, high = _box(problem, low, high)
     size = np.where(high > low, high - low, 1.0)
     todo, done, looked = deque([(low, high)]), [], 0
@@ -174,6 +175,14 @@ def prove_regions(
     return Regions(lows, highs, lower, upper, verdicts.astype(np.int8))
 
 
+def _limit(threshold: Any) -> float:
+    """A number, which may be infinite."""
+    found = numbers("threshold", threshold)
+    if found.ndim or np.isnan(found):
+        raise ValueError(f"threshold={shown(threshold)}; give a number.")
+    return float(found)
+
+
 def prove_around(
     problem: Problem, threshold: float, point: Any, *, num_halvings: int = 12
 ) -> tuple[np.ndarray, np.ndarray] | None:
@@ -188,9 +197,14 @@ def prove_around(
 
     Returns:
       Its ends, ``float64[D]`` both; None if not even the smallest one that was tried is accepted.
+
+    Raises:
+      ValueError: as :func:`prove_regions`; the point is not in the box.
     """
+    require_problem(problem)
+    threshold, num_halvings = _limit(threshold), count("num_halvings", num_halvings, most=1000)
     model = problem.model
-    point = np.asarray(point, np.float64)
+    (point,) = model.inside_of("point", numbers("point", point)[None])
     sides = model.high - model.low
     found, share, move = None, 1.0, 0.5
     for _ in range(num_halvings):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from jaxltl.algos.checkpoint import atomic_write
+from jaxltl.core.host.given import shown
 
 Compression = Literal["gzip", "xz"]
 
@@ -39,12 +40,18 @@ def read_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
     return b"".join(pieces(data, str(path), limit)) if compression_of(data) else data
 
 
+def _check_path(path: Any) -> None:
+    if not isinstance(path, str | os.PathLike):  # numbers would be files that are open already
+        raise ValueError(f"path is {shown(path)}; give the name of a file.")
+
+
 def raw_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
     """The bytes of a file as they are, at most `limit`.
 
     Raises:
       ValueError: naming the file: it cannot be read, or is larger than allowed.
     """
+    _check_path(path)
     name, parts, size = str(path), [], 0
     try:
         with open(path, "rb") as file:
@@ -86,6 +93,7 @@ def streamed(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> Iterator[b
     Raises:
       ValueError: as :func:`read_bytes`.
     """
+    _check_path(path)
     packed: list[bytes] = []
     name, size = str(path), 0
     try:

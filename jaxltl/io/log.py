@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.host import given
+from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.counts import (
     Places,
     TransitionCounts,
@@ -21,6 +23,7 @@ from jaxltl.core.models.counts import (
     place_of,
     places,
 )
+from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.io._columns import Lines, read_columns
 
 _COUNT = re.compile(r"[0-9]{1,16}")
@@ -84,9 +87,12 @@ def read_log(
     if model is not None:
         if states is not None or actions is not None:
             raise ValueError("model and names are both given; a model has names of its own.")
-        known = places(model)
+        # Successors that stand twice in a row are one, by name.
+        known = places(to_sparse(model) if isinstance(model, MDP | DenseMDP) else model)
         states, actions = known.states, known.actions
-    numbers = _names(states), _names(actions)
+    if not isinstance(count, str):
+        raise ValueError(f"count={given.shown(count)}; give the name of a column.")
+    numbers = _names("states", states), _names("actions", actions)
     name, total, size = str(path), 0, 0
     held = [np.zeros((4, 0), np.int64)]
     for lines in read_columns(path, columns, (count,)):
@@ -131,7 +137,7 @@ def read_labels(
       ValueError: naming the file and the line, as :func:`read_log`.
     """
     _check_columns(columns, 2)
-    known = set(states or ())
+    known = set() if states is None else set(map(str, given.listed("states", states)))
     found: dict[str, dict[str, bool]] = {}
     for lines in read_columns(path, columns):
         for fields in lines.times:
@@ -145,8 +151,10 @@ def read_labels(
 
 
 def _check_columns(columns: Sequence[str], number: int) -> None:
-    if isinstance(columns, str) or len(columns) != number or len(set(columns)) < number:
-        raise ValueError(f"columns={columns!r}; give {number} names, all different.")
+    names = given.listed("columns", columns)
+    different = all(isinstance(x, str) for x in names) and len(set(names)) == number
+    if isinstance(columns, str) or len(names) != number or not different:
+        raise ValueError(f"columns={given.shown(columns)}; give {number} names, all different.")
 
 
 @dataclass
@@ -157,12 +165,13 @@ class _Names:
     complete: bool
 
 
-def _names(given: Sequence[str] | None) -> _Names:
-    number = {str(x): i for i, x in enumerate(given or ())}
-    if given is not None and len(number) < len(given):
-        twice = next(x for i, x in enumerate(map(str, given)) if number[x] != i)
+def _names(what: str, names: Sequence[str] | None) -> _Names:
+    every = [] if names is None else list(map(str, given.listed(what, names)))
+    number = {x: i for i, x in enumerate(every)}
+    if len(number) < len(every):
+        twice = next(x for i, x in enumerate(every) if number[x] != i)
         raise ValueError(f"the name {twice!r} stands twice; names tell states, or actions, apart.")
-    return _Names(number, given is not None)
+    return _Names(number, names is not None)
 
 
 def _unknown(what: str, name: str, names: Sequence[str]) -> str:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core.host.given import number, shown
 from jaxltl.core.models.parametric import Ends, ParametricMDP, box_of, point_inside
 from jaxltl.core.models.ranges import Ends as Ranges
 from jaxltl.core.models.ranges import ranges
@@ -95,13 +96,15 @@ class ParametricModel:
           ValueError: a parameter is missing or unknown, a function has a pole there, or the
             probabilities of a row are none.
         """
+        if not isinstance(values, Mapping):
+            raise ValueError(f"values is {shown(values)}; give a number for each name, in a dict.")
         if set(values) != set(self.parameters):
             raise ValueError(
                 f"values are given for {', '.join(sorted(values)) or 'nothing'}; the "
                 f"parameters are {', '.join(self.parameters) or 'none'}."
             )
-        if not all(np.isfinite(float(x)) for x in values.values()):
-            raise ValueError(f"values {dict(values)} must be finite.")
+        for name, x in values.items():
+            number(f"values[{name!r}]", x)
         point = tuple(Fraction(values[name]) for name in self.parameters)
         try:
             value = np.array([float(f.at(point)) for f in self.functions])

@@ -21,6 +21,7 @@ from jaxltl.core.host.binomial import (
     frequency,
     hoeffding,
 )
+from jaxltl.core.host.given import number, one_of, whole
 from jaxltl.core.host.rows import Booleans, Integers
 from jaxltl.core.host.sparse import Floats
 
@@ -227,12 +228,10 @@ def samples_needed(
     """
     _check_method(method)
     check_confidence(confidence)
-    if not 0 < width < 1:
+    if not 0 < number("width", width) < 1:
         raise ValueError(f"width={width}; it must lie strictly between 0 and 1.")
-    if not num_claims >= 1:
-        raise ValueError(f"num_claims={num_claims}; it must be at least 1.")
-    if not num_outcomes >= 2:
-        raise ValueError(f"num_outcomes={num_outcomes}; it must be at least 2.")
+    num_claims = whole("num_claims", num_claims, least=1)
+    num_outcomes = whole("num_outcomes", num_outcomes, least=2)
     failure = (1 - confidence) / num_claims
 
     def widest(total: int) -> float:
@@ -259,8 +258,7 @@ def samples_needed(
 
 
 def _check_method(method: str) -> None:
-    if method not in get_args(Method):
-        raise ValueError(f"method={method!r}; choose one of {', '.join(get_args(Method))}.")
+    one_of("method", method, get_args(Method))
 
 
 def check_confidence(confidence: float) -> None:
@@ -345,9 +343,10 @@ def _outcomes(num_outcomes: Any, listed: Integers, shape: tuple[int, ...]) -> In
 def _claims(given: int | None, made: int) -> int:
     if given is None:
         return made
-    if not given >= made or given != int(given):
+    found = whole("num_claims", given)
+    if found < made:
         raise ValueError(f"num_claims={given}; the rows make {made}, and no fewer can be counted.")
-    return int(given)
+    return found
 
 
 def _name(row: int, shape: tuple[int, ...]) -> str:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxltl.core.host.ball import Ball
+from jaxltl.core.host.given import numbers, wholes
 from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.rows import Integers
 from jaxltl.core.host.sparse import Floats, HostMDP
@@ -17,8 +19,7 @@ def l1_expectation(
     """The extreme of ``sum_t p_t v_t`` over ``sum_t |p_t - center_t| <= radius``, in every row.
 
     Half of the radius is moved, from the worst successors to the best one (Strehl and Littman 2008,
-    section 3.2): the greedy distribution of the intervals ``[0, center]``, where that of the best
-    is ``[0, center + radius / 2]``.
+    section 3.2).
 
     Args:
       value: ``float64[T]``, finite, of each entry: ``v[successor]``.
@@ -39,8 +40,10 @@ def l1_expectation(
       >>> least.round(9).tolist(), chosen.round(9).tolist()
       ([0.1], [0.9, 0.1, 0.0])
     """
-    value, center, radius = (np.asarray(x, np.float64) for x in (value, center, radius))
-    start: Any = np.asarray(entry_start)
+    value, center, radius = (
+        numbers(name, x) for name, x in (("value", value), ("center", center), ("radius", radius))
+    )
+    start: Any = wholes("entry_start", entry_start).reshape(-1)
     if value.shape != center.shape or (start.size - 1,) != radius.shape:
         raise ValueError(
             f"value has shape {value.shape}, center {center.shape} and radius {radius.shape}; "
@@ -52,16 +55,17 @@ def l1_expectation(
             f"entry_start goes from {start[0]} to {start[-1]}; it must ascend from 0 to "
             f"{value.size}, without an empty row."
         )
+    if not (np.isfinite(value) & np.isfinite(center)).all():
+        raise ValueError("value or center is not finite in some entry; give numbers.")
     if not (radius >= 0).all():
         r = int(np.argmin(radius >= 0))
         raise ValueError(f"the radius of row {r} is {radius[r]}; it must be at least 0.")
-    row = np.repeat(np.arange(radius.size), width)
-    key = -value if maximize else value
-    order = np.lexsort((key, row))
-    best = order[start[:-1]]
-    upper = center.copy()
-    upper[best] = np.minimum(center[best] + radius / 2, 1)
     states: Any = np.zeros(start.size, np.int64)  # what is done here needs no states
-    box = HostInterval(HostMDP(states, start, row, center), np.zeros_like(center), upper)
-    chosen = box.nature(value, maximize=maximize)
-    return box.total(chosen * value), chosen
+    ball = HostInterval(
+        HostMDP(states, start, states[:0], center),
+        np.zeros_like(center),
+        np.ones_like(center),
+        Ball(center, np.minimum(radius / 2, 1)),
+    )
+    chosen = ball.nature(value, maximize=bool(maximize))
+    return ball.total(chosen * value), chosen

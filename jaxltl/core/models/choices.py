@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxltl.core.host.given import no_model, shown
 from jaxltl.core.models import kernels
 from jaxltl.core.models.sparse import SparseMDP
 
@@ -71,7 +72,12 @@ def first_action(condition: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def is_deterministic(policy: chex.Array) -> bool:
     """Whether a policy is given as one action per state (integers) rather than a distribution."""
-    return jnp.issubdtype(jnp.result_type(policy), jnp.integer)
+    try:
+        kind = jnp.result_type(policy)
+    except TypeError:
+        raise ValueError(f"policy is {shown(policy)}; give the number of an action (of a sparse "
+                         "model, of a choice) for each state, or weights of all.") from None
+    return jnp.issubdtype(kind, jnp.integer)
 
 
 class Actions(NamedTuple):
@@ -334,6 +340,8 @@ class Rows(NamedTuple):
 @singledispatch
 def choices(model: Any) -> Actions | Rows:
     """The choices of a model's states; of a representation of one's own, its `available`."""
+    if not hasattr(model, "available"):
+        raise ValueError(no_model(model))
     return Actions(model.available)
 
 
@@ -346,6 +354,8 @@ def row_choices(model: SparseMDP) -> Rows:
 @singledispatch
 def choice_shape(model: Any) -> tuple[int, ...]:
     """The shape of a quantity on choices: ``(S, A)``, in a product ``(S, Q, A)``, or ``(R,)``."""
+    if not hasattr(model, "num_actions"):
+        raise ValueError(no_model(model))
     return (*model.state_shape, model.num_actions)
 
 

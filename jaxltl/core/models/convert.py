@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxltl.core.host.given import no_model
 from jaxltl.core.host.rows import spans, starts_of
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.padded import to_padded as to_padded  # for whoever converts
@@ -42,8 +43,7 @@ def to_sparse(model: Any) -> SparseMDP:
     if isinstance(model, Product):
         return _product(model)
     if not isinstance(model, MDP | DenseMDP):
-        raise ValueError(f"{type(model).__name__} has no transitions to write out; give an MDP, a "
-                         "DenseMDP, a product of one or a SparseMDP.")
+        raise ValueError(no_model(model))
     used, available = support(model), np.asarray(model.available)
     s, a, k = np.nonzero(used)
     if isinstance(model, DenseMDP):

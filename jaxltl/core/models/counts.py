@@ -11,6 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.host.given import listed as listed_items
+from jaxltl.core.host.given import numbers, one_of, shown
 from jaxltl.core.host.rows import Integers, starts_of
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
@@ -126,7 +128,7 @@ def _checked_names(what: str, names: Sequence[str] | None, least: int) -> tuple[
         if least > _MOST_ENTRIES:
             raise ValueError(f"{what} go up to {least - 1}; number them from 0, without gaps.")
         return tuple(map(str, range(least)))
-    names = tuple(map(str, names))
+    names = tuple(map(str, listed_items(what, names)))
     if len(names) < least:
         raise ValueError(f"there are {len(names)} names of {what}; number {least - 1} has none.")
     if len(set(names)) < len(names):
@@ -264,7 +266,8 @@ def places(model: MDP | DenseMDP | SparseMDP) -> Places:
     if twice := found.ambiguous():
         raise ValueError(
             f"{twice} of the model have the same names, so that no count says which it is of; give "
-            "each choice of a state an action of its own."
+            "each choice of a state an action of its own, and convert a model whose rows repeat a "
+            "successor by to_sparse."
         )
     return found
 
@@ -300,6 +303,7 @@ def counts_on(model: MDP | DenseMDP | SparseMDP, counts: TransitionCounts) -> ND
       >>> counts_on(coin, make_counts([0, 0, 0], [0, 0, 0], [2, 1, 2])).tolist()
       [1, 2, 0, 0]
     """
+    _require_counts(counts)
     known = places(model)
     state, action, successor = (
         _renumbered(what, names, of[number], to)
@@ -406,8 +410,10 @@ def counted_model(
       >>> model.probability.tolist(), count.tolist(), model.states_where("done").tolist()
       ([0.7, 0.3, 1.0], [7, 3, 9], [False, True])
     """
-    if graph not in ("seen", "complete"):
-        raise ValueError(f"graph={graph!r}; choose one of seen, complete.")
+    _require_counts(counts)
+    one_of("graph", graph, ("seen", "complete"))
+    if labels is not None and not isinstance(labels, Mapping):
+        raise ValueError(f"labels is {shown(labels)}; give the states of each label, in a dict.")
     number = {name: i for i, name in enumerate(counts.states)}
     stays = np.zeros(len(number), bool)
     stays[_numbers(terminal, number, "terminal")] = True
@@ -475,6 +481,14 @@ def _nominal(count: Integers, start: Integers) -> NDArray[np.float64]:
     return more / np.repeat(np.add.reduceat(more, start[:-1]), width)
 
 
+def _require_counts(counts: Any) -> None:
+    if not isinstance(counts, TransitionCounts):
+        raise ValueError(
+            f"counts is {shown(counts)}; give TransitionCounts, as make_counts and "
+            "read_log return them."
+        )
+
+
 def _variable(names: tuple[str, ...]) -> NDArray[Any]:
     if all(map(_INTEGER.fullmatch, names)):
         return np.array([int(name) for name in names], np.int64)
@@ -484,7 +498,7 @@ def _variable(names: tuple[str, ...]) -> NDArray[Any]:
 def _numbers(names: Iterable[Any], number: Mapping[str, int], what: str) -> list[int]:
     """Of states, by name."""
     found = []
-    for name in [names] if isinstance(names, str | int) else names:
+    for name in [names] if isinstance(names, str | int) else listed_items(what, names):
         if str(name) not in number:
             raise ValueError(
                 f"{what}: there is no state {str(name)!r}; there are {listed(tuple(number))}."
@@ -495,6 +509,6 @@ def _numbers(names: Iterable[Any], number: Mapping[str, int], what: str) -> list
 
 def _initial(initial: Any, number: Mapping[str, int]) -> NDArray[np.float64]:
     found = np.zeros(len(number))
-    weight = list(initial.values()) if isinstance(initial, Mapping) else 1.0
+    weight = numbers("initial", list(initial.values())) if isinstance(initial, Mapping) else 1.0
     found[_numbers(initial, number, "initial")] = weight
     return found if isinstance(initial, Mapping) else found / max(found.sum(), 1)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core.host.given import no_model
 from jaxltl.core.models import operators
 from jaxltl.core.models.choices import choice_shape, choices
 from jaxltl.core.models.concrete import namespace, to_jax
@@ -145,6 +146,8 @@ def _owners(system: Any, shape: tuple[int, ...]) -> np.ndarray:
 def as_game(model: Any) -> Game:
     """A game as solvers take it; any other model as the game in which the system always moves."""
     if not isinstance(model, Game):
+        if not hasattr(model, "state_shape"):
+            raise ValueError(no_model(model))
         model = Game(model, to_jax(np.ones(model.state_shape, bool)))
     return model
 

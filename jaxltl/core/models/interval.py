@@ -11,6 +11,7 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.host.ball import Ball
+from jaxltl.core.host.given import numbers, shown
 from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.rows import starts_of
 from jaxltl.core.host.sparse import HostMDP
@@ -125,12 +126,25 @@ class IntervalMDP:
             change(self.nominal.replace(rewards=self.rewards | ends)))  # type: ignore[attr-defined]
 
 
+def require_interval(model: Any) -> IntervalMDP:
+    """The model.
+
+    Raises:
+      ValueError: it is of another kind.
+    """
+    if not isinstance(model, IntervalMDP):
+        raise ValueError(f"{type(model).__name__} has no intervals; give an IntervalMDP, as "
+                         "make_interval makes it.")
+    return model
+
+
 def refuse_ball(model: IntervalMDP, why: str) -> None:
     """Raises ValueError if a model has a radius, where only ends are understood."""
-    if isinstance(model, IntervalMDP) and model.radius is not None:
+    if model.radius is not None:
         raise ValueError(f"the model has a radius, and {why}; give its smallest intervals, "
-                         "model.box, or ask the solvers that take a radius (robust_reachability, "
-                         "robust_total_reward, robust_discounted_value, robust_satisfaction).")
+                         "model.box, or ask the solvers that take a radius "
+                         "(reachability_probability, total_reward, robust_discounted_value, "
+                         "robust_satisfaction).")
 
 
 def _travelling(lower: Any, upper: Any, center: Any, radius: Any) -> dict[str, Rewards]:
@@ -191,7 +205,7 @@ def make_interval(
     if not isinstance(model, MDP | SparseMDP):
         raise ValueError(f"{type(model).__name__} takes no intervals; give an MDP or a SparseMDP "
                          "(of an interval model, its nominal one).")
-    lower, upper = (np.asarray(x, np.float64) for x in (lower, upper))
+    lower, upper = numbers("lower", lower), numbers("upper", upper)
     shape = np.shape(model.probability)
     for name, ends in (("lower", lower), ("upper", upper), ("center", center)):
         if ends is not None and np.shape(ends) != shape:
@@ -243,7 +257,7 @@ def interval_rows(
       ValueError: as of :func:`make_interval` and :func:`~jaxltl.core.models.sparse.make_sparse`.
     """
     entry_start, successor = np.asarray(entry_start), np.asarray(successor)
-    lower, upper = (np.asarray(x, np.float64) for x in (lower, upper))
+    lower, upper = numbers("lower", lower), numbers("upper", upper)
     ball = _ball(center, radius, successor.shape, entry_start.size - 1)
     if not lower.shape == upper.shape == successor.shape:
         raise ValueError(f"successor has shape {successor.shape}, lower {lower.shape} and upper "
@@ -258,14 +272,16 @@ def interval_rows(
     check_entries(starts, entry_start, successor, np.ones(successor.size))
     row = np.repeat(np.arange(num_rows), np.diff(entry_start))
     _check_ends(starts, row, successor, lower, upper)
-    rewards = dict(rewards or {})
+    if rewards is not None and not isinstance(rewards, Mapping):
+        raise ValueError(f"rewards is {shown(rewards)}; give a dict of Rewards by name.")
+    rewards = {} if rewards is None else dict(rewards)
     place = row * np.int64(starts.size) + successor.astype(np.int64)
     if not (place[1:] > place[:-1]).all() and np.unique(place).size < place.size:
-        numbers = [lower, upper] if ball is None else [lower, upper, ball[0]]
-        row, successor, numbers, rewards = _merged(row, successor, numbers, rewards)
+        every = [lower, upper] if ball is None else [lower, upper, ball[0]]
+        row, successor, every, rewards = _merged(row, successor, every, rewards)
         entry_start = starts_of(np.bincount(row, minlength=entry_start.size - 1))
-        (lower, upper), inner = numbers[:2], numbers[2:]
-        ball = None if ball is None else (inner[0], ball[1])
+        lower, upper = every[:2]
+        ball = None if ball is None else (every[2], ball[1])
     lower, upper = _scaled(starts, entry_start, row, lower, upper)
     if ball is not None:
         _check_ball(starts, entry_start, row, lower, upper, *ball)
@@ -291,7 +307,7 @@ def _ball(
     if center is None or radius is None:
         given = "radius" if center is None else "center"
         raise ValueError(f"{given} is given alone; a ball has a center and a radius.")
-    center, radius = (np.asarray(x, np.float64) for x in (center, radius))
+    center, radius = numbers("center", center), numbers("radius", radius)
     if center.shape != entries or radius.shape != (num_rows,):
         raise ValueError(f"center has shape {center.shape} and radius {radius.shape}; expected "
                          f"{entries} and ({num_rows},), one for each transition and each choice.")

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core.host.given import listed, no_model, numbers, shown
 from jaxltl.core.models.concrete import is_traced, to_jax
 
 
@@ -251,6 +252,8 @@ def to_dense(mdp: MDP) -> DenseMDP:
       >>> to_dense(mdp).transition.tolist()
       [[[0.5, 0.5]], [[0.0, 1.0]]]
     """
+    if not hasattr(mdp, "num_actions"):
+        raise ValueError(no_model(mdp))
     num_states, num_actions = mdp.num_states, mdp.num_actions
     shape = num_states, num_actions, num_states
     place = np.arange(num_states)[:, None, None], np.arange(num_actions)[:, None]
@@ -320,7 +323,7 @@ def checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
     """
     if initial is None:
         return np.full(num_states, 1 / num_states)
-    initial = np.asarray(initial, np.float64)
+    initial = numbers("initial", initial)
     if initial.shape != (num_states,):
         raise ValueError(f"initial has shape {initial.shape}; expected ({num_states},).")
     bad = ~(initial >= 0)
@@ -352,9 +355,9 @@ def checked_label(
       ValueError: names that are not distinct or not those of the label, names without a label, a
         wrong shape, or a state that does not exist.
     """
-    names = tuple(propositions)
-    if len(set(names)) != len(names):
-        raise ValueError(f"propositions {names} are not distinct.")
+    names = tuple(listed("propositions", propositions))
+    if not all(isinstance(x, str) for x in names) or len(set(names)) != len(names):
+        raise ValueError(f"propositions {shown(names)} are not distinct.")
     if isinstance(label, Mapping):
         return _label_by_name(label, names or tuple(label), num_states)
     if label is None:

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxltl.core.host.given import no_model
 from jaxltl.core.models import kernels
 from jaxltl.core.models.choices import action_argmax as action_argmax
 from jaxltl.core.models.choices import action_max as action_max
@@ -191,6 +192,8 @@ def pushforward(model: Any, mass: jax.Array) -> jax.Array:
 
 
 def _unknown(model: Any) -> str:
+    if hasattr(model, "nominal"):
+        return no_model(model)
     return (f"{type(model).__name__} is not a model: pass an MDP, a DenseMDP, a SparseMDP, a "
             "Product or a Game.")
 
@@ -425,7 +428,7 @@ def require_policy(model: Any, policy: Any, where: Any = True) -> None:
     if isinstance(world, SparseMDP):
         row_weights(world, policy, where)
         return
-    shape = (*model.state_shape, model.num_actions)
+    shape = choice_shape(model)
     table, available = np.asarray(policy), np.asarray(model.available)
     if is_deterministic(table):
         policy_distribution(model, table)  # its shape

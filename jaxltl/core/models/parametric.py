@@ -13,6 +13,8 @@ import numpy as np
 from flax import struct
 from jax.tree_util import Partial
 
+from jaxltl.core.host.given import listed, shown
+from jaxltl.core.host.given import numbers as _numbers
 from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 
@@ -67,6 +69,27 @@ class ParametricMDP:
                 f"[{self.low[d]:.9g}, {self.high[d]:.9g}]."
             )
         return self._at(point)
+
+    def inside_of(self, name: str, points: Any) -> np.ndarray:
+        """Points of the box, ``float64[N, D]``, checked.
+
+        Raises:
+          ValueError: they have another shape, or one of them is outside.
+        """
+        found, names = _numbers(f"{name}s", points), self.parameters
+        if found.ndim != 2 or found.shape[1] != len(names) or not len(found):
+            raise ValueError(
+                f"{name}s has shape {found.shape}; expected (N, {len(names)}), a number "
+                f"for each of {', '.join(names)}."
+            )
+        out = ~((found >= self.low) & (found <= self.high))
+        if out.any():
+            n, d = (int(i) for i in np.argwhere(out)[0])
+            raise ValueError(
+                f"{name} {n} has {names[d]} = {found[n, d]:.9g}; its interval is "
+                f"[{self.low[d]:.9g}, {self.high[d]:.9g}]."
+            )
+        return found
 
     def _at(self, point: np.ndarray) -> SparseMDP:
         if self.exact is None:
@@ -126,15 +149,23 @@ def make_parametric(
     """
     if is_traced((model, low, high)):
         raise ValueError("make_parametric reads its model: call it before jit.")
+    if not isinstance(model, SparseMDP):
+        raise ValueError(
+            f"{type(model).__name__} has no entries whose probabilities could be "
+            "functions; give a SparseMDP (to_sparse makes one; of an interval model, "
+            "its nominal one)."
+        )
+    if not callable(numbers):
+        raise ValueError(f"numbers is {shown(numbers)}; give a function of float[D].")
     if parameters is None:
         parameters = (
             tuple(low)
             if isinstance(low, Mapping)
             else tuple(f"p{d}" for d in range(max(np.size(low), np.size(high))))
         )
-    names = tuple(parameters)
-    if len(set(names)) < len(names):
-        raise ValueError(f"parameters are {', '.join(names)}; name each once.")
+    names = tuple(listed("parameters", parameters))
+    if not all(isinstance(x, str) for x in names) or len(set(names)) < len(names):
+        raise ValueError(f"parameters are {shown(names)}; name each once.")
     low, high = box_of(low, high, names)
     numbers = numbers if isinstance(numbers, Partial) else Partial(numbers)
     numbers = Partial(_paired, numbers, model.host.state)
@@ -251,8 +282,8 @@ def _point(of: str, values: Any, names: Sequence[str]) -> np.ndarray:
                 f"{of}: {', '.join(missing)} {'is' if len(missing) == 1 else 'are'} "
                 f"{word}; the parameters are {', '.join(names)}."
             )
-        values = [float(values[name]) for name in names]
-    found = np.asarray(values, np.float64)
+        values = [values[name] for name in names]
+    found = _numbers(of, values)
     if found.ndim == 0 and of != "values":
         found = np.full(len(names), found)
     if found.shape != (len(names),):

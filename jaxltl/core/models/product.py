@@ -18,6 +18,7 @@ from flax import struct
 
 from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.host.given import shown
 from jaxltl.core.logic.labels import distinct_rows, require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.models import kernels, operators
@@ -217,6 +218,8 @@ def product(world: Any, task: Automaton | Formula | str, *, label_on: str = "ent
         formula = parse_ltl(task) if isinstance(task, str) else task
         require_known(formula.propositions, world.propositions, "the task")
         task = to_automaton(formula, letters=letters(world, formula.propositions))
+    if not isinstance(task, Automaton):
+        raise ValueError(f"task is {shown(task)}; give a formula, its text, or an automaton.")
     require_known(task.propositions, world.propositions, "the task")
     column = [world.propositions.index(p) for p in task.propositions]
     rows, letter = distinct_rows(np.asarray(world.label)[:, column])

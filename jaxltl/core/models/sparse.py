@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core.host.given import listed, numbers, shown
 from jaxltl.core.host.rows import LARGE
 from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.models.concrete import is_traced
@@ -215,7 +216,7 @@ def _listed(names: Mapping[str, Any]) -> str:
 
 
 def _shaped(model: SparseMDP, reward: Any) -> Rewards:
-    reward = reward if isinstance(reward, jax.Array) else np.asarray(reward, np.float64)
+    reward = reward if isinstance(reward, jax.Array) else numbers("reward", reward)
     for size, name in _sizes(model):
         if reward.shape == (size,):
             return Rewards(**{name: reward})
@@ -286,10 +287,14 @@ def make_sparse(
     if num_states == 0:
         raise ValueError("the model has no state; it needs at least one.")
     check_entries(row_start, entry_start, successor, probability)
+    for of, each in (("rewards", rewards), ("valuation", valuation)):
+        if each is not None and not isinstance(each, Mapping):
+            raise ValueError(f"{of} is {shown(each)}; give a dict, by name.")
+    action_names = tuple(listed("action_names", action_names))
     rewards = {name: _checked_rewards(name, x, num_states, num_rows, successor.size)
                for name, x in (rewards or {}).items()}
     label, names = checked_label(label, propositions, num_states)
-    action = None if action is None else _checked_action(action, num_rows, tuple(action_names))
+    action = None if action is None else _checked_action(action, num_rows, action_names)
     for name, x in (valuation or {}).items():
         if np.shape(x) != (num_states,):
             raise ValueError(f"valuation {name!r} has shape {np.shape(x)}; expected "
@@ -301,7 +306,7 @@ def make_sparse(
         probability=_scaled(row_start, start, probability),
         initial=checked_initial(initial, num_states), label=label, rewards=rewards,
         action=action, valuation={n: np.asarray(x) for n, x in (valuation or {}).items()},
-        propositions=names, action_names=tuple(action_names))
+        propositions=names, action_names=action_names)
 
 
 def checked_starts(name: str, start: Any, total: int, of: str) -> np.ndarray:
@@ -358,6 +363,8 @@ def check_entries(
 def _checked_rewards(
     name: str, reward: Rewards, num_states: int, num_rows: int, num_transitions: int
 ) -> Rewards:
+    if not isinstance(reward, Rewards):
+        raise ValueError(f"reward {name!r} is {shown(reward)}; give Rewards.")
     parts: dict[str, Any] = {}
     sizes = {"state": num_states, "choice": num_rows, "transition": num_transitions}
     for part, size in sizes.items():

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxltl.core.host.given import shown
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import TRUE, Formula
 from jaxltl.core.logic.properties import (
@@ -27,6 +28,7 @@ from jaxltl.core.values import bounded
 from jaxltl.core.values.average_reward import average_reward
 from jaxltl.core.values.opposite import opposite_event
 from jaxltl.core.values.reachability import reachability_probability
+from jaxltl.core.values.robust import width_asked
 from jaxltl.core.values.robust_bounded import (
     robust_bounded_reachability,
     robust_cumulative_reward,
@@ -38,6 +40,7 @@ from jaxltl.core.values.sparse_satisfaction import (
     Satisfaction,
     at_states,
     sparse_satisfaction,
+    starting_states,
 )
 from jaxltl.core.values.total_reward import total_reward
 
@@ -143,11 +146,17 @@ def answer(
       [True]
     """
     prop = parse_property(prop) if isinstance(prop, str) else prop
+    if not isinstance(prop, Property):
+        raise ValueError(f"prop is {shown(prop)}; give a property or its text.")
+    if not isinstance(model, SparseMDP | IntervalMDP):
+        raise ValueError(f"{type(model).__name__} is no model that answers properties; give a "
+                         "SparseMDP (to_sparse makes one) or an IntervalMDP.")
     if prop.operator == "multi":
         raise ValueError("multi(...) has several values; solve it with achievable or pareto.")
     if states is None:
         states = np.flatnonzero(np.asarray(model.initial) > 0)
-    states = np.asarray(states, np.int64)
+    states = starting_states(model, states)
+    tolerance = width_asked(tolerance)
     solve = _solver(model, prop, _aim(model, prop), states)
     found = solve(tolerance)
     if prop.relation is None:
@@ -316,7 +325,8 @@ def _without_intervals(
     raise ValueError(
         f"{prop}: {what} are not solved for where probabilities are intervals; solved for are "
         "probabilities of formulas, and expected rewards until a state is reached (F), of so many "
-        "steps (C<=k) and after them (I=k).")
+        "steps (C<=k) and after them (I=k). Ask for one of these, or give model.nominal, which is "
+        "one choice of nature.")
 
 
 def _plain(states: np.ndarray, solution: Solution, by: str = "") -> _Found:

@@ -49,6 +49,11 @@ def average_reward(
       >>> found.value.round(9).tolist(), found.policy.tolist()
       ([5.0, 8.0, 4.0], [0, 2, 3])
     """
+    if hasattr(model, "nominal"):
+        raise ValueError("averages in the long run are not solved for where probabilities are "
+                         "intervals; ask robust_discounted_value, with a discount near 1, or "
+                         "total_reward until a target, or give model.nominal, which is one "
+                         "choice of nature.")
     model = to_sparse(model)
     sign = 1 if optimum_of(objective) is np.maximum else -1
     earned, magnitude = finite_reward(model, reward)

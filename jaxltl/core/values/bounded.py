@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.host import bounded as host
+from jaxltl.core.host.given import shown, whole
 from jaxltl.core.host.spending import bounded_cost, in_units
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts, row_reward
@@ -208,8 +209,7 @@ def reward_bounded_reachability(
 
 
 def _problem(model: Any, objective: str, num_steps: int = 0) -> tuple[SparseMDP, Any]:
-    if num_steps != int(num_steps) or num_steps < 0:
-        raise ValueError(f"num_steps={num_steps}; it must be a whole number, at least 0.")
+    whole("num_steps", num_steps)
     return to_sparse(model), optimum_of(objective)
 
 
@@ -219,8 +219,8 @@ def optimum_of(objective: str) -> Any:
     Raises:
       ValueError: it is neither "max" nor "min".
     """
-    if objective not in ("max", "min"):
-        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    if not isinstance(objective, str) or objective not in ("max", "min"):
+        raise ValueError(f'objective={shown(objective)}; it must be "max" or "min".')
     return np.maximum if objective == "max" else np.minimum
 
 

@@ -10,11 +10,13 @@ import numpy as np
 
 from jaxltl.core.automata.translate import Task
 from jaxltl.core.host.confidence import ConfidenceSets, Method, intervals_from_counts
+from jaxltl.core.host.given import whole
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.counts import TransitionCounts, counts_on
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.values.mixture import safe_mean
+from jaxltl.core.values.robust import require_direction
 from jaxltl.core.values.robust_satisfaction import RobustSatisfaction, robust_satisfaction
 
 
@@ -84,6 +86,7 @@ def learn_guarantee(
       >>> round(found.bound, 3), round(found.optimistic, 3)
       (0.88, 0.918)
     """
+    require_direction(None, objective)
     sparse = to_sparse(model)
     count = counts_on(sparse, counts) if isinstance(counts, TransitionCounts) else counts
     sets = intervals_from_counts(
@@ -175,23 +178,23 @@ def guarantee_curve(
       ValueError: a size is negative or larger than the data; and as there.
     """
     sparse = to_sparse(model)
-    whole = counts_on(sparse, counts) if isinstance(counts, TransitionCounts) else counts
-    whole, wanted = np.asarray(whole), np.asarray(sizes)
-    for name, x in (("counts", whole), ("sizes", wanted)):
+    every = counts_on(sparse, counts) if isinstance(counts, TransitionCounts) else counts
+    every, wanted = np.asarray(every), np.asarray(sizes)
+    for name, x in (("counts", every), ("sizes", wanted)):
         if x.ndim != 1 or x.dtype.kind not in "iuf" or (x != np.floor(x)).any():
             raise ValueError(f"{name} is {x.dtype}{list(x.shape)}; expected a list of integers.")
-    if (whole < 0).any():
-        raise ValueError(f"counts[{int(np.argmax(whole < 0))}] is {whole.min()}; none is negative.")
-    whole = whole.astype(np.int64)
-    total = int(whole.sum())
+    if (every < 0).any():
+        raise ValueError(f"counts[{int(np.argmax(every < 0))}] is {every.min()}; none is negative.")
+    every = every.astype(np.int64)
+    total = int(every.sum())
     wrong = (wanted < 0) | (wanted > total)
     if wrong.any():
         raise ValueError(f"sizes[{int(np.argmax(wrong))}] is {wanted[wrong][0]}; there are {total} "
                          "transitions.")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(whole("seed", seed))
     bound = np.empty(wanted.size)
     for i in np.argsort(-wanted, kind="stable"):
-        whole = rng.multivariate_hypergeometric(whole, int(wanted[i]), method="marginals")
+        every = rng.multivariate_hypergeometric(every, int(wanted[i]), method="marginals")
         bound[i] = learn_guarantee(
-            sparse, whole, task, confidence, method=method, objective=objective).bound
+            sparse, every, task, confidence, method=method, objective=objective).bound
     return bound

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.host import frontier, optimal
+from jaxltl.core.host.given import listed, shown
 from jaxltl.core.host.product import HostProduct
 from jaxltl.core.host.sparse_graph import end_components
 from jaxltl.core.host.weighted import Ends, Sums, ends, weigh
@@ -160,6 +161,7 @@ def achievable(
       >>> achievable(model, both, [0.5, 0.5]).holds, achievable(model, both, [0.5, 0.6]).holds
       (True, False)
     """
+    _require(model, objectives)
     if thresholds is None:
         thresholds = [np.nan if o.threshold is None else o.threshold for o in objectives]
     if len(thresholds) != len(objectives) or not np.isfinite(np.asarray(thresholds, float)).all():
@@ -199,6 +201,7 @@ def pareto(
       >>> pareto(model, [Objective(target="a"), Objective(target="b")]).points.tolist()
       [[0.0, 1.0], [1.0, 0.0]]
     """
+    _require(model, objectives)
     search = _Search(model, objectives, tolerance / 8)
     gap = search.close(tolerance, max_points)
     front = search.front()
@@ -208,6 +211,17 @@ def pareto(
     points = front.points[kept]
     status = Status.CONVERGED if gap <= tolerance else Status.MAX_STEPS
     return Pareto(points[np.lexsort(points.T[::-1])], front, gap, status)
+
+
+def _require(model: Any, objectives: Sequence[Objective]) -> None:
+    if hasattr(model, "nominal"):
+        raise ValueError("several objectives at once are not solved for where probabilities are "
+                         "intervals; ask for one at a time, by robust_satisfaction or "
+                         "total_reward, or give model.nominal, which is one choice of "
+                         "nature.")
+    for i, each in enumerate(listed("objectives", objectives)):
+        if not isinstance(each, Objective):
+            raise ValueError(f"objectives[{i}] is {shown(each)}; give an Objective.")
 
 
 def multi(
@@ -230,6 +244,7 @@ def multi(
       ValueError: some but not all of several objectives without a threshold; or as for
         :func:`achievable`.
     """
+    _require(model, objectives)
     free = [i for i, o in enumerate(objectives) if o.threshold is None]
     if not free:
         return achievable(model, objectives, tolerance=tolerance, max_points=max_points)

@@ -12,11 +12,12 @@ import numpy as np
 from flax import struct
 from jax import lax
 
+from jaxltl.core.host.given import numbers, shown, whole
 from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.interval_plan import IntervalPlan, plan_reachability, plan_total_reward
 from jaxltl.core.host.rows import spans
 from jaxltl.core.models.concrete import is_traced, to_jax
-from jaxltl.core.models.interval import IntervalMDP, refuse_ball
+from jaxltl.core.models.interval import IntervalMDP, refuse_ball, require_interval
 from jaxltl.core.models.operators import is_deterministic, row_weights
 from jaxltl.core.types import Method, Solution, Status, require_shape, status_code
 from jaxltl.core.values.bounded import states
@@ -31,7 +32,7 @@ from jaxltl.core.values.contest import (
 )
 from jaxltl.core.values.fixed_point import implicit
 from jaxltl.core.values.iterate import in_turn
-from jaxltl.core.values.robust import interval_reward, require_direction
+from jaxltl.core.values.robust import interval_reward, require_direction, width_asked
 
 _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
 
@@ -131,7 +132,7 @@ def prepare_interval(
     if is_traced((model, target, stay, reward, policy)):
         raise ValueError("prepare_interval reads its model, so it works on concrete arrays only; "
                          "call it before jit, and solve_interval inside.")
-    refuse_ball(model, "prepare_interval has no rule for its derivatives")
+    refuse_ball(require_interval(model), "prepare_interval has no rule for its derivatives")
     if stay is not None and reward is not None:
         raise ValueError("expected rewards are until the target alone: leave stay out.")
     nature = require_direction(nature, objective)
@@ -244,10 +245,17 @@ def solve_interval(
     Differentiable, forward and reverse, in the ends and in the rewards, with the policy and the
     order of each row's successors held fixed: where neither is tied, that is the derivative.
     """
+    if not isinstance(prepared, PreparedInterval):
+        raise ValueError(f"prepared is {shown(prepared)}; give what prepare_interval returns.")
     shape = prepared.lower.shape
     lower, upper, reward = (
-        None if x is None else jnp.asarray(x, prepared.lower.dtype)
-        for x in (lower, upper, reward))
+        None if x is None else jnp.asarray(
+            x if is_traced(x) else numbers(name, x), prepared.lower.dtype)
+        for name, x in (("lower", lower), ("upper", upper), ("reward", reward)))
+    if not is_traced(max_steps):
+        max_steps = whole("max_steps", max_steps, most=2**31 - 1)
+    if tolerance is not None and not is_traced(tolerance):
+        tolerance = width_asked(tolerance)
     for name, ends in (("lower", lower), ("upper", upper)):
         if ends is not None:
             require_shape(name, ends, shape)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.host import interval_values
+from jaxltl.core.host.given import numbers, shown
 from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.interval_discounted import discounted
 from jaxltl.core.host.interval_game import Spread, spread
@@ -27,13 +28,13 @@ def require_direction(nature: str | None, objective: str) -> str:
     Raises:
       ValueError: it, or the objective, is none of ``"min"`` and ``"max"``.
     """
-    if objective not in ("max", "min"):
-        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    if not isinstance(objective, str) or objective not in ("max", "min"):
+        raise ValueError(f'objective={shown(objective)}; it must be "max" or "min".')
     if nature is None:
         return "min" if objective == "max" else "max"
-    if nature not in ("max", "min"):
-        raise ValueError(f'nature={nature!r}; it must be "min" (nature makes the value small) or '
-                         '"max" (large).')
+    if not isinstance(nature, str) or nature not in ("max", "min"):
+        raise ValueError(f'nature={shown(nature)}; it must be "min" (nature makes the value '
+                         'small) or "max" (large).')
     return nature
 
 
@@ -41,7 +42,7 @@ def width_asked(tolerance: Any) -> float:
     """The width of an enclosure that is asked for, 1e-6 where nothing is said.
 
     Raises:
-      ValueError: it is negative or no number.
+      ValueError: it is negative, infinite or no number.
     """
     if tolerance is None:
         return TOLERANCE
@@ -49,8 +50,8 @@ def width_asked(tolerance: Any) -> float:
         width = float(tolerance)
     except (TypeError, ValueError):
         width = float("nan")
-    if not width >= 0:
-        raise ValueError(f"tolerance={tolerance!r}; it must be a number of at least 0.")
+    if not 0 <= width < np.inf:
+        raise ValueError(f"tolerance={shown(tolerance)}; it must be a finite number of at least 0.")
     return width
 
 
@@ -171,11 +172,11 @@ def robust_discounted_value(
     except (TypeError, ValueError):
         rate = float("nan")
     if not 0 <= rate < 1:
-        raise ValueError(f"discount={discount!r}; it must be at least 0 and below 1.")
+        raise ValueError(f"discount={shown(discount)}; it must be at least 0 and below 1.")
     sides = sides_of(model, policy, objective, nature)
     earned = sides.entries(entry_reward(sides.model, reward))
     largest = float(np.abs(earned).max(initial=0)) / (1 - float(discount))
-    asked = 1e-8 * max(largest, 1e-300) if tolerance is None else float(tolerance)
+    asked = 1e-8 * max(largest, 1e-300) if tolerance is None else width_asked(tolerance)
     found = discounted(
         sides.host, earned, np.where(sides.choosing, 1.0, float(discount)),
         maximize=sides.maximize, large=sides.helpful, tolerance=asked)
@@ -207,7 +208,7 @@ def robust_expectation(
     require_direction(nature, "max")
     model, _ = world_of(model)
     require_shape("value", value, model.state_shape)
-    ahead = np.asarray(value, np.float64)[model.host.mdp.successor]
+    ahead = numbers("value", value)[model.host.mdp.successor]
     if not np.isfinite(ahead).all():
         raise ValueError("value is not finite in some successor; give numbers.")
     p = model.host.nature(ahead, maximize=nature == "max")

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.host import interval_bounded
+from jaxltl.core.host.given import whole
 from jaxltl.core.host.interval_bounded import RobustSteps
-from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.interval import IntervalMDP, require_interval
 from jaxltl.core.types import Method, Solution
 from jaxltl.core.values.bounded import enclosed, state_reward, states
 from jaxltl.core.values.robust import entry_reward, require_direction
@@ -42,7 +43,7 @@ def robust_next_probability(
       [0.5, 1.0]
     """
     nature = require_direction(nature, objective)
-    chosen = states(model.nominal, target, "target")
+    chosen = states(require_interval(model).nominal, target, "target")
     return _solution(interval_bounded.next_step(
         model.host, chosen, maximize=objective == "max", helpful=nature == "max"))
 
@@ -76,8 +77,8 @@ def robust_bounded_reachability(
       >>> robust_bounded_reachability(coin, [False, True], 2, nature="max").value.tolist()
       [0.9375, 1.0]
     """
-    nature, steps = require_direction(nature, objective), _counted(num_steps)
-    goal = states(model.nominal, target, "target")
+    nature, steps = require_direction(nature, objective), whole("num_steps", num_steps)
+    goal = states(require_interval(model).nominal, target, "target")
     free = np.ones_like(goal) if stay is None else states(model.nominal, stay, "stay")
     return _solution(interval_bounded.until(
         model.host, goal, free, steps, maximize=objective == "max",
@@ -111,7 +112,7 @@ def robust_cumulative_reward(
       >>> robust_cumulative_reward(coin, [1.0, 0.0], 2, nature="max").value.tolist()
       [1.5, 0.0]
     """
-    zero = np.zeros(model.num_states)
+    zero = np.zeros(require_interval(model).num_states)
     return _earned(model, entry_reward(model, reward), zero, num_steps, objective, nature)
 
 
@@ -135,7 +136,7 @@ def robust_instantaneous_reward(
     Raises:
       ValueError: the reward has no part on states, or as for :func:`robust_cumulative_reward`.
     """
-    start = state_reward(model.nominal, reward)
+    start = state_reward(require_interval(model).nominal, reward)
     zero = np.zeros(model.num_transitions)
     return _earned(model, zero, start, num_step, objective, nature)
 
@@ -144,16 +145,10 @@ def _earned(
     model: IntervalMDP, earned: Any, start: Any, num_steps: int, objective: str,
     nature: str | None,
 ) -> Solution:
-    nature, steps = require_direction(nature, objective), _counted(num_steps)
+    nature, steps = require_direction(nature, objective), whole("num_steps", num_steps)
     return _solution(interval_bounded.total(
         model.host, earned, start, steps, maximize=objective == "max", helpful=nature == "max"),
         highest=math.inf)
-
-
-def _counted(num_steps: int) -> int:
-    if num_steps != int(num_steps) or num_steps < 0:
-        raise ValueError(f"num_steps={num_steps}; it must be a whole number, at least 0.")
-    return int(num_steps)
 
 
 def _solution(found: RobustSteps, highest: float = 1) -> Solution:

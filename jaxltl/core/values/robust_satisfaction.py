@@ -132,6 +132,9 @@ def robust_product_satisfaction(
     Raises:
       ValueError: the product's actions are restricted, or a policy is none.
     """
+    if not isinstance(model, Product) or not isinstance(model.mdp, IntervalMDP):
+        raise ValueError(f"{type(model).__name__} is no product of an interval model; give "
+                         "product(model, formula).")
     if model.allowed is not None:
         raise ValueError("a product of an interval model takes no mask of actions; restrict the "
                          "world by with_allowed(world, rows).")

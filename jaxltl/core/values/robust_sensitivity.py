@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxltl.core.host.given import numbers, shown
 from jaxltl.core.host.rows import Booleans, Integers
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import reaching
-from jaxltl.core.models.interval import IntervalMDP, refuse_ball
+from jaxltl.core.models.interval import IntervalMDP, refuse_ball, require_interval
 from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.types import Solution
 from jaxltl.core.values.bounded import states
@@ -64,10 +65,13 @@ def robust_sensitivity(
       ([0.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0])
     """
     require_direction(nature, "max")
-    refuse_ball(model, "robust_sensitivity is about ends")
+    refuse_ball(require_interval(model), "robust_sensitivity is about ends")
+    if not isinstance(solution, Solution) or solution.nature is None:
+        raise ValueError(f"solution is {shown(solution)}; give what a solver of interval models "
+                         "returned, reachability_probability, say.")
     goal = states(model.nominal, target, "target")
     passed = np.ones(goal.size, bool) if stay is None else states(model.nominal, stay, "stay")
-    weight = np.asarray(model.initial if initial is None else initial, np.float64)
+    weight = numbers("initial", model.initial if initial is None else initial)
     value, policy = np.asarray(solution.value, np.float64), np.asarray(solution.policy)
     if weight.shape != goal.shape or value.shape != goal.shape:
         raise ValueError(f"initial has shape {weight.shape} and the solution's value "

@@ -61,6 +61,7 @@ def satisfaction_probability(
     Differentiable in the policy and in the world's transition probabilities, with the
     support held fixed.
     """
+    _require_product(model)
     if isinstance(model.mdp, IntervalMDP):
         return robust_product_satisfaction(
             model, policy=policy, nature=nature, tolerance=tolerance)
@@ -131,6 +132,7 @@ def optimal_satisfaction(
     Raises:
       ValueError: the objective is unknown.
     """
+    _require_product(model)
     if isinstance(model.mdp, IntervalMDP):
         return robust_product_satisfaction(
             model, objective=objective, nature=nature, tolerance=tolerance)
@@ -236,3 +238,9 @@ def _not_final(model: Product) -> Any:
 def _one_hot(policy: Any, num_actions: int) -> Any:
     xp, table = namespace(policy)
     return table[..., None] == xp.arange(num_actions)
+
+
+def _require_product(model: Any) -> None:
+    if not hasattr(model, "automaton"):
+        raise ValueError(f"{type(model).__name__} is no product of a world and a task; give "
+                         "product(world, formula).")

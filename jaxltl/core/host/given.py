@@ -1,0 +1,124 @@
+"""What callers give: numbers, whole numbers and words, or a ValueError that says what to give."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.host.rows import Integers
+from jaxltl.core.host.sparse import Floats
+
+_SHOWN = 60  # characters
+
+
+def shown(given: Any) -> str:
+    """What was given, for messages."""
+    if isinstance(given, np.ndarray) and given.size <= _SHOWN:
+        given = given.tolist()
+    text = " ".join(repr(given).split())
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+
+
+def numbers(name: str, given: Any) -> Floats:
+    """An array of numbers, in double precision.
+
+    Raises:
+      ValueError: some of it is no number.
+
+    Example:
+      >>> numbers("lower", ["x"])
+      Traceback (most recent call last):
+      ValueError: lower is ['x']; give numbers.
+    """
+    try:
+        return np.asarray(given, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name} is {shown(given)}; give numbers.") from None
+
+
+def wholes(name: str, given: Any) -> Integers:
+    """An array of whole numbers.
+
+    Raises:
+      ValueError: some of it is none, or too large to be told from the next one.
+    """
+    found = numbers(name, given)
+    if not (np.abs(found) < 2.0**53).all() or (found != np.floor(found)).any():
+        raise ValueError(f"{name} is {shown(given)}; give whole numbers.")
+    return found.astype(np.int64)
+
+
+def number(name: str, given: Any) -> float:
+    """One finite number.
+
+    Raises:
+      ValueError: it is something else, NaN or infinite.
+    """
+    found = numbers(name, np.nan if given is None else given)
+    if found.ndim or not np.isfinite(found):
+        raise ValueError(f"{name}={shown(given)}; give a finite number.")
+    return float(found)
+
+
+def whole(name: str, given: Any, *, least: int = 0, most: int = 2**63 - 1) -> int:
+    """One whole number.
+
+    Raises:
+      ValueError: it is something else, or out of its range.
+
+    Example:
+      >>> whole("num_steps", 1.5, least=1)
+      Traceback (most recent call last):
+      ValueError: num_steps=1.5; it must be a whole number of at least 1.
+    """
+    try:
+        found = int(given)
+        fits = np.ndim(given) == 0 and bool(found == given)
+    except (TypeError, ValueError, OverflowError):
+        found, fits = 0, False
+    if not fits:
+        raise ValueError(f"{name}={shown(given)}; it must be a whole number of at least {least}.")
+    if found < least or found > most:
+        bound = f"at least {least}" if found < least else f"at most {most}"
+        raise ValueError(f"{name}={shown(given)}; it must be {bound}.")
+    return found
+
+
+def one_of(name: str, given: Any, known: Sequence[str]) -> str:
+    """One of some words.
+
+    Raises:
+      ValueError: it is none of them.
+    """
+    if not isinstance(given, str) or given not in known:
+        raise ValueError(f"{name}={shown(given)}; choose one of {', '.join(known)}.")
+    return given
+
+
+def listed(name: str, given: Any) -> list[Any]:
+    """What can be gone through, one by one; of a text its letters.
+
+    Raises:
+      ValueError: it cannot.
+    """
+    if not isinstance(given, Iterable):
+        raise ValueError(f"{name} is {shown(given)}; give a list.")
+    return list(given)
+
+
+def no_model(model: Any) -> str:
+    """Why something is no model with known probabilities, and what to give, for a message."""
+    name = type(model).__name__
+    if hasattr(model, "nominal"):
+        return (
+            f"{name} has intervals for its probabilities, which this does not take; ask what does "
+            "(reachability_probability, total_reward, robust_discounted_value, "
+            "robust_satisfaction, robust_bounded_reachability), or give its nominal model, "
+            "model.nominal, whose probabilities are one choice of nature."
+        )
+    return (
+        f"{name} has no transitions; give an MDP, a DenseMDP, a SparseMDP, or a product of one of "
+        "them."
+    )

@@ -1,0 +1,190 @@
+"""Whoever gives nonsense to what takes intervals, data or parameters is told so, by ValueError."""
+
+import re
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxltl as jl
+from jaxltl.algos import feasible, interval_learning, regions
+from jaxltl.core.host.confidence import samples_needed
+from jaxltl.core.host.given import listed, number, one_of, whole
+from jaxltl.core.host.l1_ball import l1_expectation
+from jaxltl.core.values.multi_objective import multi
+from jaxltl.core.values.objectives import Objective
+from jaxltl.core.values.robust import robust_reachability, robust_total_reward
+
+NONSENSE = {
+    "none": None, "nan": float("nan"), "infinite": float("inf"), "text": "x", "negative": -1,
+    "part": -0.5, "empty": [], "shape": np.zeros((2, 5)), "huge": 10**30, "object": object(),
+    "texts": ["x", "y"], "dict": {"x": 1},
+}
+# What NumPy and Python say of it, which names neither the argument nor what to give.
+RAW = re.compile(
+    "could not convert|could not broadcast|setting an array|inhomogeneous|truth value|invalid "
+    "literal|zero-size|cannot convert|not enough values|Incompatible shapes")
+
+
+@cache
+def things(folder):
+    """A coin in all forms, and how to ask about it."""
+    sparse = jl.make_sparse(
+        None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
+        label=[[0], [1], [0]], propositions=["a"], rewards={"r": jl.Rewards(state=[1.0, 0, 0])})
+    model = jl.make_interval(sparse, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
+    counts = jl.make_counts([0, 0, 0], [0, 0, 0], [1, 2, 1])
+    (folder / "log.csv").write_text("state,action,next\n0,0,1\n0,0,2\n")
+    (folder / "labels.csv").write_text("state,label\n1,a\n")
+    (folder / "coin.drn").write_text(
+        "@type: DTMC\n@parameters\np\n@nr_states\n3\n@model\nstate 0 init\n\taction 0\n\t\t1 : p\n"
+        "\t\t2 : 1-p\nstate 1 goal\n\taction 0\n\t\t1 : 1\nstate 2\n\taction 0\n\t\t2 : 1\n")
+    read = jl.read_parametric(folder / "coin.drn")
+    box = read.over(0.1, 0.9)
+    problem = feasible.make_problem(box, "goal", bound=">=")
+    asked = {"model": model, "target": "a", "objective": "max", "nature": "min"}
+    solved = robust_reachability(model, "a", nature="min")
+    ends = {"lower": [0.4, 0.3, 1, 1], "upper": [0.7, 0.6, 1, 1]}
+    ball = {"center": [0.5, 0.5, 1, 1], "radius": [0.1, 0, 0]}
+    told = {"model": sparse, "counts": counts, "task": "F a", "confidence": 0.9,
+            "method": "anytime", "objective": "max"}
+    some = {"problem": problem, "low": 0.2, "high": 0.8}
+    rows = {"entry_start": [0, 2, 3, 4], "successor": [1, 2, 1, 2]}
+    return [
+        (jl.make_interval, {"model": sparse, **ends, **ball}),
+        (jl.interval_rows, {"row_start": None, **rows, **ends, **ball, "rewards": {},
+                            "initial": [1, 0, 0], "propositions": (), "valuation": {}}),
+        (robust_reachability, {**asked, "policy": None, "stay": None, "tolerance": 1e-6}),
+        (robust_total_reward, {**asked, "reward": "r", "policy": None, "tolerance": 1e-6}),
+        (jl.robust_discounted_value, {"model": model, "reward": "r", "discount": 0.9,
+                                      "policy": None, "tolerance": 1e-6}),
+        (jl.robust_expectation, {"model": model, "value": [0.0, 1, 2], "nature": "min"}),
+        (jl.robust_satisfaction, {"model": model, "task": "F a", "states": [0]}),
+        (jl.robust_next_probability, asked),
+        (jl.robust_bounded_reachability, {**asked, "num_steps": 2, "stay": None}),
+        (jl.robust_cumulative_reward, {"model": model, "reward": "r", "num_steps": 2}),
+        (jl.robust_instantaneous_reward, {"model": model, "reward": "r", "num_step": 2}),
+        (jl.robust_sensitivity, {"model": model, "solution": solved, "target": "a",
+                                 "nature": "min", "stay": None, "initial": [1, 0, 0]}),
+        (jl.prepare_interval, {**asked, "stay": None, "reward": None, "policy": None}),
+        (jl.intervals_from_counts, {
+            "counts": [1, 2, 3, 4], "confidence": 0.9, "method": "anytime", "used": None,
+            "entry_start": [0, 2, 4], "rows": None, "num_outcomes": None, "num_claims": None}),
+        (samples_needed, {"width": 0.1, "confidence": 0.9, "method": "anytime", "num_claims": 1,
+                          "num_outcomes": 2}),
+        (partial(l1_expectation, maximize=True), {
+            "value": [0.0, 1], "center": [0.5, 0.5], "radius": [0.1],
+            "entry_start": [0, 2]}),
+        (jl.make_counts, {"state": [0], "action": [0], "successor": [1], "count": [2],
+                          "states": None, "actions": None}),
+        (jl.counts_on, {"model": sparse, "counts": counts}),
+        (jl.counted_model, {"counts": counts, "initial": "0", "labels": {"a": ["1"]},
+                            "terminal": ["1"], "graph": "seen"}),
+        (jl.read_log, {"path": folder / "log.csv", "model": sparse, "count": "count",
+                       "columns": ("state", "action", "next")}),
+        (jl.read_log, {"path": folder / "log.csv", "states": None, "actions": None}),
+        (jl.read_labels, {"path": folder / "labels.csv", "states": ["0", "1", "2"],
+                          "columns": ("state", "label")}),
+        (jl.learn_guarantee, {**told, "rows": None, "num_claims": None, "tolerance": 1e-6}),
+        (jl.guarantee_curve, {**told, "sizes": [1, 2], "seed": 0}),
+        (jl.answer, {"model": model, "prop": 'Pmaxmin=? [F "a"]', "states": None}),
+        (jl.make_parametric, {"model": sparse, "numbers": coin, "low": [0.1], "high": [0.9],
+                              "parameters": ["p"]}),
+        (box.at, {"values": [0.5]}), (box.within, {"low": 0.2, "high": 0.8}),
+        (read.at, {"values": {"p": 0.5}}), (read.over, {"low": 0.1, "high": 0.9}),
+        (jl.read_parametric, {"path": folder / "coin.drn"}),
+        (feasible.make_problem, {"model": box, "target": "goal", "bound": ">=", "reward": None,
+                                 "stay": None, "objective": "max"}),
+        (feasible.within, some),
+        (feasible.feasible, {"problem": problem, "threshold": 0.5, "starts": 2, "num_steps": 3,
+                             "tolerance": 1e-6, "enough": None, "hparams": None}),
+        (feasible.certify, {"problem": problem, "parameters": [0.5], "tolerance": 1e-6}),
+        (regions.enclose, some),
+        (regions.prove_regions, {**some, "threshold": 0.5, "max_boxes": 5}),
+        (regions.prove_around, {"problem": problem, "threshold": 0.3, "point": [0.5],
+                                "num_halvings": 3}),
+        (interval_learning.make_problem, {"world": sparse, "task": "F a"}),
+    ]
+
+
+def coin(x):
+    return jnp.array([x[0], 1 - x[0], 1, 1])
+
+
+@pytest.mark.parametrize("kind", NONSENSE)
+def test_nonsense_is_told(kind, tmp_path_factory):
+    """What is accepted is a value of its kind; what is not raises a ValueError of ours."""
+    folder = tmp_path_factory.getbasetemp() / "nonsense"
+    folder.mkdir(exist_ok=True)
+    for call, given in things(folder):
+        for name in given:
+            try:
+                call(**given | {name: NONSENSE[kind]})
+            except ValueError as error:
+                assert not RAW.search(str(error)), (call, name, error)
+
+
+def test_good_input_is_taken(tmp_path):
+    for call, given in things(tmp_path):
+        call(**given)
+
+
+@pytest.mark.parametrize(("call", "message"), [
+    (lambda m: jl.robust_bounded_reachability(m, "a", None), "num_steps=None; it must be a whole"),
+    (lambda m: robust_reachability(m, "a", policy="x"), "policy is 'x'; give the number"),
+    (lambda m: jl.average_reward(m, "r"), "robust_discounted_value, with a discount near 1"),
+    (lambda m: multi(m, [Objective(target="a"), Objective(target="a")]), "ask for one at a time"),
+    (lambda m: jl.bounded_reachability(m, "a", 2), "ask what does .*robust_bounded_reachability"),
+    (lambda m: jl.to_dense(m), "or give its nominal model, model.nominal"),
+    (lambda m: jl.attractor(m, m.states_where("a")), "IntervalMDP has intervals"),
+    (lambda m: jl.make_interval(m, m.lower, m.upper), "of an interval model, its nominal one"),
+])
+def test_who_asks_of_intervals_what_is_not_solved(call, message):
+    model = jl.interval_rows(
+        None, [0, 2, 3, 4], [1, 2, 1, 2], [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1], initial=[1, 0, 0],
+        label=[[0], [1], [0]], propositions=["a"], rewards={"r": jl.Rewards(state=[1.0, 0, 0])})
+    with pytest.raises(ValueError, match=message):
+        call(model)
+
+
+def test_claims_thresholds_and_steps():
+    counts = {"counts": [[1, 2, 3]], "confidence": 0.9}
+    with pytest.raises(ValueError, match="num_claims=inf; it must be a whole number"):
+        jl.intervals_from_counts(**counts, num_claims=np.inf)
+    world = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+    problem = interval_learning.make_problem(world, "true")
+    for steps in (None, "x", np.nan, [1]):
+        with pytest.raises(ValueError, match=r"num_steps=.*whole number of at least 1"):
+            interval_learning.train(
+                jax.random.key(0), problem, interval_learning.Hparams(), num_steps=steps)
+
+
+def test_a_log_of_a_world_whose_slips_repeat_a_successor(tmp_path):
+    """Two slips against a wall end at one place: one transition, by name."""
+    world = jl.make_mdp([[[0, 0, 1]], [[1, 1, 1]]], [[[0.25, 0.25, 0.5]], [[1, 0, 0]]])
+    path = tmp_path / "log.csv"
+    path.write_text("state,action,next\n0,0,0\n0,0,1\n0,0,0\n")
+    counts = jl.read_log(path, world)
+    assert counts.count.tolist() == [2, 1]
+    assert jl.learn_guarantee(world, counts, "true", 0.9).bound == 1
+    with pytest.raises(ValueError, match="convert a model whose rows repeat a successor by to_sp"):
+        jl.counts_on(world, counts)
+    path.write_text("state,action,next\n1,0,0\n")
+    with pytest.raises(ValueError, match="line 2"):
+        jl.read_log(path, world)
+
+
+def test_words_and_numbers():
+    assert whole("n", 3.0) == 3
+    assert number("x", "0.5") == 0.5
+    assert one_of("bound", "<=", (">=", "<=")) == "<="
+    assert listed("names", "ab") == ["a", "b"]
+    for given, message in ((2, "n=2; it must be at least 3"), (9, "n=9; it must be at most 8"),
+                           (3.5, "whole number of at least 3"), (True, "at least 3")):
+        with pytest.raises(ValueError, match=message):
+            whole("n", given, least=3, most=8)
+    for given in (None, np.inf, [1.0], "x"):
+        with pytest.raises(ValueError, match=r"give a finite number|give numbers"):
+            number("x", given)
