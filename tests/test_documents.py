@@ -33,6 +33,24 @@ def test_the_readme_example_runs(tmp_path, monkeypatch, capsys):
         assert told in printed
 
 
+def test_the_page_on_evaluation_runs(capsys):
+    page = (ROOT / "docs" / "evaluation.md").read_text()
+    names: dict = {}
+    first, second = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    exec(compile(first, "evaluation.md", "exec"), names)
+    jl, jnp = names["jl"], names["jnp"]
+    product = jl.product(names["world"], "!trap U goal")
+    policy = jnp.broadcast_to(jnp.array([0, 0.5, 0, 0.5]), (9, product.num_memory, 4))
+    exact = float(jl.satisfaction_probability(product, policy).value[0, product.automaton.initial])
+    found = names["found"]
+    assert f"it is {exact:.4f}" in page and found.success.lower <= exact <= found.success.upper
+    printed = capsys.readouterr().out.splitlines()
+    shown = page.split("```\n2,000")[1].split("```")[0].splitlines()
+    assert [row.split()[:1] for row in printed[1:]] == [row.split()[:1] for row in shown[1:]]
+    exec(compile(second, "evaluation.md", "exec"), names)
+    assert names["again"].decision is True
+
+
 @pytest.mark.notebook
 @pytest.mark.parametrize("path", sorted(ROOT.glob("notebooks/*.ipynb")), ids=lambda p: p.stem)
 def test_a_notebook_runs(path, tmp_path):

@@ -1,7 +1,7 @@
 """Evaluations: sums beside whole episodes, coverage exactly and simulated, decisions, refusals."""
 
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -239,6 +239,8 @@ def test_simulated_evaluations_cover(number, chance, threshold, monkeypatch):
         return jax.tree.map(lambda x: x[seed, begin: begin + batch], every)
 
     monkeypatch.setattr(evaluation, "_batch", handed)
+    for name in ("share_estimate", "_decided"):  # of few counts, many times
+        monkeypatch.setattr(evaluation, name, cache(getattr(evaluation, name)))
     covered = wrong = decided = spent = 0
     for seed in range(number):
         found = evaluate(
