@@ -43,15 +43,15 @@ class SequenceSampler:
 
     Attributes:
       length: ``float[D]``, how often there are 1 to D steps.
-      reach: ``float[N]``, how often a step asks for one of 1 to N events.
-      avoid: ``float[N]``, how often 0 to N - 1 events are to be avoided.
-      usable: ``bool[E]``, the events that are drawn.
+      reach: ``float[N]``, how often a step asks for one of 1 to N sets of events.
+      avoid: ``float[N]``, how often 0 to N - 1 sets are to be avoided.
+      sets: ``bool[G, E]``, the sets of events that are drawn.
     """
 
     length: chex.Array
     reach: chex.Array
     avoid: chex.Array
-    usable: chex.Array
+    sets: chex.Array
 
 
 class SequenceWorld(NamedTuple):
@@ -104,13 +104,29 @@ def event_index(events: chex.Array, label: chex.Array) -> jax.Array:
     return jnp.argmin((events != label).sum(-1)).astype(jnp.int32)
 
 
+def proposition_sets(events: ArrayLike) -> np.ndarray:
+    """``bool[P, E]``: for each proposition the events in which it holds, to be drawn as sets.
+
+    Example:
+      >>> proposition_sets(events_of(["a", "b"], at_most=2)).astype(int).tolist()
+      [[0, 1, 0, 1], [0, 0, 1, 1]]
+    """
+    return np.asarray(events, bool).T
+
+
 def sequence_sampler(
-    length: ArrayLike, reach: ArrayLike, avoid: ArrayLike, usable: ArrayLike
+    length: ArrayLike, reach: ArrayLike, avoid: ArrayLike, sets: ArrayLike
 ) -> SequenceSampler:
     """A checked :class:`SequenceSampler`; weights need not sum to 1.
 
+    Args:
+      length, reach, avoid: see :class:`SequenceSampler`.
+      sets: ``bool[G, E]``, as of :func:`proposition_sets`; or ``bool[E]``, the events that are
+        drawn one by one.
+
     Raises:
-      ValueError: weights that are negative or all zero, or more events a step than are usable.
+      ValueError: weights that are negative or all zero, an empty set, or more sets a step than
+        there are.
 
     Example:
       >>> sampler = sequence_sampler([1, 1], [1], [1, 1], [False, True, True, True])
@@ -124,21 +140,30 @@ def sequence_sampler(
         if row.ndim != 1 or not (np.isfinite(row) & (row >= 0)).all() or not row.sum() > 0:
             raise ValueError(f"{name}={row.tolist()}; give weights of one axis, none of them "
                              "negative, some of them positive.")
-    events = np.asarray(usable)
-    if events.dtype != np.bool_ or events.ndim != 1:
-        raise ValueError(f"usable has type {events.dtype} and shape {list(events.shape)}; give "
-                         "Booleans, one for each event.")
+    groups = np.asarray(sets)
+    if groups.dtype != np.bool_ or groups.ndim not in (1, 2):
+        raise ValueError(f"sets has type {groups.dtype} and shape {list(groups.shape)}; give "
+                         "Booleans, a row for each set and a column for each event.")
+    if groups.ndim == 1:
+        groups = np.eye(groups.size, dtype=bool)[groups]
+    for row in np.flatnonzero(~groups.any(-1))[:1]:
+        raise ValueError(f"sets: row {row} has no event; leave it out.")
     most = int(np.flatnonzero(found["reach"])[-1]) + 1 + int(np.flatnonzero(found["avoid"])[-1])
-    if most > events.sum():
-        raise ValueError(f"reach and avoid ask for up to {most} events in a step, but usable has "
-                         f"{events.sum()}; give fewer weights.")
-    return SequenceSampler(found["length"], found["reach"], found["avoid"], events)
+    if most > len(groups):
+        raise ValueError(f"reach and avoid ask for up to {most} sets in a step, but there are "
+                         f"{len(groups)}; give fewer weights.")
+    return SequenceSampler(found["length"], found["reach"], found["avoid"], groups)
 
 
 def draw_sequence(key: chex.PRNGKey, sampler: SequenceSampler) -> Sequence:
-    """A sequence; the events of a step are drawn without repetition, those of two steps freely."""
+    """A sequence: for each step some sets to reach and others to avoid, without repetition.
+
+    What is to be reached is not avoided, nor is a set in which the step before may have ended: who
+    has just done that step could not help it.
+    """
     keys = jax.random.split(key, 4)
-    depth, width = sampler.length.shape[0], sampler.usable.shape[0]
+    depth, count = sampler.length.shape[0], sampler.sets.shape[0]
+    sets = jnp.asarray(sampler.sets)
 
     def size(key: chex.PRNGKey, weight: jax.Array, shape: tuple[int, ...]) -> jax.Array:
         return jax.random.categorical(key, jnp.log(jnp.asarray(weight)), shape=shape)
@@ -146,11 +171,13 @@ def draw_sequence(key: chex.PRNGKey, sampler: SequenceSampler) -> Sequence:
     length = 1 + size(keys[0], sampler.length, ()).astype(jnp.int32)
     wanted = 1 + size(keys[1], sampler.reach, (depth, 1))
     shunned = size(keys[2], sampler.avoid, (depth, 1))
-    order = jnp.where(sampler.usable, jax.random.uniform(keys[3], (depth, width)), 2.0)
-    rank = jnp.argsort(jnp.argsort(order, -1), -1)
+    rank = jnp.argsort(jnp.argsort(jax.random.uniform(keys[3], (depth, count)), -1), -1)
     asked = (jnp.arange(depth) < length)[:, None]
-    return Sequence(
-        asked & (rank < wanted), asked & (rank >= wanted) & (rank < wanted + shunned), length)
+    reach = asked & ((rank < wanted)[..., None] & sets).any(1)
+    before = jnp.concatenate([jnp.zeros_like(reach[:1]), reach[:-1]])
+    clear = ~(before[:, None] & sets).any(-1)
+    chosen = clear & (rank >= wanted) & (rank < wanted + shunned)
+    return Sequence(reach, asked & (chosen[..., None] & sets).any(1) & ~reach, length)
 
 
 def sequence_environment(
@@ -187,9 +214,10 @@ def sequence_environment(
         raise ValueError(f"events has shape {list(rows.shape)} and type {rows.dtype}; give "
                          f"Booleans [E, {count}], a column for each of the environment's "
                          "propositions.")
-    if len(sampler.usable) != len(rows):
-        raise ValueError(f"the sampler is of {len(sampler.usable)} events, but {len(rows)} are "
-                         "given; both must be of the same events.")
+    width = np.shape(sampler.sets)[-1]
+    if width != len(rows):
+        raise ValueError(f"the sampler is of {width} events, but {len(rows)} are given; both must "
+                         "be of the same events.")
     shape = (len(sampler.length), len(rows))
     told: Any = Sequence(box(0, 1, shape, bool), box(0, 1, shape, bool),  # type: ignore[arg-type]
                          box(0, np.inf, (), np.int32))  # type: ignore[arg-type]

@@ -11,6 +11,7 @@ from jaxltl.core.models.sequence_task import (
     draw_sequence,
     event_index,
     events_of,
+    proposition_sets,
     remaining,
     sequence_environment,
     sequence_sampler,
@@ -88,7 +89,25 @@ def test_what_is_drawn_has_the_weights_asked_for():
     share = np.bincount(length, minlength=4)[1:] / 3000
     assert abs(share - 1 / 3).max() < 0.04
     assert abs((reach.sum(-1)[asked] == 2).mean() - 1 / 3) < 0.03
-    assert abs((avoid.sum(-1)[asked] == 1).mean() - 1 / 2) < 0.03
+    assert abs((avoid[:, 0].sum(-1) == 1).mean() - 1 / 2) < 0.03
+    assert not (avoid[:, 1:] & reach[:, :-1]).any()  # what has just happened is not avoided
+
+
+def test_sets_of_events_are_drawn_whole():
+    events = events_of(NAMES, 2)
+    sampler = sequence_sampler([1, 1], [1, 1], [0, 1], proposition_sets(events))
+    drawn = jax.vmap(draw_sequence, (0, None))(jax.random.split(jax.random.key(2), 500), sampler)
+    sets = proposition_sets(events)
+
+    def union(parts, of):
+        inside = [part for part in parts if not (part & ~of).any()]
+        return np.any([*inside, np.zeros_like(of)], 0)
+
+    for reach, avoid in zip(np.asarray(drawn.reach), np.asarray(drawn.avoid), strict=True):
+        (before, wanted), shunned = reach, avoid[1]
+        assert (union(sets, wanted) == wanted).all()
+        free = [part & ~wanted for part in sets if not (part & before).any()]
+        assert (union(free, shunned) == shunned).all()
 
 
 def test_events_are_told_by_their_labels():
@@ -98,10 +117,11 @@ def test_events_are_told_by_their_labels():
 
 @pytest.mark.parametrize(("given", "said"), [
     ({"length": [0, 0]}, "length="), ({"reach": [-1]}, "reach="), ({"avoid": [np.nan]}, "avoid="),
-    ({"usable": [1, 0]}, "usable has type"), ({"avoid": [0, 0, 0, 1]}, "up to 5 events"),
+    ({"sets": [1, 0]}, "sets has type"), ({"avoid": [0, 0, 0, 1]}, "up to 5 sets"),
+    ({"sets": [[True], [False]]}, "row 1 has no event"),
 ])
 def test_bad_samplers_are_named(given, said):
-    weights = {"length": [1], "reach": [1, 1], "avoid": [1], "usable": [False, True, True, True]}
+    weights = {"length": [1], "reach": [1, 1], "avoid": [1], "sets": [False, True, True, True]}
     with pytest.raises(ValueError, match=said):
         sequence_sampler(**{**weights, **given})
 
