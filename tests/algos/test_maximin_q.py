@@ -36,12 +36,12 @@ class Safe(NamedTuple):
 @cache
 def safe_robots(size: int) -> Safe:
     game = robots(size)
-    collision = game.label[:, game.propositions.index("collision")]
-    region = ~attractor(game, collision, rule=~game.system).region
-    mask = game.available & forall_successor(game, region)
+    collision = np.asarray(game.label)[:, game.propositions.index("collision")]
+    region = ~np.asarray(attractor(game, collision, rule=~np.asarray(game.system)).region)
+    mask = np.asarray(game.available) & np.asarray(jax.jit(forall_successor)(game, region))
     start = np.where(region, game.initial, 0)
     part = restrict(game, start / start.sum(), allowed=mask).model
-    return Safe(game, np.asarray(region), np.asarray(mask), part, np.asarray(diagonal_reward(part)))
+    return Safe(game, region, mask, part, np.asarray(diagonal_reward(part)))
 
 
 def action_values(game: Game, reward, value, discount, per="system_move") -> np.ndarray:
@@ -116,12 +116,13 @@ def test_robots_learn_the_exact_value(size, counts):
     recurrent = np.asarray(problem.measured)
     assert (~recurrent).sum() == 4, "states in corners without a predecessor"
     system = np.asarray(problem.game.system)
-    values, number = np.unique(np.round(problem.exact[system], 8), return_counts=True)
+    exact = np.asarray(problem.exact)
+    values, number = np.unique(np.round(exact[system], 8), return_counts=True)
     assert dict(zip(values.tolist(), number.tolist(), strict=True)) == counts
     # The greedy moves are optimal, not only their estimates.
-    q = action_values(problem.game, problem.reward, np.asarray(problem.exact), 0.9)
+    q = action_values(problem.game, np.asarray(problem.reward), exact, 0.9)
     chosen = q[np.arange(len(q)), np.asarray(maximin_q.policy(state, problem, hparams))]
-    np.testing.assert_allclose(chosen[recurrent], problem.exact[recurrent], atol=1e-9)
+    np.testing.assert_allclose(chosen[recurrent], exact[recurrent], atol=1e-9)
 
 
 def test_ten_million_moves_stay_in_the_region():
@@ -204,7 +205,8 @@ def test_methods_agree_on_alternating_games(method, per):
     exact = minimax_value(game, reward, 0.8, per)
     learned = np.asarray(game.system) if method == "maximin" else slice(None)
     reached = np.asarray(maximin_q.recurrent_states(problem))[learned]
-    np.testing.assert_allclose(state.value[learned][reached], exact[learned][reached], atol=1e-9)
+    value = np.asarray(state.value)
+    np.testing.assert_allclose(value[learned][reached], exact[learned][reached], atol=1e-9)
     assert reached.sum() >= 3
     assert state.violations == 0
     q = action_values(game, reward, exact, 0.8, per)
@@ -238,11 +240,11 @@ def test_chance_is_averaged_out_by_decaying_steps(method):
     if method == "maximin":
         learned &= np.asarray(game.system)
     assert learned.sum() >= 3
-    assert np.abs(state.value - exact)[learned].max() < 0.05
+    off = np.abs(np.asarray(state.value) - exact)[learned].max()
+    assert off < 0.05
     # Steps of constant size do not settle.
     rough, metrics = train(problem, replace(hparams, step_size=0.5, step_power=0.0), 600)
-    off = np.abs(state.value - exact)[learned].max()
-    assert np.abs(rough.value - exact)[learned].max() > 2 * off
+    assert np.abs(np.asarray(rough.value) - exact)[learned].max() > 2 * off
     assert metrics.residual[-1] > 0.01
 
 

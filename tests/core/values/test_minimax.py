@@ -22,6 +22,7 @@ from tests.support import (
     assert_gradients,
     assert_solutions_agree,
     counted_traces,
+    counts,
     lane,
     mass_preserving,
     random_product,
@@ -70,6 +71,7 @@ def batch_of(cases):
 
 
 def assert_certified(solution, exact, tolerance=None):
+    solution = jax.tree.map(np.asarray, solution)
     assert (solution.status == Status.CONVERGED).all()
     assert_encloses(solution, exact)
     width = np.asarray(solution.upper - solution.lower)
@@ -539,10 +541,11 @@ def assert_solved(successor, available, system, reward):
         np.testing.assert_array_equal(brute.mean_payoff(successor, fixed, system, reward), exact)
 
 
-def test_mean_payoffs_are_those_of_all_strategy_pairs():
+@counts(100, 300)
+def test_mean_payoffs_are_those_of_all_strategy_pairs(count):
     """Small whole rewards make ties, and so games in which improvements do not show in gains."""
     rng = np.random.default_rng(9)
-    for i in range(300):
+    for i in range(count):
         num_states, num_actions = ((5, 2), (4, 3))[i % 2]
         shape = (num_states, num_actions)
         reward = rng.integers(-1 - i % 3, 2 + i % 3, shape).astype(float)
