@@ -10,18 +10,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.host.ball import Ball, Sorted, narrowed, share_of
+from jaxltl.core.host.ball import Ball, share_of
+from jaxltl.core.host.interval_table import Table, tables
 from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 
 _EPS = float(np.finfo(np.float64).eps)
-_PAIRS = 5  # entries of a row up to which each pair is compared
-_WIDTHS = 12  # different numbers of successors up to which rows of each are sorted together
 
 
 @dataclass(frozen=True)
@@ -50,14 +49,28 @@ class HostInterval:
         return np.maximum(1 - self.total(self.lower), 0)
 
     @cached_property
-    def _groups(self) -> list[_Group]:
-        """The rows by their number of entries; by its logarithm if these are many."""
-        start, width = self.mdp.entry_start[:-1], np.diff(self.mdp.entry_start)
-        kind = width
-        if np.unique(width).size > _WIDTHS:
-            kind = np.where(width > 1, np.ceil(np.log2(width)).astype(int) + 1, 1)
-        each = (np.flatnonzero(kind == k) for k in np.unique(kind))
-        return [_group(row, start[row], width[row]) for row in each]
+    def firm(self) -> bool:
+        """Whether nature must give something to every successor."""
+        return bool((self.lower > 0).all())
+
+    @cached_property
+    def tables(self) -> list[Table]:
+        """The rows by their number of entries, in parts."""
+        lack = None
+        if self.ball is not None:
+            lack = 1 - self.total(self.ball.center)
+            lack = np.where(np.abs(lack) > self.rounding, lack, 0)
+        found = []
+        for row, entry, used in tables(self.mdp.entry_start):
+            lower, upper = (x[entry] if used is None else np.where(used, x[entry], 0)
+                            for x in (self.lower, self.upper))
+            table = Table(row, entry, used, lower, upper, self.rest[row], self.rounding[row])
+            if self.ball is not None and lack is not None:
+                center = self.ball.center[entry]
+                center = center if used is None else np.where(used, center, 0)
+                table = table._replace(center=center, most=self.ball.most[row], lack=lack[row])
+            found.append(table)
+        return found
 
     def total(self, quantity: NDArray[Any]) -> NDArray[Any]:
         """The sum over each row's entries, ``[R]`` from ``[T]``."""
@@ -70,83 +83,19 @@ class HostInterval:
           quantity: ``float64[T]``, finite, of each entry.
           maximize: whether nature makes the sum large.
         """
-        key = -quantity if maximize else quantity
-        box = self._ends_for(key)
-        found = box.lower.copy()
-        free = box.upper - box.lower
-        for row, entry, used in self._groups:
-            if entry.shape[1] == 1:
-                found[entry] = box.upper[entry]
-                continue
-            if used is None and entry.shape[1] <= _PAIRS:
-                found[entry] = box._by_pairs(key, free, row, entry)
-                continue
-            rank = key[entry] if used is None else np.where(used, key[entry], np.inf)
-            order = np.argsort(rank, axis=1, kind="stable")
-            entry = np.take_along_axis(entry, order, 1)
-            room = free[entry]
-            if used is not None:
-                used = np.take_along_axis(used, order, 1)
-                room = np.where(used, room, 0)
-            before = np.zeros_like(room)
-            np.cumsum(room[:, :-1], axis=1, out=before[:, 1:])
-            left = box.rest[row, None] - before
-            given = np.clip(np.where(left > self.rounding[row, None], left, 0), 0, room)
-            # What is given whole is the upper end itself, without rounding.
-            mass = np.where(given == room, box.upper[entry], box.lower[entry] + given)
-            if used is None:
-                found[entry] = mass
+        key, found = -quantity if maximize else quantity, np.empty(quantity.size)
+        for table in self.tables:
+            mass = table.best(key[table.entry])
+            if table.used is None:
+                found[table.entry] = mass
             else:
-                found[entry[used]] = mass[used]
+                found[table.entry[table.used]] = mass[table.used]
         return found
-
-    def _ends_for(self, key: Floats) -> HostInterval:
-        """The intervals in whose stead a ball's best distribution, least keys first, is theirs."""
-        if self.ball is None:
-            return self
-        lower, upper = self.lower.copy(), self.upper.copy()
-        for row, entry, used in self._groups:
-            if entry.shape[1] == 1:
-                continue
-            rank = key[entry] if used is None else np.where(used, key[entry], np.inf)
-            order = np.argsort(rank, axis=1, kind="stable")
-            entry = np.take_along_axis(entry, order, 1)
-            used = None if used is None else np.take_along_axis(used, order, 1)
-            ends = narrowed(Sorted(
-                self.lower[entry], self.upper[entry], self.ball.center[entry], used,
-                self.ball.most[row], self._lack[row], self.rounding[row]))
-            for end, found in zip((lower, upper), ends, strict=True):
-                end[entry if used is None else entry[used]] = found if used is None else found[used]
-        return HostInterval(self.mdp, lower, upper)
-
-    @cached_property
-    def _lack(self) -> Floats:
-        """``float64[R]``, what the centers of a ball miss of one."""
-        assert self.ball is not None
-        found = 1 - self.total(self.ball.center)
-        return np.where(np.abs(found) > self.rounding, found, 0)
-
-    def _by_pairs(
-        self, key: Floats, free: Floats, row: Integers, entry: Integers
-    ) -> Floats:
-        """The distributions of some rows, ``[N, W]``: few entries are compared, not sorted."""
-        rank, room = (np.ascontiguousarray(x[entry].T) for x in (key, free))
-        rest, rounding = self.rest[row], self.rounding[row]
-        mass = np.empty(entry.shape)
-        for i in range(entry.shape[1]):
-            left = rest.copy()
-            for j in range(entry.shape[1]):
-                if j != i:
-                    first = rank[j] <= rank[i] if j < i else rank[j] < rank[i]
-                    left -= first * room[j]
-            given = np.clip(np.where(left > rounding, left, 0), 0, room[i])
-            mine = entry[:, i]
-            # What is given whole is the upper end itself, without rounding.
-            mass[:, i] = np.where(given == room[i], self.upper[mine], self.lower[mine] + given)
-        return mass
 
     def may_keep(self, entries: Booleans) -> Booleans:
         """Whether nature may put all mass on some entries: ``bool[R]`` from ``bool[T]``."""
+        if self.firm:
+            return np.logical_and.reduceat(entries, self.mdp.entry_start[:-1])
         room = self.total(np.where(entries, self.upper, 0))
         needed = np.logical_or.reduceat(
             ~entries & (self.lower > 0), self.mdp.entry_start[:-1])
@@ -238,45 +187,22 @@ class HostInterval:
     def halted(self, states: Booleans) -> tuple[HostInterval, Integers]:
         """The model in which some states stand still, and the row that each row was."""
         mdp = self.mdp
-        if not states.any():
-            return self, np.arange(mdp.num_rows)
+        start, stop = (mdp.entry_start[x[states]] for x in (mdp.row_start[:-1], mdp.row_start[1:]))
+        if (stop - start == 1).all() and (mdp.successor[start] == np.flatnonzero(states)).all():
+            return self, np.arange(mdp.num_rows)  # they do already
         count = np.where(states, 1, np.diff(mdp.row_start))
         row = spans(mdp.row_start[:-1], count)
-        part, _ = self.of_rows(starts_of(count), row)
-        loop = states[part.mdp.state]
-        first = part.mdp.entry_start[:-1][loop]
-        kept = ~loop[part.mdp.row]
-        kept[first] = True
-        successor = part.mdp.successor.copy()
-        lower, upper, chance = (x.copy() for x in (part.lower, part.upper, part.mdp.probability))
-        successor[first] = part.mdp.state[loop]
+        loop = np.repeat(states, count)
+        width = np.where(loop, 1, np.diff(mdp.entry_start)[row])
+        entry, start = spans(mdp.entry_start[row], width), starts_of(width)
+        first = start[:-1][loop]
+        successor = mdp.successor[entry]
+        lower, upper, chance = (x[entry] for x in (self.lower, self.upper, mdp.probability))
+        successor[first] = np.flatnonzero(states)
         lower[first] = upper[first] = chance[first] = 1
-        width = np.add.reduceat(kept.astype(np.int64), part.mdp.entry_start[:-1])
-        small = HostMDP(part.mdp.row_start, starts_of(width), successor[kept], chance[kept])
-        ball = part.ball
+        ball = self.ball
         if ball is not None:
-            center = ball.center.copy()
-            center[first] = 1
-            ball = ball._replace(center=center[kept])
-        return HostInterval(small, lower[kept], upper[kept], ball), row
-
-
-class _Group(NamedTuple):
-    """Rows of about one width, as a table.
-
-    Attributes:
-      row: ``int[N]``.
-      entry: ``int[N, W]``, their entries; the first one again where a row has fewer.
-      used: ``bool[N, W]``, or None where every row has W.
-    """
-
-    row: Integers
-    entry: Integers
-    used: Booleans | None
-
-
-def _group(row: Integers, start: Integers, width: Integers) -> _Group:
-    rank = np.arange(width.max())
-    used = rank < width[:, None]
-    entry = start[:, None] + np.where(used, rank, 0)
-    return _Group(row, entry, None if used.all() else used)
+            ball = ball.of(entry, row)
+            ball.center[first] = 1
+        small = HostMDP(starts_of(count), start, successor, chance)
+        return HostInterval(small, lower, upper, ball), row

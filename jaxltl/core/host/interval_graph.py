@@ -31,6 +31,11 @@ def compelled(
       every: whether all rows must, else some.
       rows: ``bool[R]``, the rows that may be taken; default all.
     """
+    if model.firm:  # the graph is the same whatever nature picks
+        if every and rows is None:
+            return forced(model.mdp, goal)
+        if not every:
+            return reaching(model.mdp, goal, rows)
     return _compelled(model, goal, every, rows)[0]
 
 
@@ -44,6 +49,9 @@ def attracting(
     Args:
       model, goal, rows: as of :func:`compelled`.
     """
+    if model.firm:
+        rows = np.ones(model.mdp.num_rows, bool) if rows is None else rows
+        return towards(model.mdp, goal, rows).astype(np.int64)
     return _compelled(model, goal, False, rows)[1]
 
 
@@ -109,6 +117,27 @@ def decided(
     if not maximize and not helpful:
         return Decided(zero, ~reaching(mdp, zero))
     return Decided(zero, surely(model, goal, ~zero, maximize=maximize, helpful=helpful)[0])
+
+
+def held(
+    model: HostInterval, target: Booleans, known: Decided, *, maximize: bool
+) -> tuple[Integers, Booleans]:
+    """What keeps a probability against the other side where it is decided.
+
+    Args:
+      model, target, maximize: as of :func:`decided`, of a policy and nature that are opposed.
+      known: what is decided.
+
+    Returns:
+      ``int[S]``, rows of the policy: where it has what it wants, these keep it. And ``bool[T]``,
+      the entries to which nature keeps: all, unless it has what it wants.
+    """
+    mdp = model.mdp
+    mine, other = (known.one, known.zero) if maximize else (known.zero, known.one)
+    rows = ~mdp.support.lead_to(~mine) & mine[mdp.state]
+    row = attracting(model, target, rows) if maximize else mdp.first_choice(rows)[1]
+    keeps = model.may_stay(other) & other[mdp.state]
+    return row.astype(np.int64), other[mdp.successor] | ~keeps[mdp.row]
 
 
 def surely(

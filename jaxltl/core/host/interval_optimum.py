@@ -15,23 +15,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxltl.core.host.elimination import Factors, factors
 from jaxltl.core.host.interval import HostInterval
-from jaxltl.core.host.levels import Edges, components_in_order
+from jaxltl.core.host.interval_nodes import Choice, Nodes
+from jaxltl.core.host.interval_systems import Systems
 from jaxltl.core.host.rows import Booleans, Integers, starts_of
-from jaxltl.core.host.sparse import Floats, HostMDP
-from jaxltl.core.host.sparse_graph import towards
+from jaxltl.core.host.sparse import Floats
 from jaxltl.core.host.transient import Enclosed
 
 _EPS = float(np.finfo(np.float64).eps)
-_TINY = 1e-290
 _LEAST = 1e-270
-_AIM = 0.1  # of the tolerance: how much of it the extra of all steps may take
-_STARTS = 60  # improvements to begin with
-_SWEEPS = 100  # of what each of them found
-_SLOW = 1e-5  # change of a sweep, as a share of the values, at which they are improved
-_NEARLY = 1e-3  # and change since the last improvement at which systems are solved
+_AIM = 0.25  # of the tolerance: how much of it the extra of all steps may take
+_ABOUT = 0.1  # residual of systems then, as a share of it
+_STARTS = 60  # improvements to begin with,
+_NEARLY = 1e-4  # until these change so much, as a share of the tolerance
+_ROUGH = 0.1  # residual of systems that are solved for these, as a share of what changed
+_SWEEPS = 10  # after each system where a model does not mix
+_SLOW = 1e-7
 _ROUNDS = 200
+_NEAR = 20  # rounds for the other bound
 _PATIENCE = 30  # rounds after which the extra grows
 
 
@@ -89,227 +90,203 @@ class JointBound(NamedTuple):
 
 
 def joint_bound(
-    problem: Joint, *, maximize: bool, tolerance: float, relative: bool
+    problem: Joint, *, maximize: bool, tolerance: float, relative: bool, against: bool = False,
+    first: Integers | None = None,
 ) -> JointBound:
-    """The optimum of a joint problem, bounded from its far side.
+    """The optimum of a joint problem, or of one against nature, bounded from both sides.
 
     Args:
       problem: what is asked.
-      maximize: whether both make the sum large, else small.
+      maximize: whether the policy makes the sum large, else small.
       tolerance: how far the bound may be.
       relative: whether as a share of the value.
+      against: whether nature wants the opposite. Then no two states are in one component.
+      first: ``int[S]``, rows by which open states are left, to begin with.
     """
-    nodes = _nodes(problem, 1 if maximize else -1)
-    chosen, p = nodes.nearer(worth=False) if problem.wandering else nodes.started()
-    extra, rounds, proven, system = np.inf, 0, False, None
-    value = np.zeros(nodes.size)
-    while not proven and rounds < _ROUNDS:
-        system = nodes.system(chosen, p, system)
-        if system is None:
-            break
-        rounds += 1
-        value = system.solve(nodes.earned(chosen, p, 0.0))
-        steps = system.solve(np.ones(nodes.size))
-        if rounds < _PATIENCE:
-            # Never more again: else who goes round for it comes and goes with it.
-            extra = min(extra, _extra(nodes, value, steps, tolerance, relative))
-        elif rounds % _PATIENCE == 0:
-            extra *= 8
-        z = value + extra * steps
-        if not np.isfinite(z).all():
-            break
-        proven = nodes.proves(z)
-        if not proven:
-            chosen, p = nodes.improved(z, chosen, p, extra)
+    search = _Search(_nodes(problem, 1 if maximize else -1, against), tolerance, relative)
+    nodes = search.nodes
+    if first is not None:
+        chosen, p = nodes.rows_of(first), nodes.anything()
+    elif problem.wandering or not (nodes.known > 0).any():
+        chosen, p = nodes.nearer(worth=False)
+    else:
+        chosen, p = nodes.nearer(worth=True)
+    begin = Choice(chosen, p, np.zeros(nodes.size), np.ones(nodes.size))
+    far = search.beyond(search.risen(begin) or begin)
+    near = None if far is None else search.attained(far)
+    return _found(problem, search, far, near)
+
+
+def _found(
+    problem: Joint, search: _Search, far: Choice | None, near: Choice | None
+) -> JointBound:
+    """What was found, in the numbers of the model."""
+    nodes = search.nodes
     states = np.flatnonzero(problem.open)
+    lost = np.full(nodes.size, np.inf if nodes.sign > 0 else 0.0)
 
     def everywhere(x: Floats) -> Floats:
         found = problem.known.copy()
         found[states] = np.maximum(nodes.sign * x, 0)[nodes.node[states]]
         return found
 
-    near = None
-    if proven and nodes.attains(value - extra * steps, chosen, p):
-        near = everywhere(value - extra * steps)
-    if not proven:
-        z = np.full(nodes.size, np.inf if maximize else 0.0)
     row = problem.model.mdp.row_start[:-1].astype(np.int64)
-    row[states] = nodes.row[chosen][nodes.node[states]]
     chance = problem.model.mdp.probability.copy()
-    chance[nodes.entry] = p
-    return JointBound(everywhere(z), near, everywhere(value), row, chance, rounds)
+    last = far or search.last
+    if last is not None:
+        chance[nodes.entry] = nodes.by_entry(last.p)
+        row[states] = nodes.row[(near or last).chosen][nodes.node[states]]
+    return JointBound(
+        everywhere(lost if far is None else far.z), None if near is None else everywhere(near.z),
+        everywhere(lost if last is None else last.value), row, chance, search.rounds)
 
 
-@dataclass(frozen=True)
-class _Nodes:
-    """Components as nodes; values carry a sign, so that all is to be made large.
+@dataclass
+class _Search:
+    """Bounds of the nodes; systems solved are counted.
 
     Attributes:
-      part: the rows by node; successors are states.
-      row: ``int[R']``, which row of the model each is; `entry`, ``int[T']``, likewise.
-      node: ``int[S]``, -1 of what is known.
-      sign: 1 or -1.
-      known: ``float64[S]``, with the sign; `cost`, ``float64[R']``, likewise.
-      depth: as of the problem.
+      nodes: what is asked.
+      tolerance, relative: how far bounds may be.
+      extra: what a step earns besides. It never grows for long: else who goes round for it comes
+        and goes with it.
+      rounds: systems; last: what was solved last.
     """
 
-    part: HostInterval
-    row: Integers
-    entry: Integers
-    node: Integers
-    sign: int
-    known: Floats
-    cost: Floats
-    depth: int
-
-    @property
-    def size(self) -> int:
-        return self.part.mdp.num_states
+    nodes: Nodes
+    tolerance: float
+    relative: bool
+    extra: float = np.inf
+    rounds: int = 0
+    last: Choice | None = None
 
     @cached_property
-    def target(self) -> Integers:
-        """The node that each entry leads to."""
-        return self.node[self.part.mdp.successor]
+    def systems(self) -> Systems:
+        return Systems(lambda: self.nodes.label)
 
-    @cached_property
-    def owner(self) -> Integers:
-        """The node that each entry leaves."""
-        return self.part.mdp.state[self.part.mdp.row]
+    def worth(self, choice: Choice, left: float) -> Choice | None:
+        """What choices are worth; None where some never leave."""
+        chain = self.nodes.chain(choice)
+        self.rounds += 1
+        value = None if chain is None else self.systems.solve(
+            chain.matrix, chain.earned, choice.value, left)
+        if value is None:
+            return None
+        self.last = choice._replace(value=value)
+        return self.last
 
-    @cached_property
-    def out(self) -> Booleans:
-        return self.target != self.owner
-
-    @cached_property
-    def outside(self) -> Floats:
-        """What each entry earns by what is known."""
-        return np.where(self.target < 0, self.known[self.part.mdp.successor], 0)
-
-    @cached_property
-    def label(self) -> Integers:
-        """Strongly connected components of the nodes, in order."""
-        kept = self.out & (self.target >= 0)
-        count = np.bincount(self.owner[kept], minlength=self.size)
-        return components_in_order(Edges(starts_of(count), self.target[kept]))
-
-    def difference(self, z: Floats) -> Floats:
-        """How much more each entry leads to than where it comes from."""
-        ahead = np.where(self.target < 0, self.outside, z[self.target])
-        return np.where(self.out, ahead - z[self.owner], 0)
-
-    def greedy(self, z: Floats, extra: float) -> tuple[Floats, Floats]:
-        """Nature's distributions at some values, and what each row gains: ``[T']``, ``[R']``."""
-        gain = self.difference(z) + extra * self.out
-        p = self.part.nature(gain, maximize=True)
-        return p, self.part.total(p * gain) + self.cost
-
-    def best(self, gain: Floats) -> tuple[Floats, Integers]:
-        """The largest gain of each node, and the first row that has it."""
-        best = np.maximum.reduceat(gain, self.part.mdp.row_start[:-1])
-        return best, self.part.mdp.first_choice(gain == best[self.part.mdp.state])[1]
-
-    def started(self) -> tuple[Integers, Floats]:
-        """Rows and distributions that leave, improved as values rise from zero by their sweeps."""
-        p = self.part.nature(self.out.astype(np.float64), maximize=True)
-        chosen = self.best(self.part.total(p * self.out))[1]
-        if self.sign > 0 and (self.known > 0).any():
-            chosen, p = self.nearer(worth=True)
-        z = np.zeros(self.size)
-        for _ in range(_STARTS):
-            chosen, p = self.improved(z, chosen, p, 0.0)
-            matrix, rest = self.chain(chosen, p), self.earned(chosen, p, 0.0)
-            before = z
-            for _ in range(_SWEEPS):
-                last, z = z, matrix @ z + rest
-                if np.abs(z - last).max() <= _SLOW * np.abs(z).max():
-                    break
-            if np.abs(z - before).max() <= _NEARLY * np.abs(z).max():
-                break
-        return self.improved(z, chosen, p, 0.0)
-
-    def nearer(self, *, worth: bool) -> tuple[Integers, Floats]:
-        """Rows and distributions by which all that is open is left, maybe for what is worth more.
+    def timed(
+        self, choice: Choice, extra: float, full: Booleans | None = None
+    ) -> tuple[Choice, float] | None:
+        """The same with their steps, and what each of these earns besides: no more than that.
 
         Args:
-          worth: whether only what is known to be worth something counts.
+          choice, extra: the choices, and what a step may earn.
+          full: ``bool[M]``, nodes that are worth the ceiling as they are.
         """
-        mdp, end = self.part.mdp, self.size
-        width = np.concatenate([np.diff(mdp.entry_start), [1, 1]])
-        ends = np.where(self.outside > 0, end, end + 1) if worth else end
-        target = np.concatenate([np.where(self.target < 0, ends, self.target), [end, end + 1]])
-        row_start = np.concatenate([mdp.row_start, mdp.num_rows + np.array([1, 2])])
-        graph = HostMDP(
-            row_start, starts_of(width), target.astype(np.int32), np.ones(target.size))
-        row = towards(graph, np.arange(end + 2) == end, np.ones(graph.num_rows, bool))
-        every = np.ones(mdp.num_transitions, bool)
-        return row[:-2].astype(np.int64), self.part.within(every)
+        chain = self.nodes.chain(choice)
+        self.rounds += 1
+        if chain is None:
+            return None
+        matrix, earned, each = chain.matrix, chain.earned, np.ones(self.nodes.size)
+        if full is not None and full.any():
+            matrix.data[np.repeat(full, np.diff(matrix.indptr))] = 0
+            matrix.eliminate_zeros()
+            earned, each = np.where(full, self.nodes.ceiling, earned), np.where(full, 0.0, 1.0)
+        steps = self.systems.solve(matrix, each, choice.steps, _ABOUT)
+        if steps is None:
+            return None
+        choice = choice._replace(steps=steps)
+        extra = min(extra, self.more(choice))
+        value = self.systems.solve(matrix, earned, choice.value, _ABOUT * extra)
+        if value is None:
+            return None
+        self.last = choice._replace(value=value)
+        return self.last, min(extra, self.more(self.last))
 
-    def improved(
-        self, z: Floats, chosen: Integers, p: Floats, extra: float
-    ) -> tuple[Integers, Floats]:
-        """The same, where something better than what was solved stands."""
-        other, gain = self.greedy(z, extra)
-        best, row = self.best(gain)
-        noise = 4 * _EPS * (np.abs(z) + self.part.rounding[row])
-        better = best > noise
-        fresh = np.zeros(self.part.mdp.num_rows, bool)
-        fresh[row[better]] = True
-        return np.where(better, row, chosen), np.where(fresh[self.part.mdp.row], other, p)
+    def risen(self, choice: Choice) -> Choice | None:
+        """Choices that are good, by policy iteration whose systems are solved as far as needed."""
+        left = 0.0
+        if self.nodes.wandering:
+            return choice
+        for _ in range(_STARTS):
+            found = self.worth(choice, left)
+            if found is None:
+                return None
+            choice, change = self.nodes.improved(found, found.value, 0.0)
+            if change <= _NEARLY * self.tolerance * self.scale(found.value):
+                break
+            left = _ROUGH * change
+            choice = self.carried(choice)
+        return choice
 
-    def _leaving(self, p: Floats) -> Floats:
-        return self.part.total(np.where(self.out, p, 0))
+    def carried(self, choice: Choice) -> Choice:
+        """The choices after some sweeps, by which news goes on from where they changed."""
+        if self.systems.mixes:
+            return choice
+        z = choice.value
+        for _ in range(_SWEEPS):
+            z, choice, change = self.nodes.swept(choice, z)
+            if change <= _SLOW:
+                break
+        return choice
 
-    def earned(self, chosen: Integers, p: Floats, extra: float) -> Floats:
-        """The right side of the system: what is earned until the next node."""
-        rest = self.part.total(p * self.outside) + self.cost
-        return (rest[chosen] / self._leaving(p)[chosen]) + extra
+    def scale(self, value: Floats) -> float:
+        """What a tolerance is a share of."""
+        size = np.abs(value)
+        return float(size[size > 0].min(initial=np.inf)) if self.relative and size.any() else 1.0
 
-    def system(self, chosen: Integers, p: Floats, before: Factors | None) -> Factors | None:
-        """The system of rows and distributions; None where it is singular."""
-        matrix = self.chain(chosen, p)
-        every = np.arange(self.size)
-        if before is None:
-            return factors(matrix, self.label, every)
-        return before._replace(rows=matrix).other(every)
+    def beyond(self, choice: Choice) -> Choice | None:
+        """A bound on the far side.
 
-    def chain(self, chosen: Integers, p: Floats) -> Any:
-        """How rows and distributions lead from node to node: ``float64[M, M]``, SciPy's."""
-        from scipy.sparse import csr_array
+        Nodes that are nearly worth the ceiling are worth that: else choices that are not worse go
+        round among them for what steps earn.
+        """
+        nodes, factor = self.nodes, 1.0
+        full = np.zeros(nodes.size, bool)
+        if not self.relative:
+            full = choice.value >= nodes.ceiling - self.tolerance / 4
+        for rounds in range(1, _ROUNDS):
+            found = self.timed(choice, self.extra, full)
+            if found is None:
+                return None
+            choice, self.extra = found
+            factor *= 8 if rounds % _PATIENCE == 0 else 1
+            z = np.minimum(choice.value + factor * self.extra * choice.steps, nodes.ceiling)
+            z[full] = nodes.ceiling
+            if not np.isfinite(z).all():
+                return None
+            p = nodes.proves(z)
+            if p is not None:
+                self.extra *= factor
+                return choice._replace(z=z, p=p if nodes.against else choice.p)
+            choice, _ = nodes.improved(choice, z, factor * self.extra)
+        return None
 
-        taken = np.zeros(self.part.mdp.num_rows, bool)
-        taken[chosen] = True
-        kept = taken[self.part.mdp.row] & self.out & (self.target >= 0) & (p > 0)
-        share = p[kept] / self._leaving(p)[self.part.mdp.row[kept]]
-        place = self.owner[kept], self.target[kept]
-        return csr_array((share, place), shape=(self.size, self.size))
+    def attained(self, choice: Choice) -> Choice | None:
+        """A bound that choices attain; against nature they may have to be others."""
+        for _ in range(_NEAR if self.nodes.against else 2):
+            z = choice.value - self.extra * choice.steps
+            if self.nodes.attains(z, choice):
+                return choice._replace(z=z)
+            if self.nodes.against:
+                choice = self.nodes.improved(choice, z, -self.extra)[0]
+            found = self.timed(choice, self.extra)
+            if found is None:
+                return None
+            choice, self.extra = found
+        return None
 
-    def proves(self, z: Floats) -> bool:
-        """Whether no row and no distribution gains anything, rounding included."""
-        gain = self.difference(z)
-        p = self.part.nature(gain, maximize=True)
-        most = self.part.total(p * gain) + self.cost + self._slack(gain, p)
-        return bool((most <= 0).all())
-
-    def attains(self, z: Floats, chosen: Integers, p: Floats) -> bool:
-        """Whether choices gain in every node, rounding included: they leave then, and have that."""
-        gain = self.difference(z)
-        least = self.part.total(p * gain) + self.cost - self._slack(gain, p)
-        return bool((least[chosen] > 0).all())
-
-    def _slack(self, gain: Floats, p: Floats) -> Floats:
-        """How much what rows gain may be off."""
-        size = np.abs(gain)
-        terms = 2 * np.diff(self.part.mdp.entry_start) + self.depth + 8
-        # Who is given the rest of the mass may miss some of it, or have too much.
-        partly = (self.part.lower < p) & (p < self.part.upper)
-        if self.part.ball is not None:
-            partly &= p != self.part.ball.center
-        last = self.part.total(np.where(partly, size, 0)) * self.part.rounding
-        slack = terms * _EPS * (self.part.total(p * size) + np.abs(self.cost)) + last
-        return slack + terms * _TINY * (slack > 0)
+    def more(self, found: Choice) -> float:
+        """How much more a step earns: little beside the tolerance, and more than rounding."""
+        nodes = self.nodes
+        most = np.abs(found.steps).max(initial=1)
+        size = max(np.abs(found.value).max(initial=0), np.abs(nodes.known).max(initial=0))
+        aim = _AIM * self.tolerance * self.scale(found.value) / most
+        return float(max(aim, 64 * (nodes.widest + 8) * _EPS * size, _LEAST))
 
 
-def _nodes(problem: Joint, sign: int) -> _Nodes:
+def _nodes(problem: Joint, sign: int, against: bool) -> Nodes:
     mdp = problem.model.mdp
     states = np.flatnonzero(problem.open)
     heads, number = np.unique(problem.component[states], return_inverse=True)
@@ -320,16 +297,6 @@ def _nodes(problem: Joint, sign: int) -> _Nodes:
     count = np.bincount(node[mdp.state[row]], minlength=heads.size)
     part, entry = problem.model.of_rows(starts_of(count), row)
     cost: Any = sign * problem.cost[row]
-    return _Nodes(
-        part, row, entry, node, sign, sign * problem.known, cost, problem.depth)
-
-
-def _extra(
-    nodes: _Nodes, value: Floats, steps: Floats, tolerance: float, relative: bool
-) -> float:
-    """How much more a step earns: little beside the tolerance, and more than rounding."""
-    most = np.abs(steps).max(initial=1)
-    size = max(np.abs(value).max(initial=0), np.abs(nodes.known).max(initial=0))
-    scale = np.abs(value)[value != 0].min(initial=size) if relative else 1.0
-    width = int(np.diff(nodes.part.mdp.entry_start).max()) + nodes.depth
-    return float(max(_AIM * tolerance * scale / most, 64 * (width + 8) * _EPS * size, _LEAST))
+    return Nodes(
+        part, row, entry, node, sign, sign * problem.known, cost, problem.depth,
+        problem.wandering, against)

@@ -13,7 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxltl.core.host.interval import HostInterval
-from jaxltl.core.host.interval_graph import attracting, decided, joint_components, surely
+from jaxltl.core.host.interval_graph import (
+    Decided,
+    attracting,
+    decided,
+    held,
+    joint_components,
+    surely,
+)
 from jaxltl.core.host.rows import Booleans, Integers, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import reaching, towards
@@ -67,17 +74,14 @@ def plan_reachability(
     halted, origin = model.halted(target | blocked)
     mdp, log = halted.mdp, list[_Question]()
     zero, one = decided(_asking(halted, log), target, maximize=maximize, helpful=helpful)
-    mine, other = (one, zero) if maximize else (zero, one)
     if maximize == helpful:  # policy and nature see to the same
+        mine = one if maximize else zero
         rows = halted.may_stay(mine) & mine[mdp.state]
         within = mine[mdp.successor] | ~rows[mdp.row]
         way = halted.fixed(np.where(rows[mdp.row], halted.within(within), mdp.probability))
         row = towards(way, target, rows) if maximize else mdp.first_choice(rows)[1]
     else:
-        rows = ~mdp.support.lead_to(~mine) & mine[mdp.state]
-        row = attracting(halted, target, rows) if maximize else mdp.first_choice(rows)[1]
-        keeps = halted.may_stay(other) & other[mdp.state]
-        within = other[mdp.successor] | ~keeps[mdp.row]
+        row, within = held(halted, target, Decided(zero, one), maximize=maximize)
     open_ = ~(zero | one)
     if maximize:
         every = np.ones(mdp.num_rows, bool)

@@ -15,7 +15,14 @@ import numpy as np
 
 from jaxltl.core.host import optimal
 from jaxltl.core.host.interval import HostInterval
-from jaxltl.core.host.interval_graph import attracting, decided, joint_components, surely
+from jaxltl.core.host.interval_graph import (
+    Decided,
+    attracting,
+    decided,
+    held,
+    joint_components,
+    surely,
+)
 from jaxltl.core.host.interval_optimum import Joint, joint_bound
 from jaxltl.core.host.rows import Booleans, Integers
 from jaxltl.core.host.sparse import Floats, HostMDP
@@ -103,6 +110,8 @@ def reachability(
     solve = _Solve(exact, joint, np.zeros(halted.mdp.num_rows), tolerance, False)
     if maximize == helpful:
         found = joint(halted, solve.cost, maximize)
+    elif (both := _opposed_reachability(halted, target, maximize, tolerance, depth)) is not None:
+        found = both
     elif maximize:
         start, _ = _started(halted, target, maximize=True)
         found = _led_by_policy(halted, start, solve, 1)
@@ -212,6 +221,34 @@ def _joint_reachability(
     low, high = (of.lower, np.maximum(bound, of.lower)) if up else (
         np.minimum(bound, of.upper), np.minimum(of.upper, 1))
     return Robust(of.value, low, high, row, chance, rounds + of.rounds, of.residual, _METHOD)
+
+
+def _opposed_reachability(
+    model: HostInterval, target: Booleans, up: bool, tolerance: float, depth: int
+) -> Robust | None:
+    """The policy makes the probability large (or small), nature the opposite: if that is proven."""
+    mdp = model.mdp
+    zero, one = decided(model, target, maximize=up, helpful=not up)
+    row, within = held(model, target, Decided(zero, one), maximize=up)
+    chance = mdp.probability if within.all() else model.within(within)
+    open_, known = ~(zero | one), one.astype(np.float64)
+    low = high = value = known
+    rounds = 0
+    if open_.any():
+        first = attracting(model, one) if up else row
+        found = joint_bound(
+            Joint(model, open_, known, np.zeros(mdp.num_rows), np.arange(mdp.num_states), depth),
+            maximize=up, tolerance=tolerance, relative=False, against=True, first=first)
+        if found.attained is None:
+            return None
+        low, high = (found.attained, found.bound) if up else (found.bound, found.attained)
+        low, high = np.clip(low, 0, 1), np.clip(high, 0, 1)
+        value, rounds = found.value, found.rounds
+        row = np.where(open_, found.row, row)
+        chance = np.where(open_[mdp.state][mdp.row], found.probability, chance)
+        if (high - low).max() > tolerance:
+            return None
+    return _between(value, low, high, row, chance, rounds, float((high - low).max()))
 
 
 def _joint_reward(
