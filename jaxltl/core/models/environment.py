@@ -193,7 +193,7 @@ def make_environment(
       >>> def reset(key):
       ...     return jnp.int32(0)
       >>> def step(place, action, key):
-      ...     place = jnp.clip(place + jnp.array([-1, 1])[action], 0, 4)
+      ...     place = jnp.clip(place + 2 * action - 1, 0, 4)
       ...     return Timestep(place, reward=0.0, terminated=place == 4)
       >>> corridor = make_environment(
       ...     reset, step, lambda place: place[None] / 4, actions=2,

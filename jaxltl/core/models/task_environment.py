@@ -237,7 +237,7 @@ def task_environment(
       >>> def reset(key):
       ...     return jnp.int32(0)
       >>> def step(place, action, key):
-      ...     place = jnp.clip(place + jnp.array([-1, 1])[action], 0, 2)
+      ...     place = jnp.clip(place + 2 * action - 1, 0, 2)
       ...     return Timestep(place, reward=0.0, terminated=False)
       >>> corridor = make_environment(reset, step, lambda place: place[None], actions=2,
       ...     labels=lambda place: place == jnp.array([0, 2]), propositions=["home", "goal"])
