@@ -28,6 +28,7 @@ import optax
 from jax import lax
 
 from jaxltl.algos import ppo
+from jaxltl.algos._ppo_networks import orthogonal
 from jaxltl.algos.schedules import Linear
 from jaxltl.envs.adapters.gymnax import from_gymnax
 
@@ -70,9 +71,9 @@ class _Pair(nn.Module):
         def layers(width: int, scale: float) -> jax.Array:
             y = x
             for _ in range(2):
-                y = nn.Dense(64, kernel_init=nn.initializers.orthogonal(np.sqrt(2)))(y)
+                y = nn.Dense(64, kernel_init=orthogonal(np.sqrt(2)))(y)
                 y = getattr(nn, self.activation)(y)
-            return nn.Dense(width, kernel_init=nn.initializers.orthogonal(scale))(y)
+            return nn.Dense(width, kernel_init=orthogonal(scale))(y)
 
         return layers(self.num_actions, 0.01), layers(1, 1.0)[..., 0]
 

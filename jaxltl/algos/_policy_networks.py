@@ -7,18 +7,8 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from flax import struct
 
-
-@struct.dataclass
-class Moments:
-    """Of the observations so far: their number, ``mean[O]``, and summed squares around it."""
-
-    count: jax.Array
-    mean: jax.Array
-    squares: jax.Array
-
-
+from jaxltl.algos.moments import Moments, scale_of
 
 
 class Network(nn.Module):
@@ -99,27 +89,6 @@ def inputs_at(inputs: jax.Array, time: jax.Array, horizon: int) -> jax.Array:
 def normalized(moments: Moments, hparams: Any, observation: jax.Array) -> jax.Array:
     """Observations centred and scaled, where that is asked for."""
     return (observation - moments.mean) / scale_of(moments) if hparams.normalize else observation
-
-
-def scale_of(moments: Moments) -> jax.Array:
-    """What has not varied is not scaled."""
-    spread = jnp.sqrt(moments.squares / jnp.maximum(moments.count, 1))
-    noise = 8 * jnp.finfo(spread.dtype).eps * jnp.abs(moments.mean)
-    return jnp.where(spread > noise, spread, 1)
-
-
-def updated_moments(moments: Moments, batch: Any) -> Moments:
-    """With a batch taken in (Chan et al. 1979)."""
-    weight = batch.valid.astype(batch.observation.dtype)[..., None]
-    count = weight.sum()
-    mean = jnp.sum(weight * batch.observation, (0, 1)) / jnp.maximum(count, 1)
-    squares = jnp.sum(weight * (batch.observation - mean) ** 2, (0, 1))
-    total = jnp.maximum(moments.count + count, 1)
-    shift = mean - moments.mean
-    return Moments(
-        count=moments.count + count, mean=moments.mean + shift * count / total,
-        squares=moments.squares + squares + shift**2 * moments.count * count / total,
-    )
 
 
 def refolded(network: Any, old: Moments, new: Moments) -> Any:

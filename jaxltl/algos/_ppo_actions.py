@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.models.environment import Box, Finite
+from jaxltl.core.models.environment import Box, Finite, clipped_action
 
 Actions = Finite | Box
 
@@ -47,7 +47,7 @@ def as_action(actions: Actions, raw: jax.Array, squash: str) -> jax.Array:
     bounded = jnp.isfinite(low) & jnp.isfinite(high)
     middle, half = jnp.where(bounded, (low + high) / 2, 0), jnp.where(bounded, (high - low) / 2, 1)
     inside = jnp.where(bounded, jnp.tanh(raw), raw) if squash == "tanh" else raw
-    return jnp.clip(middle + half * inside, low, high).astype(actions.dtype)
+    return clipped_action(actions, middle + half * inside).astype(actions.dtype)
 
 
 def log_density(actions: Actions, parameters: Any, allowed: Any, raw: jax.Array) -> jax.Array:

@@ -15,16 +15,9 @@ from jax import lax
 from jaxltl.algos import _ppo_actions as actions_of
 from jaxltl.algos import learner
 from jaxltl.algos._ppo_networks import Output, evaluated
+from jaxltl.algos.advantages import generalized_advantages
+from jaxltl.algos.moments import Moments, scale_of, updated_moments
 from jaxltl.core.models.environment import Timestep, allowed_in
-
-
-@struct.dataclass
-class Moments:
-    """Of numbers so far: how many, their mean, and summed squares around it."""
-
-    count: jax.Array
-    mean: jax.Array
-    squares: jax.Array
 
 
 @struct.dataclass
@@ -80,32 +73,6 @@ class Told(NamedTuple):
     finite: jax.Array
 
 
-def no_moments(shape: tuple[int, ...]) -> Moments:
-    """Of nothing, in the default precision."""
-    zeros = jnp.zeros(shape, jnp.result_type(float))
-    return Moments(jnp.zeros_like(zeros, shape=()), zeros, zeros)
-
-
-def updated(moments: Moments, x: jax.Array) -> Moments:
-    """With numbers ``[..., *shape]`` taken in (Chan et al. 1979); unless one is not finite."""
-    x = x.reshape(-1, *moments.mean.shape).astype(moments.mean.dtype)
-    mean = x.mean(0)
-    squares = jnp.sum((x - mean) ** 2, 0)
-    shift, total = mean - moments.mean, moments.count + len(x)
-    new = Moments(
-        total, moments.mean + shift * (len(x) / total),
-        moments.squares + squares + shift**2 * (moments.count * len(x) / total))
-    fine = jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(squares))
-    return learner.choose(fine, new, moments)
-
-
-def scale_of(moments: Moments) -> jax.Array:
-    """The standard deviation; 1 where nothing has varied."""
-    spread = jnp.sqrt(moments.squares / jnp.maximum(moments.count, 1))
-    noise = 8 * jnp.finfo(spread.dtype).eps * jnp.abs(moments.mean)
-    return jnp.where(spread > noise, spread, 1)
-
-
 def normalized(moments: Any, observation: Any) -> Any:
     """Floats centred, scaled and clipped to ten deviations; other leaves as they are."""
     if moments is None:
@@ -119,35 +86,11 @@ def normalized(moments: Any, observation: Any) -> Any:
     return jax.tree.map(one, observation, moments)
 
 
-def advantages(
-    reward: jax.Array, value: jax.Array, following: jax.Array, discount: jax.Array,
-    ended: jax.Array, gae_lambda: chex.Numeric,
-) -> jax.Array:
-    """Generalised advantages (Schulman et al. 2016) of episodes one after the other::
-
-        A_t = d_t + discount_t lambda A_{t+1} (unless the episode ends with t),
-        d_t = r_t + discount_t V'_t - V_t.
-
-    Args:
-      reward, value: ``float[T, ...]``.
-      following: ``float[T, ...]``, V' of the world that the step led to, the last of an episode
-        included; zero where nothing comes after it.
-      discount: ``float[T, ...]``, of what comes after each step.
-      ended: ``bool[T, ...]``, whether an episode ended with the step, either way.
-      gae_lambda: in [0, 1].
-
-    Returns:
-      ``float[T, ...]``.
-    """
-    error = reward + discount * following - value
-    kept = jnp.where(ended, 0, discount * gae_lambda)
-
-    def back(later: jax.Array, row: Any) -> tuple[jax.Array, jax.Array]:
-        error, kept = row
-        now = error + kept * later
-        return now, now
-
-    return lax.scan(back, jnp.zeros_like(error[0]), (error, kept), reverse=True, unroll=16)[1]
+def _unless_nonfinite(moments: Moments, numbers: jax.Array) -> Moments:
+    """With a batch taken in, unless a number in it is not finite."""
+    new = updated_moments(moments, numbers)
+    fine = jnp.all(jnp.isfinite(new.mean)) & jnp.all(jnp.isfinite(new.squares))
+    return learner.choose(fine, new, moments)
 
 
 class _Path(NamedTuple):
@@ -190,12 +133,13 @@ def collected(
     moments, returns = state.moments, state.return_moments
     if returns is not None:
         sums, walkers = _discounted_sums(walkers, reward, discount, ended)
-        returns = updated(returns, sums)
+        returns = _unless_nonfinite(returns, sums)
         reward = jnp.clip(reward / scale_of(returns), -10, 10)
     if moments is not None:
         moments = jax.tree.map(
-            lambda x, m: updated(m, x), path.observation, moments)
-    found = advantages(reward, value, following, discount, ended, hparams.gae_lambda)
+            lambda x, m: _unless_nonfinite(m, x), path.observation, moments)
+    found = generalized_advantages(
+        reward, value, following, discount, hparams.gae_lambda, ended)
     rows = Rows(seen, path.start, path.allowed, path.raw, path.log_density, value, found)
     number = ended.sum()
     mean_of = jnp.where(number > 0, 1 / jnp.maximum(number, 1), jnp.nan).astype(dtype)
@@ -231,14 +175,12 @@ def _walked(key: chex.PRNGKey, state: Any, problem: Any, hparams: Any) -> tuple[
     environment, size = problem.environment, (hparams.num_steps, hparams.num_envs)
     noise_key, move_key, reset_key = jax.random.split(key, 3)
     dtype = state.walkers.discounted.dtype
+    # All at once: on few numbers an operation takes as long as on many.
     noise = actions_of.noise(noise_key, size, environment.actions, dtype)
     keys = jax.random.split(move_key, size)
-    # All at once, for a few numbers at a time take as long as many.
-    starts = jax.random.split(reset_key, size)
-    if hparams.resets_ahead:
-        starts = jax.vmap(jax.vmap(environment.reset))(starts)
+    begin, pool = _starts(reset_key, environment, hparams)
 
-    def one(walker: Walkers, start: Any, noise: jax.Array, key: chex.PRNGKey) -> Any:
+    def one(walker: Walkers, noise: jax.Array, key: chex.PRNGKey) -> Any:
         observation = environment.observe(walker.world)
         allowed = allowed_in(environment, walker.world)
         seen = normalized(state.moments, observation)
@@ -249,25 +191,48 @@ def _walked(key: chex.PRNGKey, state: Any, problem: Any, hparams: Any) -> tuple[
         found = Timestep(*environment.step(walker.world, action, key))
         terminated, truncated = (
             jnp.asarray(x, bool) for x in (found.terminated, found.truncated))
-        ended = terminated | truncated
-        fresh = start if hparams.resets_ahead else environment.reset(start)
         total = walker.episode_return + found.reward
         length = walker.episode_length + 1
         row = _Path(
             observation, walker.memory, walker.episode_length == 0, allowed, raw, density,
             jnp.asarray(found.reward), jnp.asarray(found.cost), jnp.asarray(found.discount),
             terminated, truncated, environment.observe(found.world), total, length)
-        world, memory = learner.choose(
-            ended, (fresh, problem.memory), (found.world, said.memory))
-        after = Walkers(
-            world, memory, jnp.where(ended, 0, total), jnp.where(ended, 0, length),
-            walker.discounted)
-        return after, row
+        return replace(walker, world=found.world, memory=said.memory), row
 
-    walkers, path = lax.scan(
-        lambda walkers, given: jax.vmap(one)(walkers, *given), state.walkers,
-        (starts, noise, keys))
+    def restarted(walker: Walkers, fresh: Any, row: _Path) -> Walkers:
+        ended = row.terminated | row.truncated
+        world, memory = jax.tree.map(
+            lambda x, y: jnp.where(ended, x, y), (fresh, problem.memory),
+            (walker.world, walker.memory))
+        return Walkers(
+            world, memory, jnp.where(ended, 0, row.episode_return),
+            jnp.where(ended, 0, row.episode_length), walker.discounted)
+
+    def move(carry: Any, given: Any) -> Any:
+        walkers, used = carry
+        start, *chance = given
+        walkers, row = jax.vmap(one)(walkers, *chance)
+        ended = row.terminated | row.truncated
+        if pool is not None:
+            number = used + jnp.cumsum(ended, dtype=jnp.int32)
+            start = jax.tree.map(lambda x: x[(number - 1) % hparams.num_resets], pool)
+            used = number[-1] % hparams.num_resets
+        elif hparams.num_resets == 0:
+            start = jax.vmap(environment.reset)(start)
+        return (jax.vmap(restarted)(walkers, start, row), used), row
+
+    (walkers, _), path = lax.scan(
+        move, (state.walkers, jnp.int32(0)), (begin, noise, keys))
     return learner.strong(walkers), path
+
+
+def _starts(key: chex.PRNGKey, environment: Any, hparams: Any) -> tuple[Any, Any]:
+    """What each step begins episodes with, ``[T, N]`` worlds or keys; or all a pool of worlds."""
+    size, number = (hparams.num_steps, hparams.num_envs), hparams.num_resets
+    if number:
+        return None, jax.vmap(environment.reset)(jax.random.split(key, number))
+    keys = jax.random.split(key, size)
+    return (keys if number == 0 else jax.vmap(jax.vmap(environment.reset))(keys)), None
 
 
 def _evaluated_all(

@@ -9,8 +9,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
-from jaxltl.core.models.environment import Finite
+from jaxltl.core.models.environment import Finite, flat_observation
 
 
 class Output(NamedTuple):
@@ -29,16 +30,33 @@ class Output(NamedTuple):
     value: jax.Array
 
 
-def flat_observation(observation: Any) -> jax.Array:
-    """A tree of arrays as one vector of floats, leaf after leaf."""
-    kind = jnp.result_type(float)
-    leaves = [jnp.ravel(jnp.asarray(x)).astype(kind) for x in jax.tree.leaves(observation)]
-    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
+def orthogonal(scale: float) -> Any:
+    """An initialiser: a uniformly drawn matrix with orthonormal rows or columns, times a scale.
+
+    By Gram and Schmidt, twice over, and not by LAPACK's factorisation as in ``flax``: on few
+    processors several batched ones in one program, as seeds side by side ask for, may each hold the
+    thread that another waits for (jaxlib 0.10.1).
+    """
+    def start(key: Any, shape: Any, dtype: Any = None) -> jax.Array:
+        rows, columns = shape
+        most, least = max(rows, columns), min(rows, columns)
+        drawn = jax.random.normal(key, (least, most), dtype)
+
+        def add(i: Any, found: jax.Array) -> jax.Array:
+            row = drawn[i]
+            for _ in range(2):
+                row = row - (found @ row) @ found
+            return found.at[i].set(row / jnp.linalg.norm(row))
+
+        found = lax.fori_loop(0, least, add, jnp.zeros_like(drawn))
+        return scale * (found.T if rows == most else found)
+
+    return start
 
 
 def _dense(width: int, scale: float, name: str) -> nn.Dense:
-    start = nn.initializers.orthogonal(scale)
-    return nn.Dense(width, kernel_init=start, param_dtype=jnp.result_type(float), name=name)
+    return nn.Dense(
+        width, kernel_init=orthogonal(scale), param_dtype=jnp.result_type(float), name=name)
 
 
 class _Layers(nn.Module):
@@ -65,7 +83,8 @@ def _heads(module: Any, x: jax.Array) -> tuple[Any, jax.Array]:
     if module.num_actions:
         return scores, value
     start = nn.initializers.constant(np.log(module.initial_deviation))
-    spread = module.param("log_deviation", start, tuple(module.shape), x.dtype)
+    spread = module.param(
+        "log_deviation", start, tuple(module.shape), jnp.result_type(float))
     return (scores.reshape(module.shape), spread), value
 
 
@@ -118,7 +137,9 @@ class RecurrentActorCritic(nn.Module):
     def __call__(self, memory: jax.Array, observation: Any) -> tuple[jax.Array, Any]:
         x = _dense(self.memory, np.sqrt(2), "input")(flat_observation(observation))
         x = getattr(nn, self.activation)(x)
-        cell = nn.GRUCell(self.memory, param_dtype=jnp.result_type(float), name="cell")
+        cell = nn.GRUCell(
+            self.memory, recurrent_kernel_init=orthogonal(1.0),
+            param_dtype=jnp.result_type(float), name="cell")
         memory, x = cell(memory, x)
         return memory, _heads(self, x)
 

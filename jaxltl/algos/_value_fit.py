@@ -13,6 +13,7 @@ from jax import lax
 from jaxltl.algos._policy_networks import (
     values_at,
 )
+from jaxltl.algos.advantages import generalized_advantages
 
 
 def advantages(
@@ -49,16 +50,9 @@ def advantages(
     value = jnp.where(valid, value, 0)
     following = jnp.concatenate([value[1:], jnp.zeros_like(value[:1])])
     goes_on = jnp.concatenate([valid[1:], jnp.zeros_like(valid[:1])])
-    following = jnp.where(goes_on, following, after)
-    error = jnp.where(valid, signal + discount * following - value, 0)
-    kept = jnp.broadcast_to(discount * gae_lambda, error.shape)
-
-    def back(later: jax.Array, row: Any) -> tuple[jax.Array, jax.Array]:
-        error, kept = row
-        now = error + kept * later
-        return now, now
-
-    return lax.scan(back, jnp.zeros_like(error[0]), (error, kept), reverse=True)[1]
+    following = jnp.where(valid, jnp.where(goes_on, following, after), 0)
+    return generalized_advantages(
+        jnp.where(valid, signal, 0), value, following, discount, gae_lambda)
 
 
 def fitted(

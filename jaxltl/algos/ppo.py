@@ -28,7 +28,7 @@ from jax.tree_util import Partial
 
 from jaxltl.algos import _ppo_actions as actions_of
 from jaxltl.algos import learner
-from jaxltl.algos._ppo_collect import Moments, Walkers, collected, no_moments, normalized
+from jaxltl.algos._ppo_collect import Walkers, collected, normalized
 from jaxltl.algos._ppo_networks import ActorCritic as ActorCritic
 from jaxltl.algos._ppo_networks import RecurrentActorCritic as RecurrentActorCritic
 from jaxltl.algos._ppo_networks import (
@@ -39,6 +39,7 @@ from jaxltl.algos._ppo_networks import (
     require_network,
 )
 from jaxltl.algos._ppo_update import descent, improved
+from jaxltl.algos.moments import Moments, no_moments
 from jaxltl.algos.schedules import Schedule
 from jaxltl.algos.schedules import at as _at
 from jaxltl.core.models.environment import Agent, Box, Environment, Finite
@@ -94,8 +95,11 @@ class Hparams:
       squash: how a Gaussian action gets into its box: ``"clip"``, or ``"tanh"`` along axes that
         have both bounds; static. Either way the network speaks in units in which such axes are
         [-1, 1].
-      resets_ahead: whether the worlds in which episodes begin are drawn all at once before a step's
-        T steps, T N of them, which is faster but takes memory; static.
+      num_resets: how many worlds in which episodes begin are drawn before the T steps of a step;
+        static. None: T N, one for whatever might end, which is fast and takes memory. 0: N of them
+        in each of the T steps, which is the same to the learner. Some other number: that many,
+        handed out in turn, and from the first again if they do not suffice; where a reset is
+        costly and episodes are long, this is fastest.
     """
 
     discount: jax.Array | float
@@ -116,7 +120,7 @@ class Hparams:
     normalize_observation: bool = struct.field(pytree_node=False, default=False)
     normalize_reward: bool = struct.field(pytree_node=False, default=False)
     squash: str = struct.field(pytree_node=False, default="clip")
-    resets_ahead: bool = struct.field(pytree_node=False, default=True)
+    num_resets: int | None = struct.field(pytree_node=False, default=None)
 
 
 @struct.dataclass
@@ -252,6 +256,8 @@ def _check(problem: Problem, hparams: Hparams) -> None:
     for name in ("num_envs", "num_steps", "num_epochs", "num_minibatches"):
         if getattr(hparams, name) < 1:
             raise ValueError(f"{name}={getattr(hparams, name)}; it must be at least 1.")
+    if hparams.num_resets is not None and hparams.num_resets < 0:
+        raise ValueError(f"num_resets={hparams.num_resets}; it must be at least 0, or None.")
     if hparams.squash not in SQUASHES:
         raise ValueError(f'squash={hparams.squash!r}; choose "clip" or "tanh".')
     recurrent = has_memory(problem)

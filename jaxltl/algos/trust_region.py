@@ -39,20 +39,19 @@ from jax.tree_util import Partial
 
 from jaxltl.algos import learner
 from jaxltl.algos._policy_networks import (
-    Moments,
     gaussian,
     inputs_at,
     kl_divergence,
     mean_network,
     normalized,
     refolded,
-    updated_moments,
     value_inputs,
     value_network,
     values_at,
 )
 from jaxltl.algos._trust_step import Surrogate, direction, fisher_product, line_search, surrogate
 from jaxltl.algos._value_fit import advantages, fitted, positive, weighted_variance
+from jaxltl.algos.moments import Moments, no_moments, updated_moments
 from jaxltl.core.models.environment import (
     Agent,
     Box,
@@ -442,7 +441,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
             lambda x: jnp.asarray(x, jnp.result_type(x)),
             optax.adam(hparams.value_rate).init(values),
         ),
-        moments=Moments(jnp.zeros((), dtype), jnp.zeros(size, dtype), jnp.zeros(size, dtype)),
+        moments=no_moments((size,), dtype),
         trajectories=jnp.int32(0),
     )
     if not hparams.normalize:
@@ -451,7 +450,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         first_key, state, problem, hparams, num_trajectories=hparams.num_trajectories
     )
     return replace(
-        state, moments=updated_moments(state.moments, batch),
+        state, moments=updated_moments(state.moments, batch.observation, batch.valid),
         trajectories=jnp.int32(hparams.num_trajectories),
     )
 
@@ -472,7 +471,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     )
     moments = state.moments
     if hparams.normalize:
-        moments = updated_moments(state.moments, batch)
+        moments = updated_moments(state.moments, batch.observation, batch.valid)
         fold = partial(refolded, old=state.moments, new=moments)
         parameters = {**parameters, "mean": fold(parameters["mean"])}
         values = jax.vmap(fold)(values)

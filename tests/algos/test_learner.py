@@ -286,7 +286,7 @@ LEARNERS = {
     "trpo": partial(trust, "trpo", hidden=(), normalize=False),
     "cpo": partial(trust, "cpo", hidden=(3,)),
     "ppo": partial(proximal, normalize_observation=True, normalize_reward=True),
-    "ppo-memory": partial(proximal, "tanh", resets_ahead=False),
+    "ppo-memory": partial(proximal, "tanh", num_resets=3),
     "cce": cross_entropy,
     "cloning": cloning,
     "feasible": parameters,
@@ -394,7 +394,8 @@ def nudged(tree, dtype=float):
     """The same shapes, and one number a little different."""
     flat, structure = jax.tree.flatten(tree)
     i = next(i for i, x in enumerate(flat)
-             if np.size(x) and np.issubdtype(getattr(x, "dtype", type(x)), np.floating))
+             if np.size(x) and np.issubdtype(getattr(x, "dtype", type(x)), np.floating)
+             and np.isfinite(np.ravel(x)[0]))
     changed = np.array(flat[i], float)
     changed.flat[0] = changed.flat[0] * 0.75 + 0.125
     flat[i] = jnp.asarray(changed, getattr(flat[i], "dtype", None))

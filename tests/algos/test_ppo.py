@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache, partial
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
@@ -16,6 +17,8 @@ from jaxltl.algos import _ppo_actions as actions_of
 from jaxltl.algos import _ppo_collect as collecting
 from jaxltl.algos import _ppo_update as updating
 from jaxltl.algos import learner, ppo
+from jaxltl.algos._ppo_networks import orthogonal
+from jaxltl.algos.moments import scale_of, updated_moments
 from jaxltl.algos.schedules import Linear
 from jaxltl.core.models.environment import (
     Finite,
@@ -88,11 +91,11 @@ def collected(problem, hparams, seed=0):
     return state, jax.jit(collecting.collected)(key, state, problem, hparams)
 
 
-@pytest.mark.parametrize("ahead", [True, False])
-def test_advantages_bootstrap_where_an_episode_is_cut_off_and_not_where_it_is_over(ahead):
+@pytest.mark.parametrize("resets", [None, 0])
+def test_advantages_bootstrap_where_an_episode_is_cut_off_and_not_where_it_is_over(resets):
     """From the actions alone, the walk is made again and its advantages summed up."""
     problem = ppo.make_problem(WALK, network=Table(2))
-    hparams = ppo.Hparams(discount=0.9, gae_lambda=0.8, resets_ahead=ahead, **SIZES)
+    hparams = ppo.Hparams(discount=0.9, gae_lambda=0.8, num_resets=resets, **SIZES)
     state, (after, _, rows, told) = collected(problem, hparams)
     weights = np.asarray(state.parameters["worth"])
     shape = rows.raw.shape
@@ -138,6 +141,44 @@ def test_many_episodes_cut_off_at_once_are_all_bootstrapped():
     seen = np.asarray(rows.observation)
     np.testing.assert_allclose(
         rows.advantage, 0.5 * (seen + 1) @ worth - seen @ worth, rtol=1e-9)
+
+
+def numbered_step(world, action, key):
+    """Episodes of one step and of three."""
+    after = world._replace(time=world.time + 1)
+    return Timestep(after, reward=0.0, terminated=after.time == after.length)
+
+
+class Numbered(NamedTuple):
+    start: jax.Array
+    length: jax.Array
+    time: jax.Array
+    key: jax.Array
+
+
+NUMBERED = make_environment(
+    lambda key: Numbered(
+        jax.random.uniform(key), 1 + 2 * jax.random.randint(key, (), 0, 2), jnp.int32(0), key),
+    numbered_step, lambda world: world.start[None], actions=2)
+
+
+@pytest.mark.parametrize(("resets", "most"), [(None, None), (0, None), (5, 5)])
+def test_episodes_begin_in_worlds_drawn_for_them(resets, most):
+    problem = ppo.make_problem(NUMBERED, network=Table(2))
+    hparams = ppo.Hparams(discount=0.9, num_resets=resets, **SIZES)
+    _, (after, _, rows, told) = collected(problem, hparams)
+    place, start = np.asarray(rows.observation)[..., 0], np.asarray(rows.start)
+    assert start[0].all() and (place[1:] == place[:-1])[~start[1:]].all()
+    begun = place[1:][start[1:]]
+    assert told.episodes == len(begun) + (np.asarray(after.walkers.episode_length) == 0).sum()
+    if most is None:
+        assert np.unique(begun).size == begun.size > 10
+    else:  # handed out in turn, in the order of time and then of environments
+        drawn = begun[:most]
+        assert np.unique(drawn).size == most
+        np.testing.assert_array_equal(begun, np.resize(drawn, len(begun)))
+    same = jax.vmap(lambda world: jax.random.uniform(world.key) == world.start)
+    assert same(after.walkers.world).all(), "keys in worlds stay theirs"
 
 
 # --- actions --------------------------------------------------------------------------------------
@@ -346,15 +387,30 @@ def test_scales_are_those_of_all_that_was_seen():
             running = np.where(ended, 0, 0.9 * running)
         if i == 0:  # the second step's policy reads scaled observations, so it differs
             first = jax.tree.map(
-                lambda x, m: collecting.updated(m, x), path.observation, state.moments)
-            returns = collecting.updated(state.return_moments, jnp.asarray(np.stack(sums)))
+                lambda x, m: updated_moments(m, x), path.observation, state.moments)
+            returns = updated_moments(state.return_moments, jnp.asarray(np.stack(sums)))
             state = state.replace(moments=first, return_moments=returns)
     seen = np.concatenate(seen)
     np.testing.assert_allclose(last.moments["place"].mean, seen.mean(0), rtol=1e-9)
     np.testing.assert_allclose(
-        collecting.scale_of(last.moments["place"]), seen.std(0), rtol=1e-9)
+        scale_of(last.moments["place"]), seen.std(0), rtol=1e-9)
     np.testing.assert_allclose(
-        collecting.scale_of(last.return_moments), np.stack(sums).std(), rtol=1e-9)
+        scale_of(last.return_moments), np.stack(sums).std(), rtol=1e-9)
+
+
+@pytest.mark.parametrize("shape", [(6, 3), (3, 6), (4, 4), (1, 5)])
+def test_networks_start_orthogonal(shape):
+    """And uniformly so: the first entry's square has the mean that its row's length gives."""
+    keys = jax.random.split(jax.random.key(0), 400)
+    drawn = np.asarray(jax.vmap(lambda key: orthogonal(2.0)(key, shape, float))(keys))
+    some = drawn if shape[0] <= shape[1] else np.swapaxes(drawn, 1, 2)
+    np.testing.assert_allclose(
+        some @ np.swapaxes(some, 1, 2), np.broadcast_to(4 * np.eye(min(shape)),
+                                                        (400, min(shape), min(shape))), atol=1e-12)
+    length = max(shape)
+    error = 4 * np.sqrt(2 * (length - 1) / (length**2 * (length + 2)) / 400)
+    assert abs((drawn[:, 0, 0] ** 2).mean() / 4 - 1 / length) < error
+    assert abs(np.sign(drawn[:, 0, -1]).mean()) < 0.2
 
 
 def recall_step(world, action, key):
@@ -394,7 +450,7 @@ def test_a_short_walk_is_learned():
     problem = ppo.make_problem(WALK, network=ppo.ActorCritic(2, hidden=(8,)))
     hparams = ppo.Hparams(discount=0.9, learning_rate=Linear(0.02, 0.0, 30), num_envs=8,
                           num_steps=20, num_minibatches=4, value_clip=10.0)
-    state, metrics = ppo.train(jax.random.key(0), problem, hparams, num_steps=30)
+    _, metrics = ppo.train(jax.random.key(0), problem, hparams, num_steps=30)
     assert metrics.episode_return[0] < 8 < 11.5 < metrics.episode_return[-1]
     assert metrics.explained_variance[-1] > 0.5
     np.testing.assert_allclose(metrics.learning_rate, 0.02 * (1 - np.arange(30) / 30), rtol=1e-9)
