@@ -167,7 +167,8 @@ def make_problem(
       ValueError: an unknown bound, objective, reward or label, or a shape that does not fit; or
         the reward is infinite at every point, as the target is not reached almost surely.
     """
-    one_of("bound", bound, (">=", "<="))
+    if not isinstance(bound, str) or bound not in (">=", "<="):
+        raise ValueError(f'bound={shown(bound)}; it must be ">=" or "<=".')
     one_of("objective", objective, ("max", "min"))
     if reward is not None and not isinstance(reward, str):
         raise ValueError(f"reward is {shown(reward)}; give the name of a reward of the model.")

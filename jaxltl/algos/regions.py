@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.algos.feasible import require_problem
 from jaxltl.core.host import interval_values
 from jaxltl.core.host.given import numbers, shown
 from jaxltl.core.host.given import whole as count
@@ -90,7 +89,7 @@ def enclose(problem: Problem, low: Any = None, high: Any = None) -> tuple[float,
 
 
 def _box(problem: Problem, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
-    require_problem(problem)
+    _require_problem(problem)
     model = problem.model
     low, high = (whole if x is None else x for x, whole in ((low, model.low), (high, model.high)))
     low, high = box_of(low, high, model.parameters)
@@ -175,11 +174,17 @@ def prove_regions(
     return Regions(lows, highs, lower, upper, verdicts.astype(np.int8))
 
 
+def _require_problem(problem: Any) -> None:
+    if not all(hasattr(problem, name) for name in ("model", "objective", "bound")):
+        raise ValueError(f"problem is {shown(problem)}; give what feasible.make_problem returns.")
+
+
 def _limit(threshold: Any) -> float:
     """A number, which may be infinite."""
     found = numbers("threshold", threshold)
     if found.ndim or np.isnan(found):
-        raise ValueError(f"threshold={shown(threshold)}; give a number.")
+        what = "the threshold is NaN" if not found.ndim else f"threshold={shown(threshold)}"
+        raise ValueError(f"{what}; give a number.")
     return float(found)
 
 
@@ -201,7 +206,7 @@ def prove_around(
     Raises:
       ValueError: as :func:`prove_regions`; the point is not in the box.
     """
-    require_problem(problem)
+    _require_problem(problem)
     threshold, num_halvings = _limit(threshold), count("num_halvings", num_halvings, most=1000)
     model = problem.model
     (point,) = model.inside_of("point", numbers("point", point)[None])

@@ -140,7 +140,7 @@ def test_points_that_are_none_are_named(tmp_path):
         (("p", 0.5),): "values are given for p; the parameters are p, q",
         (("p", 3), ("q", 0)): "a function has a pole at",
         (("p", 2.0), ("q", 0.0)): "state 0, choice 0: probability -1",
-        (("p", float("nan")), ("q", 0.0)): "must be finite",
+        (("p", float("nan")), ("q", 0.0)): r"values\[.p.\]=nan; give a finite number",
     }.items():
         with pytest.raises(ValueError, match=message):
             found.at(dict(values))

@@ -9,6 +9,7 @@ import numpy as np
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import Task
+from jaxltl.core.host.ball import Ball
 from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.interval_game import spread
 from jaxltl.core.host.interval_graph import joint_accepting
@@ -126,8 +127,7 @@ def robust_product_satisfaction(
 
     Returns:
       :class:`Solution`; `value` is ``float64[S, Q]``, `policy` rows of the world, ``int32[S, Q]``.
-      Its `nature` has a distribution for each choice in each pair, pairs in order ``s * Q + q``;
-      for Buchi and parity acceptance read on entry it is left out.
+      Its `nature` has a distribution for each choice in each pair, pairs in order ``s * Q + q``.
 
     Raises:
       ValueError: the product's actions are restricted, or a policy is none.
@@ -144,33 +144,57 @@ def robust_product_satisfaction(
     delta, priority = np.asarray(task.delta), np.asarray(task.priority)
     yes, no = universal_states(task), ~live_states(task)
     state, memory = (x.ravel() for x in np.indices(shape))
-    live = task.acceptance in ("buchi", "parity")
-    delayed = live and model.label_on == "entry"
-    count = 1
-    if delayed:
-        # A memory holds the priority that was read last, too, so that states read priorities.
-        count = int(priority.max()) + 1
-        q = np.repeat(np.arange(len(delta)), count)
-        delta = delta[q] * count + priority[q]
-        memory, yes, no = memory * count, yes[q], no[q]
-    product, host = _pairs(
-        world, delta, letter, state, memory, yes & False, model.label_on == "entry")
+    on_entry = model.label_on == "entry"
+    product, host = _pairs(world, delta, letter, state, memory, yes & False, on_entry)
+    pair: Integers = np.arange(product.memory.size)
     level = None
-    if live:
-        level = product.memory % count if delayed else priority[
-            product.memory, letter[product.base_state]]
+    if task.acceptance in ("buchi", "parity"):
+        level = priority[product.memory, letter[product.base_state]]
+        if on_entry:
+            mdp = host.mdp
+            read = priority[
+                product.memory[mdp.state[mdp.row]], letter[product.base_state[mdp.successor]]]
+            host, level, pair = _reading(host, read)
     sides = host_sides(host, None, objective, nature)
     if policy is not None:
-        sides = _fixed(model, product, host, np.asarray(policy), count, sides.helpful)
-    found = _solved(
-        sides, host, yes[product.memory], no[product.memory], level,
-        task.acceptance == "safety", asked)
+        sides = _fixed(model, product, host, np.asarray(policy), sides.helpful)
+    q = product.memory[pair]
+    found = _solved(sides, host, yes[q], no[q], level, task.acceptance == "safety", asked)
     if policy is not None:
         solution = _solution(found, asked, shape, product.start, np.asarray(policy))
         return solution.replace(nature=None)  # type: ignore[attr-defined]
     policy = product.base_row[found.row[product.start]].astype(np.int32).reshape(shape)
-    solution = _solution(found, asked, shape, product.start, policy)
-    return solution.replace(nature=None) if delayed else solution  # type: ignore[attr-defined]
+    found = found._replace(probability=found.probability[:product.host.num_transitions])
+    return _solution(found, asked, shape, product.start, policy)
+
+
+def _reading(host: HostInterval, priority: Integers) -> tuple[HostInterval, Integers, Integers]:
+    """The model in which what entries read is read by states of their own, where nobody chooses.
+
+    Args:
+      host: the model.
+      priority: ``int[T]``, what each entry reads.
+
+    Returns:
+      The model, whose first states, rows and entries are those that there were; what each state
+      reads, ``int[N]``, which of those that were there is never the least met for ever; and which
+      one each is or leads to, ``int[N]``.
+    """
+    mdp, most = host.mdp, int(priority.max()) + 1
+    place, number = np.unique(mdp.successor.astype(np.int64) * most + priority, return_inverse=True)
+    target, read = np.divmod(place, most)
+    one, more = np.ones(place.size), np.arange(1, place.size + 1)
+    inner = HostMDP(
+        np.append(mdp.row_start, mdp.num_rows + more),
+        np.append(mdp.entry_start, mdp.num_transitions + more),
+        np.append(mdp.num_states + number, target).astype(np.int32),
+        np.append(mdp.probability, one))
+    ball = host.ball
+    if ball is not None:
+        ball = Ball(np.append(ball.center, one), np.append(ball.most, one))
+    level = np.append(np.full(mdp.num_states, most - 1), read)
+    return (HostInterval(inner, np.append(host.lower, one), np.append(host.upper, one), ball),
+            level, np.append(np.arange(mdp.num_states), target))
 
 
 def _pairs(
@@ -199,19 +223,20 @@ def _pairs(
 
 
 def _fixed(
-    model: Product, product: HostProduct, host: HostInterval, policy: np.ndarray, count: int,
-    helpful: bool,
+    model: Product, product: HostProduct, host: HostInterval, policy: np.ndarray, helpful: bool
 ) -> Sides:
     """The product under a policy of the world's rows and the memory, in which nature chooses."""
     world: Any = model.mdp
-    memory = product.memory[host.mdp.state] // count
+    mine = product.host.state
+    memory = product.memory[mine]
     if is_deterministic(policy):
         require_shape("policy", policy, model.state_shape)
-        taken = policy[product.base_state[host.mdp.state], memory] == product.base_row
+        taken = policy[product.base_state[mine], memory] == product.base_row
         weight = taken.astype(np.float64)
     else:
         require_shape("policy", policy, (world.num_rows, model.num_memory))
         weight = policy[product.base_row, memory].astype(np.float64)
+    weight = np.append(weight, np.ones(host.mdp.num_rows - weight.size))  # where nobody chooses
     dtype = policy.dtype if policy.dtype.kind == "f" else np.float64
     require_weights(host.mdp, weight, row_tolerance(dtype))
     weight = weight / host.mdp.over_choices(np.add, weight)[host.mdp.state]

@@ -120,9 +120,9 @@ def test_products_policies_and_games():
             start = found.product.start[0]
             place = found.product.base_state[start], found.product.memory[start]
             assert whole.value[place] == pytest.approx(found.value[start], abs=2e-6)
-            if found.automaton.acceptance in ("cosafe", "safety"):
-                own = satisfaction_probability(both, whole.policy, nature=nature)
-                np.testing.assert_allclose(own.value, whole.value, atol=3e-6)
+            assert whole.nature.shape == (world.num_transitions * both.num_memory,)
+            own = satisfaction_probability(both, whole.policy, nature=nature)
+            np.testing.assert_allclose(own.value, whole.value, atol=3e-6)
             per = np.diff(world.nominal.row_start)[world.nominal.host.state]
             share = np.tile(1 / per[:, None], both.num_memory)
             mixed = satisfaction_probability(both, share, nature=nature)
