@@ -51,6 +51,19 @@ def test_the_page_on_evaluation_runs(capsys):
     assert names["again"].decision is True
 
 
+def test_the_page_on_worlds_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "worlds-of-the-literature.md").read_text()
+    names: dict = {}
+    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(compile(code, "worlds-of-the-literature.md", "exec"), names)
+    assert (tmp_path / "flat.png").read_bytes()[:4] == b"\x89PNG"
+    assert "9800 keyless 75\n" in capsys.readouterr().out
+    gap = names["gap"]
+    assert gap.mean_optimum == (1.0, 1.0) and 0.2 < gap.mean_value[0] < 0.6
+    assert 0 <= gap.mean[1] - gap.mean[0] < 1e-9
+
+
 @pytest.mark.notebook
 @pytest.mark.parametrize("path", sorted(ROOT.glob("notebooks/*.ipynb")), ids=lambda p: p.stem)
 def test_a_notebook_runs(path, tmp_path):
