@@ -104,7 +104,7 @@ def _parts(spec: Any) -> tuple[int, ...] | None:
     """How many values each part of an action has: () for an action that is a number itself."""
     if not hasattr(spec, "num_values"):
         return None
-    return tuple(np.atleast_1d(spec.num_values).ravel().tolist()) if spec.shape else ()
+    return tuple(np.ravel(spec.num_values).tolist()) if spec.shape else ()
 
 
 def _actions(spec: Any, parts: tuple[int, ...] | None) -> Finite | Box:
@@ -158,7 +158,7 @@ def _step(
 ) -> Timestep:
     del key  # the state has one
     if parts.it:
-        action = jnp.stack(jnp.unravel_index(action, parts.it)).astype(jnp.int32)
+        action = jnp.stack(jnp.unravel_index(action, parts.it)).astype(held.it.action_spec.dtype)
     state, found = held.it.step(copied(world.state), action)
     _, further = endless.it.step(copied(world.state), action)
     terminated = further.last() & (further.discount == 0)
