@@ -94,7 +94,7 @@ def test_the_page_on_intervals_runs(tmp_path, monkeypatch, capsys):
             assert abs(float(a) - float(b)) <= 1e-6
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     exec(compile(code, "intervals.md", "exec"), {})
-    assert capsys.readouterr().out == "0.4 [0.4 0.6 1.  1. ]\n[0.7]\n"
+    assert capsys.readouterr().out == "0.4 [0.4 0.6 1.  1. ]\n[0.7]\n0.3\n"
 
 
 def test_the_page_on_tasks_in_environments_runs(capsys):
@@ -104,6 +104,19 @@ def test_the_page_on_tasks_in_environments_runs(capsys):
         exec(compile(code, "tasks-in-environments.md", "exec"), names)
     promised = re.findall(r"print\(.*\)\s+# ([^:\n]*)", page)
     assert len(promised) == 4 and capsys.readouterr().out.splitlines() == promised
+
+
+def test_the_page_on_ppo_runs(capsys):
+    page = (ROOT / "docs" / "ppo.md").read_text()
+    names: dict = {}
+    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(compile(code, "ppo.md", "exec"), names)
+    best, found = float(names["best"]), names["found"].success
+    (promised,) = re.findall(r"print\(.*\)  # (.*)", page)
+    assert promised.endswith(f"at best {best:.3f}") and capsys.readouterr().out.endswith(
+        f"at best {best:.3f}\n")
+    assert found.lower <= best and found.mean > best - 0.05
+    assert names["curves"].shape == (4, 20)
 
 
 @pytest.mark.parametrize(
