@@ -194,6 +194,8 @@ def joint_components(
     while True:
         kept = model.may_keep(used)
         used &= kept[mdp.row]
+        if not kept.any():
+            return Components(np.arange(mdp.num_states), kept), used
         alive = np.zeros(mdp.num_states, bool)
         alive[mdp.state[kept]] = True
         label = strong_components(source[used], mdp.successor[used], mdp.num_states)

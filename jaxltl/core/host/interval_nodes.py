@@ -15,12 +15,15 @@ import numpy as np
 from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.interval_table import Table
 from jaxltl.core.host.levels import Edges, components_in_order
-from jaxltl.core.host.rows import Booleans, Integers, starts_of
+from jaxltl.core.host.mixing import spreads
+from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import towards
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = 1e-290
+_FEW = 300  # nodes up to which no model mixes
+_MET = 4096  # of larger ones, how many a few steps lead to
 
 Answers = list[Floats]  # nature's distributions, a table each
 
@@ -139,6 +142,19 @@ class Nodes:
         count = np.bincount(owner[kept], minlength=self.size)
         return components_in_order(Edges(starts_of(count), target[kept]))
 
+    @cached_property
+    def mixes(self) -> bool:
+        """Whether few steps lead to many nodes."""
+        if self.size < _FEW:
+            return False
+        first, to = self.part.mdp.entry_start[self.part.mdp.row_start], self.part.mdp.successor
+
+        def follow(nodes: Any) -> Any:
+            after = self.node[to[spans(first[nodes], first[nodes + 1] - first[nodes])]]
+            return after[after >= 0]
+
+        return spreads(follow, np.array([self.size // 2]), self.size, min(_MET, self.size // 2))
+
     def values(self, z: Floats) -> Floats:
         """What entries lead to."""
         return np.concatenate([z, self.known])
@@ -217,21 +233,6 @@ class Nodes:
         change = np.maximum(best - own, mine if self.against else 0)
         return (found._replace(chosen=np.where(better, row, chosen), p=p),
                 float(change.max(initial=0)))
-
-    def swept(self, found: Choice, z: Floats) -> tuple[Floats, Choice, float]:
-        """Values after a step of the best choices at some, these, and what changed."""
-        values, p, gain = self.values(z), [], np.empty(self.row.size)
-        for block in self.blocks:
-            ahead = block.gain(values, 0.0)
-            mass = self.answer(block, ahead)
-            p.append(mass)
-            gain[block.table.row] = np.einsum("wn,wn->n", mass, ahead)
-        gain += self.cost
-        best = np.maximum.reduceat(gain, self.part.mdp.row_start[:-1])
-        better = best > gain[found.chosen] + 4 * _EPS * np.abs(z)
-        row = self.part.mdp.first_choice(gain == best[self.part.mdp.state])[1]
-        chosen = np.where(better, row, found.chosen)
-        return z + best, found._replace(chosen=chosen, p=p), float(np.abs(best).max(initial=0))
 
     def chain(self, choice: Choice) -> Chain | None:
         """The system of choices; None where some never leave their node."""

@@ -26,11 +26,13 @@ _EPS = float(np.finfo(np.float64).eps)
 _LEAST = 1e-270
 _AIM = 0.25  # of the tolerance: how much of it the extra of all steps may take
 _ABOUT = 0.1  # residual of systems then, as a share of it
-_STARTS = 60  # improvements to begin with,
-_NEARLY = 1e-4  # until these change so much, as a share of the tolerance
+_NEARLY = 1e-4  # change up to which choices are improved without it, as a share of the tolerance
 _ROUGH = 0.1  # residual of systems that are solved for these, as a share of what changed
-_SWEEPS = 10  # after each system where a model does not mix
-_SLOW = 1e-7
+_LARGE = 500  # nodes from which choices of a model that does not mix are improved by sweeps first,
+_STARTS = 40  # so many times,
+_SWEEPS = 40  # after so many sweeps of each,
+_SLOW = 1e-5  # or until one changes so little, as a share of the values,
+_STILL = 1e-2  # and as long as all of them together change more
 _ROUNDS = 200
 _NEAR = 20  # rounds for the other bound
 _PATIENCE = 30  # rounds after which the extra grows
@@ -162,7 +164,7 @@ class _Search:
 
     @cached_property
     def systems(self) -> Systems:
-        return Systems(lambda: self.nodes.label)
+        return Systems(lambda: self.nodes.label, self.nodes.mixes)
 
     def worth(self, choice: Choice, left: float) -> Choice | None:
         """What choices are worth; None where some never leave."""
@@ -209,7 +211,8 @@ class _Search:
         left = 0.0
         if self.nodes.wandering:
             return choice
-        for _ in range(_STARTS):
+        choice = self.started(choice)
+        for _ in range(_ROUNDS):
             found = self.worth(choice, left)
             if found is None:
                 return None
@@ -217,19 +220,26 @@ class _Search:
             if change <= _NEARLY * self.tolerance * self.scale(found.value):
                 break
             left = _ROUGH * change
-            choice = self.carried(choice)
         return choice
 
-    def carried(self, choice: Choice) -> Choice:
-        """The choices after some sweeps, by which news goes on from where they changed."""
-        if self.systems.mixes:
+    def started(self, choice: Choice) -> Choice:
+        """Choices that are improved as values rise from zero by their sweeps."""
+        nodes = self.nodes
+        if nodes.size < _LARGE or nodes.mixes:
             return choice
-        z = choice.value
-        for _ in range(_SWEEPS):
-            z, choice, change = self.nodes.swept(choice, z)
-            if change <= _SLOW:
+        z = np.zeros(nodes.size)
+        for _ in range(_STARTS):
+            before, chain = z, nodes.chain(choice)
+            if chain is None:
                 break
-        return choice
+            for _ in range(_SWEEPS):
+                last, z = z, chain.matrix @ z + chain.earned
+                if np.abs(z - last).max() <= _SLOW * np.abs(z).max():
+                    break
+            choice, _ = nodes.improved(choice, z, 0.0)
+            if np.abs(z - before).max() <= _STILL * np.abs(z).max():
+                break
+        return choice._replace(value=z)
 
     def scale(self, value: Floats) -> float:
         """What a tolerance is a share of."""

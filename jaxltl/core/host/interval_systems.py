@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.host.elimination import Factors, factors
-from jaxltl.core.host.mixing import spreads
 from jaxltl.core.host.rows import Integers
 from jaxltl.core.host.sparse import Floats
 
@@ -21,9 +20,7 @@ _DIRECT = 2000  # unknowns up to which each system is eliminated
 _LIKE = 10  # steps after which old factors do not help
 _STEPS = 200  # of a method without factors,
 _AGAIN = 3  # and how often it begins
-_SMALL = 300  # unknowns from which it is tried where a model mixes
 _NOISE = 32 * float(np.finfo(np.float64).eps)
-_MET = 4096  # of those, how many a few steps must lead to
 
 
 @dataclass
@@ -32,12 +29,12 @@ class Systems:
 
     Attributes:
       label: of ``int[M]``, strongly connected components in order.
-      mixes: whether few steps lead to many; None where nobody looked.
+      mixes: whether few steps lead to many.
       factors: of an earlier system, and that system.
     """
 
     label: Callable[[], Integers]
-    mixes: bool | None = None
+    mixes: bool
     factors: Factors | None = None
     matrix: Any = None
 
@@ -53,8 +50,6 @@ class Systems:
         Returns:
           ``float64[M]``; None where there is none.
         """
-        if self.mixes is None:
-            self.mixes = _mixes(matrix)
         if self.mixes:
             found = _krylov(matrix, b, start, left, _STEPS, None)
             if found is not None:
@@ -78,17 +73,6 @@ class Systems:
             self.factors = self.factors._replace(rows=matrix).other(every)
         self.matrix = matrix
         return self.factors is not None
-
-
-def _mixes(matrix: Any) -> bool:
-    size = matrix.shape[0]
-    if size < _SMALL:
-        return False
-
-    def follow(states: Any) -> Any:
-        return matrix[states].indices
-
-    return spreads(follow, np.array([size // 2]), size, min(_MET, size // 2))
 
 
 def _krylov(
