@@ -28,7 +28,7 @@ import optax
 from jax import lax
 
 from jaxltl.algos import ppo
-from jaxltl.algos._ppo_networks import orthogonal
+from jaxltl.algos.actor_critic import orthogonal
 from jaxltl.algos.schedules import Linear
 from jaxltl.envs.adapters.gymnax import from_gymnax
 

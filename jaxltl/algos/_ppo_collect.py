@@ -14,7 +14,7 @@ from jax import lax
 
 from jaxltl.algos import _ppo_actions as actions_of
 from jaxltl.algos import learner
-from jaxltl.algos._ppo_networks import Output, evaluated
+from jaxltl.algos.actor_critic import Output, evaluated
 from jaxltl.algos.advantages import generalized_advantages
 from jaxltl.algos.moments import Moments, scale_of, updated_moments
 from jaxltl.core.models.environment import Timestep, allowed_in

@@ -14,7 +14,7 @@ from jax import lax
 from jaxltl.algos import _ppo_actions as actions_of
 from jaxltl.algos import learner
 from jaxltl.algos._ppo_collect import Rows
-from jaxltl.algos._ppo_networks import Output, evaluated, has_memory
+from jaxltl.algos.actor_critic import Output, evaluated, has_memory
 from jaxltl.algos.schedules import at
 
 

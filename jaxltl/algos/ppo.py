@@ -29,16 +29,16 @@ from jax.tree_util import Partial
 from jaxltl.algos import _ppo_actions as actions_of
 from jaxltl.algos import learner
 from jaxltl.algos._ppo_collect import Walkers, collected, normalized
-from jaxltl.algos._ppo_networks import ActorCritic as ActorCritic
-from jaxltl.algos._ppo_networks import RecurrentActorCritic as RecurrentActorCritic
-from jaxltl.algos._ppo_networks import (
+from jaxltl.algos._ppo_update import descent, improved
+from jaxltl.algos.actor_critic import ActorCritic as ActorCritic
+from jaxltl.algos.actor_critic import RecurrentActorCritic as RecurrentActorCritic
+from jaxltl.algos.actor_critic import (
     default_network,
     evaluated,
     fresh_parameters,
     has_memory,
     require_network,
 )
-from jaxltl.algos._ppo_update import descent, improved
 from jaxltl.algos.moments import Moments, no_moments
 from jaxltl.algos.schedules import Schedule
 from jaxltl.algos.schedules import at as _at

@@ -17,7 +17,7 @@ from jaxltl.algos import _ppo_actions as actions_of
 from jaxltl.algos import _ppo_collect as collecting
 from jaxltl.algos import _ppo_update as updating
 from jaxltl.algos import learner, ppo
-from jaxltl.algos._ppo_networks import orthogonal
+from jaxltl.algos.actor_critic import orthogonal
 from jaxltl.algos.moments import scale_of, updated_moments
 from jaxltl.algos.schedules import Linear
 from jaxltl.core.models.environment import (

@@ -54,7 +54,8 @@ def orthogonal(scale: float) -> Any:
     return start
 
 
-def _dense(width: int, scale: float, name: str) -> nn.Dense:
+def dense(width: int, scale: float, name: str) -> nn.Dense:
+    """A layer of a network, orthogonal at the start, of the floats that are the default."""
     return nn.Dense(
         width, kernel_init=orthogonal(scale), param_dtype=jnp.result_type(float), name=name)
 
@@ -70,8 +71,8 @@ class _Layers(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         for i, width in enumerate(self.hidden):
-            x = getattr(nn, self.activation)(_dense(width, np.sqrt(2), f"hidden_{i}")(x))
-        return _dense(self.outputs, self.last_scale, "out")(x)
+            x = getattr(nn, self.activation)(dense(width, np.sqrt(2), f"hidden_{i}")(x))
+        return dense(self.outputs, self.last_scale, "out")(x)
 
 
 def _heads(module: Any, x: jax.Array) -> tuple[Any, jax.Array]:
@@ -135,7 +136,7 @@ class RecurrentActorCritic(nn.Module):
 
     @nn.compact
     def __call__(self, memory: jax.Array, observation: Any) -> tuple[jax.Array, Any]:
-        x = _dense(self.memory, np.sqrt(2), "input")(flat_observation(observation))
+        x = dense(self.memory, np.sqrt(2), "input")(flat_observation(observation))
         x = getattr(nn, self.activation)(x)
         cell = nn.GRUCell(
             self.memory, recurrent_kernel_init=orthogonal(1.0),
