@@ -235,13 +235,16 @@ def _draw_connected(
     slot: chex.Array, empty: chex.Array, each: chex.Array, key: chex.PRNGKey
 ) -> LetterState:
     copies, count = each.shape
-    bits = jax.random.bits(key, copies * count + 2, jnp.uint32)
-    # The rank of random numbers is a uniform permutation; comparing all is faster than sorting.
-    rank = (bits[2:, None] > bits[2:]).sum(axis=1, dtype=jnp.int8)
-    ties = (bits[2:, None] == bits[2:]) & np.tri(copies * count, k=-1, dtype=bool)
-    shuffled = (rank + ties.sum(axis=1, dtype=jnp.int8)) // jnp.int8(copies)
+    used = copies * count
+    bits = jax.random.bits(key, used + 2, jnp.uint32)
     drawn, place = bits[0] % np.uint32(slot.shape[0]), bits[1] % np.uint32(empty.shape[1])
-    letter = jnp.append(shuffled, jnp.int8(count))[jnp.asarray(slot)[drawn]]
+    # The rank of random numbers is a uniform permutation. Comparing all of them, and of slots and
+    # cells too, is several times faster than sorting and looking up. Low bits make them distinct.
+    low = np.uint32((1 << (used - 1).bit_length()) - 1)
+    number = (bits[2:] & ~low) | np.arange(used, dtype=np.uint32)
+    shuffled = (number[:, None] > number).sum(axis=1, dtype=jnp.int32) // copies - count
+    taken = jnp.asarray(slot)[drawn][:, None] == np.arange(used, dtype=slot.dtype)
+    letter = count + jnp.where(taken, shuffled.astype(jnp.int8), 0).sum(axis=1, dtype=jnp.int8)
     return LetterState(letter, jnp.asarray(empty)[drawn, place].astype(jnp.int32))
 
 

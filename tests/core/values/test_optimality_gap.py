@@ -113,6 +113,22 @@ def test_bounds_enclose_the_recursion(seed, kind):
         assert found.weight[order].tolist() == pytest.approx([0.5, 0.3, 0.2])
 
 
+def test_what_is_cut_off_goes_on_no_more_and_what_has_ended_stays():
+    task = "F (zero & X zero)"
+    policy = np.full((S, len(to_automaton(task).delta), A), 0.5)
+    values = []
+    for kind in (1, 2):
+        over = np.where(np.arange(S) % 3 == 0, kind, 0)
+        world, *arrays = process(2, over)
+        table = tabulate(world)
+        found = optimality_gap(table, task, on_table(table, policy), num_steps=20)
+        expected = np.array(reference(arrays, task, 20, policy))
+        order = np.argsort(np.asarray(table.world)[found.start])
+        assert np.abs(np.asarray(found.value.value)[order] - expected).max() < 1e-9
+        values.append(found.mean_value[1])
+    assert values[0] > values[1] + 0.2
+
+
 def test_the_best_of_letters_is_a_shortest_way():
     world = letter_world(size=4, letters=3, copies=2, connected=False)
     drawn = jax.vmap(world.reset)(jax.random.split(jax.random.key(0), 20))
