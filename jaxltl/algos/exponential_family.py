@@ -23,6 +23,7 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import lax
 from jax.scipy.special import digamma, gammaln
@@ -137,10 +138,11 @@ def _like(name: str, x: Any, model: jax.Array) -> jax.Array:
 def _require_positive(name: str, x: jax.Array) -> None:
     if isinstance(x, jax.core.Tracer):
         return
-    wrong = jnp.flatnonzero(~((x > 0) & jnp.isfinite(x)))
+    given = np.asarray(x)
+    wrong = np.flatnonzero(~((given > 0) & np.isfinite(given)))
     if wrong.size:
         raise ValueError(
-            f"{name}[{int(wrong[0])}] = {float(x[wrong[0]])!r}; it must be positive and finite.")
+            f"{name}[{wrong[0]}] = {float(given[wrong[0]])!r}; it must be positive and finite.")
 
 
 # --- the protocol ---------------------------------------------------------------------------

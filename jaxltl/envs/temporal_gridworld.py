@@ -466,11 +466,15 @@ def patches(world: World, radius: int = 1) -> jax.Array:
             f"radius={radius}; this world shows 0 to {world.margin} cells around each. Make it "
             f"with margin={radius}."
         )
-    rows, columns = world.shape
-    around = np.arange(2 * radius + 1) + world.margin - radius
+    return _patches(world.colors, *world.shape, world.margin, radius)
+
+
+@partial(jax.jit, static_argnums=(1, 2, 3, 4))
+def _patches(colors: jax.Array, rows: int, columns: int, margin: int, radius: int) -> jax.Array:
+    around = np.arange(2 * radius + 1) + margin - radius
     down = (np.arange(rows)[:, None, None, None]) + around[:, None]
     across = np.arange(columns)[:, None, None] + around
-    return world.colors[down, across].reshape(rows * columns, around.size, around.size)
+    return colors[down, across].reshape(rows * columns, around.size, around.size)
 
 
 def observations(world: World, radius: int = 1) -> jax.Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import chex
@@ -153,9 +154,21 @@ def rollout(
       :class:`Trajectories` with N rows. Jit-compiled callers pass the counts statically.
     """
     distribution = policy_distribution(model, policy).reshape(-1, model.num_actions)
+    stop = np.zeros(model.state_shape, bool) if stop is None else stop
+    return _rollout(model, distribution, key, stop, num_trajectories, num_steps)
+
+
+@partial(jax.jit, static_argnums=(4, 5))
+def _rollout(
+    model: Any,
+    distribution: jax.Array,
+    key: chex.PRNGKey,
+    stop: jax.Array,
+    num_trajectories: int,
+    num_steps: int,
+) -> Trajectories:
     logits = jnp.log(distribution)
     initial = jnp.log(model.initial.ravel())
-    stop = jnp.zeros(model.state_shape, bool) if stop is None else stop
     stop = stop.ravel()
 
     def one(key: chex.PRNGKey) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -120,14 +120,7 @@ class _Biases(NamedTuple):
 
 def _graph(game: Game, reward: jax.Array) -> tuple[_Graph, int]:
     """The game's graph with its rewards times a common denominator, which is returned."""
-    columns = []
-    for a in range(game.num_actions):
-        chain = induced_chain(game, jnp.full(game.state_shape, a, jnp.int32))
-        chance = np.asarray(chain.successor_probability)[:, 0]
-        slot = chance.argmax(-1)
-        if hasattr(chain, "successor"):
-            slot = np.asarray(chain.successor)[np.arange(len(slot)), 0, slot]
-        columns.append(slot)
+    columns = [np.asarray(_only_successor(game, a)) for a in range(game.num_actions)]
     available = np.asarray(game.available).reshape(-1, game.num_actions)
     values = np.where(available, np.asarray(reward, float).reshape(available.shape), 0)
     if not np.isfinite(values).all():
@@ -142,6 +135,15 @@ def _graph(game: Game, reward: jax.Array) -> tuple[_Graph, int]:
     weight = np.array(whole, np.int64 if small else object)[place.reshape(values.shape)]
     system = np.asarray(game.system).ravel()
     return _Graph(np.stack(columns, -1), weight, available, system), scale
+
+
+@jax.jit
+def _only_successor(game: Game, action: int) -> jax.Array:
+    chain = induced_chain(game, jnp.full(game.state_shape, action, jnp.int32))
+    slot = chain.successor_probability[:, 0].argmax(-1)
+    if hasattr(chain, "successor"):
+        return jnp.take_along_axis(chain.successor[:, 0], slot[:, None], axis=-1)[:, 0]
+    return slot
 
 
 def _most_bias(num_states: int) -> int:
