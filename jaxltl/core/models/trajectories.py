@@ -154,8 +154,9 @@ def rollout(
       :class:`Trajectories` with N rows. Jit-compiled callers pass the counts statically.
     """
     distribution = policy_distribution(model, policy).reshape(-1, model.num_actions)
-    stop = np.zeros(model.state_shape, bool) if stop is None else stop
-    return _rollout(model, distribution, key, stop, num_trajectories, num_steps)
+    nowhere = np.zeros(model.state_shape, bool)
+    return _rollout(
+        model, distribution, key, nowhere if stop is None else stop, num_trajectories, num_steps)
 
 
 @partial(jax.jit, static_argnums=(4, 5))
