@@ -148,30 +148,6 @@ def stack_plans(plans: Sequence[Plan]) -> Plan:
     return jax.tree.map(lambda *rows: jnp.stack([padded(x) for x in rows]), *plans)
 
 
-def sequence_agent(
-    network: Callable[..., Any], plan: Plan, *, act: Callable[..., Any] | None = None
-) -> Agent:
-    """The agent of one formula, of a network that was trained on sequences.
-
-    In each state of the automaton that it comes to, it takes the sequence that the network values
-    most, and does what the network does for that one until the state changes: choosing anew at
-    every step, it would go to and fro between two that are worth the same.
-
-    Args:
-      network: ``observation -> (parameters of the action, value)`` of a trained network; a
-        ``Partial`` whose arrays are its parameters.
-      plan: of the formula; a lane of :func:`stack_plans` under ``vmap``.
-      act: ``(parameters of the action, allowed, key) -> action``; default: of finitely many
-        actions the likeliest.
-
-    Returns:
-      An :class:`~jaxltl.core.models.environment.Agent` for observations
-      :class:`~jaxltl.core.models.task_environment.TaskObservation` of that formula.
-    """
-    begin = Choice(jnp.int32(-1), jnp.int32(0))
-    return Agent(Partial(_act, as_partial(act or likeliest), as_partial(network), plan), begin)
-
-
 class Choice(NamedTuple):
     """What an agent has taken up: a state of the automaton, and which of its sequences."""
 
@@ -179,31 +155,101 @@ class Choice(NamedTuple):
     sequence: jax.Array
 
 
-def likeliest(scores: jax.Array, allowed: Any, key: chex.PRNGKey) -> jax.Array:
-    """The action of the largest score among those that are allowed."""
+def sequence_agent(
+    network: Callable[..., Any], plan: Plan, *, act: Callable[..., Any] | None = None
+) -> Agent:
+    """The agent of one formula, of a network that was trained on sequences.
+
+    In each state of the automaton that it comes to, it takes the sequence that the network values
+    most, and does what the network does for that one until the state changes: choosing anew at
+    every step, it might go to and fro between two that are worth the same.
+
+    Args:
+      network: ``observation -> (parameters of the action, value)`` of a trained network; a
+        ``Partial`` whose arrays are its parameters, such as :func:`trained` makes.
+      plan: of the formula; a lane of :func:`stack_plans` under ``vmap``.
+      act: ``(parameters of the action, allowed, key) -> action``; default :func:`drawn`.
+
+    Returns:
+      An :class:`~jaxltl.core.models.environment.Agent` for observations
+      :class:`~jaxltl.core.models.task_environment.TaskObservation` of that formula, one-hot in the
+      automaton's state.
+    """
+    begin = Choice(jnp.int32(-1), jnp.int32(0))
+    return Agent(Partial(_act, as_partial(act or drawn), as_partial(network), plan), begin)
+
+
+def sequence_policy(
+    network: Callable[..., Any], plan: Plan, observation: Any, memory: chex.Numeric
+) -> jax.Array:
+    """``float[A]``: how likely each of finitely many actions is to an agent that chooses anew at
+    every step, by the world's observation and the automaton's state alone.
+
+    ``Partial(sequence_policy, network, plan)`` is a policy for
+    :func:`~jaxltl.core.values.optimality_gap.tabulate_policy`.
+    """
+    actions, best = _judged(network, plan, observation, jnp.asarray(memory))
+    return jax.nn.softmax(actions[best])
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class _Module:
+    """A network's definition, which is no array."""
+
+    network: nn.Module
+
+
+def trained(network: nn.Module, parameters: Any) -> Partial:
+    """``observation -> (parameters of the action, value)``: a network with its parameters."""
+    return Partial(_applied, _Module(network), parameters)
+
+
+def _applied(module: _Module, parameters: Any, observation: Any) -> Any:
+    return module.network.apply({"params": parameters}, observation)
+
+
+def drawn(parameters: Any, allowed: Any, key: chex.PRNGKey) -> jax.Array:
+    """An action drawn from what a network says: of finitely many, or of a Gaussian."""
+    if isinstance(parameters, tuple):
+        mean, log_deviation = parameters
+        return mean + jnp.exp(log_deviation) * jax.random.normal(key, mean.shape, mean.dtype)
+    return jax.random.categorical(key, _masked(parameters, allowed)).astype(jnp.int32)
+
+
+def likeliest(parameters: Any, allowed: Any, key: chex.PRNGKey) -> jax.Array:
+    """The action that a network thinks likeliest; of a Gaussian its mean."""
     del key
-    if allowed is not None:
-        scores = jnp.where(allowed, scores, -jnp.inf)
-    return jnp.argmax(scores).astype(jnp.int32)
+    if isinstance(parameters, tuple):
+        return parameters[0]
+    return jnp.argmax(_masked(parameters, allowed)).astype(jnp.int32)
+
+
+def _masked(scores: jax.Array, allowed: Any) -> jax.Array:
+    return scores if allowed is None else jnp.where(allowed, scores, -jnp.inf)
+
+
+def _judged(
+    network: Callable[..., Any], plan: Plan, seen: Any, state: jax.Array
+) -> tuple[Any, jax.Array]:
+    """What the network would do for each sequence of a state, and which it values most."""
+    rows = sequence_task.Sequence(
+        jnp.asarray(plan.reach)[state], jnp.asarray(plan.avoid)[state],
+        jnp.asarray(plan.length)[state])
+    actions, values = jax.vmap(
+        lambda row: network(sequence_task.SequenceObservation(seen, row)))(rows)
+    return actions, jnp.argmax(jnp.where(rows.length > 0, values, -jnp.inf))
 
 
 def _act(
     act: Callable[..., Any], network: Callable[..., Any], plan: Plan, memory: Any, observation: Any,
     allowed: Any, key: chex.PRNGKey,
 ) -> tuple[Any, Any]:
-    world, state = observation
-    q = jnp.argmax(state)
-    rows = sequence_task.Sequence(
-        jnp.asarray(plan.reach)[q], jnp.asarray(plan.avoid)[q], jnp.asarray(plan.length)[q])
-
-    def judge(row: Any) -> Any:
-        return network(sequence_task.SequenceObservation(world, row))
-
-    actions, values = jax.vmap(judge)(rows)
-    best = jnp.argmax(jnp.where(rows.length > 0, values, -jnp.inf))
-    taken = jnp.where(memory.state == q, memory.sequence, best).astype(jnp.int32)
+    seen, state = observation.world, jnp.argmax(observation.memory).astype(jnp.int32)
+    actions, best = _judged(network, plan, seen, state)
+    taken = jnp.where(memory.state == state, memory.sequence, best).astype(jnp.int32)
     chosen = jax.tree.map(lambda x: x[taken], actions)
-    return act(chosen, allowed, key), Choice(q.astype(jnp.int32), taken)
+    return act(chosen, allowed, key), Choice(state, taken)
 
 
 @dataclass(frozen=True)

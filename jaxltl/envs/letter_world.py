@@ -287,3 +287,17 @@ def _see(
 
 def _labels(numbers: chex.Array, world: LetterState) -> jax.Array:
     return world.letter[world.place] == numbers
+
+
+def events_seen(observation: jax.Array) -> jax.Array:
+    """``float[size, size, letters + 1]``: which event each cell of an observation is, that without
+    a letter first, as :func:`~jaxltl.core.models.sequence_task.events_of` numbers them.
+
+    Example:
+      >>> world = letter_world(size=2, letters=["x"], copies=1, connected=False)
+      >>> seen = events_seen(world.observe(world.reset(jax.random.key(0))))
+      >>> seen.shape, float(seen[..., 1].sum())
+      ((2, 2, 2), 1.0)
+    """
+    letters = observation[..., :-1]
+    return jnp.concatenate([1 - letters.sum(-1, keepdims=True), letters], -1)

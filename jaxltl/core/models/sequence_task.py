@@ -158,8 +158,8 @@ def sequence_sampler(
 def draw_sequence(key: chex.PRNGKey, sampler: SequenceSampler) -> Sequence:
     """A sequence: for each step some sets to reach and others to avoid, without repetition.
 
-    What is to be reached is not avoided, nor is a set in which the step before may have ended: who
-    has just done that step could not help it.
+    A set is not avoided if any of its events is to be reached, or may have ended the step before:
+    who has just done that step could not help it.
     """
     keys = jax.random.split(key, 4)
     depth, count = sampler.length.shape[0], sampler.sets.shape[0]
@@ -175,9 +175,9 @@ def draw_sequence(key: chex.PRNGKey, sampler: SequenceSampler) -> Sequence:
     asked = (jnp.arange(depth) < length)[:, None]
     reach = asked & ((rank < wanted)[..., None] & sets).any(1)
     before = jnp.concatenate([jnp.zeros_like(reach[:1]), reach[:-1]])
-    clear = ~(before[:, None] & sets).any(-1)
+    clear = ~((before | reach)[:, None] & sets).any(-1)
     chosen = clear & (rank >= wanted) & (rank < wanted + shunned)
-    return Sequence(reach, asked & (chosen[..., None] & sets).any(1) & ~reach, length)
+    return Sequence(reach, asked & (chosen[..., None] & sets).any(1), length)
 
 
 def sequence_environment(
