@@ -115,7 +115,7 @@ def test_the_page_on_ppo_runs(capsys):
     (promised,) = re.findall(r"print\(.*\)  # (.*)", page)
     assert promised.endswith(f"at best {best:.3f}") and capsys.readouterr().out.endswith(
         f"at best {best:.3f}\n")
-    assert found.lower <= best and found.mean > best - 0.05
+    assert found.lower <= best and found.mean > best - 0.1
     assert names["curves"].shape == (4, 20)
 
 
