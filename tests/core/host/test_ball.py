@@ -1,6 +1,7 @@
 """Nature within a ball beside ends: against linear programs, and all vertices by brute force."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,6 +30,17 @@ from tests.reference_intervals import (
 
 COUNTS = [40, pytest.param(1000, marks=pytest.mark.exhaustive)]
 DIRECTIONS = list(itertools.product((True, False), repeat=2))
+
+
+def free_model(rng):
+    """With up to four successors, and ends 0 and 1: the ball alone decides."""
+    found = random_model(rng, width=4)
+    return replace(found, lower=0 * found.lower, upper=0 * found.upper + 1)
+
+
+def some_model(rng, i):
+    """Now and then with four successors, of which a ball leaves less than its intervals do."""
+    return random_model(rng, most_rows=1, width=4) if i % 20 == 0 else random_model(rng)
 
 
 def within_ball(model, p):
@@ -86,7 +98,7 @@ def test_supports(count):
     """To which successors nature may keep, with all of them, and what must be entered."""
     rng = np.random.default_rng(0)
     for _ in range(count):
-        model = with_ball(rng, random_model(rng))
+        model = with_ball(rng, free_model(rng))
         mdp = model.mdp
         entries = rng.random(mdp.num_transitions) < 0.6
         region = rng.random(4) < 0.5
@@ -109,10 +121,10 @@ def test_supports(count):
 def test_faces(count):
     """All best distributions by rank, by what they may keep to."""
     rng = np.random.default_rng(1)
-    for _ in range(count):
-        model = with_ball(rng, random_model(rng, width=4, num_states=5))
+    for _ in range(2 * count):
+        model = with_ball(rng, free_model(rng))
         mdp = model.mdp
-        rank, entries = rng.integers(0, 3, (2, mdp.num_transitions))
+        rank, entries = rng.integers(0, 2 + rng.integers(2), (2, mdp.num_transitions))
         face = face_of(model, rank)
         entries = entries > 0
         may, p = face.may_keep(entries), face.within(entries)
@@ -134,8 +146,8 @@ def test_faces(count):
 @pytest.mark.parametrize("count", COUNTS)
 def test_probabilities_and_rewards(count):
     rng = np.random.default_rng(2)
-    for _ in range(count):
-        model = with_ball(rng, random_model(rng))
+    for i in range(count):
+        model = with_ball(rng, some_model(rng, i))
         goal = np.arange(4) == rng.integers(4)
         cost = rng.integers(0, 3, model.mdp.num_rows).astype(float)
         every = list(chains(model, goal))
@@ -161,8 +173,8 @@ def test_probabilities_and_rewards(count):
 @pytest.mark.parametrize("count", COUNTS)
 def test_parity(count):
     rng = np.random.default_rng(3)
-    for _ in range(count):
-        model = with_ball(rng, random_model(rng))
+    for i in range(count):
+        model = with_ball(rng, some_model(rng, i))
         priority = rng.integers(0, rng.integers(2, 5), 4)
         values = optima([parity(p, priority) for _, p in chains(model, np.zeros(4, bool))])
         for (maximize, helpful), value in values.items():
