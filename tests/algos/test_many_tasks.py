@@ -1,0 +1,202 @@
+"""One agent for many formulas: the network, the plans, and the agent that follows them."""
+
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxltl.algos import many_tasks
+from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.models.environment import run_episode
+from jaxltl.core.models.monitor import Verdict
+from jaxltl.core.models.sequence_task import Sequence, SequenceObservation, events_of
+from jaxltl.core.models.tabulate import tabulate
+from jaxltl.core.models.task_environment import stack_tasks, task_environment
+from jaxltl.core.values.optimality_gap import optimality_gap, tabulate_policy
+from jaxltl.envs.letter_world import events_seen, letter_world
+
+NAMES = ("a", "b", "c")
+EVENTS = events_of(NAMES)
+WORLD = letter_world(size=4, letters=NAMES, copies=1, horizon=30)
+DEPTH = 3
+TASKS = ("F(a & F b)", "!a U b", "F(a & F c) & F b", "(!c U (b & F c)) & F a")
+
+
+def way(grid, wanted, avoided):
+    """Steps to a wanted cell across cells that are not avoided, from each cell of a torus."""
+    far = jnp.where(wanted, 0.0, 99.0)
+    for _ in range(16):
+        near = jnp.minimum(jnp.minimum(jnp.roll(far, 1, 0), jnp.roll(far, -1, 0)),
+                           jnp.minimum(jnp.roll(far, 1, 1), jnp.roll(far, -1, 1)))
+        far = jnp.where(wanted, 0.0, jnp.where(avoided, 99.0, jnp.minimum(far, near + 1)))
+    return far
+
+
+def knowing(observation):
+    """What a network would say that had learned everything: shortest ways, step after step."""
+    seen, (reach, avoid, _) = observation
+    cells = events_seen(seen)
+    middle = (cells.shape[0] // 2,) * 2
+    told = [(cells @ row.astype(float)) > 0.5 for row in (reach[0], avoid[0])]
+    far = way(cells, *told)
+    move = [(-1, 0), (1, 0), (0, -1), (0, 1)]
+    # A first step must be made, also where one stands on what is wanted.
+    ahead = jnp.stack([far[middle[0] + i, middle[1] + j] for i, j in move])
+    where = jnp.stack([told[1][middle[0] + i, middle[1] + j] for i, j in move])
+    ahead = jnp.where(where, 99.0, ahead)
+    return -10.0 * ahead, -jnp.min(ahead) - 4.0 * reach[1:].any(-1).sum()
+
+
+def episodes(environment, agent, keys):
+    def one(key):
+        return run_episode(key, environment, agent, num_steps=30)
+
+    return jax.vmap(one)(keys)
+
+
+@pytest.fixture(scope="module")
+def plans():
+    return [many_tasks.make_plan(task, EVENTS, NAMES, depth=DEPTH, most=6) for task in TASKS]
+
+
+@pytest.fixture(scope="module")
+def verdicts(plans):
+    """Of all tasks in one program: ``int[N, M]``."""
+    worlds = stack_tasks([task_environment(WORLD, task) for task in TASKS])
+    keys = jax.random.split(jax.random.key(0), 64)
+
+    def run(environment, plan):
+        agent = many_tasks.sequence_agent(knowing, plan, act=many_tasks.likeliest)
+        return episodes(environment, agent, keys).world.verdict[:, -1]
+
+    return np.asarray(jax.jit(jax.vmap(run))(worlds, many_tasks.stack_plans(plans)))
+
+
+def test_who_follows_what_is_asked_for_does_formulas_that_nobody_trained(verdicts):
+    assert (verdicts == Verdict.SATISFIED).mean(1).min() > 0.95
+    assert not (verdicts == Verdict.VIOLATED).any()
+
+
+def test_a_lane_of_stacked_plans_is_the_plan(plans, verdicts):
+    agent = many_tasks.sequence_agent(knowing, plans[1], act=many_tasks.likeliest)
+    alone = episodes(task_environment(WORLD, TASKS[1]), agent, jax.random.split(
+        jax.random.key(0), 64))
+    assert (np.asarray(alone.world.verdict[:, -1]) == verdicts[1]).all()
+
+
+def test_the_certified_gap_of_an_agent_that_knows_is_small(plans):
+    fixed = letter_world(layout="a...\n....\n..b.\n...c", letters=NAMES, horizon=30)
+    table, automaton = tabulate(fixed), to_automaton(TASKS[0])
+    policy = jax.tree_util.Partial(many_tasks.sequence_policy, knowing_network(), plans[0])
+    acts = tabulate_policy(policy, fixed, table, len(automaton.delta))
+    found = optimality_gap(table, automaton, acts)
+    assert found.mean_optimum == (1.0, 1.0)
+    assert found.mean[1] < 1e-3
+
+
+def knowing_network():
+    return jax.tree_util.Partial(knowing)
+
+
+@pytest.mark.parametrize("kind", ["finite", "box"])
+def test_names_of_events_have_gone_where_the_network_sees_them(kind):
+    size = {"num_actions": 4} if kind == "finite" else {"shape": (2,)}
+    network = many_tasks.SequenceNetwork(events_seen=events_seen, hidden=(8,), detailed=2, **size)
+    rng = np.random.default_rng(0)
+    letters = np.eye(5)[rng.integers(0, 5, (4, 4))][..., :3]
+    seen = np.concatenate([letters, np.zeros((4, 4, 1))], -1)
+    rows = rng.random((2, DEPTH, 4)) < 0.4
+    order = np.array([2, 0, 1])
+    swapped = np.concatenate([letters[..., order], seen[..., 3:]], -1)
+
+    def told(seen, rows):
+        return SequenceObservation(jnp.asarray(seen), Sequence(*jnp.asarray(rows), jnp.int32(3)))
+
+    parameters = network.init(jax.random.key(0), told(seen, rows))["params"]
+    one = many_tasks.trained(network, parameters)(told(seen, rows))
+    other = many_tasks.trained(network, parameters)(
+        told(swapped, rows[..., np.concatenate([[0], 1 + order])]))
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6), one, other)
+    third = many_tasks.trained(network, parameters)(told(swapped, rows))
+    assert abs(np.asarray(third[1]) - np.asarray(one[1])) > 1e-6
+
+
+def test_without_it_the_events_are_embedded():
+    network = many_tasks.SequenceNetwork(num_actions=3, hidden=(8,), embedding=5)
+    rows = jnp.ones((2, DEPTH, 4), bool)
+    seen = SequenceObservation(jnp.ones(2), Sequence(*rows, jnp.int32(2)))
+    parameters = network.init(jax.random.key(0), seen)["params"]
+    assert parameters["events"]["kernel"].shape == (8, 5)
+    assert parameters["hidden_0"]["kernel"].shape[0] == 2 + DEPTH * 5 + DEPTH
+    scores, value = many_tasks.trained(network, parameters)(seen)
+    assert scores.shape == (3,) and value.shape == ()
+
+
+def test_an_agent_keeps_to_what_it_has_taken_up():
+    plan = many_tasks.make_plan("F a & F b", EVENTS, NAMES, depth=DEPTH)
+    worth = jnp.array([0.0, 1.0])
+
+    def fickle(observation):
+        first_is_a = observation.sequence.reach[0, 1]
+        value = jnp.where(first_is_a, observation.world[0], 1 - observation.world[0])
+        return jnp.where(first_is_a, jnp.array([5.0, 0.0]), jnp.array([0.0, 5.0])), value
+
+    agent = many_tasks.sequence_agent(fickle, plan, act=many_tasks.likeliest)
+    initial = to_automaton("F a & F b").initial
+    memory, taken = agent.memory, []
+    for value in worth:
+        seen = SimpleNamespace(world=value[None], memory=jnp.eye(len(plan.length))[initial])
+        action, memory = agent.act(memory, seen, None, jax.random.key(0))
+        taken.append(int(action))
+    assert taken == [1, 1]
+
+
+def test_masks_are_kept_and_gaussians_drawn():
+    key = jax.random.key(0)
+    allowed = jnp.array([False, True, True])
+    for act in (many_tasks.likeliest, many_tasks.drawn):
+        assert int(act(jnp.array([9.0, 0.0, -99.0]), allowed, key)) == 1
+    mean = jnp.array([1.0, 2.0])
+    assert (many_tasks.likeliest((mean, jnp.zeros(2)), None, key) == mean).all()
+    draw = jax.vmap(lambda k: many_tasks.drawn((mean, jnp.log(jnp.array([0.1, 2.0]))), None, k))
+    found = np.asarray(draw(jax.random.split(key, 4000)))
+    np.testing.assert_allclose(found.mean(0), mean, atol=0.12)
+    np.testing.assert_allclose(found.std(0), [0.1, 2.0], rtol=0.06)
+
+
+class Figures(NamedTuple):
+    """Metrics of a stub of a learner."""
+
+    episode_return: np.ndarray
+    episodes: np.ndarray
+
+
+def test_stages_follow_when_one_is_mastered():
+    seen = []
+
+    def run(state, problem, hparams, *, num_steps):
+        seen.append(problem)
+        mean = [0.5, 0.95, 0.2, 0.85, 0.99][state]
+        return state + 1, Figures(np.array([mean, np.nan]), np.array([3, 0]))
+
+    found = many_tasks.train_in_stages(
+        jax.random.key(0), "xyz", None, init=lambda *given: 0, run=run, num_chunks=5,
+        enough=[0.9, 0.8])
+    assert seen == ["x", "x", "y", "y", "z"] == ["xyz"[i] for i in found.stages]
+    assert found.state == 5 and len(found.metrics) == 5 and (np.diff(found.seconds) >= 0).all()
+
+
+def test_bad_input_is_named(plans):
+    with pytest.raises(ValueError, match="one threshold fewer"):
+        many_tasks.train_in_stages(jax.random.key(0), "xy", None, init=None, run=None,
+                                   num_chunks=1, enough=[1, 2])
+    with pytest.raises(ValueError, match="all of one depth"):
+        many_tasks.stack_plans([])
+    deeper = many_tasks.make_plan(TASKS[0], EVENTS, NAMES, depth=DEPTH + 1)
+    with pytest.raises(ValueError, match="all of one depth"):
+        many_tasks.stack_plans([plans[0], deeper])
+    with pytest.raises(ValueError, match="mentions the proposition 'x'"):
+        many_tasks.make_plan("F x", EVENTS, NAMES, depth=DEPTH)
