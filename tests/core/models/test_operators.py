@@ -9,7 +9,13 @@ import jaxltl as jl
 from jaxltl.core.models import operators
 from tests import reference
 from tests.sparse_models import random_sparse
-from tests.support import REPRESENTATIONS, assert_gradients, mass_preserving, random_representation
+from tests.support import (
+    REPRESENTATIONS,
+    assert_gradients,
+    counts,
+    mass_preserving,
+    random_representation,
+)
 
 
 def whole(function):
@@ -203,9 +209,10 @@ def test_errors_name_the_argument():
 # --- sparse models ---------------------------------------------------------------------------
 
 
-def test_primitives_of_rows_equal_those_of_the_padded_model():
+@counts(1, 3)  # each of another shape
+def test_primitives_of_rows_equal_those_of_the_padded_model(count):
     rng = np.random.default_rng(20)
-    for _ in range(3):
+    for _ in range(count):
         model = random_sparse(rng, 9, most=5, width=9)
         padded = jl.to_padded(model)
         place = model.host.state, np.arange(model.num_rows) - model.row_start[model.host.state]
