@@ -113,9 +113,9 @@ def main() -> None:
             found = evaluate(
                 jax.random.key(1000 + number), many_tasks.sequence_agent(network, plan),
                 task_environment(world, automaton), num_episodes=given.episodes)
-            row = {"seed": seed, "task": formula, "success": found.success.value,
+            row = {"seed": seed, "task": formula, "success": found.success.mean,
                    "interval": [found.success.lower, found.success.upper],
-                   "violation": found.violation.value, "steps": found.length.value}
+                   "violation": found.violation.mean, "steps": found.length.mean}
             if given.layouts:
                 begin = time.perf_counter()
                 row |= gaps(network, formula, given.layouts)
