@@ -2,6 +2,7 @@
 
 from jaxltl.core.automata.automaton import Automaton, complement, make_automaton, picture
 from jaxltl.core.automata.language import find_difference, is_equivalent
+from jaxltl.core.automata.sequences import Sequences, reach_avoid_sequences
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.games.objective import (
@@ -63,6 +64,12 @@ from jaxltl.core.models.product import (
     project_trajectories,
 )
 from jaxltl.core.models.restrict import restrict, with_allowed
+from jaxltl.core.models.sequence_task import (
+    events_of,
+    proposition_sets,
+    sequence_environment,
+    sequence_sampler,
+)
 from jaxltl.core.models.simulated_model import environment_of
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse, row_reward
 from jaxltl.core.models.tabulate import Table, tabulate
@@ -177,6 +184,7 @@ __all__ = [
     "PreparedInterval",
     "Product",
     "Rewards",
+    "Sequences",
     "ShieldedWorld",
     "Solution",
     "SparseMDP",
@@ -214,6 +222,7 @@ __all__ = [
     "environment_of",
     "episode_evaluator",
     "evaluate",
+    "events_of",
     "exists_successor",
     "expectation",
     "feature_expectation",
@@ -277,8 +286,10 @@ __all__ = [
     "product",
     "project_policy",
     "project_trajectories",
+    "proposition_sets",
     "pushforward",
     "reach",
+    "reach_avoid_sequences",
     "reachability_probability",
     "read_hoa",
     "read_labels",
@@ -302,6 +313,8 @@ __all__ = [
     "safety",
     "sample_successor",
     "satisfaction_probability",
+    "sequence_environment",
+    "sequence_sampler",
     "shield",
     "shielded",
     "soft_value",
