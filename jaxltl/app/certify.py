@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from jaxltl.core.types import Status
 from jaxltl.core.values.data_guarantee import DataGuarantee, guarantee_curve, learn_guarantee
 
 SHOWN = 5  # choices where more samples help
+DIGITS = 5  # of bounds: solvers find them within 1e-6
 POINTS = 13  # of a curve
 PICTURES = (".svg", ".png", ".pdf")
 
@@ -124,9 +126,9 @@ def text(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float)
     """The guarantee for people."""
     side, other = (">=", "more") if asked.objective == "max" else ("<=", "less")
     lines = [
-        f"P {side} {found.bound:.6g} with confidence {found.confidence:g}",
+        f"P {side} {_outward(found.bound, side == '<=')} with confidence {found.confidence:g}",
         f"  of {asked.formula!r}, under the policy found; none has {other} than "
-        f"{found.optimistic:.6g}",
+        f"{_outward(found.optimistic, side == '>=')}",
         f"  {int(evidence.counts.sum())} transitions of {evidence.model.num_rows} choices in "
         f"{evidence.model.num_states} states, {found.sets.num_claims} claims of {asked.method}"]
     status = Status(int(found.satisfaction.solution.status))
@@ -137,6 +139,12 @@ def text(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float)
             f"  more samples of {evidence.actions[row]} in {_state(evidence, row)} "
             f"({int(found.sets.num_samples[row])} so far) help most: up to {found.gain[row]:.3g}")
     return "\n".join([*lines, f"  {seconds:.3f} s"])
+
+
+def _outward(bound: float, up: bool) -> str:
+    """A bound in digits that claim no more than it does."""
+    context = Context(prec=DIGITS, rounding=ROUND_CEILING if up else ROUND_FLOOR)
+    return f"{float(context.create_decimal(float(bound))):.{DIGITS}g}"
 
 
 def most_helpful(found: DataGuarantee) -> list[int]:
