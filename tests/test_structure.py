@@ -28,8 +28,8 @@ STOREYS = (
 )
 # What a private helper helps is one learner; these serve several.
 SHARED_BY_LEARNERS = (
-    "actor_critic", "advantages", "checkpoint", "early_stopping", "exponential_family", "learner",
-    "moments", "pac", "play", "schedules", "splitmix",
+    "action_distributions", "actor_critic", "advantages", "checkpoint", "early_stopping",
+    "exponential_family", "learner", "moments", "pac", "play", "schedules", "splitmix",
 )
 NO_JAX = ("core.logic", "core.host", "core.automata")
 

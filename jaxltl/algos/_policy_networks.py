@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from jaxltl.algos.moments import Moments, scale_of
+from jaxltl.algos.moments import Moments, scale_of, standardized
 
 
 class Network(nn.Module):
@@ -88,7 +88,7 @@ def inputs_at(inputs: jax.Array, time: jax.Array, horizon: int) -> jax.Array:
 
 def normalized(moments: Moments, hparams: Any, observation: jax.Array) -> jax.Array:
     """Observations centred and scaled, where that is asked for."""
-    return (observation - moments.mean) / scale_of(moments) if hparams.normalize else observation
+    return standardized(moments, observation) if hparams.normalize else observation
 
 
 def refolded(network: Any, old: Moments, new: Moments) -> Any:

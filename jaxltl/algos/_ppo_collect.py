@@ -12,11 +12,11 @@ import jax.numpy as jnp
 from flax import struct
 from jax import lax
 
-from jaxltl.algos import _ppo_actions as actions_of
+from jaxltl.algos import action_distributions as actions_of
 from jaxltl.algos import learner
 from jaxltl.algos.actor_critic import Output, evaluated
 from jaxltl.algos.advantages import generalized_advantages
-from jaxltl.algos.moments import Moments, scale_of, updated_moments
+from jaxltl.algos.moments import Moments, normalized, scale_of, updated_moments
 from jaxltl.core.models.environment import Timestep, allowed_in
 
 
@@ -71,19 +71,6 @@ class Told(NamedTuple):
     explained_variance: jax.Array
     permitted: jax.Array
     finite: jax.Array
-
-
-def normalized(moments: Any, observation: Any) -> Any:
-    """Floats centred, scaled and clipped to ten deviations; other leaves as they are."""
-    if moments is None:
-        return observation
-
-    def one(x: jax.Array, m: Moments) -> jax.Array:
-        if not jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating):
-            return x
-        return jnp.clip((x - m.mean) / scale_of(m), -10, 10).astype(x.dtype)
-
-    return jax.tree.map(one, observation, moments)
 
 
 def _unless_nonfinite(moments: Moments, numbers: jax.Array) -> Moments:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jax import lax
 
-from jaxltl.algos import _ppo_actions as actions_of
+from jaxltl.algos import action_distributions as actions_of
 from jaxltl.algos import learner
 from jaxltl.algos._ppo_collect import Rows
 from jaxltl.algos.actor_critic import Output, evaluated, has_memory

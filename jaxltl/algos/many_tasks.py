@@ -24,13 +24,16 @@ from flax import struct
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
-from jaxltl.algos.actor_critic import dense, flat_observation
+from jaxltl.algos import action_distributions
+from jaxltl.algos.actor_critic import dense
+from jaxltl.algos.moments import normalized
 from jaxltl.core.automata import sequences
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.host import given
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models import sequence_task
-from jaxltl.core.models.environment import Agent, as_partial
+from jaxltl.core.models.environment import Agent, Box, Finite, as_partial, flat_observation
 
 
 class SequenceNetwork(nn.Module):
@@ -134,6 +137,9 @@ def stack_plans(plans: Sequence[Plan]) -> Plan:
     Raises:
       ValueError: no plan, or plans of different depths or events.
     """
+    plans = given.listed("plans", plans)
+    for plan in plans:
+        given.instance("plans", plan, Plan, "a list of those of make_plan")
     shapes = [np.shape(plan.reach) for plan in plans]
     if not shapes or len({shape[2:] for shape in shapes}) > 1:
         raise ValueError(f"plans have the shapes {shapes}; give some, all of one depth and of the "
@@ -156,7 +162,12 @@ class Choice(NamedTuple):
 
 
 def sequence_agent(
-    network: Callable[..., Any], plan: Plan, *, act: Callable[..., Any] | None = None
+    network: Callable[..., Any],
+    plan: Plan,
+    *,
+    actions: Finite | Box | None = None,
+    squash: str = "clip",
+    sampled: bool = True,
 ) -> Agent:
     """The agent of one formula, of a network that was trained on sequences.
 
@@ -168,15 +179,25 @@ def sequence_agent(
       network: ``observation -> (parameters of the action, value)`` of a trained network; a
         ``Partial`` whose arrays are its parameters, such as :func:`trained` makes.
       plan: of the formula; a lane of :func:`stack_plans` under ``vmap``.
-      act: ``(parameters of the action, allowed, key) -> action``; default :func:`drawn`.
+      actions: the environment's, ``environment.actions``; of finitely many it may be left out.
+      squash: how a Gaussian action gets into its box, ``"clip"`` or ``"tanh"``, as in training.
+      sampled: whether actions are drawn; else the most likely one is taken.
 
     Returns:
       An :class:`~jaxltl.core.models.environment.Agent` for observations
       :class:`~jaxltl.core.models.task_environment.TaskObservation` of that formula, one-hot in the
       automaton's state.
+
+    Raises:
+      ValueError: what is no plan or function, or at the first step Gaussian actions whose box is
+        not given.
     """
+    given.instance("plan", plan, Plan, "one of make_plan")
+    if actions is not None:
+        given.instance("actions", actions, Finite | Box, "the environment's, environment.actions")
+    how = _How(given.one_of("squash", squash, action_distributions.SQUASHES), bool(sampled))
     begin = Choice(jnp.int32(-1), jnp.int32(0))
-    return Agent(Partial(_act, as_partial(act or drawn), as_partial(network), plan), begin)
+    return Agent(Partial(_act, how, actions, as_partial(network, "network"), plan), begin)
 
 
 def sequence_policy(
@@ -200,33 +221,37 @@ class _Module:
     network: nn.Module
 
 
-def trained(network: nn.Module, parameters: Any) -> Partial:
-    """``observation -> (parameters of the action, value)``: a network with its parameters."""
-    return Partial(_applied, _Module(network), parameters)
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class _How:
+    """How an action is made of what a network says."""
+
+    squash: str
+    sampled: bool
 
 
-def _applied(module: _Module, parameters: Any, observation: Any) -> Any:
-    return module.network.apply({"params": parameters}, observation)
+def trained(network: nn.Module, parameters: Any, moments: Any = None) -> Partial:
+    """``observation -> (parameters of the action, value)``: a network with its parameters.
+
+    Args:
+      network: a module without memory.
+      parameters: of it, such as ``state.parameters`` of PPO.
+      moments: by which observations were normalised in training, ``state.moments``; None: not.
+    """
+    given.instance("network", network, nn.Module, "a flax.linen.Module")
+    return Partial(_applied, _Module(network), parameters, moments)
 
 
-def drawn(parameters: Any, allowed: Any, key: chex.PRNGKey) -> jax.Array:
-    """An action drawn from what a network says: of finitely many, or of a Gaussian."""
+def _applied(module: _Module, parameters: Any, moments: Any, observation: Any) -> Any:
+    return module.network.apply({"params": parameters}, normalized(moments, observation))
+
+
+def _actions_of(parameters: Any) -> Finite:
+    """The actions of logits."""
     if isinstance(parameters, tuple):
-        mean, log_deviation = parameters
-        return mean + jnp.exp(log_deviation) * jax.random.normal(key, mean.shape, mean.dtype)
-    return jax.random.categorical(key, _masked(parameters, allowed)).astype(jnp.int32)
-
-
-def likeliest(parameters: Any, allowed: Any, key: chex.PRNGKey) -> jax.Array:
-    """The action that a network thinks likeliest; of a Gaussian its mean."""
-    del key
-    if isinstance(parameters, tuple):
-        return parameters[0]
-    return jnp.argmax(_masked(parameters, allowed)).astype(jnp.int32)
-
-
-def _masked(scores: jax.Array, allowed: Any) -> jax.Array:
-    return scores if allowed is None else jnp.where(allowed, scores, -jnp.inf)
+        raise ValueError("actions=None, but the network speaks of a box; give the environment's, "
+                         "environment.actions.")
+    return Finite(parameters.shape[-1])
 
 
 def _judged(
@@ -242,14 +267,17 @@ def _judged(
 
 
 def _act(
-    act: Callable[..., Any], network: Callable[..., Any], plan: Plan, memory: Any, observation: Any,
-    allowed: Any, key: chex.PRNGKey,
+    how: _How, space: Finite | Box | None, network: Callable[..., Any], plan: Plan, memory: Any,
+    observation: Any, allowed: Any, key: chex.PRNGKey,
 ) -> tuple[Any, Any]:
     seen, state = observation.world, jnp.argmax(observation.memory).astype(jnp.int32)
     actions, best = _judged(network, plan, seen, state)
     taken = jnp.where(memory.state == state, memory.sequence, best).astype(jnp.int32)
-    chosen = jax.tree.map(lambda x: x[taken], actions)
-    return act(chosen, allowed, key), Choice(state, taken)
+    said = jax.tree.map(lambda x: x[taken], actions)
+    action = action_distributions.chosen(
+        key, _actions_of(said) if space is None else space, said, allowed,
+        sampled=how.sampled, squash=how.squash)
+    return action, Choice(state, taken)
 
 
 @dataclass(frozen=True)
@@ -301,10 +329,11 @@ def train_in_stages(
     Raises:
       ValueError: no problem, or a number of thresholds that does not fit.
     """
-    count = len(problems)
-    bars = np.full(max(count - 1, 0), enough, float) if np.ndim(enough) == 0 else np.asarray(
-        enough, float)
-    if count == 0 or num_chunks < 1 or len(bars) != count - 1:
+    count = len(given.listed("problems", problems))
+    num_chunks = given.whole("num_chunks", num_chunks, least=1)
+    bars = given.numbers("enough", enough)
+    bars = np.full(max(count - 1, 0), bars) if bars.ndim == 0 else bars
+    if count == 0 or bars.shape != (count - 1,) or np.isnan(bars).any():
         raise ValueError(f"{count} problems, {len(bars)} thresholds, num_chunks={num_chunks}; give "
                          "a problem at least, one threshold fewer than problems, and one chunk.")
     begin, stage = time.perf_counter(), 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -71,3 +73,26 @@ def scale_of(moments: Moments) -> jax.Array:
     spread = jnp.sqrt(moments.squares / jnp.maximum(moments.count, 1))
     noise = 8 * jnp.finfo(spread.dtype).eps * jnp.abs(moments.mean)
     return jnp.where(spread > noise, spread, 1)
+
+
+def standardized(moments: Moments, numbers: jax.Array) -> jax.Array:
+    """Numbers, centred and divided by their standard deviation."""
+    return (numbers - moments.mean) / scale_of(moments)
+
+
+def normalized(moments: Any, observation: Any) -> Any:
+    """A tree whose floats are :func:`standardized` and clipped to ten deviations.
+
+    Args:
+      moments: a tree of :class:`Moments`, as the observation; None: it is returned as it is.
+      observation: leaves that are no floats stay as they are.
+    """
+    if moments is None:
+        return observation
+
+    def one(x: jax.Array, m: Moments) -> jax.Array:
+        if not jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating):
+            return x
+        return jnp.clip(standardized(m, x), -10, 10).astype(x.dtype)
+
+    return jax.tree.map(one, observation, moments)

@@ -26,9 +26,9 @@ import numpy as np
 from flax import struct
 from jax.tree_util import Partial
 
-from jaxltl.algos import _ppo_actions as actions_of
+from jaxltl.algos import action_distributions as actions_of
 from jaxltl.algos import learner
-from jaxltl.algos._ppo_collect import Walkers, collected, normalized
+from jaxltl.algos._ppo_collect import Walkers, collected
 from jaxltl.algos._ppo_update import descent, improved
 from jaxltl.algos.actor_critic import ActorCritic as ActorCritic
 from jaxltl.algos.actor_critic import RecurrentActorCritic as RecurrentActorCritic
@@ -39,13 +39,12 @@ from jaxltl.algos.actor_critic import (
     has_memory,
     require_network,
 )
-from jaxltl.algos.moments import Moments, no_moments
-from jaxltl.algos.schedules import Schedule
+from jaxltl.algos.moments import Moments, no_moments, normalized
+from jaxltl.algos.schedules import Polynomial, Schedule
 from jaxltl.algos.schedules import at as _at
-from jaxltl.core.models.environment import Agent, Box, Environment, Finite
+from jaxltl.core.host import given
+from jaxltl.core.models.environment import Agent, Box, Environment, Finite, require_environment
 from jaxltl.core.types import Status
-
-SQUASHES = ("clip", "tanh")
 
 
 @struct.dataclass
@@ -221,16 +220,13 @@ def make_problem(
 
       Then ``state, metrics = train(key, problem, Hparams(discount=0.99), num_steps=100)``.
     """
-    if not isinstance(environment, Environment):
-        raise ValueError(
-            f"environment is {type(environment).__name__}; give one of make_environment.")
+    require_environment(environment)
     actions = environment.actions
     if isinstance(actions, Box) and not jnp.issubdtype(jnp.dtype(actions.dtype), jnp.floating):
         raise ValueError(
             f"environment.actions is a box of {actions.dtype}; number what is in it, Finite(n).")
     network = default_network(actions) if network is None else network
-    if not isinstance(network, nn.Module):
-        raise ValueError(f"network is {type(network).__name__}; give a flax.linen.Module.")
+    given.instance("network", network, nn.Module, "a flax.linen.Module")
     if memory is None:
         begin = getattr(network, "initial_memory", tuple)
         memory = begin()
@@ -252,14 +248,18 @@ _RANGES = {
 }
 
 
+_OPTIONAL = ("max_gradient_norm", "target_kl", "value_clip")
+_SCHEDULES = ("learning_rate", "clip", "value_clip")
+
+
 def _check(problem: Problem, hparams: Hparams) -> None:
+    given.instance("problem", problem, Problem, "one of ppo.make_problem")
+    given.instance("hparams", hparams, Hparams, "ppo.Hparams")
     for name in ("num_envs", "num_steps", "num_epochs", "num_minibatches"):
-        if getattr(hparams, name) < 1:
-            raise ValueError(f"{name}={getattr(hparams, name)}; it must be at least 1.")
-    if hparams.num_resets is not None and hparams.num_resets < 0:
-        raise ValueError(f"num_resets={hparams.num_resets}; it must be at least 0, or None.")
-    if hparams.squash not in SQUASHES:
-        raise ValueError(f'squash={hparams.squash!r}; choose "clip" or "tanh".')
+        given.whole(name, getattr(hparams, name), least=1, most=2**31 - 1)
+    if hparams.num_resets is not None:
+        given.whole("num_resets", hparams.num_resets, most=2**31 - 1)
+    given.one_of("squash", hparams.squash, actions_of.SQUASHES)
     recurrent = has_memory(problem)
     size = hparams.num_envs * (1 if recurrent else hparams.num_steps)
     if size % hparams.num_minibatches:
@@ -269,10 +269,12 @@ def _check(problem: Problem, hparams: Hparams) -> None:
             f"{what}; choose a divisor.")
     for name, (low, high) in _RANGES.items():
         number = getattr(hparams, name)
-        if isinstance(number, jax.core.Tracer) or not isinstance(
-                number, float | int | np.ndarray | np.generic | jax.Array):
+        if (number is None and name in _OPTIONAL) or (name in _SCHEDULES and callable(number)):
             continue
-        if not ((np.asarray(number) >= low) & (np.asarray(number) <= high)).all():
+        if isinstance(number, jax.core.Tracer | Polynomial):
+            continue
+        found = given.numbers(name, "None" if number is None else number)
+        if not found.size or not ((found >= low) & (found <= high)).all():
             raise ValueError(f"{name}={number}; it must lie in [{low}, {high}].")
 
 
@@ -308,9 +310,8 @@ def _act(
 ) -> tuple[jax.Array, Any]:
     actions = problem.environment.actions
     said = evaluated(problem, parameters, memory, normalized(moments, observation))
-    noise = actions_of.noise(key, (), actions, said.value.dtype) if sampled else None
-    raw = actions_of.drawn(actions, said.action, allowed, noise)
-    return actions_of.as_action(actions, raw, squash), said.memory
+    action = actions_of.chosen(key, actions, said.action, allowed, sampled=sampled, squash=squash)
+    return action, said.memory
 
 
 # --- learning -------------------------------------------------------------------------------------

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.algos import many_tasks
+from jaxltl.algos import many_tasks, ppo
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.environment import run_episode
+from jaxltl.core.models.environment import Timestep, box, make_environment, run_episode
 from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.models.sequence_task import Sequence, SequenceObservation, events_of
 from jaxltl.core.models.tabulate import tabulate
@@ -69,7 +69,7 @@ def verdicts(plans):
     keys = jax.random.split(jax.random.key(0), 64)
 
     def run(environment, plan):
-        agent = many_tasks.sequence_agent(knowing, plan, act=many_tasks.likeliest)
+        agent = many_tasks.sequence_agent(knowing, plan, sampled=False)
         return episodes(environment, agent, keys).world.verdict[:, -1]
 
     return np.asarray(jax.jit(jax.vmap(run))(worlds, many_tasks.stack_plans(plans)))
@@ -81,7 +81,7 @@ def test_who_follows_what_is_asked_for_does_formulas_that_nobody_trained(verdict
 
 
 def test_a_lane_of_stacked_plans_is_the_plan(plans, verdicts):
-    agent = many_tasks.sequence_agent(knowing, plans[1], act=many_tasks.likeliest)
+    agent = many_tasks.sequence_agent(knowing, plans[1], sampled=False)
     alone = episodes(task_environment(WORLD, TASKS[1]), agent, jax.random.split(
         jax.random.key(0), 64))
     assert (np.asarray(alone.world.verdict[:, -1]) == verdicts[1]).all()
@@ -144,7 +144,7 @@ def test_an_agent_keeps_to_what_it_has_taken_up():
         value = jnp.where(first_is_a, observation.world[0], 1 - observation.world[0])
         return jnp.where(first_is_a, jnp.array([5.0, 0.0]), jnp.array([0.0, 5.0])), value
 
-    agent = many_tasks.sequence_agent(fickle, plan, act=many_tasks.likeliest)
+    agent = many_tasks.sequence_agent(fickle, plan, sampled=False)
     initial = to_automaton("F a & F b").initial
     memory, taken = agent.memory, []
     for value in worth:
@@ -154,17 +154,55 @@ def test_an_agent_keeps_to_what_it_has_taken_up():
     assert taken == [1, 1]
 
 
-def test_masks_are_kept_and_gaussians_drawn():
-    key = jax.random.key(0)
-    allowed = jnp.array([False, True, True])
-    for act in (many_tasks.likeliest, many_tasks.drawn):
-        assert int(act(jnp.array([9.0, 0.0, -99.0]), allowed, key)) == 1
-    mean = jnp.array([1.0, 2.0])
-    assert (many_tasks.likeliest((mean, jnp.zeros(2)), None, key) == mean).all()
-    draw = jax.vmap(lambda k: many_tasks.drawn((mean, jnp.log(jnp.array([0.1, 2.0]))), None, k))
-    found = np.asarray(draw(jax.random.split(key, 4000)))
-    np.testing.assert_allclose(found.mean(0), mean, atol=0.12)
-    np.testing.assert_allclose(found.std(0), [0.1, 2.0], rtol=0.06)
+def one_state_plan():
+    """Of an automaton with one state and one sequence."""
+    reach = np.array([[[[False, True]]]])
+    return many_tasks.Plan(reach, ~reach, np.array([[1]], np.int32))
+
+
+def test_masks_are_kept():
+    scores, allowed = jnp.array([9.0, 0.0, -99.0]), jnp.array([False, True, True])
+    seen = SimpleNamespace(world=jnp.zeros(1), memory=jnp.ones(1))
+    for sampled in (False, True):
+        agent = many_tasks.sequence_agent(
+            lambda observation: (scores, 0.0), one_state_plan(), sampled=sampled)
+        assert int(agent.act(agent.memory, seen, allowed, jax.random.key(0))[0]) == 1
+
+
+@pytest.mark.parametrize("squash", ["clip", "tanh"])
+def test_a_network_of_ppo_does_the_same_with_boxes(squash):
+    """Scaled to its box, clipped or squashed, by normalised observations, as it was trained."""
+    space = box(jnp.array([0.0, -3.0]), jnp.array([10.0, 5.0]))
+    told = one_state_plan()
+    sequence = Sequence(told.reach[0, 0], told.avoid[0, 0], jnp.int32(1))
+    world = make_environment(
+        lambda key: jax.random.uniform(key, (3,)),
+        lambda place, action, key: Timestep(place + action.sum(), action.sum(), False),
+        lambda place: SequenceObservation(place, jax.tree.map(jnp.asarray, sequence)),
+        actions=space)
+    problem = ppo.make_problem(world)
+    hparams = ppo.Hparams(
+        discount=0.9, num_envs=2, num_steps=4, num_minibatches=1, squash=squash,
+        normalize_observation=True)
+    state, _ = ppo.train(jax.random.key(1), problem, hparams, num_steps=2)
+    network = many_tasks.trained(problem.network, state.parameters, state.moments)
+    here = jnp.array([0.3, 40.0, -2.0])
+    seen = SimpleNamespace(world=here, memory=jnp.ones(1))
+    ends = []
+    for sampled, of in ((True, ppo.policy), (False, ppo.greedy)):
+        own = of(state, problem, hparams)
+        other = many_tasks.sequence_agent(
+            network, told, actions=space, squash=squash, sampled=sampled)
+        act = jax.vmap(lambda key, own=own: own.act(
+            own.memory, SequenceObservation(here, sequence), None, key)[0])
+        same = jax.vmap(lambda key, other=other: other.act(other.memory, seen, None, key)[0])
+        keys = jax.random.split(jax.random.key(2), 64)
+        np.testing.assert_allclose(same(keys), act(keys), rtol=1e-6)
+        ends.append(np.asarray(same(keys)))
+    assert (ends[0] >= [0, -3]).all() and (ends[0] <= [10, 5]).all() and ends[0].std(0).min() > 0.5
+    with pytest.raises(ValueError, match="actions=None, but the network speaks of a box"):
+        agent = many_tasks.sequence_agent(network, told)
+        agent.act(agent.memory, seen, None, jax.random.key(0))
 
 
 class Figures(NamedTuple):

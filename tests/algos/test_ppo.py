@@ -13,9 +13,9 @@ import optax
 import pytest
 from jax.tree_util import Partial
 
-from jaxltl.algos import _ppo_actions as actions_of
 from jaxltl.algos import _ppo_collect as collecting
 from jaxltl.algos import _ppo_update as updating
+from jaxltl.algos import action_distributions as actions_of
 from jaxltl.algos import learner, ppo
 from jaxltl.algos.actor_critic import orthogonal
 from jaxltl.algos.moments import scale_of, updated_moments

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.runs import live_states, universal_states
+from jaxltl.core.host import given
 from jaxltl.core.host.components import strong_components
 from jaxltl.core.logic.labels import require_known
 
@@ -93,8 +94,9 @@ def reach_avoid_sequences(
     [[0, 1, 0, 0], [0, 0, 0, 0]]
     """
     for name, number in (("depth", depth), ("most", most)):
-        if number < 1:
-            raise ValueError(f"{name}={number}; it must be at least 1.")
+        given.whole(name, number, least=1, most=2**16)
+    given.instance("automaton", automaton, Automaton, "one of to_automaton")
+    propositions = given.names("propositions", propositions)
     delta, priority = _on_events(automaton, events, propositions)
     live, done = live_states(automaton), universal_states(automaton)
     tables = _Tables(delta, priority, live, _distances(delta, priority, live, done))
@@ -146,7 +148,7 @@ def _on_events(
     automaton: Automaton, events: ArrayLike, propositions: tuple[str, ...]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """The automaton's tables with a column for each event: int32 `[Q, E]`, twice."""
-    rows = np.asarray(events, bool)
+    rows = given.numbers("events", events).astype(bool)
     if rows.ndim != 2 or rows.shape[1] != len(propositions) or not len(rows):
         raise ValueError(
             f"events has shape {list(rows.shape)}; give Booleans [E, {len(propositions)}], a "

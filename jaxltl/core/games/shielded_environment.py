@@ -29,6 +29,7 @@ from jaxltl.core.models.environment import (
     Timestep,
     as_partial,
     make_environment,
+    require_environment,
 )
 from jaxltl.core.models.mdp import MDP
 
@@ -105,9 +106,10 @@ def shielded(
       >>> safe.allowed(safe.reset(jax.random.key(0))).tolist()
       [True, False]
     """
+    require_environment(environment)
     if not isinstance(environment.actions, Finite):
         raise ValueError("a shield is for finitely many actions; this world's are of a box.")
-    place = Partial(_itself) if state_of is None else as_partial(state_of)
+    place = Partial(_itself) if state_of is None else as_partial(state_of, "state_of")
     if isinstance(strategy, Permissive | Winning):
         guide = _guide(strategy)
         _require_actions(guide.allowed, environment.actions.num)

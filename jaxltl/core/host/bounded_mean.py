@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaxltl.core.host import given
 from jaxltl.core.host.binomial import around
 from jaxltl.core.host.sparse import Floats
 
@@ -32,12 +33,21 @@ def bounded_mean(
       planned: how many there were to be from the start, if that is known: the interval is then
         narrowest. It holds without, too, however it was decided how many there are.
 
+    Raises:
+      ValueError: what are no numbers, or a chance outside of its range.
+
     Example:
       >>> ends = bounded_mean(np.tile([0.2, 0.3], 500), 0.05, planned=1000)
       >>> [round(end, 3) for end in ends]
       [0.242, 0.258]
     """
-    x = np.clip(np.asarray(numbers, np.float64), 0, 1)
+    x = np.atleast_1d(given.numbers("numbers", numbers))
+    given.share("failure", failure, ends=(False, False))
+    if planned is not None:
+        given.whole("planned", planned, least=1)
+    if x.ndim != 1 or np.isnan(x).any():
+        raise ValueError(f"numbers is {given.shown(numbers)}; give one axis of them, none NaN.")
+    x = np.clip(x, 0, 1)
     count = np.arange(1, x.size + 1)
     mean = (0.5 + np.cumsum(x)) / (count + 1)
     variance = (0.25 + np.cumsum((x - mean) ** 2)) / (count + 1)

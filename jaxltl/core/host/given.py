@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -97,6 +97,50 @@ def one_of(name: str, given: Any, known: Sequence[str]) -> str:
     return given
 
 
+def share(name: str, given: Any, *, ends: tuple[bool, bool] = (True, True)) -> float:
+    """One number from 0 to 1.
+
+    Args:
+      name, given: as they are told.
+      ends: whether 0 and 1 are.
+
+    Raises:
+      ValueError: it is something else.
+
+    Example:
+      >>> share("confidence", 1, ends=(False, False))
+      Traceback (most recent call last):
+      ValueError: confidence=1; it must be above 0 and below 1.
+    """
+    found = number(name, given)
+    if not (0 <= found <= 1) or (found == 0 and not ends[0]) or (found == 1 and not ends[1]):
+        low, high = "at least" if ends[0] else "above", "at most" if ends[1] else "below"
+        raise ValueError(f"{name}={shown(given)}; it must be {low} 0 and {high} 1.")
+    return found
+
+
+def called(name: str, given: Any) -> Callable[..., Any]:
+    """A function.
+
+    Raises:
+      ValueError: it cannot be called.
+    """
+    if not callable(given):
+        raise ValueError(f"{name} is {shown(given)}; give a function.")
+    return given
+
+
+def instance(name: str, given: Any, kind: Any, remedy: str) -> Any:
+    """Something of a type, or of one of several.
+
+    Raises:
+      ValueError: it is of another one.
+    """
+    if not isinstance(given, kind):
+        raise ValueError(f"{name} is {type(given).__name__}; give {remedy}.")
+    return given
+
+
 def listed(name: str, given: Any) -> list[Any]:
     """What can be gone through, one by one; of a text its letters.
 
@@ -106,6 +150,20 @@ def listed(name: str, given: Any) -> list[Any]:
     if not isinstance(given, Iterable):
         raise ValueError(f"{name} is {shown(given)}; give a list.")
     return list(given)
+
+
+def names(name: str, given: Any) -> tuple[str, ...]:
+    """Texts, none of them twice.
+
+    Raises:
+      ValueError: something else, or one that is given twice.
+    """
+    found = listed(name, given)
+    for one in found:
+        if not isinstance(one, str) or found.count(one) > 1:
+            raise ValueError(
+                f"{name}: {shown(one)} is no name, or is given twice; give each its name.")
+    return tuple(found)
 
 
 def no_model(model: Any) -> str:

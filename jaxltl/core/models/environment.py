@@ -33,6 +33,8 @@ from jax import lax
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
+from jaxltl.core.host import given
+from jaxltl.core.models.purity import traced
 from jaxltl.core.types import require_shape
 
 
@@ -76,7 +78,7 @@ def box(
       >>> box(-1.0, [1.0, 2.0]).shape
       (2,)
     """
-    bounds = {"low": np.asarray(low), "high": np.asarray(high)}
+    bounds = {"low": _bounds(low), "high": _bounds(high)}
     for name, bound in bounds.items():
         if bound.dtype.kind not in "biuf" or np.isnan(bound.astype(float)).any():
             raise ValueError(f"box: {name}={bound.tolist()!r}; give numbers.")
@@ -94,11 +96,23 @@ def box(
     if (least > most).any():
         place = np.argwhere(least > most)[0].tolist()
         raise ValueError(f"box: low is above high at {place}; exchange them.")
-    kind = jnp.dtype(dtype or jnp.result_type(float))
+    try:
+        kind = jnp.dtype(jnp.result_type(float) if dtype is None else dtype)
+    except (TypeError, ValueError):
+        raise ValueError(f"box: dtype={given.shown(dtype)}; give a type of numbers.") from None
+    if kind.kind not in "biuf":
+        raise ValueError(f"box: dtype={kind.name}; give a type of numbers.")
     if kind.kind in "biu":  # an infinite bound is that of the type
         ends = (0, 1) if kind.kind == "b" else (jnp.iinfo(kind).min, jnp.iinfo(kind).max)
         least, most = (_clipped(x.astype(float), *ends).astype(kind) for x in (least, most))
     return Box(least.astype(kind), most.astype(kind), full, kind.name)
+
+
+def _bounds(bound: ArrayLike) -> np.ndarray:
+    try:
+        return np.asarray(bound)
+    except ValueError:  # ragged
+        return np.asarray(None)
 
 
 def _clipped(x: np.ndarray, least: int, most: int) -> np.ndarray:
@@ -201,13 +215,9 @@ def make_environment(
       >>> corridor.actions.num, corridor.observations.shape
       (2, (1,))
     """
-    names = tuple(propositions)
-    for name in names:
-        if not isinstance(name, str) or names.count(name) > 1:
-            raise ValueError(
-                f"propositions: {name!r} is no name, or is given twice; give each label its name.")
-    if horizon is not None and horizon < 1:
-        raise ValueError(f"horizon={horizon}; it must be at least 1, or None.")
+    names = given.names("propositions", propositions)
+    if horizon is not None:
+        horizon = given.whole("horizon", horizon, least=1)
     if isinstance(actions, int | np.integer):
         actions = Finite(int(actions))
     if not isinstance(actions, Finite | Box):
@@ -219,11 +229,12 @@ def make_environment(
             raise ValueError(f"propositions={list(names)}, but no labels; give both or neither.")
         labels = Partial(no_labels)
     made = Environment(
-        reset=as_partial(reset), step=as_partial(step), observe=as_partial(observe),
-        labels=as_partial(labels), allowed=None if allowed is None else as_partial(allowed),
+        reset=as_partial(reset, "reset"), step=as_partial(step, "step"),
+        observe=as_partial(observe, "observe"), labels=as_partial(labels, "labels"),
+        allowed=None if allowed is None else as_partial(allowed, "allowed"),
         actions=actions, observations=observations, propositions=names, horizon=horizon,
-        starts=None if starts is None else as_partial(starts),
-        outcomes=None if outcomes is None else as_partial(outcomes))
+        starts=None if starts is None else as_partial(starts, "starts"),
+        outcomes=None if outcomes is None else as_partial(outcomes, "outcomes"))
     seen = _check_functions(made)
     if observations is None:
         def free(x: Any) -> Box:
@@ -234,9 +245,33 @@ def make_environment(
     return made
 
 
-def as_partial(function: Callable[..., Any]) -> Partial:
+def as_partial(function: Callable[..., Any], name: str = "function") -> Partial:
     """A function as a tree of arrays, which those that ``jit`` compiles take as an argument."""
-    return function if isinstance(function, Partial) else Partial(function)
+    return function if isinstance(function, Partial) else Partial(given.called(name, function))
+
+
+def require_environment(environment: Any) -> Environment:
+    """Refuses what is no :class:`Environment`."""
+    found: Environment = given.instance(
+        "environment", environment, Environment, "one of make_environment")
+    return found
+
+
+def require_agent(agent: Any) -> Agent:
+    """Refuses what is no :class:`Agent`."""
+    found: Agent = given.instance(
+        "agent", agent, Agent, "an Agent, such as ppo.policy(state, problem, hparams), or "
+        "agent_of(function) of (observation, key)")
+    return found
+
+
+def require_key(key: Any) -> chex.PRNGKey:
+    """Refuses what is no single key."""
+    dtype = getattr(key, "dtype", None)
+    typed = dtype is not None and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)
+    if not (typed and key.shape == ()) and not (dtype == np.uint32 and key.ndim == 1):
+        raise ValueError(f"key is {given.shown(key)}; give a single one, jax.random.key(0).")
+    return key
 
 
 def no_labels(world: Any) -> jax.Array:
@@ -348,9 +383,9 @@ def run_episode(
     Raises:
       ValueError: a number below 1.
     """
-    if num_steps < 1:
-        raise ValueError(f"num_steps={num_steps}; it must be at least 1.")
-    begin, path = begin_episode(key, environment, agent)
+    given.whole("num_steps", num_steps, least=1, most=2**31 - 1)
+    environment, agent = require_environment(environment), require_agent(agent)
+    begin, path = begin_episode(require_key(key), environment, agent)
 
     def move(now: Underway, time: jax.Array) -> tuple[Underway, Move]:
         return continue_episode(now, environment, agent, jax.random.fold_in(path, time))
@@ -456,11 +491,11 @@ def step_or_reset(
 def _check_functions(made: Environment) -> Any:
     """Shapes of all that the functions return; those of an observation are returned."""
     key = jax.random.key(0)
-    world = _traced("reset", made.reset, key)
-    seen = _traced("observe", made.observe, world)
+    world = traced("reset", made.reset, key)
+    seen = traced("observe", made.observe, world)
     if not jax.tree.leaves(seen):
         raise ValueError("observe returns no array; return what the agent sees.")
-    found = _traced("step", made.step, world, some_action(made.actions), key)
+    found = traced("step", made.step, world, some_action(made.actions), key)
     if not isinstance(found, tuple) or not 3 <= len(found) <= len(Timestep._fields):
         raise ValueError(
             f"step must return Timestep({', '.join(Timestep._fields)}), the last three if they are "
@@ -478,11 +513,11 @@ def _check_functions(made: Environment) -> Any:
     if not _alike(after := _described(found.world), before := _described(world)):
         raise ValueError(f"step returns the world {after}, but reset {before}; both must have the "
                          "same structure, shapes and dtypes.")
-    require_labels(_traced("labels", made.labels, world), made.propositions)
+    require_labels(traced("labels", made.labels, world), made.propositions)
     if made.allowed is not None:
         if not isinstance(made.actions, Finite):
             raise ValueError("allowed is for finitely many actions; clip those of a box in step.")
-        mask = _traced("allowed", made.allowed, world)
+        mask = traced("allowed", made.allowed, world)
         require_shape("allowed(world)", mask, (made.actions.num,))
         if not _is_bool(mask):
             raise ValueError(f"allowed returns {mask.dtype}; return Booleans.")
@@ -497,64 +532,13 @@ def require_labels(label: Any, propositions: Sequence[str]) -> None:
             f"of the propositions {list(propositions)}.")
 
 
-def _traced(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """The shapes of what a function returns, if two calls are the same pure function."""
-    try:
-        try:
-            with jax.checking_leaks():
-                first, again, shapes = _twice(function, *arguments)
-        except Exception as problem:
-            if not _kept_by_jax(problem):
-                raise
-            first, again, shapes = _twice(function, *arguments)
-    except (jax.errors.JAXTypeError, jax.errors.ConcretizationTypeError) as problem:
-        text = str(problem).split("\n", 1)[0]
-        raise ValueError(
-            f"{name} cannot be traced: {text} Write it with jax.numpy; lax.cond and jnp.where "
-            "take the place of if.") from problem
-    except Exception as problem:
-        if "Leaked" not in str(problem):
-            raise
-        raise ValueError(
-            f"{name} is not pure: it keeps what it was called with. Keep it in the world that "
-            "is returned.") from problem
-    if not _same(first, again):
-        raise ValueError(
-            f"{name} is not pure: called twice it is two different functions. Draw from the key "
-            "that is given, and keep what changes in the world that is returned.")
-    return shapes
-
-
-def _twice(function: Callable[..., Any], *arguments: Any) -> tuple[Any, Any, Any]:
-    first, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
-    # Another object, so that the second trace is not the first, remembered.
-    return first, jax.make_jaxpr(lambda *given: function(*given))(*arguments), shapes
-
-
-def _kept_by_jax(problem: Exception) -> bool:
-    """Whether all that a leak tells of is held by tables of JAX's own, as with jaxopt's solvers.
-
-    What another function then uses of it cannot be traced there.
-    """
-    head, *leaks = str(problem).strip().split("\n\n")
-    own = "<PyTreeDef ", "<WeakrefLRUCache ", "jax._src."
-    return "Leaked" in head and bool(leaks) and all(
-        any(f" is referred to by {x}" in leak for x in own) for leak in leaks)
-
-
-def _same(first: Any, again: Any) -> bool:
-    constants = zip(first.consts, again.consts, strict=False)
-    return len(first.consts) == len(again.consts) and str(first.jaxpr) == str(again.jaxpr) and all(
-        np.array_equal(np.asarray(x), np.asarray(y), equal_nan=np.asarray(x).dtype.kind == "f")
-        for x, y in constants if not isinstance(x, jax.core.Tracer) and not jax.dtypes.issubdtype(
-            getattr(x, "dtype", np.dtype(float)), jax.dtypes.prng_key))
-
-
 def _is_bool(x: Any) -> bool:
     return np.dtype(getattr(x, "dtype", type(x))) == np.bool_
 
 
 def _as_arrays(observations: Any) -> Any:
+    for leaf in jax.tree.leaves(observations, is_leaf=lambda b: isinstance(b, Box)):
+        given.instance("observations", leaf, Box, "a tree of box(low, high)")
     return jax.tree.map(lambda b: jax.ShapeDtypeStruct(b.shape, jnp.dtype(b.dtype)), observations,
                         is_leaf=lambda b: isinstance(b, Box))
 

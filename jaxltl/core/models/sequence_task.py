@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence as Ordered
 from dataclasses import replace
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import chex
@@ -19,7 +20,8 @@ from flax import struct
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
-from jaxltl.core.models.environment import Environment, Timestep, box
+from jaxltl.core.host import given
+from jaxltl.core.models.environment import Environment, Timestep, box, require_environment
 from jaxltl.core.models.monitor import Verdict
 
 
@@ -84,9 +86,8 @@ def events_of(propositions: Ordered[str], at_most: int = 1) -> np.ndarray:
       >>> events_of(["a", "b"]).astype(int).tolist()
       [[0, 0], [1, 0], [0, 1]]
     """
-    from itertools import combinations
-
-    width = len(propositions)
+    width = len(given.names("propositions", propositions))
+    at_most = min(given.whole("at_most", at_most), width)
     rows = [held for n in range(at_most + 1) for held in combinations(range(width), n)]
     events = np.zeros((len(rows), width), bool)
     for row, held in zip(events, rows, strict=True):
@@ -135,12 +136,12 @@ def sequence_sampler(
       ((2, 4), False)
     """
     rows = {"length": length, "reach": reach, "avoid": avoid}
-    found = {name: np.asarray(row, float) for name, row in rows.items()}
+    found = {name: given.numbers(name, row) for name, row in rows.items()}
     for name, row in found.items():
         if row.ndim != 1 or not (np.isfinite(row) & (row >= 0)).all() or not row.sum() > 0:
             raise ValueError(f"{name}={row.tolist()}; give weights of one axis, none of them "
                              "negative, some of them positive.")
-    groups = np.asarray(sets)
+    groups = _booleans(sets)
     if groups.dtype != np.bool_ or groups.ndim not in (1, 2):
         raise ValueError(f"sets has type {groups.dtype} and shape {list(groups.shape)}; give "
                          "Booleans, a row for each set and a column for each event.")
@@ -153,6 +154,13 @@ def sequence_sampler(
         raise ValueError(f"reach and avoid ask for up to {most} sets in a step, but there are "
                          f"{len(groups)}; give fewer weights.")
     return SequenceSampler(found["length"], found["reach"], found["avoid"], groups)
+
+
+def _booleans(table: ArrayLike) -> np.ndarray:
+    try:
+        return np.asarray(table)
+    except ValueError:  # ragged
+        return np.asarray(None)
 
 
 def draw_sequence(key: chex.PRNGKey, sampler: SequenceSampler) -> Sequence:
@@ -208,8 +216,9 @@ def sequence_environment(
     Raises:
       ValueError: events or a sampler that do not fit.
     """
-    rows = np.asarray(events)
-    count = len(environment.propositions)
+    rows, inner = _booleans(events), require_environment(environment)
+    given.instance("sampler", sampler, SequenceSampler, "one of sequence_sampler")
+    count = len(inner.propositions)
     if rows.ndim != 2 or rows.dtype != np.bool_ or rows.shape[1] != count:
         raise ValueError(f"events has shape {list(rows.shape)} and type {rows.dtype}; give "
                          f"Booleans [E, {count}], a column for each of the environment's "
@@ -221,14 +230,15 @@ def sequence_environment(
     shape = (len(sampler.length), len(rows))
     told: Any = Sequence(box(0, 1, shape, bool), box(0, 1, shape, bool),  # type: ignore[arg-type]
                          box(0, np.inf, (), np.int32))  # type: ignore[arg-type]
-    inner, numbers = environment, np.array([violation, progress])
+    numbers = np.array([given.number("violation", violation), given.number("progress", progress)])
     return replace(
         inner,
         reset=Partial(_reset, inner, rows, sampler),
         step=Partial(_step, inner, rows, numbers),
         observe=Partial(_observe, inner), labels=Partial(_labels, inner),
         allowed=None if inner.allowed is None else Partial(_allowed, inner),
-        observations=SequenceObservation(inner.observations, told))
+        observations=SequenceObservation(inner.observations, told),
+        starts=None, outcomes=None)  # so many sequences are drawn that they are not told
 
 
 def remaining(sequence: Sequence, index: chex.Numeric) -> Sequence:
@@ -280,7 +290,7 @@ def _step(
     return Timestep(
         world=after, reward=reward.astype(jnp.result_type(float)),
         terminated=jnp.asarray(found.terminated, bool) | decided, truncated=found.truncated,
-        cost=found.cost)
+        cost=found.cost, discount=found.discount)
 
 
 def _observe(inner: Environment, state: SequenceWorld) -> SequenceObservation:

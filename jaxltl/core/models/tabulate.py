@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core.host import given
 from jaxltl.core.host.rows import starts_of
 from jaxltl.core.models.environment import (
     Environment,
@@ -19,6 +20,7 @@ from jaxltl.core.models.environment import (
     Timestep,
     allowed_in,
     as_partial,
+    require_key,
 )
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.models.time_limit import without_time_limit
@@ -108,10 +110,14 @@ def tabulate(
       [False, False, False, False, True]
     """
     inner, limit = without_time_limit(environment)
+    max_states = given.whole("max_states", max_states, least=1)
+    num_keys = given.whole("num_keys", num_keys, least=1, most=2**20)
     if not isinstance(inner.actions, Finite):
         raise ValueError("tabulate: the actions are a box; only finitely many can be listed.")
-    keys = jax.random.split(jax.random.key(0) if key is None else key, max(num_keys, 2))
-    kind = _Kind(inner, as_partial(distinct or _itself), keys, inner.reset(keys[0]))
+    key = jax.random.key(0) if key is None else require_key(key)
+    keys = jax.random.split(key, max(num_keys, 2))
+    apart = as_partial(_itself if distinct is None else distinct, "distinct")
+    kind = _Kind(inner, apart, keys, inner.reset(keys[0]))
     begun, probability, evidence = _begin(kind, environment, worlds)
     listed = _search(kind, begun, max_states)
     if evidence == "keys" or listed.evidence == "keys":

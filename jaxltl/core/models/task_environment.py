@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike
 
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.host import given
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.environment import (
@@ -33,6 +34,7 @@ from jaxltl.core.models.environment import (
     Timestep,
     box,
     make_environment,
+    require_environment,
 )
 from jaxltl.core.models.finite_task import make_finite_task
 from jaxltl.core.models.monitor import Verdict, verdicts
@@ -141,8 +143,8 @@ def make_task_tables(
       >>> make_task_tables("F goal", ["wall", "goal"]).weight.tolist()
       [0, 1]
     """
-    if ending not in ENDINGS:
-        raise ValueError(f"ending={ending!r}; choose one of {', '.join(ENDINGS)}.")
+    given.one_of("ending", ending, ENDINGS)
+    propositions = given.names("propositions", propositions)
     automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
     if not isinstance(formula, Automaton):
         require_known(automaton.propositions, propositions, f"the formula {str(formula)!r}")
@@ -154,7 +156,7 @@ def make_task_tables(
         learner_discount=learner_discount)
     weight = np.zeros(len(propositions), np.int32)
     weight[list(reading.columns)] = 1 << np.arange(len(reading.columns))
-    shown = None if embedding is None else np.asarray(embedding)
+    shown = None if embedding is None else given.numbers("embedding", embedding)
     if shown is not None and (
             shown.ndim < 2 or len(shown) != len(decisions) or shown.dtype.kind not in "biuf"):
         raise ValueError(
@@ -254,15 +256,17 @@ def task_environment(
       >>> float(found.reward), bool(found.terminated), Verdict(int(world.verdict)).name
       (1.0, True, 'SATISFIED')
     """
-    names = environment.propositions if propositions is None else tuple(propositions)
+    environment = require_environment(environment)
+    names = environment.propositions if propositions is None else propositions
     inner = make_environment(
         environment.reset, environment.step, environment.observe, actions=environment.actions,
         labels=environment.labels if labels is None else labels, propositions=names,
         allowed=environment.allowed, observations=environment.observations,
         horizon=environment.horizon, starts=environment.starts, outcomes=environment.outcomes)
     tables = formula if isinstance(formula, TaskTables) else make_task_tables(
-        formula, names, reward=reward, discount=discount, ratio=ratio, shaping=shaping,
+        formula, inner.propositions, reward=reward, discount=discount, ratio=ratio, shaping=shaping,
         learner_discount=learner_discount, ending=ending, embedding=embedding)
+    names = inner.propositions
     if tables.weight.shape != (len(names),):
         raise ValueError(
             f"the tables are of {tables.weight.shape[-1]} propositions, and the world has "
@@ -278,6 +282,7 @@ def with_tables(environment: Environment, tables: TaskTables) -> Environment:
       tables: of the other task, over the same propositions.
     """
     task_tables(environment)
+    given.instance("tables", tables, TaskTables, "those of make_task_tables")
     made: Any = environment
     parts: Any = {
         name: None if (part := getattr(made, name)) is None else part.args[-1]
@@ -291,7 +296,7 @@ def task_tables(environment: Environment) -> TaskTables:
     Raises:
       ValueError: it was not made by :func:`task_environment`.
     """
-    arguments = getattr(environment.reset, "args", ())
+    arguments = getattr(getattr(environment, "reset", None), "args", ())
     if not arguments or not isinstance(arguments[0], TaskTables):
         raise ValueError("this environment has no task; make it with task_environment.")
     return arguments[0]
@@ -309,8 +314,11 @@ def stack_tables(tables: Sequence[TaskTables]) -> TaskTables:
     Raises:
       ValueError: none, or tasks over different propositions or with embeddings of different width.
     """
+    tables = given.listed("tables", tables)
     if not tables:
         raise ValueError("there is no task; give at least one.")
+    for one in tables:
+        given.instance("tables", one, TaskTables, "a list of those of make_task_tables")
     return _stacked(_padded(tables))
 
 
@@ -338,6 +346,7 @@ def stack_tasks(environments: Sequence[Environment]) -> Environment:
       >>> jax.vmap(lambda e, key: e.reset(key).memory, (0, None))(both, jax.random.key(0)).shape
       (2,)
     """
+    environments = given.listed("environments", environments)
     if not environments:
         raise ValueError("there is no environment; give at least one.")
     padded = _padded([task_tables(e) for e in environments])
@@ -374,7 +383,7 @@ def what_is_left(task: Environment | TaskTables | Automaton, memory: Any) -> str
     else:
         tables = task if isinstance(task, TaskTables) else task_tables(task)
         (names,), count = tables.text.texts, tables.delta.shape[-2]
-    state = int(memory)
+    state = given.whole("memory", memory)
     if not 0 <= state < count:
         raise ValueError(f"memory={state}; the automaton has the states 0..{count - 1}.")
     return names[state] if state < len(names) else f"state {state} of {count}"

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.host import given
 from jaxltl.core.models.monitor import Verdict
 
 REWARDS = ("auto", "reach", "keep", "eventual", "two-discount", "parity")
@@ -103,18 +104,19 @@ def pay_of(
     Raises:
       ValueError: a reward that does not fit the automaton, or numbers outside their ranges.
     """
+    reward = given.one_of("reward", reward, REWARDS)
     name = _BY_KIND[automaton.acceptance] if reward == "auto" else reward
     _require_fit(automaton, name)
     shaped = shaping is not None
     final = name in ("reach", "keep")
     if discount is None:
         discount = 1.0 if final and not shaped else _DEFAULT
+    discount = given.number("discount", discount)
     if not 0 < discount <= 1 or (discount == 1 and not final):
         raise ValueError(
             f"discount={discount}; the reward {name!r} needs one above 0 and "
             f"{'at most' if final else 'below'} 1.")
-    if not 0 < learner_discount <= 1:
-        raise ValueError(f"learner_discount={learner_discount}; it must be above 0, at most 1.")
+    learner_discount = given.share("learner_discount", learner_discount, ends=(False, True))
     rank = _ranks(automaton)
     accepting = rank % 2 == 0
     if final:
@@ -133,8 +135,6 @@ def pay_of(
 
 
 def _require_fit(automaton: Automaton, name: str) -> None:
-    if name not in REWARDS:
-        raise ValueError(f"reward={name!r}; choose one of {', '.join(REWARDS)}.")
     kind = automaton.acceptance
     needed = {"reach": "cosafe", "keep": "safety"}.get(name, kind)
     if kind != needed:
@@ -161,8 +161,7 @@ def _stopping(
 ) -> tuple[np.ndarray, np.ndarray]:
     """What a reading earns and by what it discounts, if it stops as often as its rank says."""
     ratio = 1 - discount if ratio is None else ratio
-    if not 0 < ratio < 1:
-        raise ValueError(f"ratio={ratio}; it must be above 0 and below 1, and goes to 0.")
+    ratio = given.share("ratio", ratio, ends=(False, False))
     stops = (1 - discount) * ratio ** (rank - rank.min())
     if name == "eventual":
         stops = np.where(rank == 0, stops, 0)

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from jaxltl.core.models.environment import Environment, Timestep
+from jaxltl.core.host import given
+from jaxltl.core.models.environment import Environment, Timestep, require_environment
 
 
 def with_time_limit(environment: Environment, num_steps: int) -> Environment:
@@ -24,9 +25,8 @@ def with_time_limit(environment: Environment, num_steps: int) -> Environment:
     Raises:
       ValueError: a number below 1.
     """
-    if num_steps < 1:
-        raise ValueError(f"num_steps={num_steps}; it must be at least 1.")
-    inner = environment
+    num_steps = given.whole("num_steps", num_steps, least=1, most=2**31 - 1)
+    inner = require_environment(environment)
     return replace(
         inner, reset=Partial(_reset_clock, inner.reset),
         step=Partial(_step_clock, inner.step, np.int32(num_steps)),
@@ -40,7 +40,7 @@ def with_time_limit(environment: Environment, num_steps: int) -> Environment:
 
 def without_time_limit(environment: Environment) -> tuple[Environment, int | None]:
     """The world inside :func:`with_time_limit`, and the limit; any other as it is, and None."""
-    timed: Any = environment
+    timed: Any = require_environment(environment)
     if timed.step.func is not _step_clock:
         return environment, None
     parts = {name: part and part.args[0] for name in ("reset", "step", "observe", "labels",

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax.tree_util import Partial
 
-from jaxltl.core.models.environment import Environment, as_partial
+from jaxltl.core.host import given
+from jaxltl.core.models.environment import Environment, as_partial, require_environment
 from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.values.evaluation import Totals, checked_steps, episode_totals, task_world
 
@@ -82,20 +83,23 @@ def episode_evaluator(
       >>> [float(x) for x in evaluate(jnp.array([0.5]), jax.random.key(0))]
       [-1.3125, 0.328125]
     """
-    if num_episodes < 1:
-        raise ValueError(f"num_episodes={num_episodes}; give at least 1.")
-    several = (costs,) if isinstance(costs, str) or callable(costs) else tuple(costs)
-    task = task_world(jax.eval_shape(environment.reset, jax.random.key(0)))
+    num_episodes = given.whole("num_episodes", num_episodes, least=1, most=2**31 - 1)
+    several = (costs,) if isinstance(costs, str) or callable(costs) else tuple(
+        given.listed("costs", costs))
+    task = task_world(jax.eval_shape(require_environment(environment).reset, jax.random.key(0)))
     names = SUMS if task is None else SUMS + OF_TASKS
     for score in (objective, *several):
-        if not callable(score) and score not in names:
-            why = "needs a task, which task_environment gives" if score in OF_TASKS else "is none"
+        if not callable(score) and not (isinstance(score, str) and score in names):
+            of_task = isinstance(score, str) and score in OF_TASKS
+            why = "needs a task, which task_environment gives" if of_task else "is none"
             raise ValueError(
-                f"the score {score!r} {why}; choose one of {', '.join(names)}, or give a function "
-                "of the totals.")
+                f"the score {given.shown(score)} {why}; choose one of {', '.join(names)}, or "
+                "give a function of the totals.")
     settings = _Scores(
-        objective, several, int(num_episodes), checked_steps(environment, num_steps))
-    return Partial(_evaluate, settings, environment, as_partial(agent), discount)
+        objective, several, num_episodes, checked_steps(environment, num_steps))
+    if not isinstance(discount, jax.core.Tracer):
+        given.share("discount", discount)
+    return Partial(_evaluate, settings, environment, as_partial(agent, "agent"), discount)
 
 
 @jax.jit  # so that calls outside of jit share one compilation

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxltl.core.host import given
 from jaxltl.core.host.binomial import anytime, clopper_pearson
 from jaxltl.core.host.bounded_mean import bounded_mean
 from jaxltl.core.models.environment import (
@@ -28,6 +29,9 @@ from jaxltl.core.models.environment import (
     as_partial,
     begin_episode,
     continue_episode,
+    require_agent,
+    require_environment,
+    require_key,
     some_action,
 )
 from jaxltl.core.models.monitor import Verdict
@@ -276,7 +280,14 @@ def evaluate(
       success is not at least 0.8
     """
     num_steps = checked_steps(environment, num_steps)
-    _check_numbers(num_episodes, batch, confidence, threshold, discount)
+    most = 2**31 - 1
+    num_episodes = given.whole("num_episodes", num_episodes, least=1, most=most)
+    batch = given.whole("batch", batch, least=1, most=most)
+    shares = {"confidence": confidence, "threshold": threshold, "discount": discount}
+    for name, share in shares.items():
+        if share is not None or name == "confidence":
+            given.share(name, share, ends=(False, False))
+    require_key(key)
     agent, world = _checked_agent(agent, environment)
     if threshold is not None and task_world(world) is None:
         raise ValueError(
@@ -403,36 +414,18 @@ def _mean_error(x: Any) -> tuple[float, float]:
 
 def checked_steps(environment: Environment, num_steps: int | None) -> int:
     """After how many steps episodes are cut off; refused if nothing tells."""
-    steps = environment.horizon if num_steps is None else num_steps
+    steps = require_environment(environment).horizon if num_steps is None else num_steps
     if steps is None:
         raise ValueError(
             "episodes that never end: neither the environment nor num_steps says after how many "
             "steps; give num_steps, or with_time_limit(environment, num_steps).")
-    if steps < 1:
-        raise ValueError(f"num_steps={steps}; it must be at least 1.")
-    return int(steps)
-
-
-def _check_numbers(
-    num_episodes: int, batch: int, confidence: float, threshold: float | None,
-    discount: float | None,
-) -> None:
-    for name, number in {"num_episodes": num_episodes, "batch": batch}.items():
-        if number < 1:
-            raise ValueError(f"{name}={number}; it must be at least 1.")
-    shares = {"confidence": confidence, "threshold": threshold, "discount": discount}
-    for name, share in shares.items():
-        if share is not None and not 0 < share < 1:
-            raise ValueError(f"{name}={share}; it must be between 0 and 1, and neither.")
+    return given.whole("num_steps", steps, least=1, most=2**31 - 1)
 
 
 def _checked_agent(agent: Any, environment: Environment) -> tuple[Agent, Any]:
     """An agent as a tree of arrays, whose actions are the environment's; and the world's shapes."""
-    if not isinstance(agent, Agent):
-        raise ValueError(
-            f"agent is {type(agent).__name__}; give an Agent, such as ppo.policy(state, problem, "
-            "hparams), or agent_of(function) of (observation, key).")
-    agent = replace(agent, act=as_partial(agent.act))
+    agent = require_agent(agent)
+    agent = replace(agent, act=as_partial(agent.act, "agent.act"))
 
     def first(key: chex.PRNGKey) -> Any:
         world = environment.reset(key)

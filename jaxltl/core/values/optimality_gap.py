@@ -13,9 +13,10 @@ import numpy as np
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.host import bounded as host
+from jaxltl.core.host import given
 from jaxltl.core.host.product import host_product
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models.environment import Environment
+from jaxltl.core.models.environment import Environment, as_partial
 from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.models.product import product
@@ -71,10 +72,11 @@ def tabulate_policy(
       ``int32[S, Q]`` or ``float[S, Q, A]``, for :func:`optimality_gap`.
     """
     inner, _ = without_time_limit(environment)
+    given.instance("table", table, Table, "one of tabulate")
+    num_memory = given.whole("num_memory", num_memory, least=1, most=2**24)
     count = table.model.num_states
     size = max(1, min(count, _BATCH // num_memory))
-    if not isinstance(policy, jax.tree_util.Partial):
-        policy = jax.tree_util.Partial(policy)
+    policy = as_partial(policy, "policy")
     memory = jnp.arange(num_memory, dtype=jnp.int32)
     parts = []
     for begin in range(0, count, size):
@@ -140,22 +142,23 @@ def optimality_gap(
       >>> found.optimum.value.tolist(), found.value.value.tolist(), round(found.mean[1], 9)
       ([1.0], [0.375], 0.625)
     """
+    given.instance("table", table, Table, "one of tabulate")
     if not isinstance(task, Automaton):
         task = to_automaton(task)
-    steps = table.num_steps if num_steps is None else num_steps
+    steps = table.num_steps if num_steps is None else given.whole("num_steps", num_steps)
     model = product(table.model, task)
-    given = np.asarray(policy)
+    shown = _rows_of(policy)
     shape, num_actions = model.state_shape, int(np.max(np.asarray(table.model.action))) + 1
-    if given.shape[:2] != shape or given.ndim != 2 + (not is_deterministic(given)) or (
-            given.ndim == 3 and given.shape[2] < num_actions):
-        raise ValueError(f"policy is {given.dtype}{list(given.shape)}; expected actions "
+    if shown.shape[:2] != shape or shown.ndim != 2 + (not is_deterministic(shown)) or (
+            shown.ndim == 3 and shown.shape[2] < num_actions):
+        raise ValueError(f"policy is {shown.dtype}{list(shown.shape)}; expected actions "
                          f"int{list(shape)}, or probabilities float{[*shape, num_actions]}.")
     start = np.unique(np.asarray(table.start))
     weight = np.asarray(table.model.initial)[start]
     if steps is None:
-        value, optimum = _unbounded(table, model, given, start)
+        value, optimum = _unbounded(table, model, shown, start)
     else:
-        value, optimum = _bounded(table, model, task, given, start, steps)
+        value, optimum = _bounded(table, model, task, shown, start, steps)
     own, best = (tuple(np.asarray(x) for x in (y.lower, y.upper)) for y in (value, optimum))
     sure = np.isin(own, (0, 1)).all(axis=0) & np.isin(best, (0, 1)).all(axis=0)
     below, above = best[0] - own[1], best[1] - own[0]
@@ -165,6 +168,17 @@ def optimality_gap(
     return OptimalityGap(
         start.astype(np.int32), weight, value, optimum, lower, upper,
         _mean(weight, lower, upper), _mean(weight, *own), _mean(weight, *best))
+
+
+def _rows_of(policy: Any) -> np.ndarray:
+    try:
+        found = np.asarray(policy)
+    except ValueError:  # ragged
+        found = np.asarray(None)
+    if found.dtype.kind not in "iuf":
+        raise ValueError(
+            f"policy is {given.shown(policy)}; give actions, or their probabilities.")
+    return found
 
 
 def _bounded(

@@ -310,7 +310,7 @@ def test_sums_that_are_not_finite_are_told():
     ({"num_steps": 0}, "num_steps=0; it must be at least 1"),
     ({"num_episodes": 0}, "num_episodes=0"),
     ({"batch": 0}, "batch=0"),
-    ({"confidence": 1.0}, "confidence=1.0; it must be between"),
+    ({"confidence": 1.0}, "confidence=1.0; it must be above 0 and below 1"),
     ({"threshold": 0.9}, "threshold=0.9, but the environment has no task"),
     ({"discount": 1.5}, "discount=1.5"),
     ({"agent": choose}, "agent is function; give an Agent"),

@@ -17,6 +17,7 @@ import numpy as np
 from jaxltl.core.models.environment import Box, Finite, clipped_action
 
 Actions = Finite | Box
+SQUASHES = ("clip", "tanh")
 
 # Abscissas and weights that integrate against the standard normal density.
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(16)
@@ -48,6 +49,16 @@ def as_action(actions: Actions, raw: jax.Array, squash: str) -> jax.Array:
     middle, half = jnp.where(bounded, (low + high) / 2, 0), jnp.where(bounded, (high - low) / 2, 1)
     inside = jnp.where(bounded, jnp.tanh(raw), raw) if squash == "tanh" else raw
     return clipped_action(actions, middle + half * inside).astype(actions.dtype)
+
+
+def chosen(
+    key: chex.PRNGKey, actions: Actions, parameters: Any, allowed: Any, *, sampled: bool,
+    squash: str,
+) -> jax.Array:
+    """The action that an agent takes by what its network says: drawn, or the most likely one."""
+    kind = jax.tree.leaves(parameters)[0].dtype
+    raw = drawn(actions, parameters, allowed, noise(key, (), actions, kind) if sampled else None)
+    return as_action(actions, raw, squash)
 
 
 def log_density(actions: Actions, parameters: Any, allowed: Any, raw: jax.Array) -> jax.Array:
