@@ -128,7 +128,8 @@ def learn(
     """Learn a policy for a task, and say how well it does it.
 
     Writes policy.npz, result.json, report.html and pictures; by method = "todirl", the learned
-    network.npz and the policies of the training worlds. An interrupted run goes on where it
+    network.npz and the policies of the training worlds. With an environment in [world], a network
+    is learned in simulations and judged by fresh ones. An interrupted run goes on where it
     stopped when it is started again with the same task and options.
     """
     _begin(f"learning from {task_file}")
@@ -136,7 +137,7 @@ def learn(
         job = _job(task_file)
         task = job.read_task(task_file)
         out = _directory(out, task.name)
-        with _float64():
+        with _precision(job):
             mark = job.fingerprint(task, seed, seeds)
             result = None if again else _finished(out, mark)
             done = result is not None
@@ -148,10 +149,20 @@ def learn(
         _print_json(result)
 
 
+def _precision(job: Any) -> contextlib.AbstractContextManager[None]:
+    """Double for solvers; what others have written for simulators is for single precision."""
+    return _float64() if job.DOUBLE else contextlib.nullcontext()
+
+
 def _job(task_file: Path) -> Any:
     """The module that does what a task file asks for."""
     from jaxltl.app.files.task import method_of
+    from jaxltl.app.files.task_environment import is_environment_task
 
+    if is_environment_task(task_file):
+        from jaxltl.app import learn_environment
+
+        return learn_environment
     if method_of(task_file) == "todirl":
         from jaxltl.app import learn_todirl
 
@@ -193,8 +204,7 @@ def _learn(
         def report(step: int, figures: Mapping[str, np.ndarray]) -> None:
             bar.set_description_str("learning", refresh=False)
             bar.update(step - bar.n)
-            bar.set_postfix(loss=f"{figures['loss'].min():.4f}",
-                            gradient=f"{figures['gradient_norm'].max():.1e}")
+            bar.set_postfix(job.postfix(figures))
 
         try:
             parts = job.learn(setup, seed, seeds, report=report, checkpoint=checkpoint,
@@ -207,9 +217,15 @@ def _learn(
         checkpoint.unlink(missing_ok=True)
         outcome = job.Outcome(setup, *parts, seed=seed, seconds=time.perf_counter() - start)
         bar.set_description_str("drawing")
-        pictures += [(p, begin(p.drawing)) for p in job.pictures(outcome)]
+        pictures += [(p, _begun(begin, p)) for p in job.pictures(outcome)]
         live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]
         return _write(job, outcome, out, mark, pictures, live)
+
+
+def _begun(begin: Artist, picture: Picture) -> Callable[[], bytes]:
+    """How to get a picture, which may be drawn already."""
+    drawn: Any = picture.drawing
+    return (lambda: drawn) if isinstance(drawn, bytes) else begin(drawn)
 
 
 @contextlib.contextmanager
@@ -259,9 +275,13 @@ def _write(
 
 def _report(result: Mapping[str, Any]) -> Any:
     """The module that shows a result."""
+    from jaxltl.app.files.task_environment import METHODS
     from jaxltl.app.reports import learn as report
+    from jaxltl.app.reports import learn_environment as report_environment
     from jaxltl.app.reports import learn_todirl as report_todirl
 
+    if result["method"] in METHODS:
+        return report_environment
     return report_todirl if result["method"] == "todirl" else report
 
 
@@ -283,7 +303,7 @@ def check(task_file: Path) -> None:
         click.echo(f"ok: {world.game.num_states} states, {play.num_states} with the task's memory")
         return
     job = _job(task_file)
-    with _float64():
+    with _precision(job):
         setup = job.prepare(job.read_task(task_file), seed=0)
     click.echo(f"ok: {job.describe(setup)}")
 

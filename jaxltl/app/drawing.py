@@ -34,7 +34,7 @@ class Picture(NamedTuple):
 
     name: str
     title: str
-    drawing: Drawing | None  # None where it is drawn already
+    drawing: Drawing | bytes | None  # as SVG, or None, where it is drawn already
     caption: str
     live: str = ""
 

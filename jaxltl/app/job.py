@@ -71,6 +71,12 @@ def _first_states(
     return jax.vmap(first)(jnp.arange(num_seeds))
 
 
+def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """What the progress bar tells of the newest figures of a gradient's descent."""
+    return {"loss": f"{figures['loss'].min():.4f}",
+            "gradient": f"{figures['gradient_norm'].max():.1e}"}
+
+
 def compile_beside(function: Any, *given: Any) -> Callable[[], None]:
     """Begins to compile a jitted function in another thread; returns what waits for that.
 

@@ -48,6 +48,7 @@ from jaxltl.app.job import (
     took,
 )
 from jaxltl.app.job import fingerprint as fingerprint
+from jaxltl.app.job import postfix as postfix
 from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.product import Product, lift_policy, product
 from jaxltl.core.models.trajectories import Trajectories
@@ -57,6 +58,7 @@ from jaxltl.core.values.mixture import at_starts, from_starts
 from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
 from jaxltl.core.values.soft import softmax_policy
 
+DOUBLE = True  # the precision of its figures
 STEPS = 500  # at most, unless the task says otherwise
 _TOLERANCE = 1e-6  # of the gradient's norm
 

@@ -58,6 +58,7 @@ from jaxltl.app.job import (
     took,
 )
 from jaxltl.app.job import fingerprint as fingerprint
+from jaxltl.app.job import postfix as postfix
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.models.batch import lift_memory, narrow, stack_products
@@ -79,6 +80,7 @@ from jaxltl.envs.cell_kinds import COLORS
 from jaxltl.envs.gridworld import ACTIONS
 from jaxltl.io.learned_reward import LearnedReward, save_reward
 
+DOUBLE = True  # the precision of its figures
 STEPS = 300  # at most, unless the task says otherwise
 
 

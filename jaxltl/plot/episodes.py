@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,6 +52,9 @@ class Scene(NamedTuple):
 def draw_episode(environment: Any, episode: Any, *, title: str | None = None) -> Figure:
     """One episode in a letter world, a flat world or a zone world, as a line on its map.
 
+    Of another world the line alone, with a mark where a proposition begins to hold, if its worlds
+    have a ``place``, ``float[2]``, as an attribute or as a key.
+
     Args:
       environment: the world, with or without a time limit, or a task's environment of it.
       episode: of :func:`~jaxltl.core.models.environment.run_episode`, of one trajectory.
@@ -62,9 +66,41 @@ def draw_episode(environment: Any, episode: Any, *, title: str | None = None) ->
     Raises:
       ValueError: another world, or many trajectories.
     """
-    scene = scene_of(environment, episode)
     figure = Figure(figsize=(4.4, 4.9), layout="constrained", facecolor=PAPER)
-    axes = figure.subplots()
+    scene = scene_of(environment, episode)
+    _draw_scene(figure.subplots(), scene, title)
+    ends = f"ends after {len(scene.track) - 1} steps"
+    note(figure, [(ACCENT, "begins", "o"), (ACCENT, ends, "s")])
+    return figure
+
+
+def draw_episodes(
+    environment: Any, episodes: Sequence[Any], *, titles: Sequence[str] | None = None
+) -> Figure:
+    """Several episodes as :func:`draw_episode` draws one, side by side.
+
+    Args:
+      environment: as there.
+      episodes: at least one, each of one trajectory.
+      titles: of each; default what held on the way, in order.
+
+    Returns:
+      The figure.
+
+    Raises:
+      ValueError: no episode, another world, or many trajectories in one.
+    """
+    if not episodes:
+        raise ValueError("there is no episode; give at least one.")
+    figure = Figure(figsize=(3.4 * len(episodes), 3.9), layout="constrained", facecolor=PAPER)
+    every = figure.subplots(1, len(episodes), squeeze=False)[0]
+    for i, (axes, episode) in enumerate(zip(every, episodes, strict=True)):
+        _draw_scene(axes, scene_of(environment, episode), titles[i] if titles else None)
+    note(figure, [(ACCENT, "begins", "o"), (ACCENT, "ends", "s")])
+    return figure
+
+
+def _draw_scene(axes: Axes, scene: Scene, title: str | None) -> None:
     _draw_ground(axes, scene)
     halo = [withStroke(linewidth=3.0, foreground=PAPER, alpha=0.8)]
     for part in _segments(scene):
@@ -74,8 +110,6 @@ def draw_episode(environment: Any, episode: Any, *, title: str | None = None) ->
     for place, marker in ((places[0], "o"), (places[-1], "s")):
         axes.plot(*place, marker, color=ACCENT, ms=7, mec=PAPER, mew=1.0, zorder=6)
     head(axes, _met(scene) if title is None else title)
-    note(figure, [(ACCENT, "begins", "o"), (ACCENT, f"ends after {len(places) - 1} steps", "s")])
-    return figure
 
 
 def scene_of(environment: Any, episode: Any) -> Scene:
@@ -88,6 +122,8 @@ def scene_of(environment: Any, episode: Any) -> Scene:
     label = np.asarray(episode.label)[:count]
     shown = [", ".join(name for name, holds in zip(environment.propositions, row, strict=True)
                        if holds) for row in label]
+    if not isinstance(world, LetterState | FlatState | ZoneState):
+        return _free(np.asarray(world, float)[:count], shown)
     numbers: Any = environment.labels
     while isinstance(numbers.args[0], Partial):  # what a limit or a task has put around it
         numbers = numbers.args[0]
@@ -111,17 +147,35 @@ def scene_of(environment: Any, episode: Any) -> Scene:
     return _upright(float(numbers.extent), zones, track, heading, shown)
 
 
-def _place_of(world: Any) -> LetterState | FlatState | ZoneState:
-    """The world with places inside what limits and tasks have added."""
+def _place_of(world: Any) -> Any:
+    """The world with places inside what limits and tasks have added; of others, the places."""
     while not isinstance(world, LetterState | FlatState | ZoneState):
+        place = world.get("place") if isinstance(world, dict) else getattr(world, "place", None)
+        if place is not None and np.ndim(place) == 2 and np.shape(place)[1] == 2:
+            return place
         if hasattr(world, "world"):
             world = world.world
         elif type(world) is tuple and len(world) == 2:
             world = world[0]
         else:
             raise ValueError(f"{type(world).__name__} has no picture; give an episode of a "
-                             "letter_world, a flat_world or a zone_world.")
+                             "letter_world, a flat_world or a zone_world, or of a world with a "
+                             "place, float[2].")
     return world
+
+
+def _free(track: NDArray[np.float64], shown: list[str]) -> Scene:
+    """Of a world of which only the places are known: a mark where something begins to hold."""
+    least, most = track.min(axis=0), track.max(axis=0)
+    side = 1.16 * max(float((most - least).max()), 1e-6)
+    corner = (least + most) / 2 - side / 2
+    places = np.stack([track[:, 0] - corner[0], side - (track[:, 1] - corner[1])], axis=1)
+    marks, before = [], ""
+    for (x, y), now in zip(places.tolist(), shown, strict=True):
+        if now and now != before:
+            marks.append((x, y, 0.03 * side, now))
+        before = now
+    return Scene(side, 0, [], marks, places, None, shown, False)
 
 
 def _named(discs: Discs, names: tuple[str, ...]) -> list[tuple[float, float, float, str]]:

@@ -1,0 +1,167 @@
+"""The environment that a task file names, made by a function that is imported only then."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import inspect
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from jaxltl.app.files.tables import errors_in
+from jaxltl.app.files.task_environment import EnvironmentTask
+from jaxltl.core.models.environment import Environment, make_environment
+from jaxltl.core.models.time_limit import with_time_limit
+
+OWN = {
+    "flat_world": "jaxltl.envs.flat_world:flat_world",
+    "letter_world": "jaxltl.envs.letter_world:letter_world",
+    "zone_world": "jaxltl.envs.zone_world:zone_world",
+}
+# Of each package, the module and the function that make what its adapter takes.
+PACKAGES = {
+    "brax": ("brax.envs", "get_environment"),
+    "craftax": ("craftax.craftax_env", "make_craftax_env_from_name"),
+    "gymnax": ("gymnax", "make"),
+    "jumanji": ("jumanji", "make"),
+    "navix": ("navix", "make"),
+    "xminigrid": ("xminigrid", "make"),
+}
+
+
+def load_environment(task: EnvironmentTask) -> Environment:
+    """The world of a task file, with its labels, and truncated at its horizon if it gives one.
+
+    Raises:
+      ValueError: what is named is not there, fails, or returns no environment. The message names
+        the file, the table and the key.
+    """
+    spec, folder = task.world, task.path.parent
+    with errors_in(f"{task.path}: [world] labels: "):
+        labels = _function(spec["labels"], folder) if "labels" in spec else None
+    with errors_in(f"{task.path}: [world] environment: "):
+        found = _made(spec["environment"], spec.get("arguments", {}), folder, labels,
+                      spec.get("propositions", ()))
+    with errors_in(f"{task.path}: [world] "):
+        return with_time_limit(found, spec["horizon"]) if "horizon" in spec else found
+
+
+def _made(
+    name: str, arguments: Mapping[str, Any], folder: Path, labels: Callable[..., Any] | None,
+    propositions: list[str],
+) -> Environment:
+    root, _, rest = name.partition(":")
+    if root in PACKAGES and rest:
+        return _of_package(root, rest, arguments, labels, propositions)
+    function = _function(OWN.get(name, name), folder)
+    try:
+        inspect.signature(function).bind(**arguments)
+    except TypeError as problem:
+        raise ValueError(f"{name!r} does not take [world.arguments]: {problem}.") from None
+    with _theirs(name):
+        found = function(**arguments)
+    if not isinstance(found, Environment):
+        raise ValueError(
+            f"{name!r} returns a {type(found).__name__}, no Environment; let it return one of "
+            "make_environment, or of an adapter such as from_gymnax.")
+    if labels is None:
+        return found
+    with _theirs("labels"):
+        return make_environment(
+            found.reset, found.step, found.observe, actions=found.actions, labels=labels,
+            propositions=propositions, allowed=found.allowed, observations=found.observations,
+            horizon=found.horizon, starts=found.starts, outcomes=found.outcomes)
+
+
+def _of_package(
+    root: str, name: str, arguments: Mapping[str, Any], labels: Any, propositions: Any
+) -> Environment:
+    """One of another package, by its adapter."""
+    adapters = importlib.import_module(f"jaxltl.envs.adapters.{root}")
+    module, function = PACKAGES[root]
+    try:
+        make = getattr(importlib.import_module(module), function)
+    except ImportError as problem:
+        raise ValueError(
+            f'needs the package {root} ({problem}); pip install "jaxltl[{root}]".') from None
+    extra = {"auto_reset": False} if root == "craftax" else {}
+    with _theirs(f"{root}:{name}"):
+        made = make(name, **extra, **arguments)
+        pair = made if isinstance(made, tuple) else (made,)
+        return getattr(adapters, f"from_{root}")(*pair, labels=labels, propositions=propositions)
+
+
+def _function(name: str, folder: Path) -> Callable[..., Any]:
+    """What ``"package.module:function"`` or ``"file.py:function"`` names."""
+    place, _, attribute = name.rpartition(":")
+    if not place or not attribute.isidentifier():
+        known = ", ".join((*OWN, *(f"{p}:NAME" for p in PACKAGES)))
+        raise ValueError(
+            f'{name!r} names no function; write "package.module:function", "file.py:function" '
+            f"for a file beside the task file, or one of {known}.")
+    module = _module_of_file(folder / place) if place.endswith(".py") else _module(place)
+    found = getattr(module, attribute, None)
+    if not callable(found):
+        there = [n for n, x in vars(module).items() if callable(x) and not n.startswith("_")
+                 and getattr(x, "__module__", None) == module.__name__]
+        is_ = "is no function" if hasattr(module, attribute) else "is not there"
+        raise ValueError(
+            f"{attribute!r} {is_} in {place!r}; its functions are {', '.join(there) or '(none)'}.")
+    return found
+
+
+def _module(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as problem:
+        missing = getattr(problem, "name", None) or ""
+        if name != missing and not name.startswith(f"{missing}."):
+            raise ValueError(f"{name!r} cannot be imported: {problem}.") from None
+        raise ValueError(
+            f"there is no module {name!r}: {problem}. Install its package, or name a file beside "
+            'the task file, "file.py:function".') from None
+    except Exception as problem:
+        raise ValueError(_told(name, problem)) from problem
+
+
+def _module_of_file(path: Path) -> Any:
+    """A file as a module, which finds its neighbours while it is read."""
+    if not path.is_file():
+        raise ValueError(f"there is no file {str(path)!r}.")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.path.insert(0, str(path.parent.absolute()))
+    before = sys.modules.get(path.stem)
+    sys.modules[path.stem] = module  # where dataclasses look for their module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as problem:
+        raise ValueError(_told(path.name, problem)) from problem
+    finally:
+        sys.path.pop(0)
+        if before is not None:
+            sys.modules[path.stem] = before
+    return module
+
+
+@contextlib.contextmanager
+def _theirs(name: str) -> Iterator[None]:
+    """Errors of somebody else's function, told with the place that they come from."""
+    try:
+        yield
+    except Exception as problem:
+        raise ValueError(_told(name, problem)) from problem
+
+
+def _told(name: str, problem: Exception) -> str:
+    last = (traceback.extract_tb(problem.__traceback__) or [None])[-1]
+    text = str(problem).strip().rstrip(".")
+    if isinstance(problem, ValueError):
+        return f"{name!r}: {text}."
+    where = "" if last is None else f" ({Path(last.filename).name}, line {last.lineno})"
+    return f"{name!r} raises {type(problem).__name__}: {text}{where}."
