@@ -103,7 +103,10 @@ def _bicgstab(
             break
         y = solve(p)
         v = y - matrix @ y
-        alpha = rho / _dot(shadow, v)
+        turned = _dot(shadow, v)
+        if not turned:
+            break
+        alpha = rho / turned
         s = r - alpha * v
         z = solve(s)
         t = z - matrix @ z

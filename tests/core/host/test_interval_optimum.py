@@ -1,10 +1,13 @@
 """Bounds of both sides at once: against those that solve one player inside the other."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from scipy import sparse
 
 from jaxltl.core.host import interval_optimum, interval_values
+from jaxltl.core.host.interval_nodes import Choice
 from jaxltl.core.host.interval_systems import Systems
 from jaxltl.core.models.interval import interval_rows
 
@@ -63,3 +66,73 @@ def test_systems_of_changing_choices(mixes, monkeypatch):
         b = rng.random(60)
         x = systems.solve(sparse.csr_array(dense), b, x, 1e-9)
         np.testing.assert_allclose(x, np.linalg.solve(np.eye(60) - dense, b), atol=1e-6)
+
+
+def test_systems_on_which_a_krylov_method_breaks_down():
+    """Its first step is orthogonal to where it began."""
+    systems = Systems(lambda: np.array([1, 0]), True)
+    matrix = sparse.csr_array([[0, 2.0], [0, 0]])
+    assert systems.solve(matrix, np.ones(2), np.zeros(2), 1e-9).tolist() == [3, 1]
+
+
+@pytest.mark.parametrize("maximize", (True, False))
+def test_who_may_stay_for_ever_proves_nothing(maximize):
+    """Nature may stay in state 0, where nothing is gained or lost; what is claimed is false."""
+    host = interval_rows(
+        [0, 1, 2, 3, 4], [0, 2, 4, 5, 6], [0, 1, 2, 3, 2, 3], [0, 0, 0.5, 0.5, 1, 1],
+        [1, 1, 0.5, 0.5, 1, 1]).host
+    open_, known = np.array([True, True, False, False]), np.array([0, 0, 1.0, 0])
+    nodes = interval_optimum._nodes(
+        interval_optimum.Joint(host, open_, known, np.zeros(4), np.arange(4)),
+        1 if maximize else -1, True)
+    here = Choice(np.array([0, 1]), nodes.anything(), np.zeros(2), np.ones(2))
+    if maximize:  # nature stays, and the target is never reached
+        assert not nodes.attains(np.array([0.3, 0.4]), here)
+    else:  # nature goes on, and has a half
+        assert nodes.proves(np.array([-0.9, -0.4])) is None
+        assert nodes.proves(np.array([-0.3, -0.4])) is not None
+
+
+@pytest.mark.parametrize("against", (True, False))
+def test_what_is_nearly_certain_is_proven_too(against):
+    host = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.9999, 1e-4, 1, 1],
+                         [0.9999, 1e-4, 1, 1]).host
+    nodes = interval_optimum._nodes(
+        interval_optimum.Joint(host, np.arange(3) == 0, np.array([0, 1.0, 0]), np.zeros(3),
+                               np.arange(3)), 1, against)
+    assert nodes.proves(np.array([0.9995])) is None
+    assert nodes.proves(np.array([0.99995])) is not None
+    assert nodes.proves(np.array([1.0])) is not None
+
+
+@pytest.mark.parametrize("against", (True, False))
+def test_what_rows_gain_is_bounded_with_its_rounding(against):
+    """By exact fractions, of rows that mostly stay and leave what rounding makes to the rest."""
+    rng = np.random.default_rng(8)
+    many = 60
+    leave = 10.0 ** rng.uniform(-12, -1, many)
+    low = leave[:, None] * rng.random((many, 2)) / 4
+    high = low + leave[:, None] * rng.random((many, 2))
+    stays = 1 - leave * (1 - rng.random(many) / 8)
+    lower = np.append(np.column_stack([1 - leave * 1.5, low]).ravel(), [1, 1])
+    upper = np.append(np.column_stack([stays, high + leave[:, None]]).ravel(), [1, 1])
+    host = interval_rows(
+        [0, many, many + 1, many + 2], [*range(0, 3 * many + 1, 3), 3 * many + 1, 3 * many + 2],
+        [0, 1, 2] * many + [1, 2], lower, upper).host
+    nodes = interval_optimum._nodes(interval_optimum.Joint(
+        host, np.array([True, False, False]), np.array([0, 0.83, 0.1]), rng.random(many + 2) * 1e-9,
+        np.arange(3)), 1, against)
+    value = rng.random(1)
+    (block,) = nodes.blocks
+    gain = block.gain(nodes.values(value), 0.0)
+    least, most = (
+        nodes._sums(block, gain, nodes.answer(block, gain), sign) for sign in (-1, 1))
+    ahead = [Fraction(float(x)) - Fraction(float(value[0])) for x in (value[0], 0.83, 0.1)]
+    order = sorted(range(3), key=lambda k: ahead[k], reverse=not against)
+    for i, r in enumerate(block.table.row):
+        mine = slice(3 * r, 3 * r + 3)
+        p, ends = ([Fraction(float(x)) for x in of[mine]] for of in (host.lower, host.upper))
+        for k in order:
+            p[k] += min(ends[k] - p[k], 1 - sum(p))
+        exact = sum(x * y for x, y in zip(p, ahead, strict=True)) + Fraction(float(nodes.cost[r]))
+        assert Fraction(float(least[i])) <= exact <= Fraction(float(most[i]))
