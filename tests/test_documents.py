@@ -1,5 +1,6 @@
-"""What the README, the pages on intervals and on data and the notebooks show runs as it stands."""
+"""What the README, the pages with examples and the notebooks show runs as it stands."""
 
+import importlib.util
 import os
 import re
 import shlex
@@ -15,12 +16,13 @@ from nbclient import NotebookClient
 from jaxltl.cli import main
 
 ROOT = Path(__file__).parent.parent
+ADAPTED = ("brax", "craftax", "gymnax", "jumanji", "navix", "pgx", "xminigrid")
 
 
 def test_the_readme_example_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert len(blocks) == 5
+    assert len(blocks) == 6
     names: dict = {}
     for code in blocks:
         exec(compile(code, "README.md", "exec"), names)
@@ -28,6 +30,7 @@ def test_the_readme_example_runs(tmp_path, monkeypatch, capsys):
     assert names["model"].num_transitions == names["coin"].num_transitions == 6
     assert names["metrics"].loss.shape == (4, 20)
     assert (names["metrics"].loss[:, -1] < names["metrics"].loss[:, 0]).all()
+    assert names["found"].decision is True
     printed = capsys.readouterr().out
     for told in ("P >= 0.938 with confidence 0.95\n", "no policy has more than 0.986", "\n0.8333"):
         assert told in printed
@@ -68,6 +71,10 @@ def test_the_page_on_worlds_runs(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("path", sorted(ROOT.glob("notebooks/*.ipynb")), ids=lambda p: p.stem)
 def test_a_notebook_runs(path, tmp_path):
     notebook = nbformat.read(path, as_version=4)
+    code = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "code")
+    for name in re.findall(rf"^\s*(?:import|from) ({'|'.join(ADAPTED)})\b", code, re.MULTILINE):
+        if importlib.util.find_spec(name) is None:
+            pytest.skip(f"{path.stem} needs the package {name}")
     client = NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(tmp_path)}})
     client.execute(env={**os.environ, "XLA_FLAGS": ""})  # long enough to be compiled for speed
     outputs = [o for cell in notebook.cells for o in cell.get("outputs", ())]
@@ -119,8 +126,19 @@ def test_the_page_on_ppo_runs(capsys):
     assert names["curves"].shape == (4, 20)
 
 
-@pytest.mark.parametrize(
-    "name", ["brax", "craftax", "gymnax", "jumanji", "navix", "pgx", "xminigrid"])
+def test_the_page_on_many_formulas_runs(capsys):
+    page = (ROOT / "docs" / "many-formulas.md").read_text()
+    names: dict = {}
+    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(compile(code, "many-formulas.md", "exec"), names)
+    printed = capsys.readouterr().out.splitlines()
+    (sequences,) = re.findall(r"```\n(3 steps.*?)```", page, re.DOTALL)
+    assert printed[3:-1] == sequences.splitlines()
+    assert names["found"].success.lower > 0.8 and len(names["formulas"]) == 3
+    assert names["gap"].mean_optimum == (1.0, 1.0) and names["gap"].mean[1] < 0.2
+
+
+@pytest.mark.parametrize("name", ADAPTED)
 @pytest.mark.filterwarnings("ignore:Brax System:UserWarning")
 def test_the_page_on_environments_runs(name, capsys):
     page = (ROOT / "docs" / "environments.md").read_text()
