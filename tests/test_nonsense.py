@@ -9,13 +9,23 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.algos import feasible, interval_learning, regions
+from jaxltl.algos import feasible, interval_learning, many_tasks, ppo, regions
+from jaxltl.core.automata.sequences import reach_avoid_sequences
+from jaxltl.core.host.bounded_mean import bounded_mean
 from jaxltl.core.host.confidence import samples_needed
 from jaxltl.core.host.given import listed, number, one_of, whole
 from jaxltl.core.host.l1_ball import l1_expectation
+from jaxltl.core.models import environment as en
+from jaxltl.core.models import sequence_task as st
+from jaxltl.core.models import task_environment as te
+from jaxltl.core.models.time_limit import with_time_limit
+from jaxltl.core.values.evaluation import share_estimate
 from jaxltl.core.values.multi_objective import multi
 from jaxltl.core.values.objectives import Objective
 from jaxltl.core.values.robust import robust_reachability, robust_total_reward
+from jaxltl.envs.flat_world import flat_world
+from jaxltl.envs.letter_world import letter_world
+from jaxltl.envs.zone_world import zone_world
 
 NONSENSE = {
     "none": None, "nan": float("nan"), "infinite": float("inf"), "text": "x", "negative": -1,
@@ -107,6 +117,82 @@ def things(folder):
                                 "num_halvings": 3}),
         (interval_learning.make_problem, {"world": sparse, "task": "F a"}),
     ]
+
+
+@cache
+def simulated():
+    """A corridor with a task, and what is asked of it."""
+    def step(place, action, key):
+        return en.Timestep(jnp.clip(place + 2 * action - 1, 0, 2), reward=0.0, terminated=False)
+
+    corridor = {
+        "reset": lambda key: jnp.int32(0), "step": step, "observe": lambda place: place[None] / 2,
+        "actions": 2, "labels": lambda place: place == jnp.array([0, 2]),
+        "propositions": ["home", "goal"], "allowed": None, "observations": None, "horizon": 4,
+        "starts": None, "outcomes": None}
+    world = en.make_environment(**corridor)
+    task = te.task_environment(world, "F goal")
+    agent = en.agent_of(lambda seen, key: jnp.int32(0))
+    events, key = st.events_of(["home", "goal"]), jax.random.key(0)
+    sets = st.proposition_sets(events)
+    asked = {"propositions": ["home", "goal"], "reward": "auto", "discount": None, "ratio": None,
+             "learner_discount": 1.0, "ending": "repeat", "embedding": None}
+    told = {"events": events, "propositions": ("home", "goal"), "depth": 2, "most": 2}
+    table, plan = jl.tabulate(world), many_tasks.make_plan("F goal", **told)
+    return [
+        (en.box, {"low": 0.0, "high": 1.0, "shape": (2,), "dtype": None}),
+        (en.make_environment, corridor), (en.agent_of, {"function": step}),
+        (en.run_episode, {"key": key, "environment": world, "agent": agent, "num_steps": 2}),
+        (with_time_limit, {"environment": world, "num_steps": 2}),
+        (te.make_task_tables, {"formula": "F goal", **asked}),
+        (te.task_environment, {"environment": world, "formula": "F goal", "labels": None, **asked}),
+        (te.with_tables, {"environment": task, "tables": te.task_tables(task)}),
+        (te.task_tables, {"environment": task}), (te.stack_tasks, {"environments": [task]}),
+        (te.stack_tables, {"tables": [te.task_tables(task)]}),
+        (te.what_is_left, {"task": task, "memory": 0}),
+        (st.events_of, {"propositions": ["a"], "at_most": 1}),
+        (st.sequence_sampler, {"length": [1], "reach": [1], "avoid": [1], "sets": sets}),
+        (st.sequence_environment, {
+            "environment": world, "events": events, "violation": -1.0, "progress": 0.0,
+            "sampler": st.sequence_sampler([1], [1], [1], sets)}),
+        (jl.tabulate, {"environment": world, "worlds": None, "max_states": 10, "num_keys": 2,
+                       "key": key, "distinct": None}),
+        (jl.evaluate, {"key": key, "agent": agent, "environment": task, "num_episodes": 4,
+                       "num_steps": 3, "confidence": 0.9, "threshold": 0.5, "discount": 0.9,
+                       "batch": 2}),
+        (share_estimate, {"count": 1, "total": 2, "failure": 0.05}),
+        (jl.episode_evaluator, {
+            "environment": task, "agent": lambda numbers: agent, "objective": "reward",
+            "costs": "failure", "num_episodes": 2, "num_steps": 2, "discount": 1.0}),
+        (jl.tabulate_policy, {"policy": lambda seen, memory: jnp.int32(0), "environment": world,
+                              "table": table, "num_memory": 2}),
+        (jl.optimality_gap, {"table": table, "task": "F goal",
+                             "policy": np.zeros((3, 2), int), "num_steps": 3}),
+        (bounded_mean, {"numbers": [0.5], "failure": 0.1, "planned": None}),
+        (reach_avoid_sequences, {"automaton": jl.to_automaton("F goal"), **told}),
+        (many_tasks.make_plan, {"task": "F goal", **told}),
+        (many_tasks.stack_plans, {"plans": [plan]}),
+        (many_tasks.sequence_agent, {"network": step, "plan": plan, "actions": None,
+                                     "squash": "clip"}),
+        (ppo.make_problem, {"environment": world, "network": None}),
+        (partial(letter_world, connected=False), {
+            "size": 4, "letters": 2, "copies": 1, "horizon": 5, "num_maps": 4, "seed": 0}),
+        (partial(letter_world, layout="a.\n..", letters=1), {"start": 1, "horizon": 5}),
+        (flat_world, {"discs": (("red", 0.0, 0.0, 0.5),), "extent": 2.0, "time_step": 0.1,
+                      "horizon": 5, "start": None, "num_starts": 4, "seed": 0}),
+        (zone_world, {"colors": ("a", "b"), "zones": 1, "radius": 0.4, "extent": 2.5,
+                      "saturation": 0.05, "num_maps": 4, "seed": 0}),
+    ]
+
+
+@pytest.mark.parametrize("kind", NONSENSE)
+def test_nonsense_about_simulated_worlds_is_told(kind):
+    for call, given in simulated():
+        for name in given:
+            try:
+                call(**given | {name: NONSENSE[kind]})
+            except ValueError as error:
+                assert not RAW.search(str(error)), (call, name, error)
 
 
 def coin(x):

@@ -127,7 +127,7 @@ def make_plan(
     """
     automaton = task if isinstance(task, Automaton) else to_automaton(task)
     found = sequences.reach_avoid_sequences(
-        automaton, events, tuple(propositions), depth=depth, most=most)
+        automaton, events, given.names("propositions", propositions), depth=depth, most=most)
     return Plan(found.reach, found.avoid, found.length)
 
 

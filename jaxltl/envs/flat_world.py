@@ -20,6 +20,7 @@ import numpy as np
 from flax import struct
 from jax.tree_util import Partial
 
+from jaxltl.core.host import given
 from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
 from jaxltl.core.models.time_limit import with_time_limit, without_time_limit
 
@@ -96,16 +97,25 @@ def flat_world(
       >>> world.labels(here).tolist()
       [False, False, False, False, False, False, False]
     """
-    names = tuple(sorted({name for name, *_ in discs}))
-    numbers = np.array([rest for _, *rest in discs], np.float32).reshape(-1, 3)
+    rows = [tuple(given.listed("discs", row)) for row in given.listed("discs", discs)]
+    if not all(len(row) == 4 and isinstance(row[0], str) for row in rows):
+        raise ValueError(f"discs is {given.shown(discs)}; give (colour, x, y, radius) of each.")
+    names = tuple(sorted({name for name, *_ in rows}))
+    numbers = given.numbers("discs", [row[1:] for row in rows]).astype(np.float32).reshape(-1, 3)
     if not len(numbers) or not np.isfinite(numbers).all() or not (numbers[:, 2] > 0).all():
         raise ValueError("flat_world: discs are (colour, x, y, radius), at least one, with radii "
                          "above zero.")
-    if not (extent > 0 and time_step > 0):
-        raise ValueError(f"extent={extent}, time_step={time_step}; both must be positive.")
-    if start is not None and not (np.shape(start) == (2,) and np.abs(start).max() <= extent):
+    extent, time_step = given.number("extent", extent), given.number("time_step", time_step)
+    num_starts = given.whole("num_starts", num_starts, least=1, most=2**26)
+    seed = given.whole("seed", seed)
+    if not (0 < extent < 1e6 and 0 < time_step < 1e6):
+        raise ValueError(
+            f"extent={extent}, time_step={time_step}; both must be positive, and below a million.")
+    if start is not None and not (
+            np.shape(place := given.numbers("start", start)) == (2,)
+            and np.abs(place).max() <= extent):
         raise ValueError(f"start={start!r}; give a place (x, y) within {extent} of the middle.")
-    color = np.array([[name == one for one in names] for name, *_ in discs])
+    color = np.array([[name == one for one in names] for name, *_ in rows])
     scene = Discs(numbers[:, :2], numbers[:, 2], color, np.float32(extent))
     number = np.array([extent, time_step], np.float32)
     if start is not None:
@@ -128,8 +138,6 @@ def discs_of(environment: Environment) -> Discs:
 
 def _free_places(scene: Discs, extent: float, count: int, seed: int) -> np.ndarray:
     """``float32[count, 2]``, uniform outside of all discs."""
-    if count < 1:
-        raise ValueError(f"num_starts={count}; it must be at least 1.")
     random, found, rounds = np.random.default_rng(seed), [np.zeros((0, 2), np.float32)], 0
     while (have := sum(map(len, found))) < count:
         if (rounds := rounds + 1) > 20 and have < 0.01 * rounds * count:

@@ -24,6 +24,7 @@ import numpy as np
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
+from jaxltl.core.host import given
 from jaxltl.core.models.environment import (
     Environment,
     Timestep,
@@ -99,6 +100,9 @@ def letter_world(
       (('a', 'b', 'c'), (7, 7, 13), 75)
     """
     names, starts = _names(letters), None
+    copies, num_maps = given.whole("copies", copies), given.whole("num_maps", num_maps, most=2**24)
+    size, seed = given.whole("size", size, most=2**10), given.whole("seed", seed)
+    num_maps = max(num_maps, 1) if not connected else given.whole("num_maps", num_maps, least=1)
     if layout is None:
         if start is not None:
             raise ValueError(f"start={start} is for a given layout; leave it out.")
@@ -117,8 +121,8 @@ def letter_world(
         empty = np.flatnonzero(letter == len(names))
         if start is None and not len(empty):
             raise ValueError("layout: no cell is empty; say where to begin, start=0.")
-        if start is not None and not 0 <= start < size * size:
-            raise ValueError(f"start={start}; the cells are 0 to {size * size - 1}.")
+        if start is not None:
+            start = given.whole("start", start, most=size * size - 1)
         places = (empty if start is None else np.array([start])).astype(np.int32)
         reset, starts = Partial(_begin, letter, places), Partial(_starts, letter, places)
     views, count = _views(size), len(names)
@@ -133,7 +137,7 @@ def letter_world(
 
 def _names(letters: int | Sequence[str]) -> tuple[str, ...]:
     if not isinstance(letters, int | np.integer):
-        return tuple(letters)
+        return given.names("letters", letters)
     if not 1 <= letters <= len(_NAMES):
         raise ValueError(f"letters={letters}; it must be 1 to {len(_NAMES)}, or their names.")
     return tuple(_NAMES[:letters])

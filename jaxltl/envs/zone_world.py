@@ -25,6 +25,7 @@ import numpy as np
 from flax import struct
 from jax.tree_util import Partial
 
+from jaxltl.core.host import given
 from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
 from jaxltl.core.models.time_limit import with_time_limit
 
@@ -111,11 +112,14 @@ def zone_world(
       >>> world.propositions, world.observations.shape, world.actions.shape
       (('green', 'yellow', 'blue', 'magenta'), (75,), (2,))
     """
-    names = tuple(colors)
+    names = given.names("colors", colors)
+    zones, num_maps = given.whole("zones", zones), given.whole("num_maps", num_maps, most=2**20)
+    seed = given.whole("seed", seed)
     for name, number in (("radius", radius), ("extent", extent), ("saturation", saturation),
                          ("zones", zones), ("num_maps", num_maps), ("colors", len(names))):
-        if not number > 0:
-            raise ValueError(f"zone_world: {name}={number}; it must be positive.")
+        if not 0 < given.number(name, number) < 1e7:
+            raise ValueError(
+                f"zone_world: {name}={number}; it must be positive, and below ten million.")
     places = draw_places(len(names) * zones, extent, num_maps, seed)
     numbers = _Numbers(*(np.float32(x) for x in (
         radius, extent, 0.02, 0.3 * 0.05 / _MASS, saturation, 0.01 / _MASS, 0.3 / 0.095, 3.0, 0.5)))

@@ -143,7 +143,7 @@ def test_maps_without_ways_are_uniform():
     ({"layout": "a z\nb .", "letters": 3}, "'z' is none of the letters"),
     ({"layout": [[0, 9], [0, 0]], "letters": 3}, "integers .* from -1 to 2"),
     ({"layout": "a a\na a"}, "no cell is empty"),
-    ({"layout": "a a\na .", "start": 4}, "cells are 0 to 3"),
+    ({"layout": "a a\na .", "start": 4}, "start=4; it must be at most 3"),
     ({"start": 4}, "for a given layout"),
 ])
 def test_what_does_not_fit_is_named(options, said):

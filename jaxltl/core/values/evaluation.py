@@ -279,7 +279,7 @@ def evaluate(
       >>> print(str(found).rpartition("\\n")[2].strip())
       success is not at least 0.8
     """
-    num_steps = checked_steps(environment, num_steps)
+    num_steps = checked_steps(require_environment(environment), num_steps)
     most = 2**31 - 1
     num_episodes = given.whole("num_episodes", num_episodes, least=1, most=most)
     batch = given.whole("batch", batch, least=1, most=most)
@@ -372,6 +372,9 @@ def share_estimate(count: int, total: int, failure: float, fixed: bool = True) -
       >>> round(found.lower, 3), round(found.upper, 3), found.method
       (0.444, 0.975, 'Clopper-Pearson')
     """
+    total = given.whole("total", total, least=1, most=2**53)
+    count = given.whole("count", count, most=total)
+    given.share("failure", failure, ends=(False, False))
     ends = clopper_pearson if fixed else anytime
     (lower,), (upper,) = ends(np.array([count]), np.array([total]), failure)
     share = count / total
@@ -414,7 +417,7 @@ def _mean_error(x: Any) -> tuple[float, float]:
 
 def checked_steps(environment: Environment, num_steps: int | None) -> int:
     """After how many steps episodes are cut off; refused if nothing tells."""
-    steps = require_environment(environment).horizon if num_steps is None else num_steps
+    steps = environment.horizon if num_steps is None else num_steps
     if steps is None:
         raise ValueError(
             "episodes that never end: neither the environment nor num_steps says after how many "
