@@ -15,7 +15,13 @@ from jaxltl.core.models.task_environment import task_environment
 from jaxltl.envs.flat_world import flat_world
 from jaxltl.envs.letter_world import letter_world
 from jaxltl.envs.zone_world import zone_world
-from jaxltl.plot.episodes import _segments, draw_episode, play_episode, scene_of
+from jaxltl.plot.episodes import (
+    _segments,
+    draw_episode,
+    draw_episodes,
+    play_episode,
+    scene_of,
+)
 from jaxltl.plot.style import to_bytes
 
 KEY = jax.random.key(0)
@@ -88,6 +94,27 @@ def test_discs_and_zones_stand_upright():
     assert len(circles) == 9
     assert np.allclose([float(c["r"]) for c in circles[:8]], 0.4 * 440 / 5)
     assert to_bytes(draw_episode(zones, run), "png")[:4] == b"\x89PNG"
+
+
+def test_a_world_with_a_place_is_a_line_with_marks_where_something_begins_to_hold():
+    def walk(world, action, key):
+        place = world["place"] + jnp.array([1.0, 0.5])
+        return Step({"place": place}, 0.0, False)
+
+    far = make_environment(
+        lambda key: {"place": jnp.zeros(2)}, walk, lambda world: world["place"], actions=1,
+        labels=lambda world: world["place"][:1] > 1.5, propositions=["far"])
+    scene = scene_of(far, episode(far, jnp.int32(0), 4))
+    assert scene.size == pytest.approx(4 * 1.16)
+    middle = scene.size / 2
+    np.testing.assert_allclose(
+        scene.track - middle, [[-2, 1], [-1, 0.5], [0, 0], [1, -0.5], [2, -1]], atol=1e-6)
+    (x, y, _, name), = scene.discs
+    assert (x, y) == pytest.approx((middle, middle)) and name == "far"
+    both = draw_episodes(far, [episode(far, jnp.int32(0), 4)] * 2, titles=["one", "two"])
+    assert [axes.get_title("left") or axes.get_title() for axes in both.axes] == ["one", "two"]
+    with pytest.raises(ValueError, match="there is no episode"):
+        draw_episodes(far, [])
 
 
 def test_what_has_no_picture_is_named():
