@@ -312,7 +312,8 @@ class _Followers(NamedTuple):
       seen: ``uint8[B, A, K, W + 1]``, their bytes, and whether the episode goes on.
       probability, reward, cost: ``float[B, A, K]``.
       allowed: ``bool[B, A]``.
-      drawn: ``uint8[B, A, N, W + 1]``, the bytes of what was drawn by the keys.
+      drawn: ``uint8[B, A, N, W']``, the bytes of what was drawn by the keys; where outcomes are
+        not told also of what was earned.
     """
 
     world: Any
@@ -363,9 +364,13 @@ def _follow(kind: _Kind, draws: int, world: Any) -> _Followers:
             rest = [jnp.broadcast_to(jnp.asarray(x), probability.shape) for x in told[1:]]
             found = Timestep(told.world, *rest)
         mask = jnp.bool_(True)
+        drawn_again = jax.vmap(seen)(tries)
+        if environment.outcomes is None:  # else what is earned is what they tell
+            paid = jax.vmap(lambda x: _bytes((x.reward, x.cost)))(tries)
+            drawn_again = jnp.concatenate([drawn_again, paid], axis=-1)
         return _Followers(
             _plain(found.world), jax.vmap(seen)(found), probability, found.reward, found.cost,
-            mask, jax.vmap(seen)(tries))
+            mask, drawn_again)
 
     every = jax.vmap(one)(jnp.arange(environment.actions.num, dtype=jnp.int32))  # type: ignore[union-attr]
     mask = allowed_in(environment, world)
@@ -476,7 +481,7 @@ def _check(found: _Followers, base: int, told: bool) -> None:
     for b, a in np.argwhere(differ)[:1]:
         raise ValueError(
             f"tabulate: step is random: action {a} in world {base + b} leads to "
-            f"{len(np.unique(drawn[b, a]))} worlds from {drawn.shape[-1]} keys, and the "
+            f"{len(np.unique(drawn[b, a]))} outcomes from {drawn.shape[-1]} keys, and the "
             "environment does not tell how. Give make_environment(outcomes=...), which tells the "
             "worlds and their probabilities.")
 

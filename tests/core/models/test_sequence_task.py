@@ -131,3 +131,17 @@ def test_events_that_do_not_fit_are_named():
         sequence_environment(letters_at_random(), EVENTS[:, :2], SAMPLER)
     with pytest.raises(ValueError, match="of 4 events, but 2"):
         sequence_environment(letters_at_random(), EVENTS[:2], SAMPLER)
+
+
+def test_starts_of_the_inner_world_are_not_those_of_sequences_and_discounts_are_kept():
+    inner = make_environment(
+        lambda key: jnp.int32(0),
+        lambda place, action, key: Timestep(place, 0.0, False, discount=0.5),
+        lambda place: place[None], actions=2, labels=lambda place: place[None] > 0,
+        propositions=["a"], starts=lambda: (jnp.zeros(1, jnp.int32), jnp.ones(1)))
+    events = events_of(["a"])
+    sampler = sequence_sampler([1], [1], [1], [False, True])
+    made = sequence_environment(inner, events, sampler)
+    assert made.starts is None and made.outcomes is None
+    world = made.reset(jax.random.key(0))
+    assert float(made.step(world, 0, jax.random.key(0)).discount) == 0.5

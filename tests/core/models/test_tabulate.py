@@ -264,3 +264,13 @@ def without_one(p):
 def test_what_cannot_be_listed_is_named(world, options, said):
     with pytest.raises(ValueError, match=said):
         tabulate(world(), **options)
+
+
+def test_a_reward_that_is_drawn_is_refused():
+    """One draw of it would stand in the model as if it were sure."""
+    world = make_environment(
+        lambda key: jnp.int32(0),
+        lambda place, action, key: Timestep((place + action) % 2, jax.random.normal(key), False),
+        lambda place: place[None], actions=2)
+    with pytest.raises(ValueError, match="step is random: action 0 in world 0 leads to 4 outcomes"):
+        tabulate(world)
