@@ -186,6 +186,8 @@ def learn(
     found, history = run_seeds(
         method.algorithm, (seed, num_seeds), method.problem, method.hparams, report,
         num_steps=task.learner["steps"], checkpoint=checkpoint)
+    # One cost of a search is a number like the others.
+    history = {k: v[..., 0] if v.shape[2:] == (1,) else v for k, v in history.items()}
     # No key of the learner's is one of these.
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 2), 3)
     agents = [_agent(setup, found.state, i) for i in range(num_seeds)]

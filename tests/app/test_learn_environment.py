@@ -195,6 +195,7 @@ def test_other_methods(write, tmp_path, method, table, boxed):
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["method"] == method and result["evaluation"]["num_episodes"] == 200
     assert result["evaluation"]["success"]["mean"] > 0.9
+    assert ("cost" in result["training"]["last"]) == ("cost" in path.read_text())
     environment, agent = job.load_policy(path, tmp_path / "out" / "policy.npz")
     again = evaluate(jax.random.key(5), agent, environment, num_episodes=200)
     assert again.success.mean > 0.9
