@@ -514,7 +514,7 @@ def test_problems_that_cannot_be_are_named(make, message):
     ({"num_minibatches": 7}, "num_minibatches=7 does not divide 1024, the number of num_envs"),
     ({"discount": 1.5}, r"discount=1.5; it must lie in \[0, 1\]"),
     ({"clip": float("nan")}, "clip=nan; it must lie"),
-    ({"squash": "cut"}, 'squash=\'cut\'; choose "clip" or "tanh"'),
+    ({"squash": "cut"}, "squash='cut'; choose one of clip, tanh"),
 ])
 def test_settings_that_cannot_be_are_named(options, message):
     with pytest.raises(ValueError, match=message):
