@@ -13,22 +13,18 @@ import json
 import shutil
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 import jaxltl
-from jaxltl.app import programs
+from jaxltl.app import programs, run_job
 from jaxltl.app.drawing import artist
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from jaxltl.app.drawing import Artist, Picture
     from jaxltl.core.automata.automaton import Automaton
 
 
@@ -134,15 +130,16 @@ def learn(
     """
     _begin(f"learning from {task_file}")
     with artist(apart=programs.is_alone()) as begin:  # before anything else, so that it can load
-        job = _job(task_file)
+        job = run_job.job_of(task_file)
         task = job.read_task(task_file)
-        out = _directory(out, task.name)
+        out = _place(out, task.name)
         with _precision(job):
             mark = job.fingerprint(task, seed, seeds)
-            result = None if again else _finished(out, mark)
+            result = None if again else run_job.finished(out, mark)
             done = result is not None
-            result = result or _learn(job, task, out, seed, seeds, mark, begin)
-    click.echo(_report(result).table(result))
+            result = result or run_job.run_job(
+                job, task, out, (seed, seeds), mark, begin, _say)
+    click.echo(run_job.report_of(result).table(result))
     click.echo(f"\n{'done before: see' if done else 'wrote'} {out}/report.html and the files "
                f"beside it{'; --again does it again' if done else ''}")
     if as_json:
@@ -152,137 +149,6 @@ def learn(
 def _precision(job: Any) -> contextlib.AbstractContextManager[None]:
     """Double for solvers; what others have written for simulators is for single precision."""
     return _float64() if job.DOUBLE else contextlib.nullcontext()
-
-
-def _job(task_file: Path) -> Any:
-    """The module that does what a task file asks for."""
-    from jaxltl.app.files.task import method_of
-    from jaxltl.app.files.task_environment import is_environment_task
-
-    if is_environment_task(task_file):
-        from jaxltl.app import learn_environment
-
-        return learn_environment
-    if method_of(task_file) == "todirl":
-        from jaxltl.app import learn_todirl
-
-        return learn_todirl
-    from jaxltl.app import learn
-
-    return learn
-
-
-def _finished(out: Path, mark: str) -> dict[str, Any] | None:
-    """The result of the same task and options, if a directory has it."""
-    try:
-        result = json.loads((out / "result.json").read_text())
-    except (OSError, ValueError):
-        return None
-    same = isinstance(result, dict) and result.get("fingerprint") == mark
-    return result if same and (out / "report.html").exists() else None
-
-
-def _learn(
-    job: Any, task: Any, out: Path, seed: int, seeds: int, mark: str, begin: Artist
-) -> dict[str, Any]:
-    """Does the whole job, shows how far it is, and returns what result.json holds."""
-    from jaxltl.algos.checkpoint import atomic_write
-
-    start = time.perf_counter()
-    setup = job.prepare(task, seed)
-    _say(job.describe(setup))
-    checkpoint = out / f"checkpoint-{mark}.npz"
-    # A place that cannot be written to must be known before the work, not after.
-    with atomic_write(out / "task.toml") as file:
-        file.write(task.path.read_bytes())
-    if checkpoint.exists():
-        _say(f"going on from {checkpoint}")
-    steps = task.learner.get("steps", job.STEPS)
-    with _learning(steps) as bar:
-        pictures = [(p, begin(p.drawing)) for p in job.task_pictures(setup)]
-
-        def report(step: int, figures: Mapping[str, np.ndarray]) -> None:
-            bar.set_description_str("learning", refresh=False)
-            bar.update(step - bar.n)
-            bar.set_postfix(job.postfix(figures))
-
-        try:
-            parts = job.learn(setup, seed, seeds, report=report, checkpoint=checkpoint,
-                              progress=bar.set_description_str)
-        except KeyboardInterrupt:
-            bar.close()
-            kept = "; the same command goes on from the last checkpoint"
-            _say(f"interrupted{kept if checkpoint.exists() else ''}")
-            raise SystemExit(130) from None
-        checkpoint.unlink(missing_ok=True)
-        outcome = job.Outcome(setup, *parts, seed=seed, seconds=time.perf_counter() - start)
-        bar.set_description_str("drawing")
-        pictures += [(p, _begun(begin, p)) for p in job.pictures(outcome)]
-        live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]
-        return _write(job, outcome, out, mark, pictures, live)
-
-
-def _begun(begin: Artist, picture: Picture) -> Callable[[], bytes]:
-    """How to get a picture, which may be drawn already."""
-    drawn: Any = picture.drawing
-    return (lambda: drawn) if isinstance(drawn, bytes) else begin(drawn)
-
-
-@contextlib.contextmanager
-def _learning(total: int) -> Iterator[Any]:
-    """A progress bar that moves each second, whatever the work is at."""
-    from tqdm import tqdm
-
-    done = threading.Event()
-    with tqdm(total=total, unit="step", leave=False, desc="compiling") as bar:
-
-        def tick() -> None:
-            while not done.wait(1):
-                bar.refresh()
-
-        clock = threading.Thread(target=tick, daemon=True)
-        clock.start()
-        try:
-            yield bar
-        finally:
-            done.set()
-            clock.join()
-
-
-def _write(
-    job: Any, outcome: Any, out: Path, mark: str,
-    pictures: list[tuple[Picture, Callable[[], bytes]]],
-    live: list[tuple[Any, dict[str, Callable[[], bytes]]]],
-) -> dict[str, Any]:
-    from jaxltl.algos.checkpoint import atomic_write
-
-    result = {**job.summary(outcome), "fingerprint": mark}
-    job.save(out, outcome)
-    shown = []
-    for picture, drawn in pictures:
-        shown.append((picture, drawn()))
-        with atomic_write(out / picture.name) as file:
-            file.write(shown[-1][1])
-    parts = [(x, {k: drawn().decode() for k, drawn in each.items()}) for x, each in live]
-    page = _report(result).page(result, parts, shown, (out / "task.toml").read_text())
-    with atomic_write(out / "report.html") as file:
-        file.write(page.encode())
-    # Last, so that its presence says that all the rest is there.
-    with atomic_write(out / "result.json") as file:
-        file.write((json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
-    return result
-
-
-def _report(result: Mapping[str, Any]) -> Any:
-    """The module that shows a result."""
-    from jaxltl.app.files.task_environment import METHODS
-    from jaxltl.app.reports import learn as report
-    from jaxltl.app.reports import learn_environment as report_environment
-    from jaxltl.app.reports import learn_todirl as report_todirl
-
-    if result["method"] in METHODS:
-        return report_environment
-    return report_todirl if result["method"] == "todirl" else report
 
 
 @main.command()
@@ -302,7 +168,7 @@ def check(task_file: Path) -> None:
         play, _ = game.load_objective(file, world)
         click.echo(f"ok: {world.game.num_states} states, {play.num_states} with the task's memory")
         return
-    job = _job(task_file)
+    job = run_job.job_of(task_file)
     with _precision(job):
         setup = job.prepare(job.read_task(task_file), seed=0)
     click.echo(f"ok: {job.describe(setup)}")
@@ -339,7 +205,7 @@ def synthesize(
     from jaxltl.app.reports import synthesize as report
 
     file = read_game(game_file)
-    out = _directory(out, file.name)
+    out = run_job.make_directory(_place(out, file.name))
     # A place that cannot be written to must be known before the work, not after.
     with atomic_write(out / "game.toml") as copy:
         copy.write(game_file.read_bytes())
@@ -358,16 +224,9 @@ def synthesize(
     synthesis.demand(found)
 
 
-def _directory(out: Path | None, name: str) -> Path:
-    """The directory for results, made if it is not there."""
-    out = out or Path("out") / name.replace(" ", "_")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(
-            f"cannot write into {str(out)!r}: {error.strerror}; choose another with --out."
-        ) from None
-    return out
+def _place(out: Path | None, name: str) -> Path:
+    """The directory for results, which may still have to be made."""
+    return out or Path("out") / name.replace(" ", "_")
 
 
 @contextlib.contextmanager

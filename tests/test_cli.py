@@ -306,6 +306,7 @@ def test_a_task_that_cannot_be_done_from_some_start(write, tmp_path):  # noqa: F
 ])
 def test_mistakes_come_as_one_line(write, tmp_path, replacement, message):  # noqa: F811
     assert message in failure("learn", write(replacement), "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_places_that_cannot_be_used(write, tmp_path):  # noqa: F811

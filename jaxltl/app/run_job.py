@@ -1,0 +1,176 @@
+"""A job of learning from a task file to a directory of results: shown, and gone on from.
+
+A job is a module such as :mod:`jaxltl.app.learn`, with its `Outcome` and its functions by the same
+names. Heavy modules are imported inside, so that the command's first line comes at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from jaxltl.app.drawing import Artist, Picture
+
+
+def job_of(task_file: Path) -> Any:
+    """The module that does what a task file asks for."""
+    from jaxltl.app.files.task import method_of
+    from jaxltl.app.files.task_environment import is_environment_task
+
+    if is_environment_task(task_file):
+        from jaxltl.app import learn_environment
+
+        return learn_environment
+    if method_of(task_file) == "todirl":
+        from jaxltl.app import learn_todirl
+
+        return learn_todirl
+    from jaxltl.app import learn
+
+    return learn
+
+
+def finished(out: Path, mark: str) -> dict[str, Any] | None:
+    """The result of the same task and options, if a directory has it."""
+    try:
+        result = json.loads((out / "result.json").read_text())
+    except (OSError, ValueError):
+        return None
+    same = isinstance(result, dict) and result.get("fingerprint") == mark
+    return result if same and (out / "report.html").exists() else None
+
+
+def make_directory(out: Path) -> Path:
+    """A directory for results, made if it is not there.
+
+    Raises:
+      ValueError: it cannot be made.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(
+            f"cannot write into {str(out)!r}: {error.strerror}; choose another with --out."
+        ) from None
+    return out
+
+
+def run_job(
+    job: Any, task: Any, out: Path, seeds: tuple[int, int], mark: str, begin: Artist,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """Does the whole job, shows how far it is, and returns what ``result.json`` holds.
+
+    Args:
+      job: of :func:`job_of`; `task` is what its ``read_task`` gives.
+      out: the directory of results, in which an interrupted job leaves its checkpoint.
+      seeds: the first, and how many.
+      mark: the job's fingerprint, which a checkpoint must have to be gone on from.
+      begin: begins to draw a picture.
+      say: takes lines on how far it is.
+    """
+    from jaxltl.algos.checkpoint import atomic_write
+
+    start = time.perf_counter()
+    setup = job.prepare(task, seeds[0])
+    say(job.describe(setup))
+    checkpoint = make_directory(out) / f"checkpoint-{mark}.npz"
+    # A place that cannot be written to must be known before the work, not after.
+    with atomic_write(out / "task.toml") as file:
+        file.write(task.path.read_bytes())
+    if checkpoint.exists():
+        say(f"going on from {checkpoint}")
+    steps = task.learner.get("steps", job.STEPS)
+    with _learning(steps) as bar:
+        pictures = [(p, begin(p.drawing)) for p in job.task_pictures(setup)]
+
+        def report(step: int, figures: Mapping[str, np.ndarray]) -> None:
+            bar.set_description_str("learning", refresh=False)
+            bar.update(step - bar.n)
+            bar.set_postfix(job.postfix(figures))
+
+        try:
+            parts = job.learn(setup, *seeds, report=report, checkpoint=checkpoint,
+                              progress=bar.set_description_str)
+        except KeyboardInterrupt:
+            bar.close()
+            kept = "; the same command goes on from the last checkpoint"
+            say(f"interrupted{kept if checkpoint.exists() else ''}")
+            raise SystemExit(130) from None
+        checkpoint.unlink(missing_ok=True)
+        outcome = job.Outcome(setup, *parts, seed=seeds[0], seconds=time.perf_counter() - start)
+        bar.set_description_str("drawing")
+        pictures += [(p, _begun(begin, p)) for p in job.pictures(outcome)]
+        live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]
+        return _write(job, outcome, out, mark, pictures, live)
+
+
+def _begun(begin: Artist, picture: Picture) -> Callable[[], bytes]:
+    """How to get a picture, which may be drawn already."""
+    drawn: Any = picture.drawing
+    return (lambda: drawn) if isinstance(drawn, bytes) else begin(drawn)
+
+
+@contextlib.contextmanager
+def _learning(total: int) -> Iterator[Any]:
+    """A progress bar that moves each second, whatever the work is at."""
+    from tqdm import tqdm
+
+    done = threading.Event()
+    with tqdm(total=total, unit="step", leave=False, desc="compiling") as bar:
+
+        def tick() -> None:
+            while not done.wait(1):
+                bar.refresh()
+
+        clock = threading.Thread(target=tick, daemon=True)
+        clock.start()
+        try:
+            yield bar
+        finally:
+            done.set()
+            clock.join()
+
+
+def _write(
+    job: Any, outcome: Any, out: Path, mark: str,
+    pictures: list[tuple[Picture, Callable[[], bytes]]],
+    live: list[tuple[Any, dict[str, Callable[[], bytes]]]],
+) -> dict[str, Any]:
+    from jaxltl.algos.checkpoint import atomic_write
+
+    result = {**job.summary(outcome), "fingerprint": mark}
+    job.save(out, outcome)
+    shown = []
+    for picture, drawn in pictures:
+        shown.append((picture, drawn()))
+        with atomic_write(out / picture.name) as file:
+            file.write(shown[-1][1])
+    parts = [(x, {k: drawn().decode() for k, drawn in each.items()}) for x, each in live]
+    page = report_of(result).page(result, parts, shown, (out / "task.toml").read_text())
+    with atomic_write(out / "report.html") as file:
+        file.write(page.encode())
+    # Last, so that its presence says that all the rest is there.
+    with atomic_write(out / "result.json") as file:
+        file.write((json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
+    return result
+
+
+def report_of(result: Mapping[str, Any]) -> Any:
+    """The module that shows a result."""
+    from jaxltl.app.files.task_environment import METHODS
+    from jaxltl.app.reports import learn as report
+    from jaxltl.app.reports import learn_environment as report_environment
+    from jaxltl.app.reports import learn_todirl as report_todirl
+
+    if result["method"] in METHODS:
+        return report_environment
+    return report_todirl if result["method"] == "todirl" else report
