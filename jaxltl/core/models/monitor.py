@@ -78,6 +78,28 @@ def verdicts(automaton: Automaton) -> np.ndarray:
     return table
 
 
+def lasting_verdicts(automaton: Automaton) -> np.ndarray:
+    """``int32[Q, L]``: the verdict on a word that led to a state, if one letter repeats for ever.
+
+    Of a world that terminates: the state after its last label, and the letter of that label. It is
+    never undecided. On the host.
+
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> lasting_verdicts(to_automaton("G F a"))[0].tolist()
+      [2, 1]
+    """
+    delta, least = np.asarray(automaton.delta), np.asarray(automaton.priority)
+    # The state after 2^n readings of one letter, and the least priority among them. After as many
+    # as there are states the run is on its cycle, and as many more read all of it.
+    letter = np.arange(delta.shape[1])
+    for _ in range(len(delta).bit_length()):
+        least = np.minimum(least, least[delta, letter])
+        delta = delta[delta, letter]
+    even = least[delta, letter] % 2 == 0
+    return np.where(even, Verdict.SATISFIED, Verdict.VIOLATED).astype(np.int32)
+
+
 def make_monitor(automaton: Automaton) -> Monitor:
     """The monitor of an automaton, with any acceptance; made on the host.
 

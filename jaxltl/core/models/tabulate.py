@@ -45,9 +45,11 @@ class Table:
         before, as :func:`~jaxltl.core.values.optimality_gap.optimality_gap` does.
       num_steps: the limit of :func:`~jaxltl.core.models.time_limit.with_time_limit`, which is no
         part of the states; None: there is none; static.
-      evidence: why the probabilities are the environment's; static. ``"told"``: by its
-        `outcomes`, which agreed with what was drawn; ``"keyless"``: nothing depends on a key, read
-        off the program; ``"keys"``: all keys that were tried led to the same.
+      evidence: why the probabilities are the environment's; static. ``"keyless"``: nothing depends
+        on a key, read off the program; ``"told"``: by its `starts` and `outcomes`, which agreed
+        with what was drawn; ``"keys"``: all keys that were tried led to the same; ``"distinct"``:
+        the caller says so, as the program does not rule out that something depends on what
+        `distinct` leaves out. Where several hold, the last of them in this order.
     """
 
     model: SparseMDP
@@ -85,8 +87,9 @@ def tabulate(
       max_states: how many states there may be.
       num_keys: how many keys are tried.
       key: of the keys; default ``jax.random.key(0)``.
-      distinct: ``world -> tree``, what tells worlds apart; default everything. Leave out what has
-        no part in what follows, like keys and counters that a world carries along.
+      distinct: ``world -> tree``, what tells worlds apart; default everything. Leave out only what
+        has no part in what follows, like a counter, or a key from which nothing is drawn. The rest
+        as it is, and the program shows that; else it is your word, and `evidence` says so.
 
     Returns:
       :class:`Table`.
@@ -124,6 +127,8 @@ def tabulate(
         evidence = "keys"
     elif "told" in (evidence, listed.evidence):
         evidence = "told"
+    if not _left_out_is_idle(kind):
+        evidence = "distinct"
     initial = np.zeros(len(listed.ended))
     np.add.at(initial, listed.start, probability)
     world = _joined(listed.world)
@@ -256,16 +261,24 @@ def _told_apart(kind: _Kind, plain: Any) -> np.ndarray:
 def _fits(worlds: Any, shape: Any) -> bool:
     same: Any = jax.tree.structure(shape)
     return same == jax.tree.structure(worlds) and all(
-        np.shape(x)[1:] == y.shape for x, y in zip(
+        np.shape(x)[1:] == y.shape and _same_type(x, y) for x, y in zip(
             jax.tree.leaves(worlds), jax.tree.leaves(shape), strict=True))
+
+
+def _same_type(x: Any, like: Any) -> bool:
+    """In single precision also of NumPy's numbers of double precision."""
+    kind = getattr(x, "dtype", None)
+    return kind == like.dtype or (
+        isinstance(kind, np.dtype) and kind.kind in "biufc"
+        and jax.dtypes.canonicalize_dtype(kind) == like.dtype)
 
 
 def _count(name: str, worlds: Any, shape: Any) -> int:
     lengths = {np.shape(x)[:1] for x in jax.tree.leaves(worlds)}
     if not _fits(worlds, shape) or len(lengths) != 1 or lengths & {(), (0,)}:
         raise ValueError(
-            f"{name}: give worlds as reset returns them, each array with a first axis more, of the "
-            "same length.")
+            f"{name}: give worlds as reset returns them, each array of its type, with a first axis "
+            "more, of the same length.")
     return int(lengths.pop()[0])
 
 
@@ -299,6 +312,29 @@ def _marked(program: Any, given: list[bool]) -> list[bool]:
             written = _marked(part.jaxpr, reads)
         marks |= {id(x) for x, mark in zip(line.outvars, written, strict=True) if mark}
     return [id(x) in marks for x in program.outvars]
+
+
+def _left_out_is_idle(kind: _Kind) -> bool:
+    """Whether nothing that is listed depends on what `distinct` leaves out; True is a proof."""
+    environment = kind.environment
+
+    def listed(world: Any, action: Any, key: Any) -> Any:
+        found = Timestep(*environment.step(world, action, key))
+        told = None
+        if environment.outcomes is not None:
+            each, probability = environment.outcomes(world, action)
+            told = jax.vmap(kind.distinct)(each[0]), tuple(each)[1:5], probability
+        mask = allowed_in(environment, world)
+        return kind.distinct(found.world), found[1:5], told, mask, environment.labels(world)
+
+    shown = jax.make_jaxpr(kind.distinct)(kind.like).jaxpr
+    kept = {id(x) for x in shown.outvars}  # as they are; of a part of an array nothing is known
+    left = [id(x) not in kept for x in shown.invars]
+    if not any(left):
+        return True
+    action = jax.ShapeDtypeStruct((), jnp.int32)
+    program = jax.make_jaxpr(listed)(kind.like, action, kind.keys[0]).jaxpr
+    return not any(_marked(program, left + [False] * (len(program.invars) - len(left))))
 
 
 # --- the search -----------------------------------------------------------------------------------
@@ -388,6 +424,8 @@ def _search(kind: _Kind, begun: Any, max_states: int) -> _Listed:
     shape = kind.like
     action = jax.ShapeDtypeStruct((), jnp.int32)
     told = environment.outcomes is not None
+    if environment.outcomes is not None:
+        _count("outcomes", jax.eval_shape(environment.outcomes, shape, action)[0][0], shape)
     keyless = not told and not reads_key(environment.step, shape, action, kind.keys[0])
     draws = 1 if keyless else len(kind.keys)
     width = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(

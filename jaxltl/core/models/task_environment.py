@@ -37,7 +37,7 @@ from jaxltl.core.models.environment import (
     require_environment,
 )
 from jaxltl.core.models.finite_task import make_finite_task
-from jaxltl.core.models.monitor import Verdict, verdicts
+from jaxltl.core.models.monitor import Verdict, lasting_verdicts, verdicts
 from jaxltl.core.models.product import Names
 from jaxltl.core.models.task_reward import Pay, pay_of
 
@@ -166,7 +166,7 @@ def make_task_tables(
     return TaskTables(
         weight=weight, letter=np.asarray(reading.letter),
         delta=np.asarray(automaton.delta, np.int32), initial=np.int32(automaton.initial),
-        verdict=decisions, repeated=_at_the_end(automaton, decisions, ending),
+        verdict=decisions, repeated=_at_the_end(automaton, ending),
         accepting=pay.accepting, reward=pay.reward.astype(number),
         discount=pay.discount.astype(number), decided=pay.decided.astype(number),
         potential=pay.potential.astype(number),
@@ -494,20 +494,12 @@ def _of_world(function: Callable[..., Any], joint: TaskWorld) -> Any:
 # --- tables ---------------------------------------------------------------------------------------
 
 
-def _at_the_end(automaton: Automaton, decisions: np.ndarray, ending: str) -> np.ndarray:
+def _at_the_end(automaton: Automaton, ending: str) -> np.ndarray:
     """``int32[Q, L]``: the verdict of a world that ends in a state after a letter."""
-    delta, least = np.asarray(automaton.delta), np.asarray(automaton.priority)
-    if ending != "repeat":
-        verdict = Verdict.VIOLATED if ending == "violated" else Verdict.UNDECIDED
-        return np.full(delta.shape, verdict, np.int32)
-    # The state after 2^n readings of one letter, and the least priority among them. After as many
-    # as there are states the run is on its cycle, and as many more read all of it.
-    letter = np.arange(delta.shape[1])
-    for _ in range(len(delta).bit_length()):
-        least = np.minimum(least, least[delta, letter])
-        delta = delta[delta, letter]
-    even = least[delta, letter] % 2 == 0
-    return np.where(even, Verdict.SATISFIED, Verdict.VIOLATED).astype(np.int32)
+    if ending == "repeat":
+        return lasting_verdicts(automaton)
+    verdict = Verdict.VIOLATED if ending == "violated" else Verdict.UNDECIDED
+    return np.full(np.shape(automaton.delta), verdict, np.int32)
 
 
 def _padded(tables: Sequence[TaskTables]) -> list[TaskTables]:

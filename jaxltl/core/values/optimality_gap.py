@@ -17,7 +17,7 @@ from jaxltl.core.host import given
 from jaxltl.core.host.product import host_product
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.environment import Environment, as_partial
-from jaxltl.core.models.monitor import Verdict, verdicts
+from jaxltl.core.models.monitor import Verdict, lasting_verdicts, verdicts
 from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.models.product import product
 from jaxltl.core.models.tabulate import Table
@@ -42,6 +42,8 @@ class OptimalityGap(NamedTuple):
       lower, upper: ``float64[N]``, bounds on the gap, optimum minus value.
       mean: bounds on the mean gap over the beginnings.
       mean_value, mean_optimum: bounds on theirs.
+      evidence: why the table is the environment, on which all bounds rest; see
+        :class:`~jaxltl.core.models.tabulate.Table`.
     """
 
     start: np.ndarray
@@ -53,6 +55,7 @@ class OptimalityGap(NamedTuple):
     mean: tuple[float, float]
     mean_value: tuple[float, float]
     mean_optimum: tuple[float, float]
+    evidence: str
 
 
 def tabulate_policy(
@@ -104,15 +107,16 @@ def optimality_gap(
     """The best probability of a task minus an agent's, from each beginning, with bounds on it.
 
     Both are of doing the task for sure within so many steps, ``P(some prefix of n steps at most is
-    such that every continuation satisfies it)``: what an episode of a length of n counts as
-    success. They are step-bounded reachability in the product of the table and the task (Baier and
-    Katoen 2008, section 10.1.1), enclosed with their rounding; exactly 0 or 1 where the graph says
-    so. The agent decides by the world and the automaton's state alone; the optimum is that of all
-    policies, also of those that know the time. Without a limit of steps both are the
-    probabilities of the task, by the exact solvers.
+    such that every continuation satisfies it)``: what an episode of n steps at most of
+    :func:`~jaxltl.core.models.task_environment.task_environment` counts as success. They are
+    step-bounded reachability in the product of the table and the task (Baier and Katoen 2008,
+    section 10.1.1), enclosed with their rounding; exactly 0 or 1 where the graph says so. The agent
+    decides by the world and the automaton's state alone; the optimum is that of all policies, also
+    of those that know the time. Without a limit of steps both are the probabilities of the task, by
+    the exact solvers.
 
-    An episode that ends by itself stays where it is, and its last label repeats. One that the
-    environment cuts off has had its steps.
+    An episode that ends by itself stays where it is, and its last label repeats: that is then its
+    one continuation. One that the environment cuts off has had its steps.
 
     Args:
       table: from :func:`~jaxltl.core.models.tabulate.tabulate`.
@@ -167,7 +171,8 @@ def optimality_gap(
     upper = np.maximum(np.where(sure, above, np.nextafter(above, np.inf)), 0)
     return OptimalityGap(
         start.astype(np.int32), weight, value, optimum, lower, upper,
-        _mean(weight, lower, upper), _mean(weight, *own), _mean(weight, *best))
+        _mean(weight, lower, upper), _mean(weight, *own), _mean(weight, *best),
+        table.evidence)
 
 
 def _rows_of(policy: Any) -> np.ndarray:
@@ -185,16 +190,17 @@ def _bounded(
     table: Table, model: Any, task: Automaton, policy: np.ndarray, start: np.ndarray, steps: int
 ) -> tuple[Any, Any]:
     """The agent's probability and the best within so many steps, from each beginning."""
-    base, decisions = table.model.host, verdicts(task)
+    base, decisions, letter = table.model.host, verdicts(task), np.asarray(model.letter)
     found = host_product(
-        base, np.asarray(task.delta), np.asarray(model.letter), start,
+        base, np.asarray(task.delta), letter, start,
         np.asarray(model.initial_memory)[start], still=decisions != Verdict.UNDECIDED)
-    target = decisions[found.memory] == Verdict.SATISFIED
+    ended = np.asarray(table.terminated)[found.base_state]
+    at_end = lasting_verdicts(task)[found.memory, letter[found.base_state]]
+    target = np.where(ended, at_end, decisions[found.memory]) == Verdict.SATISFIED
     going = ~np.asarray(table.truncated)[found.base_state]
     best = host.until(found.host, target, going, steps, np.maximum)
     single = np.diff(base.row_start)[found.base_state] == 1
-    fixed = found.still | (single & (
-        np.asarray(table.truncated) | np.asarray(table.terminated))[found.base_state])
+    fixed = found.still | (single & (ended | ~going))
     weight = _weights(
         policy, np.asarray(table.model.action)[found.base_row],
         found.base_state, found.memory, found.host, fixed)

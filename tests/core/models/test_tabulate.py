@@ -213,6 +213,43 @@ def test_what_tells_worlds_apart():
         tabulate(world, max_states=50)
 
 
+def test_what_distinct_leaves_out_is_idle_or_the_callers_word():
+    def drawn(world, action, key):
+        place, carried = world
+        now, carried = jax.random.split(carried)
+        return Timestep(((place + jax.random.bernoulli(now)) % 3, carried), 0.0, False)
+
+    def told(world, action):
+        places = (world[0] + jnp.arange(2, dtype=jnp.int32)) % 3
+        carried = jax.random.split(world[1])
+        return Timestep((places, carried), jnp.zeros(2), jnp.zeros(2, bool)), jnp.full(2, 0.5)
+
+    def start(key):
+        return jnp.int32(0), jax.random.key(5)
+
+    def evidence(step, reset=start, distinct=lambda x: x[0], **options):
+        return tabulate(make_environment(
+            reset, step, lambda x: jnp.float32(x[0]), actions=2, **options),
+            distinct=distinct).evidence
+
+    def idle(world, action, key):
+        return Timestep(((world[0] + action) % 3, world[1]), 0.0, False)
+
+    assert evidence(drawn) == "distinct"  # of 2^n draws one was listed, as if it were sure
+    assert evidence(idle) == "keyless"
+    assert evidence(idle, distinct=lambda x: x[0] * 2) == "distinct"  # may be, but is not shown
+    assert evidence(
+        lambda x, a, key: idle(x, a, key)._replace(reward=1.0 * x[1]),
+        lambda key: (jnp.int32(0), jnp.int32(1))) == "distinct"
+    assert evidence(
+        idle, lambda key: (jnp.int32(0), jnp.int32(1)),
+        labels=lambda x: x[1][None] == 1, propositions=["one"]) == "distinct"
+    by_key = jax.random.bernoulli
+    assert evidence(lambda x, a, key: told(x, a)[0]._replace(
+        world=((x[0] + by_key(key)) % 3, x[1]), reward=0.0, terminated=False),
+        outcomes=told) == "told"
+
+
 def test_another_layout_is_not_compiled_anew():
     cells = np.full((3, 3), -1)
     cells[0, 1] = 0
