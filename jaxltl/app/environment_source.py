@@ -115,6 +115,10 @@ def _function(name: str, folder: Path) -> Callable[..., Any]:
 
 
 def _module(name: str) -> Any:
+    if not all(part.isidentifier() for part in name.split(".")):
+        raise ValueError(
+            f"{name!r} is neither the name of a module, package.module, nor that of a file, "
+            "file.py.")
     try:
         return importlib.import_module(name)
     except ImportError as problem:
@@ -124,7 +128,7 @@ def _module(name: str) -> Any:
         raise ValueError(
             f"there is no module {name!r}: {problem}. Install its package, or name a file beside "
             'the task file, "file.py:function".') from None
-    except Exception as problem:
+    except (Exception, SystemExit) as problem:
         raise ValueError(_told(name, problem)) from problem
 
 
@@ -140,7 +144,7 @@ def _module_of_file(path: Path) -> Any:
     sys.modules[path.stem] = module  # where dataclasses look for their module
     try:
         spec.loader.exec_module(module)
-    except Exception as problem:
+    except (Exception, SystemExit) as problem:
         raise ValueError(_told(path.name, problem)) from problem
     finally:
         sys.path.pop(0)
@@ -154,14 +158,17 @@ def _theirs(name: str) -> Iterator[None]:
     """Errors of somebody else's function, told with the place that they come from."""
     try:
         yield
-    except Exception as problem:
+    except (Exception, SystemExit) as problem:
         raise ValueError(_told(name, problem)) from problem
 
 
-def _told(name: str, problem: Exception) -> str:
-    last = (traceback.extract_tb(problem.__traceback__) or [None])[-1]
-    text = str(problem).strip().rstrip(".")
+def _told(name: str, problem: BaseException) -> str:
+    """An error in one line: that of many says first what is wrong."""
+    text = (str(problem).strip().splitlines() or [""])[0].rstrip(".: ")
     if isinstance(problem, ValueError):
         return f"{name!r}: {text}."
-    where = "" if last is None else f" ({Path(last.filename).name}, line {last.lineno})"
-    return f"{name!r} raises {type(problem).__name__}: {text}{where}."
+    places = traceback.extract_tb(problem.__traceback__)
+    # A SyntaxError names its own place.
+    where = "" if isinstance(problem, SyntaxError) or not places else (
+        f" ({Path(places[-1].filename).name}, line {places[-1].lineno})")
+    return f"{name!r} raises {type(problem).__name__}{': ' if text else ''}{text}{where}."

@@ -53,7 +53,7 @@ def is_list(value: Any, kind: type | tuple[type, ...]) -> bool:
 
 
 def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MOST
 
 
 TEXT = Rule(lambda v: isinstance(v, str) and bool(v.strip()), "a text")
@@ -63,7 +63,8 @@ NAME = Rule(
     "a plain name of letters, digits, spaces, -, _ and ., that begins with neither a dot nor a "
     "space",
 )
-COUNT = Rule(_is_count, "a whole number of at least 1")
+MOST = 2**31 - 1  # that a compiled program counts to
+COUNT = Rule(_is_count, f"a whole number of at least 1 and at most {MOST}")
 NUMBER = Rule(is_number, "a finite number")
 TRUTH = Rule(lambda v: isinstance(v, bool), "true or false")
 TABLE = Rule(lambda v: isinstance(v, dict), "a table")
@@ -219,8 +220,8 @@ def check_table(
         if key not in known:
             guess = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
             raise ValueError(
-                f"{where} has no key {key!r}; "
-                + (f"did you mean {guess[0]!r}? " if guess else "")
+                f"{where} has no key {key!r}"
+                + (f"; did you mean {guess[0]!r}? " if guess else ". ")
                 + f"Its keys are {', '.join(known)}."
             )
         if not known[key].holds(value):

@@ -158,9 +158,9 @@ def _check_method(path: Path, data: Mapping[str, Any], method: str) -> None:
         method == "cpo" and "limit" not in settings,
         "lacks limit, which the expected cost of an episode is to keep to")])
     tables.reject(path, "cce", [
-        ("limit" in settings and "cost" not in settings,
+        (method == "cce" and "limit" in settings and "cost" not in settings,
          'limit is that of a cost: give cost = "failure", "violation" or another score'),
-        ("cost" in settings and "limit" not in settings,
+        (method == "cce" and "cost" in settings and "limit" not in settings,
          "cost needs a limit, which it is to keep to")])
     tables.reject(path, "world", [(
         ("labels" in world) != ("propositions" in world),
