@@ -17,6 +17,7 @@ from jaxltl.core.host.sparse import Floats
 
 _SMALL = 3000  # states of a component up to which it may be filled
 _LARGE = 3000  # states of a component from which
+_SEVERAL = 1.5  # mean number of successors, fewer of which are nearly trees and fill little,
 _NARROW = 40  # and mean bandwidth beyond which it fills less to begin with those of least degree
 _SPREAD = 8  # how many times its mean bandwidth a larger one must have states
 _MOST = 2**28  # entries that may be filled, 12 bytes each
@@ -198,7 +199,8 @@ def _block(
         return _Block(order, inner, outer, None, 0)
     # In one large component those of least degree may go first (Liu 1985).
     most = np.bincount(label[order]).max(initial=0)
-    wide = most > max(order.size / 2, _LARGE) and _bandwidth(inner) > _NARROW
+    wide = (most > max(order.size / 2, _LARGE) and inner.nnz > _SEVERAL * order.size
+            and _bandwidth(inner) > _NARROW)
     try:
         factor = linalg.splu(
             _minus(inner).T, permc_spec="MMD_AT_PLUS_A" if wide else "NATURAL",

@@ -28,6 +28,7 @@ def random_rows(rng, size, components):
 def test_solutions(way, monkeypatch):
     if way == "by degree":
         monkeypatch.setattr(elimination, "_LARGE", 0)
+        monkeypatch.setattr(elimination, "_SEVERAL", 0)
         monkeypatch.setattr(elimination, "_NARROW", -1)
     if way == "apart":
         monkeypatch.setattr(elimination, "_MOST_BETWEEN", -1)
