@@ -24,6 +24,7 @@ _MOST = 2**28  # entries that may be filled, 12 bytes each
 _MOST_BETWEEN = 10**7  # of these, between components that are eliminated together
 _APART = 500  # states from which a component is eliminated alone, if they are not
 _SAMPLED = 64  # rows in which what fills is counted where its bound is too large
+_PANEL = 2  # columns that are eliminated at once: each wants room for a full one
 _FILL = 4  # growth of the fill after which the order is sought anew
 _KRYLOV = 500  # steps of a Krylov method where elimination would fill
 _SWEEPS = 20_000  # and sweeps after it
@@ -204,7 +205,7 @@ def _block(
     try:
         factor = linalg.splu(
             _minus(inner).T, permc_spec="MMD_AT_PLUS_A" if wide else "NATURAL",
-            diag_pivot_thresh=0, options={"SymmetricMode": True})
+            diag_pivot_thresh=0, relax=1, panel_size=_PANEL, options={"SymmetricMode": True})
     except (RuntimeError, MemoryError):
         return None
     return _Block(order, inner, outer, factor, int(factor.nnz))
@@ -221,8 +222,8 @@ def _bandwidth(matrix: Any) -> float:
 def _first_entries(source: Integers, target: Integers, size: int) -> tuple[Integers, Integers]:
     """Where the first entry of each row, and of each column, stands; at most at the diagonal."""
     left, top = np.arange(size), np.arange(size)
-    np.minimum.at(left, source, target)
-    np.minimum.at(top, target, source)
+    np.minimum.at(left, source, target.astype(left.dtype))  # of one type, which is far faster
+    np.minimum.at(top, target, source.astype(top.dtype))
     return left, top
 
 

@@ -135,8 +135,8 @@ def distinct(number: Integers, size: int) -> Integers:
 
 def count_down(counter: Integers, number: Integers) -> None:
     """Takes one from a counter for each time that its number stands, in place."""
-    if number.size < counter.size // 16:
-        np.subtract.at(counter, number, 1)
+    if number.size < counter.size:
+        np.subtract.at(counter, number, counter.dtype.type(1))  # another type is far slower
     else:
         counter -= np.bincount(number, minlength=counter.size).astype(counter.dtype)
 
