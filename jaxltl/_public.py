@@ -43,6 +43,7 @@ from jaxltl.core.models.environment import (
 )
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows, make_interval
+from jaxltl.core.models.lanes import on_host, vmap_over_mesh
 from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp, to_dense
 from jaxltl.core.models.monitor import Monitor, Verdict, make_monitor, monitor_step, verdict
 from jaxltl.core.models.operators import (
@@ -272,6 +273,7 @@ __all__ = [
     "multi",
     "next_probability",
     "occupancy_measure",
+    "on_host",
     "optimal_actions",
     "optimal_satisfaction",
     "optimal_value",
@@ -340,6 +342,7 @@ __all__ = [
     "total_reward",
     "verdict",
     "verify",
+    "vmap_over_mesh",
     "what_is_left",
     "winning_region",
     "with_allowed",

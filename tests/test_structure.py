@@ -54,7 +54,7 @@ PUBLIC = [
     "letters", "lift_memory", "lift_policy", "lift_trajectories", "machine_reward",
     "make_automaton", "make_counts", "make_environment", "make_game", "make_interval", "make_mdp",
     "make_monitor", "make_parametric", "make_sparse", "make_trajectories", "mean_payoff",
-    "minimax_value", "monitor_step", "multi", "next_probability", "occupancy_measure",
+    "minimax_value", "monitor_step", "multi", "next_probability", "occupancy_measure", "on_host",
     "optimal_actions", "optimal_satisfaction", "optimal_value", "optimality_gap", "pareto",
     "parity", "parse_ltl", "permissive_strategy", "policy_value", "prepare", "prepare_interval",
     "product", "project_policy", "project_trajectories", "proposition_sets", "pushforward", "reach",
@@ -68,8 +68,8 @@ PUBLIC = [
     "sparse_satisfaction", "stack_products", "stack_tasks", "states_where", "step_or_reset",
     "strategy_value", "synchronize", "tabulate", "tabulate_policy", "task_environment",
     "task_performance", "task_performances", "to_automaton", "to_dense", "to_padded", "to_sparse",
-    "to_stormpy", "total_reward", "verdict", "verify", "what_is_left", "winning_region",
-    "with_allowed", "with_time_limit", "write_hoa", "write_model", "zone_world",
+    "to_stormpy", "total_reward", "verdict", "verify", "vmap_over_mesh", "what_is_left",
+    "winning_region", "with_allowed", "with_time_limit", "write_hoa", "write_model", "zone_world",
 ]
 
 
