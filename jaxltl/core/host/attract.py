@@ -10,6 +10,7 @@ import numpy as np
 from jaxltl.core.host.rows import (
     Booleans,
     Integers,
+    changes,
     count_down,
     distinct,
     first_action,
@@ -187,7 +188,7 @@ def _join_pairs(worklist: _Worklist, pairs: Integers) -> Integers:
     rule, open_, action, region, rank = flat
     joins = (rule[state] | (remaining[state] == 0)) & open_[state]
     state, a = state[joins], a[joins]
-    first = np.diff(state, prepend=-1) > 0  # pairs are in order, so one state's stand together
+    first = changes(state)  # pairs are in order, so one state's stand together
     frontier = state[first]
     action[frontier] = a[first]
     open_[frontier], region[frontier], rank[frontier] = False, True, search.round

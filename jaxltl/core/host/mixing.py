@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxltl.core.host import transient
 from jaxltl.core.host.relaxation import Relaxed, Sums, cut, relaxed
-from jaxltl.core.host.rows import Booleans, spans
+from jaxltl.core.host.rows import Booleans, changes, spans
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.transient import Enclosed, Transient
 
@@ -73,7 +73,7 @@ def _without_loops(problem: Transient) -> tuple[Floats, Booleans | None]:
     weight = mdp.probability.copy()
     weight[loop] = 0
     of = mdp.row[loop]
-    first = loop[np.diff(of, prepend=-1) > 0]  # a row may repeat its successors
+    first = loop[changes(of)]  # a row may repeat its successors
     row = mdp.row[first]
     width = np.diff(mdp.entry_start)[row]
     entry = spans(mdp.entry_start[row], width)

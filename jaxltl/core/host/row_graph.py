@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxltl.core.host.components import strong_components
 from jaxltl.core.host.graph import HostGraph
-from jaxltl.core.host.rows import Booleans, Integers, count_down, distinct, spans
+from jaxltl.core.host.rows import Booleans, Integers, changes, count_down, distinct, spans
 from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.host.sparse_graph import end_components
 
@@ -79,7 +79,7 @@ class RowGraph:
             joins = (rule[state] | (left[state] == 0)) & open_[state]
             state, hit = state[joins], hit[joins]
             # Rows are in order, so one state's stand together.
-            first = np.diff(state, prepend=-1) > 0
+            first = changes(state)
             frontier = state[first]
             row[frontier] = hit[first]
             if round_ == 1:

@@ -104,8 +104,9 @@ class Rows:
 def spans(start: Integers, count: Integers) -> Integers:
     """The numbers ``start[i], ..., start[i] + count[i] - 1`` of all spans in a row."""
     end = count.cumsum()
-    total = int(end[-1]) if end.size else 0
-    return np.arange(total) + np.repeat(start - end + count, count)
+    found = (start - end + count).repeat(count)
+    found += np.arange(found.size)
+    return found
 
 
 def starts_of(count: Integers) -> Integers:
@@ -125,12 +126,23 @@ def distinct(number: Integers, size: int) -> Integers:
     >>> distinct(np.array([3, 1, 3]), 5).tolist()
     [1, 3]
     """
-    if number.size < size // 8:
+    if number.size < size // 16:
         number = np.sort(number)
-        return number[np.diff(number, prepend=-1) > 0]
+        return number[changes(number)]
     mark = np.zeros(size, bool)
     mark[number] = True
     return np.flatnonzero(mark)
+
+
+def changes(number: Integers) -> Booleans:
+    """Whether each number is another one than the number before it: ``bool[N]``.
+
+    >>> changes(np.array([1, 1, 3])).tolist()
+    [True, False, True]
+    """
+    found = np.ones(number.size, bool)
+    np.not_equal(number[1:], number[:-1], out=found[1:])
+    return found
 
 
 def count_down(counter: Integers, number: Integers) -> None:

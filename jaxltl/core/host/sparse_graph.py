@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.host.components import strong_components
-from jaxltl.core.host.rows import LARGE, Booleans, Integers, count_down, distinct, spans
+from jaxltl.core.host.rows import LARGE, Booleans, Integers, changes, count_down, distinct, spans
 from jaxltl.core.host.sparse import HostMDP
 
 _FEW = 24  # states of a frontier up to which Python's own loop beats NumPy's overhead
@@ -120,7 +120,7 @@ class _Forced(NamedTuple):
         state = state[(self.left[state] == 0) & self.open[state]]
         self.open[state], self.region[state] = False, True
         # Rows are in order, so one state's stand together.
-        return state[np.diff(state, prepend=-1) > 0]
+        return state[changes(state)]
 
     def few(self, frontier: Integers) -> Integers:
         """The same by plain loops, while few states join at a time, as along a chain."""

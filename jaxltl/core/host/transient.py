@@ -10,6 +10,7 @@ policy attains a bound that the policy's own expected time proves.
 from __future__ import annotations
 
 from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from jaxltl.core.host.choices import Choices, choices_of
 from jaxltl.core.host.elimination import Factors, factors, order_of
 from jaxltl.core.host.exact import LARGEST, System, exact_optimum
 from jaxltl.core.host.levels import Edges, Levels, components_in_order, peel
-from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
+from jaxltl.core.host.rows import LARGE, Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import searched
 
@@ -183,7 +184,8 @@ def _residual(system: _System, value: Floats, sign: int) -> float:
     if not value.size or not np.isfinite(value).all():
         return np.inf if value.size else 0.0
     image = _backup(system, np.append(value, 1))
-    best = sign * np.maximum.reduceat(sign * image, system.row_start[:-1])
+    operation = np.maximum if sign > 0 else np.minimum
+    best = operation.reduceat(image, system.row_start[:-1])
     return float((np.abs(best - value) / np.maximum(value, 1)).max())
 
 
@@ -231,13 +233,15 @@ def _system(problem: Transient) -> _System:
     if not inner.all():
         target, weight, of = target[inner], weight[inner], of[inner]
     count = np.bincount(of, minlength=row.size)
-    # What is known comes first in each row, which so is never empty.
-    start = starts_of(count + 1)
-    first = start[:-1]
-    place = np.arange(target.size) + of + 1
+    # What is known comes first in a row where it is something, or where the row is empty else.
+    some = (known != 0) | (count == 0)
+    start = starts_of(count + some)
+    first = start[:-1][some]
     targets, weights = np.empty(start[-1], np.int32), np.empty(start[-1])
-    targets[first], weights[first] = node.size, known
-    targets[place], weights[place] = number[target], weight
+    inside = np.ones(start[-1], bool)
+    inside[first] = False
+    targets[first], weights[first] = node.size, known[some]
+    targets[inside], weights[inside] = number[target], weight
     row_start = starts_of(np.bincount(number[state], minlength=node.size))
     return _System(row_start, start, targets, weights, row, node, leaving, widest)
 
@@ -258,6 +262,11 @@ def _number_left(back: Edges, among: Booleans) -> Integers:
 
 def _backup(system: _System, value: Floats) -> Floats:
     """``c_r + P_r x`` of each row."""
+    if system.target.size > LARGE:
+        from scipy import sparse
+
+        arrays = system.weight, system.target, system.entry_start
+        return sparse.csr_array(arrays, shape=(system.row.size, value.size)) @ value
     return np.add.reduceat(system.weight * value[system.target], system.entry_start[:-1])
 
 
@@ -273,39 +282,37 @@ def _sweep(
     if not levels.node.size:
         return
     part = system.taken(levels.node)
-    row_at, entry_at = part.row_start.tolist(), part.entry_start
     single = part.row.size == part.node.size
     same = bool((bounds[0] == bounds[1]).all())
-    sides = (2,) if same else (0, 1, 2)
+    sides = [bounds[2]] if same else [bounds[2], bounds[1], bounds[0]]
     operation = np.maximum if sign > 0 else np.minimum
-    first_row = system.row_start[levels.node]
-    for a, b in zip(levels.start[:-1], levels.start[1:], strict=True):
+    images: Any = np.empty(part.row.size)
+    row_at = part.row_start[levels.start]
+    entry_at = part.entry_start[row_at].tolist()
+    for (a, b), (r0, r1), (e0, e1) in zip(
+            pairwise(levels.start), pairwise(row_at.tolist()), pairwise(entry_at), strict=True):
         if a == b:
             continue
-        r0, r1 = row_at[a], row_at[b]
-        starts = entry_at[r0:r1]
-        e0, e1 = int(starts[0]), int(entry_at[r1])
-        target, weight = part.target[e0:e1], part.weight[e0:e1]
-        node = levels.node[a:b]
-        begin = part.row_start[a:b] - r0
+        target, weight, node = part.target[e0:e1], part.weight[e0:e1], levels.node[a:b]
+        starts, image = part.entry_start[r0:r1] - e0, images[r0:r1]
+        begin = None if single else part.row_start[a:b] - r0
         for side in sides:
-            image = np.add.reduceat(weight * bounds[side][target], starts - e0)
-            best = image if single else operation.reduceat(image, begin)
-            bounds[side, node] = best
-            if side == sides[0] and not single:
-                chosen[node] = first_row[a:b] + _first(image, best, begin)
-        if same:
-            bounds[:2, node] = bounds[2, node]
+            np.add.reduceat(weight * side[target], starts, out=image)
+            side[node] = image if begin is None else operation.reduceat(image, begin)
+    if not single:
+        rank = _first(images, sides[-1][levels.node], part.row_start)
+        chosen[levels.node] = system.row_start[levels.node] + rank
+    if same:
+        bounds[:2, levels.node] = bounds[2, levels.node]
 
 
-def _first(image: Floats, best: Floats, begin: Integers) -> Integers:
+def _first(image: Floats, best: Floats, row_start: Integers) -> Integers:
     """The rank of the first row that attains the best of its state."""
-    count = np.diff(begin, append=image.size)
-    hit = np.flatnonzero(image == np.repeat(best, count))
-    owner = np.searchsorted(begin, hit, "right") - 1
-    found = np.empty(begin.size, np.int64)
-    found[owner[::-1]] = hit[::-1]
-    return found - begin
+    owner = np.arange(best.size, dtype=np.int32).repeat(np.diff(row_start))
+    hit = np.flatnonzero(image == best[owner])[::-1]
+    found = np.empty(best.size, np.int64)
+    found[owner[hit]] = hit  # the first one is written last
+    return found - row_start[:-1]
 
 
 # --- the states on circles, and between them ----------------------------------------------------
