@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 import jaxltl
+from jaxltl.app import processes as several
 from jaxltl.app import programs, run_job
 from jaxltl.app.drawing import artist
 
@@ -87,6 +88,46 @@ def _compiling(*, soon: bool) -> Callable[[Callable[..., None]], Callable[..., N
     return wrap
 
 
+class _Devices(click.ParamType):
+    """How many devices: a number, or all that there are, which is 0."""
+
+    name = "N"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> int:
+        if isinstance(value, int):
+            return value
+        if value == "all":
+            return 0
+        if value.isascii() and value.isdigit() and 0 < int(value) < 2**31:
+            return int(value)
+        raise _Failure(f"--mesh {value}: give a number of devices, or all; what is not for --mesh "
+                       "comes before it.")
+
+
+def _over_devices(command: Callable[..., None]) -> Callable[..., None]:
+    """For commands that can use several devices and processes: which, as one argument."""
+
+    @click.option("--mesh", is_flag=False, flag_value="all", type=_Devices(),
+                  help="Use several devices: so many, or all. With srun or mpirun, those of all "
+                  "processes.")
+    @click.option("--coordinator", metavar="HOST:PORT",
+                  help="Without such a launcher: where process 0 is met.")
+    @click.option("--process", type=click.IntRange(0), metavar="I", help="Which process this is.")
+    @click.option("--processes", type=click.IntRange(1), metavar="N", help="Of how many.")
+    @click.option("--wait", default=several.WAIT, show_default=True, metavar="SECONDS",
+                  type=click.FloatRange(1, 86400),
+                  help="How long another process may be silent, at the start and later.")
+    @functools.wraps(command)
+    def run(
+        *args: Any, mesh: int | None, coordinator: str | None, process: int | None,
+        processes: int | None, wait: float, **options: Any,
+    ) -> None:
+        asked = several.Asked(mesh, coordinator, process, processes, wait)
+        command(*args, asked=asked, **options)
+
+    return run
+
+
 def _say(text: str) -> None:
     """A line on how far the work is, which is no part of the result."""
     click.echo(text, err=True)
@@ -94,7 +135,16 @@ def _say(text: str) -> None:
 
 def _begin(text: str) -> None:
     """The first line, before anything is imported that takes long."""
-    _say(f"jaxltl {jaxltl.__version__}: {text}")
+    _say(_first_line(text))
+
+
+def _first_line(text: str) -> str:
+    return f"jaxltl {jaxltl.__version__}: {text}"
+
+
+def _first_says(launch: several.Launch) -> Callable[[str], None]:
+    """:func:`_say` in the first of several processes, in which alone it is of use."""
+    return _say if launch.process == 0 else lambda text: None
 
 
 def _print_json(result: Any) -> None:
@@ -116,10 +166,12 @@ def main() -> None:
               help="Learn with this many seeds side by side and keep the best.")
 @click.option("--again", is_flag=True, help="Do it again where it is done already.")
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
+@_over_devices
 @_compiling(soon=True)
 @_plain_errors
 def learn(
-    task_file: Path, out: Path | None, seed: int, seeds: int, again: bool, as_json: bool
+    task_file: Path, out: Path | None, seed: int, seeds: int, again: bool, as_json: bool,
+    asked: several.Asked,
 ) -> None:
     """Learn a policy for a task, and say how well it does it.
 
@@ -127,18 +179,29 @@ def learn(
     network.npz and the policies of the training worlds. With an environment in [world], a network
     is learned in simulations and judged by fresh ones. An interrupted run goes on where it
     stopped when it is started again with the same task and options.
+
+    With --mesh the seeds lie over devices, also over those of several processes, each of which is
+    started with the same arguments; see docs/devices.md.
     """
-    _begin(f"learning from {task_file}")
-    with artist(apart=programs.is_alone()) as begin:  # before anything else, so that it can load
-        job = run_job.job_of(task_file)
-        task = job.read_task(task_file)
+    launch = several.launched(asked)
+    say = _first_says(launch)
+    say(_first_line(f"learning from {task_file}"))
+    apart = programs.is_alone() and launch.process == 0
+    # Before anything else, so that it can load.
+    with artist(apart=apart) as begin, several.taking_part(asked, launch, say) as place:
+        job = place.together(lambda: run_job.job_of(task_file))
+        task = place.together(lambda: job.read_task(task_file))
         out = _place(out, task.name)
         with _precision(job):
             mark = job.fingerprint(task, seed, seeds)
+            place.agree({"--out": out, "--seed": seed, "--seeds": seeds, "--again": again,
+                         "as job the task and versions": mark})
             result = None if again else run_job.finished(out, mark)
-            done = result is not None
+            done = place.sees(f"{out}/result.json", result is not None)
             result = result or run_job.run_job(
-                job, task, out, (seed, seeds), mark, begin, _say)
+                job, task, out, (seed, seeds), mark, begin, say, place)
+    if not place.is_first or result is None:
+        return
     click.echo(run_job.report_of(result).table(result))
     click.echo(f"\n{'done before: see' if done else 'wrote'} {out}/report.html and the files "
                f"beside it{'; --again does it again' if done else ''}")

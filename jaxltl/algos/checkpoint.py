@@ -3,6 +3,9 @@
 With the state goes a fingerprint of what it was learned from: every array of the problem and of
 the settings by shape, dtype and a hash of its bytes, and every static field. A state of another
 problem is refused, though its shapes be the same.
+
+Of arrays that lie on the devices of several processes each writes its part, and the file names
+them. It is read onto any other mesh, by any number of processes, or by one without.
 """
 
 from __future__ import annotations
@@ -25,9 +28,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.algos import _checkpoint_parts as parts
 from jaxltl.core.models.concrete import to_jax
 
 _GIVEN = "given"  # the fingerprint's name in the file
+_PARTS = "parts"  # the name of what is in other files
 
 
 @contextlib.contextmanager
@@ -99,6 +104,9 @@ def save(
 ) -> None:
     """Writes a learner's state as an ``.npz``, atomically.
 
+    In several processes all of them call it, with a directory that they share. What lies on the
+    devices of several is written by each, beside the file, which the first process writes last.
+
     Args:
       path: the file.
       state: any tree of arrays.
@@ -107,10 +115,29 @@ def save(
     Raises:
       ValueError: the place cannot be written to.
     """
+    path, named = Path(path), [(name, _data(leaf)) for name, leaf in _named(state)]
+    apart = {name: leaf for name, leaf in named if parts.is_apart(leaf)}
+    before = parts.parts_of(path)
+    stored = parts.write(path, apart, atomic_write) if apart else {}
+    if jax.process_index() and any(parts.is_shared(leaf) for _, leaf in named):
+        return
     arrays: dict[str, Any] = {_GIVEN: np.array(json.dumps(dict(given or {})))}
-    arrays |= {name: np.asarray(_data(leaf)) for name, leaf in _named(state)}
+    arrays |= {name: np.asarray(leaf) for name, leaf in named if name not in apart}
+    if stored:
+        arrays[_PARTS] = np.array(json.dumps({name: list(x) for name, x in stored.items()}))
     with atomic_write(path) as file:
         np.savez(file, **arrays)
+    kept = {file for x in stored.values() for *_, file, _ in x.pieces}
+    parts.remove([part for part in before if part.name not in kept])
+
+
+def remove(path: str | os.PathLike[str]) -> None:
+    """Removes a state that :func:`save` wrote, with its parts and what was begun and not finished.
+
+    No process may still be writing it.
+    """
+    path = Path(path)
+    parts.remove([path, *parts.parts_of(path), *parts.unfinished(path)])
 
 
 def load(
@@ -121,43 +148,63 @@ def load(
     Args:
       path: the file.
       like: a state of the same learner and problem (for example from ``init``); a first axis of
-        length zero stands for one of any length.
+        length zero stands for one of any length. What lies on several devices there comes to lie
+        on them, whatever devices the state was saved from; each process reads what it needs.
       given: as in :func:`save`, which has to be the same.
 
     Raises:
       ValueError: the file is damaged, its arrays do not fit `like`, or it was saved for another
         problem or with other settings.
     """
-    try:
-        # An open file of our own is closed even where a damaged archive is given up.
-        with open(path, "rb") as file:
-            arrays = read_arrays(file)
-        before = json.loads(str(arrays.pop(_GIVEN)))
-    except (OSError, ValueError, KeyError) as error:
-        raise ValueError(f"{str(path)!r} is not a saved state: {error}") from error
-    leaves = []
-    for name, leaf in _named(like):
-        expected = _data(leaf)
-        found = arrays.get(name)
-        if found is None or not _fits(found, expected):
-            is_ = "missing" if found is None else f"{found.dtype}{list(found.shape)}"
-            raise ValueError(
-                f"{str(path)!r} does not belong to this run: {name} is {is_}, expected "
-                f"{expected.dtype}{list(expected.shape)}. Delete the file to start afresh."
-            )
-        value = to_jax(found)
-        if expected is not leaf:
-            value = jax.random.wrap_key_data(value, impl=jax.random.key_impl(leaf))
-        leaves.append(value)
+    with parts.reading(path) as others:
+        try:
+            # An open file of our own is closed even where a damaged archive is given up.
+            with open(path, "rb") as file:
+                arrays: dict[str, Any] = read_arrays(file)
+            before = json.loads(str(arrays.pop(_GIVEN)))
+            stored = json.loads(str(arrays.pop(_PARTS, "{}")))
+            arrays |= {name: parts.Stored(*x) for name, x in stored.items()}
+            leaves = [_loaded(str(path), name, leaf, arrays.get(name), others)
+                      for name, leaf in _named(like)]
+        except _Another as error:
+            raise ValueError(str(error)) from None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{str(path)!r} is not a saved state: {error}") from error
     _require_same(str(path), before, dict(given or {}))
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 
-def _fits(found: np.ndarray, expected: jax.Array) -> bool:
+class _Another(Exception):
+    """An array that another learner or problem has."""
+
+
+def _loaded(path: str, name: str, leaf: Any, found: Any, others: parts.Parts) -> Any:
+    """An array where it is to be, from the file's or from the parts beside it."""
+    expected = _data(leaf)
+    if found is None or not _fits(found, expected):
+        is_ = "missing" if found is None else f"{found.dtype}{list(found.shape)}"
+        raise _Another(
+            f"{path!r} does not belong to this run: {name} is {is_}, expected "
+            f"{expected.dtype}{list(expected.shape)}. Delete the file to start afresh."
+        )
+    over = isinstance(expected, jax.Array) and len(expected.sharding.device_set) > 1
+    if over:
+        def block(index: Any) -> np.ndarray:
+            return others.read(found, index) if isinstance(found, parts.Stored) else found[index]
+
+        value = jax.make_array_from_callback(tuple(found.shape), expected.sharding, block)
+    else:
+        value = to_jax(others.read(found) if isinstance(found, parts.Stored) else found)
+    if expected is not leaf:
+        value = jax.random.wrap_key_data(value, impl=jax.random.key_impl(leaf))
+    return value
+
+
+def _fits(found: np.ndarray | parts.Stored, expected: jax.Array) -> bool:
     shape = expected.shape
     if shape[:1] == (0,):
         shape = (*found.shape[:1], *shape[1:])
-    return found.shape == shape and found.dtype == expected.dtype
+    return tuple(found.shape) == shape and found.dtype == expected.dtype
 
 
 def _require_same(path: str, before: dict[str, str], now: dict[str, str]) -> None:

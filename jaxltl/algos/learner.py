@@ -25,11 +25,14 @@ import numpy as np
 import optax
 from flax import struct
 from jax import lax
+from jax.sharding import Mesh
 from jax.tree_util import Partial
 
 from jaxltl.algos import checkpoint as files
+from jaxltl.algos._run_over_mesh import run_over_mesh
 from jaxltl.core.host.given import whole
 from jaxltl.core.models.concrete import to_jax
+from jaxltl.core.models.lanes import on_host
 from jaxltl.core.types import Status, worst
 
 Init = Callable[..., Any]
@@ -66,11 +69,15 @@ def run(
         raise ValueError(f"num_steps={num_steps}, max_rows={max_rows}; both must be at least 1.")
     if num_steps > MOST:
         raise ValueError(f"num_steps={num_steps}; at most {MOST} are made at once.")
+    return _run(step, state, problem, hparams, _lengths(num_steps, max_rows))
+
+
+def _lengths(num_steps: int, max_rows: int) -> np.ndarray:
+    """Of at most so many blocks of steps; the first is short, so that rows end full strides."""
     stride = -(-num_steps // max_rows)
-    # The first block is the short one, so that every row ends a full stride.
     lengths = np.full(-(-num_steps // stride), stride, np.int32)
     lengths[0] = num_steps - (num_steps - 1) // stride * stride
-    return _run(step, state, problem, hparams, lengths)
+    return lengths
 
 
 @partial(jax.jit, static_argnames="step")
@@ -406,6 +413,7 @@ def run_in_chunks(
     max_rows: int = 10,
     report: Callable[[int, Any], None] | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
+    mesh: Mesh | None = None,
 ) -> Chunks:
     """Steps in compiled chunks, with a report and a saved state after each.
 
@@ -423,6 +431,9 @@ def run_in_chunks(
       report: called with the number of steps and the newest metrics after each chunk.
       checkpoint: a file that holds all of this after every chunk, written atomically. If it
         exists, the run goes on from it, and ends with the same bits.
+      mesh: devices over which the lanes lie (:mod:`~jaxltl.core.models.lanes`). In several
+        processes each calls this with the same arguments, and has all of the result but the state,
+        which stays where it is. Checkpoints of other devices, or of none, are gone on from too.
 
     Returns:
       :class:`Chunks`.
@@ -441,23 +452,24 @@ def run_in_chunks(
         given = files.fingerprint(step=step, problem=problem, hparams=hparams)
         if os.path.exists(checkpoint):
             now, rows = files.load(checkpoint, (now, rows), given)
-    advance = _lane_steps(step, keep, num_lanes)
-    while (made := int(np.asarray(now.count).max())) < num_steps and not np.asarray(now.done).all():
-        now, fresh = run(
-            advance, strong(now), problem, (hparams, until),
-            num_steps=min(chunk, num_steps - made), max_rows=max_rows,
-        )
+    if mesh is None:
+        advance = partial(_run, _lane_steps(step, keep, num_lanes))
+    else:
+        advance = run_over_mesh(mesh, _run, _lane_steps(step, keep, None))
+    ended, made = on_host((now.done, now.count))
+    while made.max() < num_steps and not ended.all():
+        lengths = _lengths(min(chunk, num_steps - int(made.max())), max_rows)
+        now, fresh = advance(strong(now), problem, (hparams, until), lengths)
         rows = jax.tree.map(
             lambda x, y: np.concatenate([x, y]), jax.device_get(rows), jax.device_get(fresh))
+        ended, made = on_host((now.done, now.count))
         if checkpoint is not None:
             files.save(checkpoint, (now, rows), given)
         if report is not None:
-            report(int(np.asarray(now.count).max()), jax.tree.map(lambda x: x[-1], rows[1]))
+            report(int(made.max()), jax.tree.map(lambda x: x[-1], rows[1]))
     step_of = np.asarray(rows[0])
     return Chunks(
-        now.state, jax.tree.map(np.asarray, rows[1]), step_of[:, 0] if lanes else step_of,
-        np.asarray(now.done),
-    )
+        now.state, jax.tree.map(np.asarray, rows[1]), step_of[:, 0] if lanes else step_of, ended)
 
 
 def _begin(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | None) -> _Progress:
@@ -465,7 +477,7 @@ def _begin(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | 
     lanes = () if num_lanes is None else (num_lanes,)
     shape = _metrics_of(step, state, problem, hparams, num_lanes)
     metrics = jax.tree.map(lambda x: np.zeros((*lanes, *x.shape), x.dtype), shape)
-    count = np.asarray(state.step, np.int32)
+    count = np.asarray(on_host(state.step), np.int32)
     return _Progress(state, *to_jax((metrics, count, np.zeros(count.shape, bool))))
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 import jaxltl
 from jaxltl.algos import learner
@@ -22,6 +23,7 @@ from jaxltl.algos.checkpoint import atomic_write
 from jaxltl.app.drawing import Picture, drawing
 from jaxltl.app.files.task import Task
 from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.models.lanes import on_host, vmap_over_mesh
 from jaxltl.core.models.product import Product
 
 Report = Callable[[int, Mapping[str, np.ndarray]], None]
@@ -35,24 +37,33 @@ def settings(kind: Any, spec: Mapping[str, Any]) -> Any:
 
 def run_seeds(
     algorithm: Any, seeds: tuple[int, int], problem: Any, hparams: Any, report: Report | None,
-    **options: Any,
+    mesh: Mesh | None = None, **options: Any,
 ) -> tuple[learner.Chunks, dict[str, np.ndarray]]:
     """Runs of a learner from N seeds side by side, and their figures ``[T, N]`` by name.
 
     Args:
       algorithm: the learner's module.
       seeds: the first, and how many.
+      mesh: devices that several seeds are learned on; the same in every process.
       options: for :func:`~jaxltl.algos.learner.run_in_chunks`.
     """
+    if seeds[1] == 1:
+        mesh = None
     given = (algorithm.init, *seeds, problem, hparams)
-    wait = compile_beside(_first_states, *given)
-    learner.trace_lanes(algorithm.step, jax.eval_shape(_first_states, *given), problem, hparams)
-    wait()
-    states = _first_states(*given)
+    if mesh is None:
+        wait = compile_beside(_first_states, *given)
+        learner.trace_lanes(algorithm.step, jax.eval_shape(_first_states, *given), problem, hparams)
+        wait()
+        states = _first_states(*given)
+    else:
+        first = vmap_over_mesh(_first_of(algorithm.init), mesh, in_axes=(0, None, None, None))
+        states = first(np.arange(seeds[1]), np.int32(seeds[0]), problem, hparams)
     by_name = report and (lambda step, metrics: report(step, vars(metrics)))
     found = learner.run_in_chunks(
-        algorithm.step, states, problem, hparams, lanes=True, report=by_name, **options
+        algorithm.step, states, problem, hparams, lanes=True, report=by_name, mesh=mesh, **options
     )
+    if mesh is not None:  # what comes then is each process's own
+        found = found._replace(state=jax.tree.map(jnp.asarray, on_host(found.state)))
     return found, {"step": found.step, **vars(found.metrics)}
 
 
@@ -61,14 +72,22 @@ def _first_states(
     init: Callable[..., Any], seed: int, num_seeds: int, problem: Any, hparams: Any
 ) -> Any:
     """A learner's N first states, each from a key of its own; one program."""
-    root = jax.random.fold_in(jax.random.key(seed), 1)
-
     def first(n: Any) -> Any:
-        return init(jax.random.fold_in(root, n), problem, hparams)
+        return _first_of(init)(n, seed, problem, hparams)
 
     if num_seeds == 1:  # without vmap, a smaller program
         return jax.tree.map(lambda x: x[None], first(0))
     return jax.vmap(first)(jnp.arange(num_seeds))
+
+
+@functools.cache  # compiled once for each learner, so it must stay the same function
+def _first_of(init: Callable[..., Any]) -> Callable[..., Any]:
+    """The first state of lane n."""
+    def first(n: Any, seed: Any, problem: Any, hparams: Any) -> Any:
+        root = jax.random.fold_in(jax.random.key(seed), 1)
+        return init(jax.random.fold_in(root, n), problem, hparams)
+
+    return first
 
 
 def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from jaxltl.algos import learner, mlirl
 from jaxltl.app._learn_pictures import live as live
@@ -126,6 +127,7 @@ def _problem(setup: Setup, allowed: np.ndarray | None) -> tuple[tuple[str, ...],
 def _trained(
     setup: Setup, names: tuple[str, ...], problem: mlirl.Problem, hparams: mlirl.Hparams,
     seeds: tuple[int, int], report: Report | None, checkpoint: Path | None,
+    mesh: Mesh | None = None,
 ) -> Learned:
     """What N seeds learn of a problem."""
     spec, model = setup.task.learner, setup.model
@@ -133,6 +135,7 @@ def _trained(
     found, history = run_seeds(
         mlirl, seeds, problem, hparams, report, num_steps=spec.get("steps", STEPS), keep="before",
         until=learner.gradient_vanishes(spec.get("tolerance", _TOLERANCE)), checkpoint=checkpoint,
+        mesh=mesh,
     )
     wait()
     states = jax.device_get(dataclasses.replace(found.state, key=None))
@@ -154,7 +157,8 @@ def _trained(
 
 
 def _with_guarantee(
-    setup: Setup, seeds: tuple[int, int], report: Report | None, checkpoint: Path | None
+    setup: Setup, seeds: tuple[int, int], report: Report | None, checkpoint: Path | None,
+    mesh: Mesh | None,
 ) -> tuple[Learned, int, Attempt | None]:
     """What is learned under the guarantee, which seed is kept, and how a probability was reached.
     """
@@ -162,11 +166,11 @@ def _with_guarantee(
     names, problem = setup.learning
     hparams = settings(mlirl.Hparams, setup.task.learner)
     if isinstance(guarantee.asked, str):
-        learned = _trained(setup, names, problem, hparams, seeds, report, checkpoint)
+        learned = _trained(setup, names, problem, hparams, seeds, report, checkpoint, mesh)
         return learned, _least_loss(learned), None
     # With a weight of zero it is one program for all weights.
     hparams = dataclasses.replace(hparams, mu=0.0 if hparams.mu is None else hparams.mu)
-    learned = _trained(setup, names, problem, hparams, seeds, report, checkpoint)
+    learned = _trained(setup, names, problem, hparams, seeds, report, checkpoint, mesh)
     free = _lane(learned, _least_loss(learned))
 
     def train(mu: float, before: Learned, problem: mlirl.Problem = problem) -> Learned:
@@ -347,6 +351,7 @@ def learn(
     report: Report | None = None,
     checkpoint: Path | None = None,
     progress: Callable[[str], None] = lambda stage: None,
+    mesh: Mesh | None = None,
 ) -> tuple[Learned, int, Solution, Attempt | None, dict[str, Any] | None, np.ndarray,
            dict[str, Any] | None]:
     """Learns with N seeds, keeps the best, and evaluates it; see :class:`Outcome`.
@@ -357,7 +362,8 @@ def learn(
       ValueError: the learner cannot work on this task.
     """
     model = setup.model
-    learned, chosen, attempt = _with_guarantee(setup, (seed, num_seeds), report, checkpoint)
+    learned, chosen, attempt = _with_guarantee(
+        setup, (seed, num_seeds), report, checkpoint, mesh)
     progress("checking")
     solution = satisfaction_probability(model, learned.policy[chosen])
     at_start = functools.partial(from_starts, model)

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from jaxltl.algos.checkpoint import atomic_write, read_arrays
 from jaxltl.app._environment_learners import Method, make_method
@@ -177,6 +178,7 @@ def learn(
     report: Report | None = None,
     checkpoint: Path | None = None,
     progress: Callable[[str], None] = lambda stage: None,
+    mesh: Mesh | None = None,
 ) -> tuple[Any, Mapping[str, np.ndarray], int, list[Evaluation], list[Episode]]:
     """Learns with N seeds, keeps the best, and evaluates all of them; see :class:`Outcome`.
 
@@ -185,7 +187,7 @@ def learn(
     task, method = setup.task, setup.method
     found, history = run_seeds(
         method.algorithm, (seed, num_seeds), method.problem, method.hparams, report,
-        num_steps=task.learner["steps"], checkpoint=checkpoint)
+        num_steps=task.learner["steps"], checkpoint=checkpoint, mesh=mesh)
     # One cost of a search is a number like the others.
     history = {k: v[..., 0] if v.shape[2:] == (1,) else v for k, v in history.items()}
     # No key of the learner's is one of these.

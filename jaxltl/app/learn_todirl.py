@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.sharding import Mesh
 
 from jaxltl.algos import learner, todirl
 from jaxltl.app._todirl_guarantee import check_attainable, hold, is_weighable, likeliest
@@ -205,6 +206,7 @@ def learn(
     report: Report | None = None,
     checkpoint: Path | None = None,
     progress: Callable[[str], None] = lambda stage: None,
+    mesh: Mesh | None = None,
 ) -> tuple[Learned, int, Judged, Judged | None]:
     """Learns with N seeds, keeps one without looking at test worlds, and judges it.
 
@@ -229,7 +231,7 @@ def learn(
     hparams = settings(todirl.Hparams, spec)
     if setup.is_probability and is_weighable(setup):
         hparams = replace(hparams, mu=0.0)  # it is one program for all weights
-    learned = _trained(setup, problem, hparams, (seed, num_seeds), report, checkpoint)
+    learned = _trained(setup, problem, hparams, (seed, num_seeds), report, checkpoint, mesh)
     chosen = _least_loss(learned)
     if setup.is_probability:
         learned, chosen = _weighed(setup, problem, hparams, _lane(learned, chosen), seed), 0
@@ -241,12 +243,12 @@ def learn(
 
 def _trained(
     setup: Setup, problem: todirl.Problem, hparams: todirl.Hparams, seeds: tuple[int, int],
-    report: Report | None = None, checkpoint: Path | None = None,
+    report: Report | None = None, checkpoint: Path | None = None, mesh: Mesh | None = None,
 ) -> Learned:
     """What N seeds learn of a problem."""
     found, history = run_seeds(
         todirl, seeds, problem, hparams, report, num_steps=setup.task.learner.get("steps", STEPS),
-        until=learner.has_stopped, checkpoint=checkpoint,
+        until=learner.has_stopped, checkpoint=checkpoint, mesh=mesh,
     )
     states, best = found.state, found.state.best
     score = np.asarray(best.neg_log_likelihood)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from jaxltl.app.drawing import Artist, Picture
+    from jaxltl.app.processes import Place
 
 
 def job_of(task_file: Path) -> Any:
@@ -65,9 +66,11 @@ def make_directory(out: Path) -> Path:
 
 def run_job(
     job: Any, task: Any, out: Path, seeds: tuple[int, int], mark: str, begin: Artist,
-    say: Callable[[str], None],
-) -> dict[str, Any]:
+    say: Callable[[str], None], place: Place,
+) -> dict[str, Any] | None:
     """Does the whole job, shows how far it is, and returns what ``result.json`` holds.
+
+    In several processes the first alone draws and writes, and returns something.
 
     Args:
       job: of :func:`job_of`; `task` is what its ``read_task`` gives.
@@ -76,21 +79,23 @@ def run_job(
       mark: the job's fingerprint, which a checkpoint must have to be gone on from.
       begin: begins to draw a picture.
       say: takes lines on how far it is.
+      place: the devices and processes.
     """
-    from jaxltl.algos.checkpoint import atomic_write
+    from jaxltl.algos import checkpoint as files
 
     start = time.perf_counter()
-    setup = job.prepare(task, seeds[0])
+    setup = place.together(lambda: job.prepare(task, seeds[0]))
     say(job.describe(setup))
-    checkpoint = make_directory(out) / f"checkpoint-{mark}.npz"
-    # A place that cannot be written to must be known before the work, not after.
-    with atomic_write(out / "task.toml") as file:
-        file.write(task.path.read_bytes())
-    if checkpoint.exists():
+    if place.mesh is not None:
+        say(spread(seeds[1], place))
+    checkpoint = out / f"checkpoint-{mark}.npz"
+    place.together(lambda: _claim(out, task, place))
+    if place.sees(str(checkpoint), checkpoint.exists()):
         say(f"going on from {checkpoint}")
+    place.sees(str(out), (out / "task.toml").exists())
     steps = task.learner.get("steps", job.STEPS)
-    with _learning(steps) as bar:
-        pictures = [(p, begin(p.drawing)) for p in job.task_pictures(setup)]
+    with _learning(steps, shown=place.is_first) as bar:
+        pictures = [(p, begin(p.drawing)) for p in job.task_pictures(setup) if place.is_first]
 
         def report(step: int, figures: Mapping[str, np.ndarray]) -> None:
             bar.set_description_str("learning", refresh=False)
@@ -99,18 +104,49 @@ def run_job(
 
         try:
             parts = job.learn(setup, *seeds, report=report, checkpoint=checkpoint,
-                              progress=bar.set_description_str)
+                              progress=bar.set_description_str, mesh=place.mesh)
         except KeyboardInterrupt:
             bar.close()
             kept = "; the same command goes on from the last checkpoint"
             say(f"interrupted{kept if checkpoint.exists() else ''}")
             raise SystemExit(130) from None
-        checkpoint.unlink(missing_ok=True)
+        if not place.is_first:
+            return None
+        files.remove(checkpoint)
         outcome = job.Outcome(setup, *parts, seed=seeds[0], seconds=time.perf_counter() - start)
         bar.set_description_str("drawing")
         pictures += [(p, _begun(begin, p)) for p in job.pictures(outcome)]
         live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]
         return _write(job, outcome, out, mark, pictures, live)
+
+
+def _claim(out: Path, task: Any, place: Place) -> None:
+    """The directory of results; one that cannot be written to must be known before the work."""
+    from jaxltl.algos.checkpoint import atomic_write
+
+    if place.is_first:
+        make_directory(out)
+        with atomic_write(out / "task.toml") as file:
+            file.write(task.path.read_bytes())
+
+
+def spread(num_seeds: int, place: Place) -> str:
+    """How seeds come to lie on several devices, and what that brings, in one line.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> spread(6, SimpleNamespace(num_devices=4))
+      '6 seeds on 4 devices, at most 2 on each'
+    """
+    number = place.num_devices
+    if num_seeds == 1:
+        return ("one seed is learned on one device"
+                + ("" if number == 1 else ", and the others bring nothing; --seeds N uses them"))
+    most = -(-num_seeds // number)
+    used = -(-num_seeds // most)
+    idle = f"; {number - used} of them bring nothing" if used < number else ""
+    many = "devices" if number > 1 else "device"
+    return f"{num_seeds} seeds on {number} {many}, at most {most} on each{idle}"
 
 
 def _begun(begin: Artist, picture: Picture) -> Callable[[], bytes]:
@@ -120,12 +156,12 @@ def _begun(begin: Artist, picture: Picture) -> Callable[[], bytes]:
 
 
 @contextlib.contextmanager
-def _learning(total: int) -> Iterator[Any]:
+def _learning(total: int, *, shown: bool) -> Iterator[Any]:
     """A progress bar that moves each second, whatever the work is at."""
     from tqdm import tqdm
 
     done = threading.Event()
-    with tqdm(total=total, unit="step", leave=False, desc="compiling") as bar:
+    with tqdm(total=total, unit="step", leave=False, desc="compiling", disable=not shown) as bar:
 
         def tick() -> None:
             while not done.wait(1):

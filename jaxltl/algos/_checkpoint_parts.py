@@ -1,0 +1,161 @@
+"""Arrays that lie on the devices of several processes, as files: each process writes its own part.
+
+A part has a name of its own each time that it is written. The file that tells which parts there
+are comes last, by one process, when all have written theirs; until then the parts before stay. So
+whenever a process dies, that file and what it names are whole.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+Write = Callable[[Path], contextlib.AbstractContextManager[Any]]
+
+
+def is_shared(x: Any) -> bool:
+    """Whether an array lies on the devices of several processes."""
+    return isinstance(x, jax.Array) and not x.is_fully_addressable
+
+
+def is_apart(x: Any) -> bool:
+    """Whether it does, and not all of it on those of each."""
+    return is_shared(x) and not x.is_fully_replicated
+
+
+class Stored(NamedTuple):
+    """An array in parts.
+
+    Attributes:
+      shape, dtype: of all of it.
+      pieces: where each begins and ends, the name of its file, and its name there.
+    """
+
+    shape: list[int]
+    dtype: str
+    pieces: list[tuple[list[int], list[int], str, str]]
+
+
+def write(path: Path, arrays: Mapping[str, Any], create: Write) -> dict[str, Stored]:
+    """Writes this process's part of arrays, and waits until the others have written theirs.
+
+    Args:
+      path: the file that is to tell of the parts.
+      arrays: global ones, by name; in every process the same.
+      create: opens a file that appears when it is complete.
+
+    Returns:
+      What there is, of all processes.
+    """
+    from jax.experimental.multihost_utils import process_allgather
+
+    token = np.frombuffer(secrets.token_bytes(8), np.uint32)
+    mine = {
+        _name(array, shard.index): np.asarray(shard.data)
+        for array, x in enumerate(arrays.values()) for shard in x.addressable_shards
+        if shard.replica_id == 0}
+    if mine:
+        with create(_part(path, jax.process_index(), token)) as file:
+            np.savez(file, allow_pickle=False, **mine)
+    tokens = np.asarray(process_allgather(token))  # when it is back all have written
+    names = [_part(path, process, x).name for process, x in enumerate(tokens)]
+    return {
+        name: Stored(list(x.shape), str(x.dtype), [
+            (*_ends(shard.index, x.shape), names[shard.device.process_index],
+             _name(array, shard.index))
+            for shard in x.global_shards if shard.replica_id == 0])
+        for array, (name, x) in enumerate(arrays.items())}
+
+
+def _part(path: Path, process: int, token: np.ndarray) -> Path:
+    return path.with_name(f"{path.name}.part-{process}-{token.tobytes().hex()}")
+
+
+def parts_of(path: Path) -> list[Path]:
+    """All parts beside a file, those that it names and others."""
+    return sorted(path.parent.glob(f"{_literal(path.name)}.part-*"))
+
+
+def unfinished(path: Path) -> list[Path]:
+    """What processes that were killed have begun to write of a file and of its parts."""
+    return sorted(path.parent.glob(f".{_literal(path.name)}.*"))
+
+
+def _literal(name: str) -> str:
+    return "".join(f"[{x}]" if x in "*?[" else x for x in name)
+
+
+def remove(paths: list[Path]) -> None:
+    """Removes files, those that are there."""
+    for path in paths:
+        path.unlink(missing_ok=True)
+
+
+class Parts:
+    """The parts beside a file, read as they are needed, each piece once."""
+
+    def __init__(self, path: Path) -> None:
+        self._beside, self._files = path, dict[str, Any]()
+        self._pieces = dict[tuple[str, str], np.ndarray]()
+
+    def read(self, stored: Stored, index: tuple[slice, ...] | None = None) -> np.ndarray:
+        """A block of an array, or all of it, from the pieces that have something of it.
+
+        Raises:
+          ValueError: a part is missing or damaged.
+        """
+        begin, end = _ends(index or (), stored.shape)
+        found = np.zeros([b - a for a, b in zip(begin, end, strict=True)], stored.dtype)
+        for first, last, file, name in stored.pieces:
+            low, high = np.maximum(begin, first), np.minimum(end, last)
+            if (low < high).all():
+                piece = self._piece(file, name)
+                found[_block(low, high, begin)] = piece[_block(low, high, first)]
+        return found
+
+    def _piece(self, file: str, name: str) -> np.ndarray:
+        if (file, name) not in self._pieces:
+            try:
+                if file not in self._files:
+                    self._files[file] = np.load(self._beside.with_name(file), allow_pickle=False)
+                self._pieces[file, name] = self._files[file][name]
+            except Exception as error:  # damaged bytes make numpy and zipfile raise almost anything
+                what = "missing" if isinstance(error, FileNotFoundError) else "damaged"
+                raise ValueError(f"its part {file!r} is {what}.") from None
+        return self._pieces[file, name]
+
+    def close(self) -> None:
+        for file in self._files.values():
+            file.close()
+
+
+@contextlib.contextmanager
+def reading(path: str | os.PathLike[str]) -> Iterator[Parts]:
+    """The parts beside a file, closed again."""
+    parts = Parts(Path(path))
+    try:
+        yield parts
+    finally:
+        parts.close()
+
+
+def _ends(index: tuple[slice, ...], shape: Any) -> tuple[list[int], list[int]]:
+    """Where a block begins and ends; axes that are not named are whole."""
+    index = (*index, *(slice(None),) * (len(shape) - len(index)))
+    each = [x.indices(int(n)) for x, n in zip(index, shape, strict=True)]
+    return [x[0] for x in each], [x[1] for x in each]
+
+
+def _block(low: Any, high: Any, first: Any) -> tuple[slice, ...]:
+    return tuple(slice(int(a - c), int(b - c)) for a, b, c in zip(low, high, first, strict=True))
+
+
+def _name(array: int, index: tuple[slice, ...]) -> str:
+    return f"{array}-" + "-".join(str(x.start or 0) for x in index)

@@ -1,0 +1,41 @@
+"""Runs of lanes over the devices of a mesh, with what a program has to know of them on the host."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from jaxltl.core.models.lanes import on_host, vmap_over_mesh
+
+Run = Callable[..., tuple[Any, Any]]
+
+
+def run_over_mesh(mesh: Mesh, run: Run, step: Callable[..., Any]) -> Any:
+    """``run(step, state, problem, hparams, lengths)`` of lanes, whose metrics come to the host.
+
+    Args:
+      mesh: the devices.
+      run: of one lane, which yields its state and its metrics, with a first axis of rows.
+      step: of one lane.
+
+    Returns:
+      A function of the lanes' states, the problem, the lanes' numbers with what they share, and
+      the lengths; it yields the states, which stay where they are, and metrics ``[rows, N, ...]``.
+    """
+    lanes = vmap_over_mesh(_lane(run, step), mesh, in_axes=(0, None, (0, None), None))
+
+    def advance(state: Any, problem: Any, given: Any, lengths: np.ndarray) -> tuple[Any, Any]:
+        state, rows = lanes(state, problem, given, lengths)
+        return state, jax.tree.map(lambda x: np.swapaxes(x, 0, 1), on_host(rows))
+
+    return advance
+
+
+@cache  # compiled once for each step, so it must stay the same function
+def _lane(run: Run, step: Callable[..., Any]) -> Callable[..., Any]:
+    return partial(run, step)
