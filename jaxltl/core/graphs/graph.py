@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxltl.core.graphs.colouring import components_by_sweeps
 from jaxltl.core.host.graph import HostGraph
 from jaxltl.core.host.row_graph import RowGraph
 from jaxltl.core.host.rows import rows_of, rows_of_matrix
@@ -26,6 +27,7 @@ from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.product import Product, reads
+from jaxltl.core.models.sharded import is_sharded
 from jaxltl.core.models.sparse import SparseMDP
 
 
@@ -84,7 +86,9 @@ class TracedGraph:
         return _sweeps(self, goal, allowed & self.available, rule, among, chance=chance)
 
     def components(self, core, allowed, closed: bool):
-        """As of a HostGraph, by a callback to one."""
+        """As of a HostGraph, by a callback to one; where no host has the model, by sweeps."""
+        if is_sharded(self.model):
+            return components_by_sweeps(self, core, allowed, closed)
         shape, flat = self.state_shape, int(np.prod(self.state_shape))
         result = (
             jax.ShapeDtypeStruct(shape, jnp.int32),

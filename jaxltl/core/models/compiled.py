@@ -15,6 +15,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.kernels import gather, owners
 from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.models.product import Product, flat_successor
+from jaxltl.core.models.sharded import ShardedMDP, is_sharded
 from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts
 from jaxltl.core.types import Solution
 
@@ -42,6 +43,8 @@ def compiled_form(model: Any, reward: Any = None) -> tuple[Any, Any]:
         form, reward = compiled_form(model.mdp, reward)
         system = jnp.asarray(model.system).reshape(form.state_shape)
         return (model if form is model.mdp else Game(form, system)), reward
+    if is_sharded(model):
+        return _named_reward(model, reward)
     if not is_sparse(model):
         return model, reward
     if isinstance(model, Product):
@@ -52,6 +55,18 @@ def compiled_form(model: Any, reward: Any = None) -> tuple[Any, Any]:
     return replace(
         model, label=none, propositions=(), rewards={}, valuation={}, action=None, action_names=()
     ), reward
+
+
+def _named_reward(model: Any, reward: Any) -> tuple[Any, Any]:
+    if isinstance(reward, str):
+        rewards = getattr(model, "rewards", {})
+        if reward not in rewards:
+            names = ", ".join(map(repr, rewards)) or "none"
+            raise ValueError(f"there is no reward {reward!r}; the model has {names}.")
+        reward = rewards[reward]
+    if isinstance(model, ShardedMDP):
+        model = replace(model, rewards={}, propositions=())
+    return model, reward
 
 
 def in_shape_of(model: Any, solution: Solution) -> Solution:

@@ -14,8 +14,9 @@ import numpy as np
 
 
 def is_traced(tree: Any) -> bool:
-    """Whether any array in a tree is abstract, so that the host cannot read it."""
-    return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
+    """Whether the host does not read a tree: an array is abstract, or lies on several devices."""
+    return any(isinstance(x, jax.core.Tracer) or (
+        isinstance(x, jax.Array) and not x.is_fully_replicated) for x in jax.tree.leaves(tree))
 
 
 def namespace(*trees: Any) -> tuple[Any, ...]:

@@ -164,7 +164,11 @@ def transition_matrix(model: Any, policy: jax.Array) -> jax.Array:
 @singledispatch
 def following(model: Any, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
     """``v -> P_pi v`` of a deterministic policy, ``float[N]`` from ``float[N]``, for sweeps."""
-    chain = induced_chain(model, policy)
+    return along(induced_chain(model, policy))
+
+
+def along(chain: Any) -> Callable[[jax.Array], jax.Array]:
+    """``v -> P v`` of a model with one action."""
     return lambda value: expectation(chain, value)[:, 0]
 
 
@@ -198,14 +202,51 @@ def _unknown(model: Any) -> str:
             "Product or a Game.")
 
 
+@singledispatch
+def combined(model: Any, value: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
+    """Terms of a weight and the value there, combined over the successors of each choice.
+
+    What :func:`expectation`, :func:`exists_successor` and :func:`least_successor` are made of where
+    a model is written down as successors.
+
+    Args:
+      model: the model.
+      value: ``[S, ...]``.
+      term, combine: as of :func:`~jaxltl.core.models.kernels.fold`.
+
+    Returns:
+      ``[S, ..., A]``.
+    """
+    raise TypeError(_unknown(model))
+
+
+@singledispatch
+def given_states(model: Any) -> jax.Array | bool:
+    """The states that are the model's own: all, but of one on a mesh ``bool[N]``."""
+    return True
+
+
+@singledispatch
+def greatest_predecessor(model: Any, quantity: jax.Array) -> jax.Array:
+    """Largest quantity among the choices that may lead to a state: ``[S, ...]``, ``[S, ..., A]``.
+
+    Decided on the support; 0 where no choice leads.
+
+    Args:
+      model: the model.
+      quantity: integers, at least 0; of a product ``[S, Q, A]``.
+    """
+    raise TypeError(_unknown(model))
+
+
 @expectation.register
 def _(model: MDP, value: jax.Array) -> jax.Array:
-    return _combined(model, value, jnp.multiply, jnp.add)
+    return combined(model, value, jnp.multiply, jnp.add)
 
 
 @exists_successor.register
 def _(model: MDP, region: jax.Array) -> jax.Array:
-    return _combined(model, jnp.asarray(region), kernels.hits, jnp.logical_or)
+    return combined(model, jnp.asarray(region), kernels.hits, jnp.logical_or)
 
 
 @forall_successor.register
@@ -215,12 +256,21 @@ def _(model: MDP, region: jax.Array) -> jax.Array:
 
 @least_successor.register
 def _(model: MDP, value: jax.Array) -> jax.Array:
-    return _combined(model, value, only_real, jnp.minimum)
+    return combined(model, value, only_real, jnp.minimum)
 
 
-def _combined(model: MDP, value: jax.Array, term: Any, combine: Any) -> jax.Array:
+@combined.register
+def _(model: MDP, value: jax.Array, term: Any, combine: Any) -> jax.Array:
     weight = model.successor_probability
     return kernels.stacked(kernels.by_action(model.successor, weight, value, term, combine))
+
+
+@greatest_predecessor.register
+def _(model: MDP, quantity: jax.Array) -> jax.Array:
+    wide = quantity.shape[1:-1]
+    used = (model.successor_probability > 0).reshape(*model.successor.shape, *(1,) * len(wide))
+    sent = jnp.where(used, jnp.moveaxis(quantity, -1, 1)[:, :, None], 0)  # [S, A, K, ...]
+    return jnp.zeros(quantity.shape[:-1], quantity.dtype).at[model.successor].max(sent)
 
 
 @sample_successor.register
@@ -409,7 +459,7 @@ def valid_policy(model: Any, policy: jax.Array, where: jax.Array | bool = True) 
     given = jnp.where(available | (policy == 0), policy, jnp.nan)
     total = over.sum(given)
     row = (jnp.abs(total - 1) <= row_tolerance(policy.dtype)) & over.all(given >= 0)
-    row |= ~jnp.asarray(where)
+    row |= ~jnp.asarray(where & given_states(model))
     uniform = available / over.spread(jnp.maximum(over.sum(available), 1))
     used = jnp.where(
         over.spread(row), jnp.where(available, policy, 0), uniform.astype(policy.dtype))
@@ -422,7 +472,7 @@ def require_policy(model: Any, policy: Any, where: Any = True) -> None:
     Raises:
       ValueError: a row is no distribution over available actions, with its state; or a shape.
     """
-    if is_traced((model, policy, where)):
+    if is_traced((model, policy, where)) or given_states(model) is not True:
         return
     world = getattr(model, "mdp", model)
     if isinstance(world, SparseMDP):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import replace
+from functools import singledispatch
 from typing import Any
 
 import chex
@@ -180,7 +181,7 @@ def letters(world: MDP | DenseMDP, propositions: Collection[str] | None = None) 
     keep = [i for i, p in enumerate(world.propositions)
             if propositions is None or p in propositions]
     names = [world.propositions[i] for i in keep]
-    rows, _ = distinct_rows(np.asarray(world.label)[:, keep])
+    rows, _ = distinct_rows(label_rows(world)[:, keep])
     return [frozenset(n for n, holds in zip(names, row, strict=True) if holds) for row in rows]
 
 
@@ -222,12 +223,24 @@ def product(world: Any, task: Automaton | Formula | str, *, label_on: str = "ent
         raise ValueError(f"task is {shown(task)}; give a formula, its text, or an automaton.")
     require_known(task.propositions, world.propositions, "the task")
     column = [world.propositions.index(p) for p in task.propositions]
-    rows, letter = distinct_rows(np.asarray(world.label)[:, column])
+    labels = label_rows(world)
+    rows, letter = distinct_rows(labels[:, column])
     index = np.array(
         [_letter(task, row, int(np.argmax(letter == i))) for i, row in enumerate(rows)], np.int32
     )
-    automaton = to_jax(task)
-    return Product(world, automaton, to_jax(index[letter.ravel()]), label_on)
+    return Product(world, to_jax(task), shown_by(world, index[letter.ravel()]), label_on)
+
+
+@singledispatch
+def label_rows(world: Any) -> np.ndarray:
+    """The labels of a world on the host, ``bool[S, P]``; of one on a mesh those that occur."""
+    return np.asarray(world.label)
+
+
+@singledispatch
+def shown_by(world: Any, letter: np.ndarray) -> jax.Array:
+    """``int32[S]``, what each state shows, from a number for each of the :func:`label_rows`."""
+    return to_jax(letter)
 
 
 def _letter(automaton: Automaton, row: np.ndarray, state: int) -> int:
@@ -271,8 +284,7 @@ def _each_memory(world: MDP | DenseMDP, operator, value, term, combine) -> jax.A
     """
     if isinstance(world, DenseMDP):
         return jax.vmap(lambda v: operator(world, v), in_axes=1, out_axes=1)(value)
-    weight = world.successor_probability
-    return kernels.stacked(kernels.by_action(world.successor, weight, value, term, combine))
+    return operators.combined(world, value, term, combine)
 
 
 def reads(model: Product, marked: jax.Array) -> jax.Array:
@@ -376,6 +388,11 @@ def _(model: Product, policy: jax.Array) -> MDP:
 
 @operators.transition_matrix.register
 def _(model: Product, policy: jax.Array) -> jax.Array:
+    if not isinstance(model.mdp, MDP | DenseMDP):
+        eye = jnp.eye(model.num_states, dtype=model.dtype)
+        return jax.vmap(
+            lambda v: operators.action_mean(policy, operators.expectation(
+                model, v.reshape(model.state_shape))).ravel(), out_axes=-1)(eye)
     s = jnp.arange(model.mdp.num_states)[:, None, None, None]
     q = jnp.arange(model.num_memory)[None, :, None, None]
     successor = _successor(model.mdp)[:, None]
@@ -383,6 +400,38 @@ def _(model: Product, policy: jax.Array) -> jax.Array:
     weight = policy[..., None] * model.successor_probability
     shape = (model.num_states, *weight.shape[2:])
     return operators.scatter_matrix(flat.reshape(shape), weight.reshape(shape))
+
+
+@operators.following.register
+def _(model: Product, policy: jax.Array) -> Any:
+    if isinstance(model.mdp, MDP | DenseMDP):
+        return operators.along(operators.induced_chain(model, policy))
+
+    def onward(value: jax.Array) -> jax.Array:
+        ahead = operators.expectation(model, value.reshape(model.state_shape))
+        return jnp.take_along_axis(ahead, policy[..., None], axis=-1).ravel()
+
+    return onward
+
+
+@operators.given_states.register
+def _(model: Product) -> Any:
+    found: Any = operators.given_states(model.mdp)
+    return found if found is True else found[:, None]
+
+
+@operators.greatest_predecessor.register
+def _(model: Product, quantity: jax.Array) -> jax.Array:
+    moves = model.next_memory[:, :, None] == jnp.arange(model.num_memory)  # [S, Q, Q']
+
+    def moved(here: jax.Array) -> jax.Array:
+        """``[S, Q']`` from ``[S, Q]``."""
+        return jnp.max(jnp.where(moves, here[:, :, None], 0), axis=1)
+
+    if model.label_on == "entry":
+        return moved(operators.greatest_predecessor(model.mdp, quantity))
+    quantity = jax.vmap(moved, in_axes=-1, out_axes=-1)(quantity)
+    return operators.greatest_predecessor(model.mdp, quantity)
 
 
 def _successor(world: MDP | DenseMDP) -> jax.Array:

@@ -303,7 +303,7 @@ def make_sparse(
     start, successor, probability, rewards = parts
     return SparseMDP(
         row_start=row_start.astype(np.int32), entry_start=start, successor=successor,
-        probability=_scaled(row_start, start, probability),
+        probability=scaled(row_start, start, probability),
         initial=checked_initial(initial, num_states), label=label, rewards=rewards,
         action=action, valuation={n: np.asarray(x) for n, x in (valuation or {}).items()},
         propositions=names, action_names=action_names)
@@ -330,34 +330,38 @@ def checked_starts(name: str, start: Any, total: int, of: str) -> np.ndarray:
     return start.astype(np.int64)  # NumPy takes no unsigned ones for counts
 
 
-def placed(row_start: np.ndarray, row: int) -> str:
-    """A choice by its state and rank, for messages."""
+def placed(row_start: np.ndarray, row: int, first: int = 0) -> str:
+    """A choice by its state and rank, for messages; the first state's number is `first`."""
     state = int(np.searchsorted(row_start, row, "right")) - 1
-    return f"state {state}, choice {row - int(row_start[state])}"
+    return f"state {first + state}, choice {row - int(row_start[state])}"
 
 
 def check_entries(
-    row_start: np.ndarray, entry_start: np.ndarray, successor: np.ndarray, probability: np.ndarray
+    row_start: np.ndarray, entry_start: np.ndarray, successor: np.ndarray, probability: np.ndarray,
+    *, first: int = 0, num_states: int | None = None,
 ) -> None:
-    """Raises a ValueError where a state, a row or an entry is not what a model may have."""
-    num_states = row_start.size - 1
+    """Raises a ValueError where a state, a row or an entry is not what a model may have.
+
+    Of a part of a model, `first` is its first state and `num_states` are those of all of it.
+    """
+    num_states = row_start.size - 1 if num_states is None else num_states
     if (np.diff(row_start) == 0).any():
-        raise ValueError(f"state {np.flatnonzero(np.diff(row_start) == 0)[0]} has no choice; give "
-                         "it one, for example a loop to itself.")
+        raise ValueError(f"state {first + np.flatnonzero(np.diff(row_start) == 0)[0]} has no "
+                         "choice; give it one, for example a loop to itself.")
     if (np.diff(entry_start) == 0).any():
         row = int(np.flatnonzero(np.diff(entry_start) == 0)[0])
-        raise ValueError(f"{placed(row_start, row)} leads nowhere; give it a successor.")
+        raise ValueError(f"{placed(row_start, row, first)} leads nowhere; give it a successor.")
     if successor.min() < 0 or successor.max() >= num_states:
         e = int(np.flatnonzero((successor < 0) | (successor >= num_states))[0])
         row = int(np.searchsorted(entry_start, e, "right")) - 1
-        raise ValueError(f"{placed(row_start, row)}: successor {successor[e]} is out of range; "
-                         f"states are 0 to {num_states - 1}.")
+        raise ValueError(f"{placed(row_start, row, first)}: successor {successor[e]} is out of "
+                         f"range; states are 0 to {num_states - 1}.")
     # A sum is NaN or infinite if any of it is.
     if not probability.min() >= 0 or not np.isfinite(probability.sum()):
         e = int(np.flatnonzero(~(probability >= 0) | np.isinf(probability))[0])
         row = int(np.searchsorted(entry_start, e, "right")) - 1
-        raise ValueError(f"{placed(row_start, row)}: probability {probability[e]}; probabilities "
-                         "must be finite and not negative.")
+        raise ValueError(f"{placed(row_start, row, first)}: probability {probability[e]}; "
+                         "probabilities must be finite and not negative.")
 
 
 def _checked_rewards(
@@ -442,13 +446,20 @@ def _sorted(entry_start: np.ndarray, successor: np.ndarray, row: np.ndarray) -> 
     return within.data
 
 
-def _scaled(row_start: np.ndarray, entry_start: np.ndarray, probability: np.ndarray) -> np.ndarray:
+def scaled(
+    row_start: np.ndarray, entry_start: np.ndarray, probability: np.ndarray, *, first: int = 0
+) -> np.ndarray:
+    """Probabilities whose rows sum to one, from such as do within 1e-6.
+
+    Raises:
+      ValueError: a row does not, with its state, the number of the first one being `first`.
+    """
     total = np.add.reduceat(probability, entry_start[:-1])
     off = np.abs(total - 1)
     if off.max() > 1e-6:
         row = int(np.flatnonzero(off > 1e-6)[0])
-        raise ValueError(f"{placed(row_start, row)}: the probabilities sum to {total[row]:.9g}, "
-                         "not 1; correct the row.")
+        raise ValueError(f"{placed(row_start, row, first)}: the probabilities sum to "
+                         f"{total[row]:.9g}, not 1; correct the row.")
     count = np.diff(entry_start)
     wrong = off > (count + 2) * np.finfo(np.float64).eps
     if not wrong.any():

@@ -17,6 +17,7 @@ from jax import lax
 
 from jaxltl.core.models.entries import Entries
 from jaxltl.core.models.operators import transition_matrix
+from jaxltl.core.models.sharded import is_sharded
 from jaxltl.core.models.tables import Primitives, Successors
 from jaxltl.core.values.iterate import in_turn, iterate
 
@@ -164,9 +165,16 @@ def solver(
     if method not in ("auto", "direct", "iterative"):
         raise ValueError(f"method={method!r}; choose auto, direct or iterative.")
     system = lax.stop_gradient(system)
-    if method == "iterative" or (method == "auto" and system.num_states > DENSE_LIMIT):
+    small = is_small(system.table, system.num_states)
+    if method == "iterative" or (method == "auto" and not small):
         return Krylov(system, max_steps=max_steps)
     return Inverse(system, in_turn(inverse, system.matrix()))
+
+
+def is_small(table: Any, num_states: int) -> bool:
+    """Whether systems of so many states are inverted; those on several devices never are."""
+    spread = isinstance(table, Primitives) and is_sharded(table.model)
+    return num_states <= DENSE_LIMIT and not spread
 
 
 def _refined(inverse_: jax.Array, matvec: Any, b: jax.Array) -> jax.Array:

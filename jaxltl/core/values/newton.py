@@ -18,10 +18,10 @@ from jax import lax
 
 from jaxltl.core.values.iterate import iterate
 from jaxltl.core.values.linear import (
-    DENSE_LIMIT,
     Bicgstab,
     System,
     inverse,
+    is_small,
     norm,
     start_bicgstab,
 )
@@ -111,7 +111,7 @@ def solve(
       The value, its image, and the applications of P; and the weights, packed.
     """
     # Elsewhere an exact step is no better than another.
-    small = monotone and value.shape[0] <= DENSE_LIMIT
+    small = monotone and is_small(table, value.shape[0])
     over = table.choices
 
     def step(table: Any, k: _Search, given: Backup) -> _Search:

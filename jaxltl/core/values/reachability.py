@@ -31,7 +31,7 @@ from jaxltl.core.models.operators import (
     action_argmax,
     action_mean,
     expectation,
-    induced_chain,
+    following,
     is_deterministic,
     require_policy,
     valid_policy,
@@ -144,8 +144,7 @@ def reachability_probability(
             found = _evaluate(model, target, policy, tolerance, max_steps, method=method)
         return found
     if traced:
-        sets, components = in_turn(partial(_decided, objective=objective), model, target)
-        return _optimize(model, sets, components, tolerance, max_steps, objective=objective)
+        return _inside_jit(model, target, tolerance, max_steps, objective=objective)
     found = _by_layers(model, target, tolerance, objective)
     if found is not None:
         return found
@@ -165,6 +164,12 @@ def reachability_probability(
     action = np.asarray(found.policy)
     good = _attaining(graph, sets, components, action, ties, objective)
     return replace(found, policy=to_jax(_quickest(model, graph, good, decided, action)))
+
+
+@partial(jax.jit, static_argnames=("objective",))
+def _inside_jit(model, target, tolerance, max_steps, *, objective) -> Solution:
+    sets, components = in_turn(partial(_decided, objective=objective), model, target)
+    return _optimize(model, sets, components, tolerance, max_steps, objective=objective)
 
 
 def _decided(model: Any, target: Any, *, objective: str) -> tuple[Sets, EndComponents | None]:
@@ -528,10 +533,10 @@ def _tighter(sign: int, finest: bool, table: None, carry: _Bounds, search: _Sear
 
 
 def _followed(sign: int, search: _Search, near: jax.Array, action: jax.Array) -> jax.Array:
-    chain = induced_chain(search.model, action)
+    onward = following(search.model, action)
 
     def sweep(_, y: jax.Array) -> jax.Array:
-        image = expectation(chain, y.ravel())[:, 0].reshape(y.shape)
+        image = onward(y.ravel()).reshape(y.shape)
         return search.nearer(sign, y, jnp.where(search.undecided, image, search.one))
 
     return lax.fori_loop(0, _POLICY_SWEEPS, sweep, near)

@@ -20,6 +20,7 @@ from jaxltl.core.models.concrete import is_traced, namespace, to_jax
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.operators import is_deterministic, require_policy
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.sharded import is_sharded
 from jaxltl.core.types import Solution
 from jaxltl.core.values.enclosed import is_sparse
 from jaxltl.core.values.opposite import opposite_event
@@ -139,6 +140,11 @@ def optimal_satisfaction(
     refuse_nature(nature)
     if objective in ("max", "min") and is_sparse(model):
         return product_satisfaction(model, objective=objective, tolerance=tolerance)
+    run = _over_mesh if is_sharded(model) else _optimal
+    return run(model, tolerance, max_steps, objective=objective)
+
+
+def _optimal(model: Product, tolerance: Any, max_steps: Any, *, objective: str) -> Solution:
     problem = as_reachability(model, objective)
     found = reachability_probability(
         problem.model, problem.target, objective=problem.objective, tolerance=tolerance,
@@ -148,6 +154,10 @@ def optimal_satisfaction(
             problem.accepting.region, _visiting(problem, found), found.policy)
         found = replace(found, policy=to_jax(xp.where(region, action, chosen).astype(xp.int32)))
     return opposite_event(found) if problem.opposite else found
+
+
+# What no host reads is one program, not one an operation.
+_over_mesh = jax.jit(_optimal, static_argnames=("objective",))
 
 
 class Reaching(NamedTuple):
