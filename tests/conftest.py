@@ -54,6 +54,8 @@ keep_all_programs()
 import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
+# Meshes of one, two and four devices; all else stays on the first.
+jax.config.update("jax_num_cpu_devices", 4)
 # Among as many objects as compiled programs leave, a tenth of the time would go into looking for
 # circles of some hundred new ones.
 gc.set_threshold(50_000, 20, 20)
