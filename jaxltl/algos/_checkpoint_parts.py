@@ -101,9 +101,9 @@ def remove(paths: list[Path]) -> None:
 class Parts:
     """The parts beside a file, read as they are needed, each piece once."""
 
-    def __init__(self, path: Path) -> None:
-        self._beside, self._files = path, dict[str, Any]()
-        self._pieces = dict[tuple[str, str], np.ndarray]()
+    def __init__(self, path: Path, closing: contextlib.ExitStack) -> None:
+        self._beside, self._closing = path, closing
+        self._files, self._pieces = dict[str, Any](), dict[tuple[str, str], np.ndarray]()
 
     def read(self, stored: Stored, index: tuple[slice, ...] | None = None) -> np.ndarray:
         """A block of an array, or all of it, from the pieces that have something of it.
@@ -124,26 +124,20 @@ class Parts:
         if (file, name) not in self._pieces:
             try:
                 if file not in self._files:
-                    self._files[file] = np.load(self._beside.with_name(file), allow_pickle=False)
+                    opened = self._closing.enter_context(self._beside.with_name(file).open("rb"))
+                    self._files[file] = np.load(opened, allow_pickle=False)
                 self._pieces[file, name] = self._files[file][name]
             except Exception as error:  # damaged bytes make numpy and zipfile raise almost anything
                 what = "missing" if isinstance(error, FileNotFoundError) else "damaged"
                 raise ValueError(f"its part {file!r} is {what}.") from None
         return self._pieces[file, name]
 
-    def close(self) -> None:
-        for file in self._files.values():
-            file.close()
-
 
 @contextlib.contextmanager
 def reading(path: str | os.PathLike[str]) -> Iterator[Parts]:
     """The parts beside a file, closed again."""
-    parts = Parts(Path(path))
-    try:
-        yield parts
-    finally:
-        parts.close()
+    with contextlib.ExitStack() as closing:
+        yield Parts(Path(path), closing)
 
 
 def _ends(index: tuple[slice, ...], shape: Any) -> tuple[list[int], list[int]]:

@@ -1,0 +1,204 @@
+"""Several processes: who they are, what they agree on, and how a run ends and goes on."""
+
+import os
+import random
+import signal
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from jaxltl.algos import checkpoint
+from jaxltl.app._teller import told
+from jaxltl.app.processes import Asked, Launch, Place, launched
+from tests import several
+
+SLURM = {"SLURM_NTASKS": "3", "SLURM_PROCID": "2", "SLURM_JOB_ID": "5",
+         "SLURM_STEP_NODELIST": "n[1-3]", "SLURM_LOCALID": "0"}
+MPI = {"OMPI_COMM_WORLD_SIZE": "2", "OMPI_COMM_WORLD_RANK": "1",
+       "OMPI_MCA_orte_hnp_uri": "13.0;tcp://10.0.0.1:34911"}
+MPI_5 = {k: v for k, v in MPI.items() if "orte" not in k}
+HERE = {"coordinator": "node1:77", "process": 1, "processes": 2}
+
+
+@pytest.mark.parametrize(("options", "environment", "expected"), [
+    ({}, {}, Launch()),
+    ({"mesh": None}, SLURM, Launch()),
+    ({}, SLURM, Launch(2, 3)),
+    ({}, MPI, Launch(1, 2)),
+    ({}, {**SLURM, **MPI}, Launch(1, 2)),
+    ({}, {**SLURM, "SLURM_NTASKS": "1", "SLURM_PROCID": "0"}, Launch()),
+    ({"processes": 1}, SLURM, Launch()),
+    (HERE, {}, Launch(1, 2, "node1:77")),
+    (HERE, SLURM, Launch(1, 2, "node1:77")),
+    ({"coordinator": "node1:77"}, MPI_5, Launch(1, 2, "node1:77")),
+    ({}, {**MPI_5, "JAX_COORDINATOR_ADDRESS": "node2:8"}, Launch(1, 2, "node2:8")),
+    ({"coordinator": "[::1]:77", "process": 0, "processes": 2}, {}, Launch(0, 2, "[::1]:77")),
+])
+def test_which_process_this_is(options, environment, expected):
+    assert launched(Asked(**{"mesh": 0, **options}), environment) == expected
+
+
+@pytest.mark.parametrize(("options", "environment", "message"), [
+    ({"mesh": None, "process": 1}, {}, "--process is of use with --mesh alone"),
+    ({"process": 1, "processes": 2}, {}, "--coordinator is missing, and nobody else says it"),
+    ({"process": 1, "coordinator": "a:1"}, {}, "--processes is missing"),
+    ({"processes": 2, "coordinator": "a:1"}, {}, "--process is missing"),
+    ({**HERE, "process": 2}, {}, "--process 2 is none of 2 processes; number them from 0 to 1"),
+    ({**HERE, "coordinator": "node1"}, {}, "'node1' is no HOST:PORT"),
+    ({**HERE, "coordinator": ":70000"}, {}, "':70000' is no HOST:PORT"),
+    ({}, MPI_5, "--coordinator is missing, and Open MPI does not say where process 0 is"),
+])
+def test_what_contradicts_itself_or_is_missing_is_named(options, environment, message):
+    with pytest.raises(ValueError, match=message):
+        launched(Asked(**{"mesh": 0, **options}), environment)
+
+
+FATAL = ("F1122 16:30:07.588292   16822 client.h:80] Terminating process because the JAX "
+         "distributed service detected fatal errors. This most likely indicates that another task "
+         "died; see the other task logs for more details. absl::Status: ")
+
+
+@pytest.mark.parametrize(("text", "start"), [
+    ("UNAVAILABLE: The following tasks are unhealthy (stopped sending heartbeats):\n1\nThe tasks",
+     "process 0 stops, for process 1 gives no sign of life any more; what was saved is kept"),
+    ("UNAVAILABLE: The following tasks are unhealthy (stopped sending heartbeats):\n1\n12\nThe",
+     "process 0 stops, for processes 1, 12 give no sign of life any more"),
+    ("DEADLINE_EXCEEDED: Deadline Exceeded\n\nRPC: /xla.coordination.CoordinationService/Register"
+     "Task\n*** Check", "process 0: not all processes have joined in time"),
+    ("ALREADY_EXISTS: Aborted connect attempt as there is a request from a newer incarnation\n\n"
+     "RPC: /xla.coordination.CoordinationService/RegisterTask", "process 0: another process has"),
+    ("UNAVAILABLE: Failed to send RPC to coordination service. Either the leader task was "
+     "preempted\n:UNKNOWN:Error received from peer\n\nRPC: /xla.coordination.CoordinationService/"
+     "PollForError", "process 0 stops, for process 0, which the others meet at, has ended"),
+    ("INTERNAL: Shutdown barrier has failed.", "process 0 stops, for another process has ended"),
+])
+def test_the_last_words_of_the_runtime_in_a_line(text, start):
+    line = told(FATAL + text, 0)
+    assert line.startswith(start) and "\n" not in line and line.endswith(".")
+
+
+def test_alone_nothing_is_exchanged():
+    place = Place()
+    assert place.is_first and place.exchanged("a") == ["a"] and place.sees("it", False) is False
+    place.agree({"--seed": 3})
+    assert place.together(lambda: 7) == 7
+    with pytest.raises(ValueError, match="of mine"):
+        place.together(lambda: int("x of mine"))
+
+
+# --- runs of two processes ----------------------------------------------------------------------
+
+
+def at_once(tmp_path, number=2, seconds=120):
+    return several.ended(several.start_run(number, tmp_path), seconds)
+
+
+def lines(found):
+    return dict(line.split(": ") for line in found.out.splitlines() if ": " in line)
+
+
+def is_whole(directory):
+    """The saved run is read by a process alone, and is of the same steps in every lane."""
+    path = directory / "run.npz"
+    if not path.exists():
+        return 0
+    with np.load(path) as index:
+        names = [name for name in index.files if name not in ("given", "parts")]
+    assert names
+    saved = checkpoint.load(path, *_like(path))
+    assert len(set(np.asarray(saved[0].count).tolist())) == 1
+    np.testing.assert_array_equal(saved[0].state.step, saved[0].count)
+    assert len(saved[1][0]) and (saved[1][0][-1] == np.asarray(saved[0].count)).all()
+    return int(saved[0].count[0])
+
+
+def _like(path):
+    """What the run saves, and what it is told apart by."""
+    from jaxltl.algos import learner
+
+    with jax.enable_x64(False):  # as the program
+        step, states, goal = several.problem_and_state()
+        given = {}
+        hparams = learner._spread(0.01, states)
+        now = learner._begin(step, states, goal, hparams, several.LANES)
+        rows = jax.tree.map(
+            lambda x: np.zeros((0, *x.shape), x.dtype), (now.count, now.metrics))
+        given = checkpoint.fingerprint(step=step, problem=goal, hparams=hparams)
+    return (now, rows), given
+
+
+def killed(tmp_path, number, victim, moment):
+    """The other processes of a run, one of which is killed; how they ended, and how soon."""
+    processes = several.start_run(number, tmp_path)
+    moment(processes)
+    os.killpg(processes[victim].pid, signal.SIGKILL)
+    begin = time.monotonic()
+    found = several.ended(processes, 120)
+    return [x for i, x in enumerate(found) if i != victim], time.monotonic() - begin
+
+
+def saved_once(directory):
+    def wait(processes):
+        end = time.monotonic() + 120
+        while not (directory / "run.npz").exists() and time.monotonic() < end:
+            assert all(p.poll() is None for p in processes)
+            time.sleep(0.01)
+
+    return wait
+
+
+def check_end(others, seconds):
+    """Unless all were done, the others end in time, with a line."""
+    for found in others:
+        if found.status == 0:
+            assert not found.errors
+            continue
+        assert len(found.errors) == 1, found
+        assert "has ended" in found.err or "no sign of life" in found.err, found
+        assert "go" in found.errors[0] and "Traceback" not in found.err
+        assert seconds < 60
+
+
+def test_a_run_goes_on_when_a_process_has_died(tmp_path):
+    """With as many processes and with one: to the same bits as a run that nothing befell."""
+    others, seconds = killed(tmp_path, 2, 1, saved_once(tmp_path))
+    assert others[0].status != 0
+    check_end(others, seconds)
+    made = is_whole(tmp_path)
+    assert 0 < made < several.STEPS
+    alone = at_once(tmp_path, 1)[0]
+    assert alone.status == 0 and lines(alone)["went on"] == "True"
+    assert int(lines(alone)["rows"]) == several.STEPS // 5
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    expected = lines(at_once(whole, 1)[0])
+    assert expected["went on"] == "False" and lines(alone)["ended"] == expected["ended"]
+    checkpoint.remove(tmp_path / "run.npz")
+    assert list(tmp_path.iterdir()) == [whole]
+
+
+@pytest.mark.exhaustive
+def test_twenty_restarts_after_kills_at_random_end_alike(tmp_path):
+    """At any time: while they meet, compute, save or end; restarted by two, three or one."""
+    expected, draw, went_on = None, random.Random(7), 0
+    for i in range(20):
+        directory = tmp_path / str(i)
+        directory.mkdir()
+
+        def moment(processes, i=i, directory=directory):
+            if i % 4 == 0:
+                time.sleep(draw.uniform(0.5, 5))
+            else:
+                saved_once(directory)(processes)
+                time.sleep(draw.expovariate(1.0))
+
+        check_end(*killed(directory, 2, draw.randrange(2), moment))
+        is_whole(directory)
+        found = at_once(directory, (2, 2, 3, 1)[i % 4])
+        assert [x.status for x in found] == [0] * len(found), found
+        went_on += lines(found[0])["went on"] == "True"
+        expected = expected or lines(found[0])["ended"]
+        assert lines(found[0])["ended"] == expected
+    assert went_on > 5

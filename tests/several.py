@@ -1,0 +1,133 @@
+"""A run of several processes that saves its way: started, killed, and what became of it.
+
+As a program: ``several.py DIRECTORY COORDINATOR PROCESS PROCESSES``.
+"""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ROOT = Path(__file__).parent.parent
+STEPS, LANES = 4000, 4
+
+
+class Ended(NamedTuple):
+    """How a process ended, and what it printed."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def errors(self) -> list[str]:
+        return [line for line in self.err.splitlines() if "error" in line.lower()]
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+def start(number: int, *command: str, places: bool = True) -> list[subprocess.Popen]:
+    """Processes 0 to `number` - 1 of a command, each with a group of its own.
+
+    With `places` the command ends with where they meet, which it is, and of how many; else these
+    are the options of the command line.
+    """
+    address, found = f"127.0.0.1:{free_port()}", []
+    for i in range(number):
+        names = ("--coordinator", "--process", "--processes")
+        values = (address, str(i), str(number))
+        more = values if places else [x for pair in zip(names, values, strict=True) for x in pair]
+        found.append(subprocess.Popen(
+            [sys.executable, *command, *more], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            text=True, cwd=ROOT, start_new_session=True,
+            env={**os.environ, "PYTHONPATH": str(ROOT)}))
+    return found
+
+
+def start_run(number: int, directory: Path) -> list[subprocess.Popen]:
+    return start(number, str(Path(__file__)), str(directory))
+
+
+def ended(processes: list[subprocess.Popen], seconds: float) -> list[Ended]:
+    """When all have ended; whatever happens, nothing of them stays behind."""
+    try:
+        return [Ended(p.returncode, *texts) for p, texts in
+                [(p, p.communicate(timeout=seconds)) for p in processes]]
+    finally:
+        for process in processes:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+# --- the program ------------------------------------------------------------------------------
+
+
+def main(directory: Path, coordinator: str, process: int, processes: int) -> None:
+    from jaxltl.app.processes import Asked, launched, taking_part
+
+    asked = Asked(0, coordinator, process, processes, wait=15)
+    with taking_part(asked, launched(asked, {}), print) as place:
+        run(directory, place)
+
+
+def problem_and_state() -> tuple[Any, Any, Any]:
+    """A toy: what is to be approached, by steps that draw, and the first states of the lanes."""
+    import jax
+    import jax.numpy as jnp
+    from flax import struct
+
+    @struct.dataclass
+    class State:
+        position: Any
+        step: Any
+        key: Any
+
+    @struct.dataclass
+    class Metrics:
+        distance: Any
+
+    def step(state: State, goal: Any, rate: Any) -> tuple[State, Metrics]:
+        noise = jax.random.normal(jax.random.fold_in(state.key, state.step), goal.shape)
+        position = state.position + rate * (goal - state.position) + 0.01 * noise
+        return (State(position, state.step + 1, state.key),
+                Metrics(jnp.abs(goal - position).max()))
+
+    keys = jax.random.split(jax.random.key(0), LANES)
+    states = State(jnp.zeros((LANES, 3)), jnp.zeros(LANES, jnp.int32), keys)
+    return step, states, jnp.arange(3.0)
+
+
+def run(directory: Path, place: Any) -> None:
+    """Steps of the lanes, saved after every 50, and what comes out, printed by the first."""
+    from jaxltl.algos import learner
+    from jaxltl.core.models.lanes import on_host
+
+    step, states, goal = problem_and_state()
+    path = directory / "run.npz"
+    begun = place.sees(str(path), path.exists())
+    made: list[int] = []
+    found = learner.run_in_chunks(
+        step, states, goal, 0.01, num_steps=STEPS, lanes=True, chunk=50, checkpoint=path,
+        mesh=place.mesh, report=lambda done, _: made.append(done))
+    state = on_host(found.state)
+    if place.is_first:
+        print(f"went on: {begun and (not made or made[0] > 50)}")
+        print(f"rows: {len(found.step)}")
+        print(f"ended: {state.position.tobytes().hex()}")
+
+
+if __name__ == "__main__":
+    from tests.several import main as of_that_name  # by which what is saved knows its functions
+
+    of_that_name(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
+    sys.stdout.flush()
+    os._exit(0)
