@@ -9,8 +9,8 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
+from jaxltl.core.models import lanes
 from jaxltl.core.types import require_shape
 
 
@@ -51,14 +51,10 @@ def evaluate_all(
 ) -> tuple[jax.Array, jax.Array]:
     """Objectives ``[n]`` and costs ``[n, C]`` of a population."""
     keys = jax.random.split(key, len(samples))
-    sharding = hparams.sharding
-    if sharding is not None:
-        samples, keys = lax.with_sharding_constraint((samples, keys), sharding)
+    samples, keys = lanes.split((samples, keys), hparams.sharding)
     found = jax.vmap(partial(scores, problem))(samples, keys)
-    if sharding is not None:  # every device ranks them all, in one order of operations
-        whole = jax.sharding.NamedSharding(sharding.mesh, jax.sharding.PartitionSpec())
-        found = lax.with_sharding_constraint(found, whole)
-    return found
+    # Every device ranks them all, in one order of operations.
+    return lanes.whole(found, hparams.sharding)
 
 
 def scores(

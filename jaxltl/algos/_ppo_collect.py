@@ -17,6 +17,7 @@ from jaxltl.algos import learner
 from jaxltl.algos.actor_critic import Output, evaluated
 from jaxltl.algos.advantages import generalized_advantages
 from jaxltl.algos.moments import Moments, normalized, scale_of, updated_moments
+from jaxltl.core.models import lanes
 from jaxltl.core.models.environment import Timestep, allowed_in
 
 
@@ -113,7 +114,9 @@ def collected(
     value, last = every.value.astype(dtype), final.value.astype(dtype)
     following = jnp.concatenate([value[1:], last[None]])
     cut = path.truncated & ~path.terminated
-    following = _at_ends(cut, following, problem, state, every.memory, path.last)
+    at_ends = lanes.apart(_at_ends, hparams.sharding, (1, 1, 1, None), 1)
+    following = at_ends(
+        cut, following, (every.memory, path.last), (problem, state.parameters, state.moments))
     following = jnp.where(path.terminated, 0, following)
     discount = jnp.asarray(hparams.discount, dtype) * path.discount.astype(dtype)
     reward, ended = path.reward.astype(dtype), path.terminated | path.truncated
@@ -166,12 +169,27 @@ def _walked(key: chex.PRNGKey, state: Any, problem: Any, hparams: Any) -> tuple[
     noise = actions_of.noise(noise_key, size, environment.actions, dtype)
     keys = jax.random.split(move_key, size)
     begin, pool = _starts(reset_key, environment, hparams)
+    step = (state.parameters, state.moments, problem, hparams, pool)
+    walk = lanes.apart(
+        partial(_walk, sharding=hparams.sharding), hparams.sharding, (0, 0, 1, 1, 1, None), (0, 1))
+    walkers, path = walk(
+        lanes.ranks(hparams.sharding), state.walkers, begin, noise, keys, step)
+    return learner.strong(walkers), path
+
+
+def _walk(
+    rank: jax.Array, walkers: Walkers, begin: Any, noise: Any, keys: jax.Array, given: Any, *,
+    sharding: Any,
+) -> tuple[Walkers, _Path]:
+    """Steps of all environments, or of those of one device."""
+    parameters, moments, problem, hparams, pool = given
+    environment = problem.environment
 
     def one(walker: Walkers, noise: jax.Array, key: chex.PRNGKey) -> Any:
         observation = environment.observe(walker.world)
         allowed = allowed_in(environment, walker.world)
-        seen = normalized(state.moments, observation)
-        said = evaluated(problem, state.parameters, walker.memory, seen)
+        seen = normalized(moments, observation)
+        said = evaluated(problem, parameters, walker.memory, seen)
         raw = actions_of.drawn(environment.actions, said.action, allowed, noise)
         density = actions_of.log_density(environment.actions, said.action, allowed, raw)
         action = actions_of.as_action(environment.actions, raw, hparams.squash)
@@ -201,16 +219,16 @@ def _walked(key: chex.PRNGKey, state: Any, problem: Any, hparams: Any) -> tuple[
         walkers, row = jax.vmap(one)(walkers, *chance)
         ended = row.terminated | row.truncated
         if pool is not None:
-            number = used + jnp.cumsum(ended, dtype=jnp.int32)
-            start = jax.tree.map(lambda x: x[(number - 1) % hparams.num_resets], pool)
-            used = number[-1] % hparams.num_resets
+            number, last = lanes.running_sum(ended, rank, sharding)
+            start = jax.tree.map(
+                lambda x: x[(used + number - 1) % hparams.num_resets], pool)
+            used = (used + last) % hparams.num_resets
         elif hparams.num_resets == 0:
             start = jax.vmap(environment.reset)(start)
         return (jax.vmap(restarted)(walkers, start, row), used), row
 
-    (walkers, _), path = lax.scan(
-        move, (state.walkers, jnp.int32(0)), (begin, noise, keys))
-    return learner.strong(walkers), path
+    (walkers, _), path = lax.scan(move, (walkers, jnp.int32(0)), (begin, noise, keys))
+    return walkers, path
 
 
 def _starts(key: chex.PRNGKey, environment: Any, hparams: Any) -> tuple[Any, Any]:
@@ -232,15 +250,14 @@ def _evaluated_all(
     return function(memory, observation)
 
 
-def _at_ends(
-    cut: jax.Array, following: jax.Array, problem: Any, state: Any, memory: Any, last: Any
-) -> jax.Array:
+def _at_ends(cut: jax.Array, following: jax.Array, ends: Any, judge: Any) -> jax.Array:
     """Values that follow, with those of the worlds where episodes were cut off put in.
 
     They are few, so that only they are evaluated, some at a time.
     """
     size, some = cut.size, min(cut.size, max(cut.shape[1], 32))
-    flat = jax.tree.map(lambda x: x.reshape(size, *x.shape[2:]), (memory, last))
+    problem, parameters, moments = judge
+    flat = jax.tree.map(lambda x: x.reshape(size, *x.shape[2:]), ends)
     place = jnp.nonzero(cut.ravel(), size=size, fill_value=size)[0]
     place = jnp.concatenate([place, jnp.full(some, size, place.dtype)])
 
@@ -256,6 +273,6 @@ def _at_ends(
         values = values.at[chosen].set(found.value.astype(values.dtype), mode="drop")
         return turn + active(carry, given), values
 
-    given = cut.sum(), place, flat, state.moments, state.parameters
+    given = cut.sum(), place, flat, moments, parameters
     _, values = learner.while_active(active, body, (jnp.int32(0), following.ravel()), given)
     return values.reshape(following.shape)

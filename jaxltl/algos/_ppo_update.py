@@ -16,6 +16,7 @@ from jaxltl.algos import learner
 from jaxltl.algos._ppo_collect import Rows
 from jaxltl.algos.actor_critic import Output, evaluated, has_memory
 from jaxltl.algos.schedules import at
+from jaxltl.core.models import lanes
 
 
 class Figures(NamedTuple):
@@ -119,7 +120,8 @@ def improved(
     """
     limits = Limits(at(hparams.clip, state.step), _at(hparams.value_clip, state.step))
     rate = at(hparams.learning_rate, state.step)
-    recurrent = has_memory(problem)
+    recurrent, over = has_memory(problem), hparams.sharding
+    rows, begun = lanes.whole((rows, begun), over)  # any device may be asked for any of them
     if not recurrent:
         rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
     size = hparams.num_envs if recurrent else len(rows.value)
@@ -128,8 +130,10 @@ def improved(
     def update(going: _Going, chosen: jax.Array) -> tuple[_Going, Any]:
         some = jax.tree.map(lambda x: jnp.take(x, chosen, axis=int(recurrent)), rows)
         memory = jax.tree.map(lambda x: x[chosen], begun) if recurrent else ()
+        some, memory = lanes.split(some, over, int(recurrent)), lanes.split(memory, over)
         (_, told), slope = jax.value_and_grad(loss, has_aux=True)(
             going.parameters, some, memory, problem, hparams, limits)
+        slope, told = lanes.whole((slope, told), over)
         norm = jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(slope)))
         told = told._replace(gradient_norm=norm)
         stopped = going.stopped

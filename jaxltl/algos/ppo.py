@@ -43,6 +43,7 @@ from jaxltl.algos.moments import Moments, no_moments, normalized
 from jaxltl.algos.schedules import Polynomial, Schedule
 from jaxltl.algos.schedules import at as _at
 from jaxltl.core.host import given
+from jaxltl.core.models import lanes
 from jaxltl.core.models.environment import Agent, Box, Environment, Finite, require_environment
 from jaxltl.core.types import Status
 
@@ -99,6 +100,10 @@ class Hparams:
         in each of the T steps, which is the same to the learner. Some other number: that many,
         handed out in turn, and from the first again if they do not suffice; where a reset is
         costly and episodes are long, this is fastest.
+      sharding: a ``NamedSharding`` whose spec names the mesh axis over which the environments, and
+        each minibatch, are split, such as ``NamedSharding(mesh, PartitionSpec("environments"))``;
+        static. The run is the same up to the order of sums. What a step collected is sent to
+        all devices once, for a minibatch is drawn from all of it.
     """
 
     discount: jax.Array | float
@@ -120,6 +125,7 @@ class Hparams:
     normalize_reward: bool = struct.field(pytree_node=False, default=False)
     squash: str = struct.field(pytree_node=False, default="clip")
     num_resets: int | None = struct.field(pytree_node=False, default=None)
+    sharding: Any = struct.field(pytree_node=False, default=None)
 
 
 @struct.dataclass
@@ -267,6 +273,8 @@ def _check(problem: Problem, hparams: Hparams) -> None:
         raise ValueError(
             f"num_minibatches={hparams.num_minibatches} does not divide {size}, the number of "
             f"{what}; choose a divisor.")
+    lanes.require_split("sharding", hparams.sharding, num_envs=hparams.num_envs, **{
+        "the number of rows of a minibatch": size // hparams.num_minibatches})
     for name, (low, high) in _RANGES.items():
         number = getattr(hparams, name)
         if (number is None and name in _OPTIONAL) or (name in _SCHEDULES and callable(number)):
@@ -342,7 +350,8 @@ def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         moments = jax.tree.map(lambda x: no_moments(x.shape), first)
     return learner.strong(State(
         key=key, step=jnp.int32(0), parameters=parameters,
-        optimizer=descent(hparams).init(parameters), walkers=walkers, moments=moments,
+        optimizer=descent(hparams).init(parameters),
+        walkers=lanes.split(walkers, hparams.sharding), moments=moments,
         return_moments=no_moments(()) if hparams.normalize_reward else None,
         transitions=jnp.int32(0)))
 

@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
@@ -93,8 +94,9 @@ def on_host(tree: Any) -> Any:
         if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
             found = one(jax.random.key_data(x))
             return jax.random.wrap_key_data(found, impl=jax.random.key_impl(x))
+        sharding: Any = x.sharding
         if not x.is_fully_addressable and not x.is_fully_replicated:
-            x = _copied(x, x.sharding.mesh)
+            x = _copied(x, sharding.mesh)
         return np.asarray(x)
 
     return jax.tree.map(one, tree)
@@ -117,6 +119,121 @@ def axes_of(mesh: Mesh, axis: str | Sequence[str] | None) -> tuple[str, ...]:
 def automatic(mesh: Mesh) -> Mesh:
     """The mesh whose arrays JAX splits by itself: the types of others say where each must lie."""
     return Mesh(mesh.devices, mesh.axis_names, axis_types=(AxisType.Auto,) * len(mesh.axis_names))
+
+
+def _first_axes(sharding: NamedSharding) -> tuple[str, ...]:
+    """Names of the mesh axes that the first entry of a spec splits over."""
+    first = (*sharding.spec, None)[0]
+    return () if first is None else (first,) if isinstance(first, str) else tuple(first)
+
+
+def _here(mesh: Any) -> Any:
+    """The mesh that holds where this is traced: of a mesh that was set, or of a lane on it."""
+    ambient = jax.sharding.get_abstract_mesh()
+    return automatic(mesh) if ambient.empty else ambient
+
+
+def _count(mesh: Any, axes: Sequence[str]) -> int:
+    return math.prod(mesh.shape[name] for name in axes)
+
+
+# --- within a lane --------------------------------------------------------------------------------
+
+
+def require_split(name: str, sharding: Any, **sizes: int) -> None:
+    """Raises unless a sharding is None, or one that splits axes of these lengths evenly.
+
+    Raises:
+      ValueError: it is something else, or does not.
+    """
+    if sharding is None:
+        return
+    given.instance(name, sharding, NamedSharding, "a jax.sharding.NamedSharding")
+    axes = _first_axes(sharding)
+    if not axes:
+        raise ValueError(
+            f"{name} has the spec {sharding.spec}, which splits nothing; name a mesh axis, "
+            f"PartitionSpec({sharding.mesh.axis_names[0]!r}).")
+    devices = _count(sharding.mesh, axes)
+    for what, size in sizes.items():
+        if size % devices:
+            more = devices - size % devices
+            raise ValueError(
+                f"{name} splits over {devices} devices, but {what} is {size}; choose a multiple, "
+                f"such as {size + more}.")
+
+
+def split(tree: Any, sharding: NamedSharding | None, axis: int = 0) -> Any:
+    """A tree whose arrays have one axis split over the devices that a sharding's spec names.
+
+    Within a lane, under ``jit``; None: as it is.
+    """
+    if sharding is None:
+        return tree
+    spec = PartitionSpec(*[None] * axis, _first_axes(sharding))
+    return jax.tree.map(lambda x: _constrained(x, _here(sharding.mesh), spec), tree)
+
+
+def whole(tree: Any, sharding: NamedSharding | None) -> Any:
+    """A tree whose arrays are on all devices of a sharding; None: as it is."""
+    if sharding is None:
+        return tree
+    mesh = _here(sharding.mesh)
+    return jax.tree.map(lambda x: _constrained(x, mesh, PartitionSpec()), tree)
+
+
+def apart(
+    function: Callable[..., Any], sharding: NamedSharding | None, axes: Sequence[int | None],
+    out_axes: Any,
+) -> Callable[..., Any]:
+    """A function that each device calls with its own part of the arguments; under ``jit``.
+
+    Args:
+      function: of parts; it may say what goes from device to device.
+      sharding: whose spec names the devices; None: the function itself.
+      axes: of each argument the axis that is split, or None: each device has all of it.
+      out_axes: the same of what it returns, a tree prefix.
+    """
+    if sharding is None:
+        return function
+    names, mesh = _first_axes(sharding), _here(sharding.mesh)
+
+    def spec(axis: int | None) -> PartitionSpec:
+        return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, names)
+
+    return jax.shard_map(
+        function, mesh=mesh, in_specs=tuple(map(spec, axes)),
+        out_specs=jax.tree.map(spec, out_axes, is_leaf=lambda x: x is None),
+        axis_names=set(names), check_vma=False)
+
+
+def vmap_split(function: Callable[..., Any], sharding: NamedSharding | None, in_axes: Any) -> Any:
+    """:func:`vmap_over_mesh` over the devices that a sharding's spec names; None: ``vmap``."""
+    if sharding is None:
+        return jax.vmap(function, in_axes)
+    mesh: Any = sharding.mesh
+    return vmap_over_mesh(function, mesh, _first_axes(sharding), in_axes=in_axes)
+
+
+def ranks(sharding: NamedSharding | None) -> jax.Array:
+    """``int32[D]``, the numbers of a sharding's devices, each of which :func:`apart` gives one."""
+    devices = 1 if sharding is None else _count(sharding.mesh, _first_axes(sharding))
+    return jnp.arange(devices, dtype=jnp.int32)
+
+
+def running_sum(
+    counted: jax.Array, rank: jax.Array, sharding: NamedSharding | None
+) -> tuple[jax.Array, jax.Array]:
+    """How many of all devices' ``bool[N]`` are True up to each of one's own, ``int32``; and in all.
+
+    In a function that :func:`apart` calls, with its part of :func:`ranks`.
+    """
+    number = jnp.cumsum(counted, dtype=jnp.int32)
+    if sharding is None:
+        return number, number[-1]
+    every = lax.all_gather(number[-1], _first_axes(sharding))
+    before = jnp.where(jnp.arange(len(every)) < rank, every, 0)
+    return number + before.sum(dtype=jnp.int32), every.sum(dtype=jnp.int32)
 
 
 # --- arguments ------------------------------------------------------------------------------------
@@ -161,10 +278,10 @@ def _placed(
     arguments: Any, lanes: tuple[bool, ...], number: int, mesh: Mesh, axes: tuple[str, ...]
 ) -> Any:
     """Arguments where they are needed, so that none lies on a device outside of the mesh."""
-    ambient = jax.sharding.get_abstract_mesh()
-    mesh = automatic(mesh) if ambient.empty else mesh
-    even = number % math.prod(mesh.shape[name] for name in axes) == 0
-    split, whole = (NamedSharding(mesh, PartitionSpec(*x)) for x in ((axes,), ()))
+    if jax.sharding.get_abstract_mesh().empty:
+        mesh = automatic(mesh)
+    even = number % _count(mesh, axes) == 0
+    own, all_ = (NamedSharding(mesh, PartitionSpec(*x)) for x in ((axes,), ()))
 
     def one(x: Any, sharding: NamedSharding) -> Any:
         if not isinstance(x, jax.Array | np.ndarray):
@@ -178,7 +295,7 @@ def _placed(
 
     leaves, tree = jax.tree.flatten(arguments)
     return jax.tree.unflatten(tree, [
-        one(x, split if has and even else whole) for x, has in zip(leaves, lanes, strict=True)])
+        one(x, own if has and even else all_) for x, has in zip(leaves, lanes, strict=True)])
 
 
 def _from_each(x: Any, sharding: NamedSharding) -> jax.Array:
@@ -195,7 +312,7 @@ def _copied(x: jax.Array, mesh: Mesh) -> jax.Array:
     return _constrained(x, mesh, PartitionSpec())
 
 
-def _constrained(x: jax.Array, mesh: Mesh, spec: PartitionSpec) -> jax.Array:
+def _constrained(x: jax.Array, mesh: Any, spec: PartitionSpec) -> jax.Array:
     sharding = NamedSharding(mesh, spec)
     if AxisType.Explicit in mesh.axis_types:
         return jax.sharding.reshard(x, sharding)
@@ -210,27 +327,26 @@ def _mapped(
     function: Callable[..., Any], mesh: Mesh, axes: tuple[str, ...], lanes: tuple[bool, ...],
     options: tuple[tuple[str, Any], ...], arguments: Any,
 ) -> Any:
-    if jax.sharding.get_abstract_mesh().empty:
-        mesh = automatic(mesh)
+    here = _here(mesh)
     leaves, tree = jax.tree.flatten(arguments)
     number = _number(lanes, arguments)
-    devices = math.prod(mesh.shape[name] for name in axes)
-    split, whole = PartitionSpec(axes), PartitionSpec()
-    specs = [split if has else whole for has in lanes]
+    devices = _count(mesh, axes)
+    specs = [PartitionSpec(axes) if has else PartitionSpec() for has in lanes]
     uneven = number % devices
     if uneven:
         repeated = np.arange(number + devices - uneven) % number
         leaves = [x[repeated] if has else x for x, has in zip(leaves, lanes, strict=True)]
-    if AxisType.Explicit in mesh.axis_types:
-        leaves = [jax.sharding.reshard(x, NamedSharding(mesh, spec))
+    if AxisType.Explicit in here.axis_types:
+        leaves = [jax.sharding.reshard(x, NamedSharding(here, spec))
                   for x, spec in zip(leaves, specs, strict=True)]
     side_by_side = jax.vmap(
         partial(function, **dict(options)),
         jax.tree.unflatten(tree, [0 if has else None for has in lanes]))
     # Loops begin with constants, which are not marked as different on each device: no check.
     found = jax.shard_map(
-        side_by_side, mesh=mesh, in_specs=jax.tree.unflatten(tree, specs), out_specs=split,
-        axis_names=set(axes), check_vma=False)(*jax.tree.unflatten(tree, leaves))
+        side_by_side, mesh=here, in_specs=jax.tree.unflatten(tree, specs),
+        out_specs=PartitionSpec(axes), axis_names=set(axes), check_vma=False,
+    )(*jax.tree.unflatten(tree, leaves))
     if uneven:
-        found = jax.tree.map(lambda x: _constrained(x, mesh, whole)[:number], found)
+        found = jax.tree.map(lambda x: _constrained(x, here, PartitionSpec())[:number], found)
     return found

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.sharding import NamedSharding
 
 from jaxltl.core.host import given
 from jaxltl.core.host.binomial import anytime, clopper_pearson
@@ -34,6 +35,7 @@ from jaxltl.core.models.environment import (
     require_key,
     some_action,
 )
+from jaxltl.core.models.lanes import on_host, require_split, vmap_split
 from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.types import Status
 
@@ -228,6 +230,7 @@ def evaluate(
     threshold: float | None = None,
     discount: float | None = None,
     batch: int = 256,
+    sharding: NamedSharding | None = None,
 ) -> Evaluation:
     """How well an agent does: shares and means over fresh episodes, with honest intervals.
 
@@ -257,6 +260,8 @@ def evaluate(
       threshold: on the chance of success, in (0, 1).
       discount: in (0, 1), of `discounted_reward` and `discounted_visits`.
       batch: episodes that are simulated side by side; they alone take memory.
+      sharding: a ``NamedSharding`` whose spec names the mesh axis over which they are split; in
+        several processes each makes the same call, and is told the same.
 
     Returns:
       :class:`Evaluation`, on the host.
@@ -288,6 +293,7 @@ def evaluate(
         if share is not None or name == "confidence":
             given.share(name, share, ends=(False, False))
     require_key(key)
+    require_split("sharding", sharding)
     agent, world = _checked_agent(agent, environment)
     if threshold is not None and task_world(world) is None:
         raise ValueError(
@@ -295,9 +301,9 @@ def evaluate(
             "task_environment.")
     failure, parts, count, success, decision = 1 - confidence, [], 0, 0, None
     while count < num_episodes and decision is None:
-        found = jax.device_get(_batch(
+        found = on_host(_batch(
             key, environment, agent, jnp.int32(count), 1.0 if discount is None else discount,
-            num_steps=num_steps, batch=min(batch, num_episodes)))
+            num_steps=num_steps, batch=min(batch, num_episodes), sharding=sharding))
         parts.append(jax.tree.map(lambda x, most=num_episodes - count: x[:most], found))
         count += len(parts[-1].length)
         if threshold is not None:
@@ -307,14 +313,18 @@ def evaluate(
     return _told(totals, num_steps, confidence, threshold, discount, decision)
 
 
-@partial(jax.jit, static_argnames=("num_steps", "batch"))
+@partial(jax.jit, static_argnames=("num_steps", "batch", "sharding"))
 def _batch(
     key: chex.PRNGKey, environment: Environment, agent: Agent, first: jax.Array,
     discount: chex.Numeric, *, num_steps: int, batch: int,
+    sharding: NamedSharding | None = None,
 ) -> Totals:
-    keys = jax.vmap(partial(jax.random.fold_in, key))(first + jnp.arange(batch))
-    return jax.vmap(lambda k: episode_totals(
-        k, environment, agent, num_steps=num_steps, discount=discount))(keys)
+    def one(key: chex.PRNGKey, environment: Environment, agent: Agent, discount: Any) -> Totals:
+        return episode_totals(key, environment, agent, num_steps=num_steps, discount=discount)
+
+    axes, keys = (0, None, None, None), jax.vmap(partial(jax.random.fold_in, key))(
+        first + jnp.arange(batch))
+    return vmap_split(one, sharding, axes)(keys, environment, agent, discount)
 
 
 # --- on the host ----------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from jax.sharding import NamedSharding, PartitionSpec
 from jax.tree_util import Partial
 
 from jaxltl.core.host.binomial import anytime, clopper_pearson
@@ -125,6 +126,16 @@ def test_figures_are_those_of_the_episodes(name):
             batch=batch)
 
 
+@pytest.mark.parametrize("number", [2, pytest.param(4, marks=pytest.mark.exhaustive)])
+def test_episodes_over_devices_are_the_episodes(number):
+    """Also where the devices do not divide a batch."""
+    mesh = jax.make_mesh((number,), ("episodes",), devices=jax.devices()[:number])
+    run = partial(evaluate, jax.random.key(3), WANDERER, ENVIRONMENTS["finite"],
+                  num_episodes=NUMBER, num_steps=STEPS, discount=DISCOUNT, batch=NUMBER // 2 + 1)
+    split = run(sharding=NamedSharding(mesh, PartitionSpec("episodes")))
+    assert split == run()
+
+
 def test_worlds_are_not_kept():
     """No array has an axis of the steps, so that memory does not grow with them."""
     shown = str(jax.make_jaxpr(lambda key: evaluation._batch(
@@ -234,7 +245,7 @@ def test_simulated_evaluations_cover(number, chance, threshold, monkeypatch):
     plain = evaluate(jax.random.key(1), IDLE, environment, num_episodes=most, batch=batch,
                      threshold=threshold)
 
-    def handed(key, environment, agent, first, discount, *, num_steps, batch):
+    def handed(key, environment, agent, first, discount, *, num_steps, batch, sharding):
         begin = int(first)
         return jax.tree.map(lambda x: x[seed, begin: begin + batch], every)
 
