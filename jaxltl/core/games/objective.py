@@ -18,6 +18,7 @@ from flax import struct
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.concrete import is_traced, namespace, to_jax
+from jaxltl.core.models.product import label_rows, shown_by
 
 States: TypeAlias = chex.Array | Formula | str  # a set of states
 
@@ -85,10 +86,10 @@ def states_where(model: Any, condition: States, place: str = "condition") -> jax
         world = model
         while hasattr(world, "mdp"):
             world = world.mdp
-        holds = satisfying(np.asarray(world.label), world.propositions, condition, place)
+        holds = satisfying(label_rows(world), world.propositions, condition, place)
+        xp, holds = namespace(shown_by(world, np.asarray(holds)))
         extra = len(model.state_shape) - 1
-        holds = np.asarray(holds).reshape(-1, *(1,) * extra)
-        return to_jax(np.broadcast_to(holds, model.state_shape))
+        return to_jax(xp.broadcast_to(holds.reshape(-1, *(1,) * extra), model.state_shape))
     _, condition = namespace(condition if is_traced(condition) else np.asarray(condition))
     if condition.shape != model.state_shape or condition.dtype != bool:
         raise ValueError(
