@@ -1,7 +1,11 @@
 """Whoever gives nonsense to what takes intervals, data or parameters is told so, by ValueError."""
 
+import importlib
 import re
+import warnings
 from functools import cache, partial
+from itertools import product
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +13,16 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.algos import feasible, interval_learning, many_tasks, ppo, regions
+from jaxltl.algos import (
+    cce,
+    feasible,
+    interval_learning,
+    many_tasks,
+    ppo,
+    regions,
+    trust_region,
+)
+from jaxltl.algos.exponential_family import diagonal_gaussian
 from jaxltl.core.automata.sequences import reach_avoid_sequences
 from jaxltl.core.host.bounded_mean import bounded_mean
 from jaxltl.core.host.confidence import samples_needed
@@ -23,8 +36,12 @@ from jaxltl.core.values.evaluation import share_estimate
 from jaxltl.core.values.multi_objective import multi
 from jaxltl.core.values.objectives import Objective
 from jaxltl.core.values.robust import robust_reachability, robust_total_reward
+from jaxltl.envs import navigation
 from jaxltl.envs.flat_world import flat_world
 from jaxltl.envs.letter_world import letter_world
+from jaxltl.envs.navigation_steps import as_environment
+from jaxltl.envs.networks import make_network
+from jaxltl.envs.robots import grid_game, robots
 from jaxltl.envs.zone_world import zone_world
 
 NONSENSE = {
@@ -119,6 +136,27 @@ def things(folder):
     ]
 
 
+def imported(name, attribute, *given):
+    return getattr(importlib.import_module(name), attribute)(*given)
+
+
+def pair(made):
+    return {"env": made[0], "params": made[1]}
+
+
+# Of each: the package, how to make what its adapter takes, and what else it takes.
+ADAPTERS = {
+    "gymnax": ("gymnax", lambda: pair(imported("gymnax", "make", "Catch-bsuite")), {}),
+    "navix": ("navix", lambda: {"env": imported("navix", "make", "Navix-Empty-5x5-v0")}, {}),
+    "xminigrid": ("xminigrid", lambda: pair(
+        imported("xminigrid", "make", "MiniGrid-Empty-5x5")), {}),
+    "jumanji": ("jumanji", lambda: {"env": imported("jumanji", "make", "Game2048-v1")}, {}),
+    "brax": ("brax", lambda: {"env": imported("brax.envs", "get_environment", "fast")}, {}),
+    "pgx": ("pgx", lambda: {"env": imported("pgx", "make", "tic_tac_toe")},
+            {"opponent": lambda state, key: 0, "player": 0}),
+}
+
+
 @cache
 def simulated():
     """A corridor with a task, and what is asked of it."""
@@ -174,25 +212,129 @@ def simulated():
         (many_tasks.stack_plans, {"plans": [plan]}),
         (many_tasks.sequence_agent, {"network": step, "plan": plan, "actions": None,
                                      "squash": "clip"}),
-        (ppo.make_problem, {"environment": world, "network": None}),
+        *taught(world, key),
         (partial(letter_world, connected=False), {
             "size": 4, "letters": 2, "copies": 1, "horizon": 5, "num_maps": 4, "seed": 0}),
+        (partial(letter_world, size=3, letters=1, copies=1, num_maps=2), {
+            "connected": True, "flat": False}),
         (partial(letter_world, layout="a.\n..", letters=1), {"start": 1, "horizon": 5}),
         (flat_world, {"discs": (("red", 0.0, 0.0, 0.5),), "extent": 2.0, "time_step": 0.1,
-                      "horizon": 5, "start": None, "num_starts": 4, "seed": 0}),
+                      "horizon": 5, "discrete": False, "start": None, "num_starts": 4, "seed": 0}),
         (zone_world, {"colors": ("a", "b"), "zones": 1, "radius": 0.4, "extent": 2.5,
                       "saturation": 0.05, "num_maps": 4, "seed": 0}),
     ]
 
 
-@pytest.mark.parametrize("kind", NONSENSE)
+def taught(world, key):
+    """What learners are asked; they are traced alone, since what they take is decided by then."""
+    problem = ppo.make_problem(world)
+    settings = {"num_envs": 2, "num_steps": 2, "num_epochs": 1, "num_minibatches": 1}
+    hparams = ppo.Hparams(discount=0.9, **settings)
+    state = jax.eval_shape(lambda: ppo.init(key, problem, hparams))
+    coin = jl.from_dense(
+        [[[0.5, 0.5]], [[0, 1]]], label=[[0], [1]], propositions=["a"])
+    told = {"reward": None, "observe": None, "opponent": None}
+    safe = {"environment": jl.environment_of(coin), "state_of": None}
+    plane = navigation.navigation()
+    network = navigation.policy_network(plane)
+    score = navigation.evaluator(plane, 1, num_trajectories=1)
+    family = diagonal_gaussian(jnp.zeros(network.num_parameters), 1.0)
+
+    def begun(**given):
+        return jax.eval_shape(lambda: ppo.init(key, problem, ppo.Hparams(**given)))
+
+    def searched(**given):
+        return jax.eval_shape(lambda: cce.init(
+            key, cce.make_problem(score, family), cce.Hparams(**given)))
+
+    def trusted(**given):
+        there = trust_region.make_problem(as_environment(plane, 1), horizon=3)
+        return jax.eval_shape(lambda: trust_region.init(
+            key, there, trust_region.Hparams(discount=0.9, method="trpo", **given)))
+
+    return [
+        (ppo.make_problem, {"environment": world, "network": None, "memory": None}),
+        (partial(ppo.make_problem, world), {
+            "network": ppo.RecurrentActorCritic(num_actions=2, memory=4), "memory": None}),
+        (partial(traced, ppo.init), {"key": key, "problem": problem, "hparams": hparams}),
+        (ppo.policy, {"state": state, "problem": problem, "hparams": hparams}),
+        (begun, {
+            "discount": 0.9, "gae_lambda": 0.9, "learning_rate": 0.1, "clip": 0.1,
+            "value_clip": None, "value_weight": 0.5, "entropy_weight": 0.1, "target_kl": None,
+            "max_gradient_norm": 0.5, "adam_epsilon": 1e-5, "normalize_advantage": True,
+            "normalize_observation": False, "normalize_reward": False, "squash": "clip",
+            "num_resets": None, **settings}),
+        (searched, {"elite_reuse": False, "antithetic": False, "population": 10, "rho": 0.5}),
+        (trusted, {"normalize": True, "num_trajectories": 4, "value_batches": 2, "hidden": (4,)}),
+        (many_tasks.train_in_stages, {
+            "key": key, "problems": [problem], "hparams": hparams, "init": lambda *given: state,
+            "run": lambda state, *given, num_steps: (state, Ended()), "num_chunks": 1,
+            "num_steps": 1, "enough": 0.9, "report": None}),
+        (jl.environment_of, {"model": coin, **told}),
+        (jl.environment_of, {"model": robots(2), **told}),
+        (jl.shielded, {"strategy": jl.permissive_strategy(coin, "F a"), **safe}),
+        (jl.shielded, {"strategy": np.ones((2, 1), bool), **safe}),
+        (robots, {"size": 3}),
+        (partial(grid_game, "a..\n..b"), {"system_stays": True, "environment_stays": False}),
+        (partial(make_network, "2-3-1"), {"biases": True}),
+        (partial(as_environment, plane), {"task": 1, "absorbing": None}),
+        (partial(navigation.evaluator, plane), {"task": 1, "absorbing": None}),
+    ]
+
+
+class Ended(NamedTuple):
+    """What training tells in which no episode ended."""
+
+    episode_return: np.ndarray = np.array([np.nan])
+    episodes: np.ndarray = np.array([0])
+
+
+def traced(function, **given):
+    """What a function would return, of which nothing is compiled."""
+    return jax.eval_shape(lambda: function(**given))
+
+
+# In place of one value several, and one as a text.
+SEVERAL = {"truths": np.array([True, False]), "axis": np.ones(3), "digits": "0.5"}
+
+
+@pytest.mark.parametrize("kind", NONSENSE | SEVERAL)
 def test_nonsense_about_simulated_worlds_is_told(kind):
     for call, given in simulated():
         for name in given:
             try:
-                call(**given | {name: NONSENSE[kind]})
+                call(**given | {name: (NONSENSE | SEVERAL)[kind]})
             except ValueError as error:
                 assert not RAW.search(str(error)), (call, name, error)
+
+
+@pytest.mark.parametrize("name", ADAPTERS)
+def test_nonsense_given_to_adapters_is_told(name):
+    package, make, others = ADAPTERS[name]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        pytest.importorskip(package)
+        with jax.enable_x64(False):
+            given = make() | {"labels": None, "propositions": ()} | others
+            adapter = getattr(jl, f"from_{name}")
+            adapter(**given)
+            for argument, (kind, value) in product(given, (NONSENSE | SEVERAL).items()):
+                try:
+                    adapter(**given | {argument: value})
+                except ValueError as error:
+                    assert not RAW.search(str(error)), (kind, argument, error)
+
+
+def test_flags_are_named():
+    for call, message in (
+            (lambda: letter_world(flat=np.ones(2, bool)), r"flat=\[True, True\]; give True or Fa"),
+            (lambda: letter_world(connected=None), "connected=None; give True or False"),
+            (lambda: flat_world(discrete="no"), "discrete='no'; give True or False"),
+            (lambda: jax.jit(lambda x: flat_world(discrete=x))(True), "discrete=.*; give True or")):
+        with pytest.raises(ValueError, match=message):
+            call()
+    assert letter_world(size=3, letters=1, num_maps=2, copies=1, flat=jnp.bool_(True)
+                        ).observations.shape == (18,)
 
 
 def coin(x):

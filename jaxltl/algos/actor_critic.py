@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxltl.core.host import given
 from jaxltl.core.models.environment import Finite, flat_observation
 
 
@@ -152,6 +153,32 @@ def default_network(actions: Any) -> ActorCritic:
     return ActorCritic(shape=actions.shape)
 
 
+def initial_memory(network: nn.Module, memory: Any = None) -> Any:
+    """What a network remembers before it has seen anything, a tree of arrays; ``()``: it cannot.
+
+    Args:
+      network: whose method ``initial_memory()`` says so, if it has one.
+      memory: in place of that; None: not given.
+
+    Raises:
+      ValueError: what is given are no numbers, or has not the shapes that the network's own has.
+    """
+    begin = getattr(network, "initial_memory", tuple)
+    if memory is None:
+        return jax.tree.map(jnp.asarray, begin())
+    try:
+        found = jax.tree.map(jnp.asarray, memory)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(
+            f"memory is {given.shown(memory)}; give a tree of arrays of numbers.") from None
+    own = begin() if hasattr(network, "initial_memory") else found
+    if jax.tree.map(jnp.shape, found) != jax.tree.map(jnp.shape, own):
+        raise ValueError(
+            f"memory has the shapes {jax.tree.map(jnp.shape, found)}, and that of the network "
+            f"{jax.tree.map(jnp.shape, own)}; give one of those shapes, or none.")
+    return found
+
+
 def has_memory(problem: Any) -> bool:
     """Whether the problem's network is recurrent."""
     return bool(jax.tree.leaves(problem.memory))
@@ -169,8 +196,8 @@ def evaluated(problem: Any, parameters: Any, memory: Any, observation: Any) -> O
 
 def fresh_parameters(key: Any, network: nn.Module, memory: Any, observation: Any) -> Any:
     """A network's parameters at its own random start."""
-    given = (memory, observation) if jax.tree.leaves(memory) else (observation,)
-    return network.init(key, *given).get("params", {})
+    read = (memory, observation) if jax.tree.leaves(memory) else (observation,)
+    return network.init(key, *read).get("params", {})
 
 
 def require_network(network: Any, memory: Any, observation: Any, space: Any, finite: bool) -> None:
@@ -183,11 +210,17 @@ def require_network(network: Any, memory: Any, observation: Any, space: Any, fin
       finite: whether there are finitely many.
     """
     recurrent = bool(jax.tree.leaves(memory))
-    given = (memory, observation) if recurrent else (observation,)
+    read = (memory, observation) if recurrent else (observation,)
     wanted = "logits float[A]" if finite else "(mean, log_deviation)"
     form = f"(memory, ({wanted}, value))" if recurrent else f"({wanted}, value)"
-    found, variables = jax.eval_shape(
-        lambda *x: network.init_with_output(jax.random.key(0), *x), *given)
+    try:
+        found, variables = jax.eval_shape(
+            lambda *x: network.init_with_output(jax.random.key(0), *x), *read)
+    except TypeError as problem:  # what a function says that is called with other arguments
+        remembers = "; for one that remembers, give memory, or let initial_memory() return it"
+        raise ValueError(
+            f"network cannot be called as network({'memory, ' * recurrent}observation): {problem}. "
+            f"Let it return {form}{'' if recurrent else remembers}.") from problem
     if set(variables) - {"params"}:
         raise ValueError(
             f"network keeps {sorted(set(variables) - {'params'})} beside its parameters; leave out "

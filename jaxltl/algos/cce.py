@@ -37,6 +37,7 @@ from jaxltl.algos import learner
 from jaxltl.algos._elites import Pool, Sample, better, elite_weights, num_elites, rows_of, select
 from jaxltl.algos._evaluation import evaluate_all, per_cost, scores, split
 from jaxltl.algos.schedules import SLACK, Polynomial, Schedule, at
+from jaxltl.core.host import given
 from jaxltl.core.types import Status, require_shape
 
 WEIGHTINGS = ("until_feasible", "literal", "uniform")
@@ -534,10 +535,14 @@ def _nan_last(x: float) -> float:
 
 
 def _check(problem: Problem, hparams: Hparams) -> None:
+    for name in ("elite_reuse", "antithetic"):
+        given.truth(name, getattr(hparams, name))
     if hparams.weighting not in WEIGHTINGS:
         raise ValueError(
             f"weighting={hparams.weighting!r}; choose {', '.join(map(repr, WEIGHTINGS))}.")
-    if not 0 < hparams.rho < 1 or hparams.rho * hparams.population < 1 - SLACK:
+    rho = given.number("rho", hparams.rho)
+    population = given.whole("population", hparams.population, least=1, most=2**31 - 1)
+    if not 0 < rho < 1 or rho * population < 1 - SLACK:
         raise ValueError(
             f"rho={hparams.rho} of population={hparams.population} leaves no elite, or all; give "
             "rho in (0, 1) with rho * population at least 1."

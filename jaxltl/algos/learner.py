@@ -30,7 +30,7 @@ from jax.tree_util import Partial
 
 from jaxltl.algos import checkpoint as files
 from jaxltl.algos._run_over_mesh import run_over_mesh
-from jaxltl.core.host.given import whole
+from jaxltl.core.host.given import truth, whole
 from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.lanes import on_host
 from jaxltl.core.types import Status, worst
@@ -441,6 +441,7 @@ def run_in_chunks(
     Raises:
       ValueError: the checkpoint belongs to another learner, problem or setting.
     """
+    lanes = truth("lanes", lanes)
     chunk = chunk or max(max_rows, -(-num_steps // 100))
     num_lanes = len(state.step) if lanes else None
     hparams = _spread(hparams, state) if lanes else hparams

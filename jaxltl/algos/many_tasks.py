@@ -329,7 +329,11 @@ def train_in_stages(
     Raises:
       ValueError: no problem, or a number of thresholds that does not fit.
     """
-    count = len(given.listed("problems", problems))
+    problems = given.listed("problems", problems)
+    for name, function in (("init", init), ("run", run), ("report", report)):
+        if function is not None or name != "report":
+            given.called(name, function)
+    count = len(problems)
     num_chunks = given.whole("num_chunks", num_chunks, least=1)
     bars = given.numbers("enough", enough)
     bars = np.full(max(count - 1, 0), bars) if bars.ndim == 0 else bars

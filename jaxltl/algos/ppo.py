@@ -37,14 +37,22 @@ from jaxltl.algos.actor_critic import (
     evaluated,
     fresh_parameters,
     has_memory,
+    initial_memory,
     require_network,
 )
 from jaxltl.algos.moments import Moments, no_moments, normalized
-from jaxltl.algos.schedules import Polynomial, Schedule
+from jaxltl.algos.schedules import Schedule, is_schedule
 from jaxltl.algos.schedules import at as _at
 from jaxltl.core.host import given
 from jaxltl.core.models import lanes
-from jaxltl.core.models.environment import Agent, Box, Environment, Finite, require_environment
+from jaxltl.core.models.environment import (
+    Agent,
+    Box,
+    Environment,
+    Finite,
+    require_environment,
+    require_key,
+)
 from jaxltl.core.types import Status
 
 
@@ -210,8 +218,8 @@ def make_problem(
         ``initial_memory()`` returns, if it has one.
 
     Raises:
-      ValueError: a network that returns something else, or keeps more than parameters; a box of
-        integers; no environment.
+      ValueError: a network that returns something else, or keeps more than parameters; a memory
+        that is not the network's; a box of integers; no environment.
 
     Example:
       >>> from jaxltl.core.models.environment import Timestep, make_environment
@@ -233,10 +241,7 @@ def make_problem(
             f"environment.actions is a box of {actions.dtype}; number what is in it, Finite(n).")
     network = default_network(actions) if network is None else network
     given.instance("network", network, nn.Module, "a flax.linen.Module")
-    if memory is None:
-        begin = getattr(network, "initial_memory", tuple)
-        memory = begin()
-    memory = learner.strong(jax.tree.map(jnp.asarray, memory))
+    memory = learner.strong(initial_memory(network, memory))
     seen = jax.eval_shape(lambda key: environment.observe(environment.reset(key)),
                           jax.random.key(0))
     space = (jax.ShapeDtypeStruct((actions.num,), jnp.result_type(float))
@@ -258,14 +263,20 @@ _OPTIONAL = ("max_gradient_norm", "target_kl", "value_clip")
 _SCHEDULES = ("learning_rate", "clip", "value_clip")
 
 
-def _check(problem: Problem, hparams: Hparams) -> None:
+def _require_ours(problem: Problem, hparams: Hparams) -> None:
     given.instance("problem", problem, Problem, "one of ppo.make_problem")
     given.instance("hparams", hparams, Hparams, "ppo.Hparams")
+
+
+def _check(problem: Problem, hparams: Hparams) -> None:
+    _require_ours(problem, hparams)
     for name in ("num_envs", "num_steps", "num_epochs", "num_minibatches"):
         given.whole(name, getattr(hparams, name), least=1, most=2**31 - 1)
     if hparams.num_resets is not None:
         given.whole("num_resets", hparams.num_resets, most=2**31 - 1)
     given.one_of("squash", hparams.squash, actions_of.SQUASHES)
+    for name in ("normalize_advantage", "normalize_observation", "normalize_reward"):
+        given.truth(name, getattr(hparams, name))
     recurrent = has_memory(problem)
     size = hparams.num_envs * (1 if recurrent else hparams.num_steps)
     if size % hparams.num_minibatches:
@@ -277,12 +288,16 @@ def _check(problem: Problem, hparams: Hparams) -> None:
         "the number of rows of a minibatch": size // hparams.num_minibatches})
     for name, (low, high) in _RANGES.items():
         number = getattr(hparams, name)
-        if (number is None and name in _OPTIONAL) or (name in _SCHEDULES and callable(number)):
+        if (number is None and name in _OPTIONAL) or (name in _SCHEDULES and is_schedule(number)):
             continue
-        if isinstance(number, jax.core.Tracer | Polynomial):
-            continue
-        found = given.numbers(name, "None" if number is None else number)
-        if not found.size or not ((found >= low) & (found <= high)).all():
+        kind = getattr(number, "dtype", None) or np.asarray(number).dtype
+        real = kind.kind in "iu" or jnp.issubdtype(kind, jnp.floating)
+        if np.ndim(number) or not real:  # a whole number that is too large is an object
+            raise ValueError(
+                f"{name}={given.shown(number)}; give one number"
+                f"{', or a Partial(function) of the step' if name in _SCHEDULES else ''}. Many "
+                "settings are a vmap.")
+        if not isinstance(number, jax.core.Tracer) and not low <= number <= high:
             raise ValueError(f"{name}={number}; it must lie in [{low}, {high}].")
 
 
@@ -303,6 +318,8 @@ def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
 
 
 def _agent(state: State, problem: Problem, hparams: Hparams, sampled: bool) -> Agent:
+    given.instance("state", state, State, "one of ppo.init or ppo.train")
+    _require_ours(problem, hparams)
     act = Partial(_actor(sampled, hparams.squash), problem, state.parameters, state.moments)
     return Agent(act, problem.memory)
 
@@ -328,7 +345,7 @@ def _act(
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """The network at its own random start, and N environments at theirs."""
     _check(problem, hparams)
-    return _begun(key, problem, hparams)
+    return _begun(require_key(key), problem, hparams)
 
 
 @jax.jit
@@ -359,6 +376,7 @@ def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
 def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     """T steps of N environments, and some epochs of minibatches of what they tell."""
     _check(problem, hparams)
+    given.instance("state", state, State, "one of ppo.init or ppo.train")
     collect_key, update_key = jax.random.split(learner.step_key(state))
     after, begun, rows, told = collected(collect_key, state, problem, hparams)
     parameters, optimizer, figures, updates, nonfinite = improved(

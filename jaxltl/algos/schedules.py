@@ -56,6 +56,18 @@ Schedule = Any  # a number, a Polynomial, or a pytree that is called with l = 1,
 
 
 
+def is_schedule(given: Any) -> bool:
+    """Whether it is a schedule of the step, and no number: a tree of arrays, so that it is traced.
+
+    Example:
+      >>> import math
+      >>> [is_schedule(x) for x in (Linear(1.0, 0.0, 4), Polynomial(1.0, -1.0), 0.5, math.exp)]
+      [True, True, False, False]
+    """
+    own = isinstance(given, Polynomial) or callable(given)
+    return own and not jax.tree_util.all_leaves([given])
+
+
 def at(schedule: Schedule, step: jax.Array | int) -> Any:
     """A schedule's number in the step after `step` steps, l = step + 1."""
     l = jnp.asarray(step) + 1  # noqa: E741

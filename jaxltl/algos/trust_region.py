@@ -52,6 +52,7 @@ from jaxltl.algos._policy_networks import (
 from jaxltl.algos._trust_step import Surrogate, direction, fisher_product, line_search, surrogate
 from jaxltl.algos._value_fit import advantages, fitted, positive, weighted_variance
 from jaxltl.algos.moments import Moments, no_moments, updated_moments
+from jaxltl.core.host import given
 from jaxltl.core.models.environment import (
     Agent,
     Box,
@@ -292,6 +293,7 @@ def _as_action(problem: Problem, action: jax.Array) -> jax.Array:
 
 
 def _check(problem: Problem, hparams: Hparams) -> None:
+    given.truth("normalize", hparams.normalize)
     if hparams.method not in METHODS:
         raise ValueError(f'method={hparams.method!r}; choose "trpo" or "cpo".')
     if hparams.method == "cpo" and problem.limit is None:
@@ -299,8 +301,10 @@ def _check(problem: Problem, hparams: Hparams) -> None:
     if hparams.method == "cpo" and hparams.penalty is not None:
         raise ValueError('penalty is for method="trpo": CPO finds its own multiplier.')
     for name in ("num_trajectories", "cg_steps", "search_steps", "fisher_stride", "value_batches"):
-        if getattr(hparams, name) < 1:
-            raise ValueError(f"{name}={getattr(hparams, name)}; it must be at least 1.")
+        given.whole(name, getattr(hparams, name), least=1, most=2**31 - 1)
+    for name in ("hidden", "value_hidden"):
+        for width in given.listed(name, getattr(hparams, name)):
+            given.whole(f"{name}: a width", width, least=1, most=2**31 - 1)
     samples = hparams.num_trajectories * problem.horizon
     if hparams.value_batches > samples:
         raise ValueError(f"value_batches={hparams.value_batches} of {samples} samples; use fewer.")

@@ -100,6 +100,7 @@ def letter_world(
       (('a', 'b', 'c'), (7, 7, 13), 75)
     """
     names, starts = _names(letters), None
+    connected, flat = given.truth("connected", connected), given.truth("flat", flat)
     copies, num_maps = given.whole("copies", copies), given.whole("num_maps", num_maps, most=2**24)
     size, seed = given.whole("size", size, most=2**10), given.whole("seed", seed)
     num_maps = max(num_maps, 1) if not connected else given.whole("num_maps", num_maps, least=1)

@@ -38,6 +38,7 @@ from flax import struct
 from jax import lax
 from numpy.typing import ArrayLike
 
+from jaxltl.core.host import given
 from jaxltl.envs.networks import Network, apply_layers, layers, make_network, padded
 
 TASKS = (1, 2, 3, 4)
@@ -364,7 +365,7 @@ def simulate(
       ((10, 30), (10, 30, 2))
     """
     _check_fits(world, network)
-    settings = _Static((num_trajectories, absorbing))
+    settings = _Static((num_trajectories, given.truth("absorbing", absorbing)))
     return _simulate(network, settings, world, jnp.asarray(parameters), key)
 
 
@@ -431,13 +432,14 @@ def evaluator(
     if num_trajectories < 1:
         raise ValueError(f"num_trajectories={num_trajectories}; give at least 1.")
     if not callable(task):
-        if task not in TASKS:
+        if np.ndim(task) or task not in TASKS:
             raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4, or give a function.")
         absorbing = task == 1 if absorbing is None else absorbing
         score = jax.tree_util.Partial(_table_4, _Static(int(task)))
     else:
         score = task if isinstance(task, jax.tree_util.Partial) else jax.tree_util.Partial(task)
-    settings = _Static((int(num_trajectories), bool(absorbing)))
+    absorbing = absorbing is not None and given.truth("absorbing", absorbing)
+    settings = _Static((int(num_trajectories), absorbing))
     return jax.tree_util.Partial(_evaluate, network, settings, world, score)
 
 

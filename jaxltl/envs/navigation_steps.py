@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core.host import given
 from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
 from jaxltl.envs import navigation as nav
 from jaxltl.envs.navigation import Navigation, State
@@ -79,9 +80,9 @@ def as_environment(
       >>> total
       [(30.0, -1.0), (0.0, 0.0), (0.0, 0.0)]
     """
-    if task not in nav.TASKS:
+    if np.ndim(task) or task not in nav.TASKS:
         raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4.")
-    stays = task == 1 if absorbing is None else absorbing
+    stays = task == 1 if absorbing is None else given.truth("absorbing", absorbing)
     settings = _Settings(
         jnp.int32(task), jnp.bool_(stays), np.dtype(dtype or jnp.result_type(float)))
     reset, step, observe, labels = (

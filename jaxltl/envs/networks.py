@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax.tree_util import Partial
 
+from jaxltl.core.host import given
 from jaxltl.core.models.environment import (
     Agent,
     Box,
@@ -90,7 +91,7 @@ def make_network(
     for place, name in (("hidden", hidden), ("output", output)):
         if name not in ACTIVATIONS:
             raise ValueError(f"{place}={name!r}; choose among {', '.join(ACTIVATIONS)}.")
-    return Network(numbers, hidden, output, bool(biases))
+    return Network(numbers, hidden, output, given.truth("biases", biases))
 
 
 def num_parameters(sizes: Sequence[int], biases: bool = True) -> int:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core.games.objective import States, states_where
+from jaxltl.core.host import given
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models import operators
 from jaxltl.core.models.game import Game, make_game
@@ -24,6 +25,9 @@ from jaxltl.envs import gridworld as grid
 ACTIONS = (*grid.ACTIONS, "stay")
 CORNERS = ("lower_left", "lower_right", "upper_left", "upper_right")
 _STAY = ACTIONS.index("stay")
+
+
+_MOST = 181  # cells a side, so that 32 bits number the states
 
 
 def robots(size: int) -> Game:
@@ -47,7 +51,7 @@ def robots(size: int) -> Game:
       the actions :data:`ACTIONS`.
 
     Raises:
-      ValueError: the size is not an integer of at least 2.
+      ValueError: the size is not an integer of at least 2, or more than 32 bits number.
 
     Example:
       >>> game = robots(3)
@@ -59,8 +63,9 @@ def robots(size: int) -> Game:
       >>> [p for p, holds in zip(game.propositions, game.label[state]) if holds]
       ['diagonal', 'system_turn', 'system_lower_left']
     """
-    if isinstance(size, bool) or not isinstance(size, int | np.integer) or size < 2:
-        raise ValueError(f"size={size!r}; give the cells along a side, an integer from 2 on.")
+    if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 2 <= size <= _MOST:
+        raise ValueError(
+            f"size={size!r}; give the cells along a side, an integer from 2 to {_MOST}.")
     size = int(size)
     world = grid.gridworld("\n".join(["." * size] * size))
     cells = np.arange(size * size).reshape(size, size)[::-1].ravel()  # the map's first row is up
@@ -128,6 +133,8 @@ def grid_game(
       ['system_turn', 'environment_b', 'system_a']
     """
     world = grid.gridworld(text, slip=slip, legend=legend, wall=wall)
+    system_stays = given.truth("system_stays", system_stays)
+    environment_stays = given.truth("environment_stays", environment_stays)
     position = places(text, wall=wall)
     rows_columns = grid.parse_map(text).shape
     cells = np.ravel_multi_index(tuple(position.T), rows_columns)

@@ -120,6 +120,7 @@ def zone_world(
         if not 0 < given.number(name, number) < 1e7:
             raise ValueError(
                 f"zone_world: {name}={number}; it must be positive, and below ten million.")
+    radius, extent, saturation = float(radius), float(extent), float(saturation)
     places = draw_places(len(names) * zones, extent, num_maps, seed)
     numbers = _Numbers(*(np.float32(x) for x in (
         radius, extent, 0.02, 0.3 * 0.05 / _MASS, saturation, 0.01 / _MASS, 0.3 / 0.095, 3.0, 0.5)))

@@ -42,9 +42,9 @@ def bounded_mean(
       [0.242, 0.258]
     """
     x = np.atleast_1d(given.numbers("numbers", numbers))
-    given.share("failure", failure, ends=(False, False))
+    failure = given.share("failure", failure, ends=(False, False))
     if planned is not None:
-        given.whole("planned", planned, least=1)
+        planned = given.whole("planned", planned, least=1)
     if x.ndim != 1 or np.isnan(x).any():
         raise ValueError(f"numbers is {given.shown(numbers)}; give one axis of them, none NaN.")
     x = np.clip(x, 0, 1)

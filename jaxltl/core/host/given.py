@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -97,6 +98,24 @@ def one_of(name: str, given: Any, known: Sequence[str]) -> str:
     return given
 
 
+def truth(name: str, given: Any) -> bool:
+    """True or False, also as NumPy and JAX have it.
+
+    Raises:
+      ValueError: it is something else, or several of them.
+
+    Example:
+      >>> truth("flat", [True, False])
+      Traceback (most recent call last):
+      ValueError: flat=[True, False]; give True or False.
+    """
+    kind = getattr(given, "dtype", None)
+    if isinstance(given, bool) or (kind == np.bool_ and np.ndim(given) == 0):
+        with contextlib.suppress(TypeError):  # one that is traced, and not known yet
+            return bool(given)
+    raise ValueError(f"{name}={shown(given)}; give True or False.")
+
+
 def share(name: str, given: Any, *, ends: tuple[bool, bool] = (True, True)) -> float:
     """One number from 0 to 1.
 
@@ -147,9 +166,10 @@ def listed(name: str, given: Any) -> list[Any]:
     Raises:
       ValueError: it cannot.
     """
-    if not isinstance(given, Iterable):
-        raise ValueError(f"{name} is {shown(given)}; give a list.")
-    return list(given)
+    if isinstance(given, Iterable):
+        with contextlib.suppress(TypeError):  # an array without axes
+            return list(given)
+    raise ValueError(f"{name} is {shown(given)}; give a list.")
 
 
 def names(name: str, given: Any) -> tuple[str, ...]:

@@ -383,7 +383,7 @@ def run_episode(
     Raises:
       ValueError: a number below 1.
     """
-    given.whole("num_steps", num_steps, least=1, most=2**31 - 1)
+    num_steps = given.whole("num_steps", num_steps, least=1, most=2**31 - 1)
     environment, agent = require_environment(environment), require_agent(agent)
     begin, path = begin_episode(require_key(key), environment, agent)
 

@@ -11,6 +11,7 @@ import numpy as np
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
+from jaxltl.core.host import given
 from jaxltl.core.models.convert import to_padded
 from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
 from jaxltl.core.models.game import Game
@@ -125,11 +126,11 @@ def _opponent(
 ) -> np.ndarray:
     """The logarithm of what it plays."""
     available = np.asarray(model.available)
-    given = available.astype(float) if policy is None else np.asarray(policy, float)
-    if given.shape != available.shape or not np.isfinite(given).all() or (given < 0).any():
-        raise ValueError(f"opponent has shape {list(given.shape)}; give weights "
+    plays = available.astype(float) if policy is None else given.numbers("opponent", policy)
+    if plays.shape != available.shape or not np.isfinite(plays).all() or (plays < 0).any():
+        raise ValueError(f"opponent has shape {list(plays.shape)}; give weights "
                          f"{list(available.shape)}, of each action in each state.")
-    weight = np.where(available, given, 0)
+    weight = np.where(available, plays, 0)
     for state in np.flatnonzero(~system & ~weight.any(1))[:1]:
         raise ValueError(f"opponent: it moves in state {state}, but has no weight on what is "
                          "available there; give some.")

@@ -288,10 +288,11 @@ def evaluate(
     most = 2**31 - 1
     num_episodes = given.whole("num_episodes", num_episodes, least=1, most=most)
     batch = given.whole("batch", batch, least=1, most=most)
-    shares = {"confidence": confidence, "threshold": threshold, "discount": discount}
-    for name, share in shares.items():
-        if share is not None or name == "confidence":
-            given.share(name, share, ends=(False, False))
+    confidence = given.share("confidence", confidence, ends=(False, False))
+    if threshold is not None:
+        threshold = given.share("threshold", threshold, ends=(False, False))
+    if discount is not None:
+        discount = given.share("discount", discount, ends=(False, False))
     require_key(key)
     require_split("sharding", sharding)
     agent, world = _checked_agent(agent, environment)
@@ -384,7 +385,7 @@ def share_estimate(count: int, total: int, failure: float, fixed: bool = True) -
     """
     total = given.whole("total", total, least=1, most=2**53)
     count = given.whole("count", count, most=total)
-    given.share("failure", failure, ends=(False, False))
+    failure = given.share("failure", failure, ends=(False, False))
     ends = clopper_pearson if fixed else anytime
     (lower,), (upper,) = ends(np.array([count]), np.array([total]), failure)
     share = count / total

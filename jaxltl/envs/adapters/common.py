@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.tree_util import Partial
 
+from jaxltl.core.host import given
 from jaxltl.core.models.environment import Timestep, as_partial
 
 
@@ -69,6 +70,17 @@ def require_environment(root: str, env: Any, kinds: Any, remedy: str) -> None:
         raise ValueError(
             f"from_{root}: env is a {kind.__module__}.{kind.__qualname__}, no environment of "
             f"{root}; give {remedy}.")
+
+
+def params_of(root: str, params: Any, own: Any) -> Any:
+    """The parameters that are given, or the environment's own; refuses those of another type."""
+    if params is None:
+        return own
+    if not isinstance(params, type(own)):
+        raise ValueError(
+            f"from_{root}: params is {given.shown(params)}; give a {type(own).__qualname__}, such "
+            "as the environment's own with params.replace(...), or None for its own.")
+    return params
 
 
 def refuse_wrappers(root: str, env: Any, attribute: str, kinds: Any, remedy: str) -> None:

@@ -16,6 +16,7 @@ from jaxltl.envs.adapters.common import (
     arrays,
     copied,
     package,
+    params_of,
     require_environment,
     timestep,
 )
@@ -56,8 +57,7 @@ def from_craftax(
     if isinstance(env, bases.EnvironmentAutoReset):
         raise ValueError(
             f"from_craftax: {type(env).__name__} starts anew by itself; give {make}.")
-    if params is None:
-        params = env.default_params
+    params = params_of("craftax", params, env.default_params)
     held, limit = Held(env), params.max_timesteps
     return make_environment(
         Partial(_reset, held, params), Partial(_step, held, params), Partial(_observe, held),

@@ -25,6 +25,7 @@ from jaxltl.envs.adapters.common import (
     labels_of_state,
     observation_of,
     package,
+    params_of,
     require_environment,
     timestep,
 )
@@ -60,8 +61,7 @@ def from_gymnax(
     require_environment(
         "gymnax", env, module.Environment,
         "gymnax.make(name)[0], without wrappers, which start anew by themselves")
-    if params is None:
-        params = env.default_params
+    params = params_of("gymnax", params, env.default_params)
     held, limit = Held(env), getattr(params, "max_steps_in_episode", None)
     known = type(env).is_truncated is module.Environment.is_truncated and isinstance(limit, int)
     return make_environment(

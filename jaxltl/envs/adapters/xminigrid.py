@@ -17,6 +17,7 @@ from jaxltl.envs.adapters.common import (
     labels_of_state,
     observation_of,
     package,
+    params_of,
     refuse_wrappers,
     require_environment,
     timestep,
@@ -55,8 +56,7 @@ def from_xminigrid(
     refuse_wrappers(
         "xminigrid", env, "_env",
         (wrappers.GymAutoResetWrapper, wrappers.DmEnvAutoResetWrapper), "give what is in it")
-    if params is None:
-        params = env.default_params()
+    params = params_of("xminigrid", params, env.default_params())
     if params.max_steps is None:
         raise ValueError(
             "from_xminigrid: params.max_steps is None; give params.replace(max_steps=...).")
