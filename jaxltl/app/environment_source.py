@@ -33,21 +33,26 @@ PACKAGES = {
 }
 
 
-def load_environment(task: EnvironmentTask) -> Environment:
+def load_environment(task: EnvironmentTask, world: Environment | None = None) -> Environment:
     """The world of a task file, with its labels, and truncated at its horizon if it gives one.
+
+    Args:
+      task: the file.
+      world: in place of what the file names; then nothing is imported.
 
     Raises:
       ValueError: what is named is not there, fails, or returns no environment. The message names
         the file, the table and the key.
     """
     spec, folder = task.world, task.path.parent
-    with errors_in(f"{task.path}: [world] labels: "):
-        labels = _function(spec["labels"], folder) if "labels" in spec else None
-    with errors_in(f"{task.path}: [world] environment: "):
-        found = _made(spec["environment"], spec.get("arguments", {}), folder, labels,
-                      spec.get("propositions", ()))
+    if world is None:
+        with errors_in(f"{task.path}: [world] labels: "):
+            labels = _function(spec["labels"], folder) if "labels" in spec else None
+        with errors_in(f"{task.path}: [world] environment: "):
+            world = _made(spec["environment"], spec.get("arguments", {}), folder, labels,
+                          spec.get("propositions", ()))
     with errors_in(f"{task.path}: [world] "):
-        return with_time_limit(found, spec["horizon"]) if "horizon" in spec else found
+        return with_time_limit(world, spec["horizon"]) if "horizon" in spec else world
 
 
 def _made(

@@ -6,6 +6,7 @@ that the intervals of the kept one, which are from fresh episodes, are what they
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,9 +22,9 @@ from jaxltl.app._environment_learners import Method, make_method
 from jaxltl.app.drawing import Picture, drawing
 from jaxltl.app.environment_source import load_environment
 from jaxltl.app.explorer import Curves, curves
-from jaxltl.app.files.tables import errors_in
+from jaxltl.app.files.tables import errors_in, read_bytes
 from jaxltl.app.files.task import many
-from jaxltl.app.files.task_environment import EnvironmentTask
+from jaxltl.app.files.task_environment import EnvironmentTask, named_files
 from jaxltl.app.files.task_environment import read_task as read_task
 from jaxltl.app.guarantee import check_formula
 from jaxltl.app.job import (
@@ -40,7 +41,14 @@ from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.labels import require_known
-from jaxltl.core.models.environment import Agent, Environment, Episode, Finite, run_episode
+from jaxltl.core.models.environment import (
+    Agent,
+    Environment,
+    Episode,
+    Finite,
+    require_environment,
+    run_episode,
+)
 from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.models.task_environment import task_environment
 from jaxltl.core.values.evaluation import (
@@ -103,14 +111,19 @@ class Outcome:
     seconds: float
 
 
-def prepare(task: EnvironmentTask, seed: int) -> Setup:
+def prepare(task: EnvironmentTask, seed: int, world: Environment | None = None) -> Setup:
     """The world with its task, and the learner; all that the file names checked.
+
+    Args:
+      task: the file.
+      seed: nothing is drawn here.
+      world: in place of the one that the file names.
 
     Raises:
       ValueError: something in the file, or in what it names, is wrong.
     """
     del seed
-    world = load_environment(task)
+    world = load_environment(task, world)
     with errors_in(f"{task.path}: [task] formula: "):
         automaton = to_automaton(task.formula)
     with errors_in(f"{task.path}: [task] "):
@@ -344,7 +357,8 @@ def save(out: Path, outcome: Outcome) -> None:
     """Writes ``policy.npz`` and, where the world has places, ``episode.html`` into a directory.
 
     Arrays of ``policy.npz`` are those of the learner's state that the kept policy is made of, by
-    their place in it; :func:`load_policy` reads them.
+    their place in it; with them goes the task file, and where it lay. :func:`load_policy` reads
+    them.
 
     Raises:
       ValueError: the place cannot be written to.
@@ -352,7 +366,10 @@ def save(out: Path, outcome: Outcome) -> None:
     from jaxltl.plot.episodes import play_episode
 
     one = jax.tree.map(lambda x: x[outcome.chosen], outcome.states)
-    save_arrays(out / "policy.npz", dict(_parts(outcome.setup.method, one)))
+    task = outcome.setup.task
+    save_arrays(out / "policy.npz", {
+        **dict(_parts(outcome.setup.method, one)), "task": task.text,
+        "task_file": str(task.path.absolute())})
     try:
         page = play_episode(outcome.setup.environment, outcome.episodes[0])
     except ValueError:
@@ -368,34 +385,64 @@ def _parts(method: Method, state: Any) -> list[tuple[str, Any]]:
     return [(jax.tree_util.keystr(path, simple=True, separator="."), x) for path, x in leaves]
 
 
-def load_policy(task_file: str | Path, policy_file: str | Path) -> tuple[Environment, Agent]:
-    """The environment with its task, and the policy that was written for it.
+def load_policy(
+    policy_file: str | Path,
+    *,
+    environment: Environment | None = None,
+    task_file: str | Path | None = None,
+) -> tuple[Environment, Agent]:
+    """A policy that ``jaxltl learn`` wrote, and the environment with the task that it is for.
+
+    The file has the text of its task file, but no code: the function that makes the environment is
+    imported and called as the task names it. A file of functions is looked for where the task file
+    lay, and beside the policy. Do so with policies of those alone whom you trust; of others, give
+    `environment`, and nothing is imported.
 
     Args:
-      task_file: as it was learned from.
       policy_file: ``policy.npz``.
+      environment: in place of what the task names, without its task, but with its labels.
+      task_file: in place of what was kept of it.
 
     Returns:
       What :func:`~jaxltl.core.values.evaluation.evaluate` and
       :func:`~jaxltl.core.models.environment.run_episode` take.
 
     Raises:
-      ValueError: a mistake in the task file, or arrays that are not of its policy.
+      ValueError: no such file, or none of a policy; a mistake in the task, or functions that are
+        not there; arrays that are not of its policy.
     """
-    setup = prepare(read_task(task_file), 0)
+    policy_file = Path(policy_file)
+    with errors_in(f"{policy_file}: "):
+        arrays = read_arrays(io.BytesIO(read_bytes(policy_file, "the policy")))
+    task = read_task(task_file) if task_file else _kept_task(policy_file, arrays)
+    setup = prepare(task, 0, None if environment is None else require_environment(environment))
     method = setup.method
-    with open(policy_file, "rb") as file, errors_in(f"{policy_file}: "):
-        arrays = read_arrays(file)
-    state = method.algorithm.init(jax.random.key(0), method.problem, method.hparams)
+    state = jax.eval_shape(
+        lambda key: method.algorithm.init(key, method.problem, method.hparams), jax.random.key(0))
     for name, x in _parts(method, state):
         found = arrays.get(name)
         if found is None or found.shape != x.shape:
             is_ = "missing" if found is None else f"of shape {list(found.shape)}"
             raise ValueError(
-                f"{policy_file}: {name} is {is_}, and the policy of {task_file} has one of "
-                f"{list(x.shape)}; give the file that was learned from this task.")
+                f"{policy_file}: {name} is {is_}, and the policy of {task.path} has one of "
+                f"{list(x.shape)}; give the file that was learned from this task, in this "
+                "environment.")
     kept = {name: getattr(state, name) for name in method.kept}
-    leaves = [jnp.asarray(arrays[name]) for name, _ in _parts(method, state)]
+    leaves = [jnp.asarray(arrays[name], x.dtype) for name, x in _parts(method, state)]
     state = replace(state, **jax.tree.unflatten(jax.tree.structure(kept), leaves))
     likeliest = setup.task.evaluation.get("policy") == "likeliest"
     return setup.environment, method.agent(state, likeliest)
+
+
+def _kept_task(policy_file: Path, arrays: Mapping[str, np.ndarray]) -> EnvironmentTask:
+    """The task in a policy's file, in the folder that has the files that it names."""
+    if not all(name in arrays and arrays[name].dtype.kind == "U" for name in ("task", "task_file")):
+        raise ValueError(
+            f"{policy_file}: no task is kept with it, as jaxltl learn does for environments; give "
+            "the policy.npz of such a job, or task_file=.")
+    path, raw = Path(str(arrays["task_file"])), str(arrays["task"]).encode()
+    beside = policy_file.absolute().parent
+    named = named_files(read_task(path, raw).world)
+    there = [folder for folder in (path.parent, beside)
+             if all((folder / name).is_file() for name in named)]
+    return read_task((there or [path.parent])[0] / path.name, raw)

@@ -145,14 +145,48 @@ def test_learn_says_and_writes_what_it_found(learned):
 def test_the_written_policy_does_what_the_result_says(learned):
     path, out, _ = learned
     result = json.loads((out / "result.json").read_text())
-    environment, agent = job.load_policy(path, out / "policy.npz")
+    environment, agent = job.load_policy(out / "policy.npz")
     keys = jax.random.split(jax.random.fold_in(jax.random.key(0), 2), 3)
     again = evaluate(keys[1], agent, environment, num_episodes=200)
     assert again.success.mean == result["evaluation"]["success"]["mean"]
     assert again.length.mean == pytest.approx(result["evaluation"]["length"]["mean"])
     np.savez(out / "other.npz", nothing=np.zeros(1))
     with pytest.raises(ValueError, match=r"other\.npz: parameters.* is missing"):
-        job.load_policy(path, out / "other.npz")
+        job.load_policy(out / "other.npz", task_file=path)
+
+
+def test_a_written_policy_is_used_without_its_task_file(learned, tmp_path):
+    path, out, _ = learned
+    world = load_environment(read_task(path))
+    here = tmp_path / "policy.npz"
+    arrays = dict(np.load(out / "policy.npz"))
+    assert arrays["task"].item() == path.read_text()
+    np.savez(here, **arrays | {"task_file": np.array("/nowhere/task.toml")})
+
+    def act(**given):
+        _, agent = job.load_policy(here, **given)
+        seen = environment.observe(environment.reset(jax.random.key(0)))
+        return np.asarray(jax.vmap(lambda key: agent.act((), seen, None, key)[0])(
+            jax.random.split(jax.random.key(3), 20)))
+
+    environment, _ = job.load_policy(out / "policy.npz")
+    with pytest.raises(ValueError, match=r"/nowhere/task.toml: \[world\] environment: there is no"):
+        job.load_policy(here)
+    wanted = act(task_file=path)
+    np.testing.assert_array_equal(act(environment=world), wanted)
+    shutil.copy(path.parent / "own.py", tmp_path)
+    np.testing.assert_array_equal(act(), wanted)
+    for given, message in (
+            ({"environment": 3}, "environment is int; give one of make_environment"),
+            ({"environment": load_environment(read_task(path)).replace(propositions=("a", "b"))},
+             r"task.toml: \[task\] formula: .*'goal'")):
+        with pytest.raises(ValueError, match=message):
+            job.load_policy(here, **given)
+    np.savez(here, next_memory=np.zeros(1))
+    with pytest.raises(ValueError, match=r"policy\.npz: no task is kept with it"):
+        job.load_policy(here)
+    with pytest.raises(ValueError, match=r"the policy cannot be read: .*No such file"):
+        job.load_policy(tmp_path / "none.npz")
 
 
 def test_what_is_done_is_not_done_again(learned, monkeypatch):
@@ -196,7 +230,7 @@ def test_other_methods(write, tmp_path, method, table, boxed):
     assert result["method"] == method and result["evaluation"]["num_episodes"] == 200
     assert result["evaluation"]["success"]["mean"] > 0.9
     assert ("cost" in result["training"]["last"]) == ("cost" in path.read_text())
-    environment, agent = job.load_policy(path, tmp_path / "out" / "policy.npz")
+    environment, agent = job.load_policy(tmp_path / "out" / "policy.npz")
     again = evaluate(jax.random.key(5), agent, environment, num_episodes=200)
     assert again.success.mean > 0.9
 

@@ -91,7 +91,7 @@ def errors_in(place: str) -> Iterator[None]:
 
 def read_tables(
     path: Path, what: str, known: Mapping[str, Mapping[str, Rule]],
-    required: Mapping[str, Sequence[str]],
+    required: Mapping[str, Sequence[str]], raw: bytes | None = None,
 ) -> tuple[dict[str, Any], bytes]:
     """The tables of a TOML file, all of known keys whose values obey their rules, and its bytes.
 
@@ -99,11 +99,12 @@ def read_tables(
       path: the file; `what` it is begins an error.
       known: keys and rules by table; a file may have a plain ``name`` beside its tables.
       required: keys that a table must have; by the empty name, the tables.
+      raw: the file's bytes, if they are known already.
 
     Raises:
       ValueError: the file is missing or malformed, or a key is unknown, missing or wrong.
     """
-    data, raw = read_toml(path, what)
+    data, raw = read_toml(path, what, raw)
     check_table(path, "", data, {"name": NAME, **dict.fromkeys(known, TABLE)}, required[""])
     for table in known:
         if table in data:
@@ -111,13 +112,15 @@ def read_tables(
     return data, raw
 
 
-def read_toml(path: Path, what: str) -> tuple[dict[str, Any], bytes]:
-    """The tables of a TOML file, and its bytes.
+def read_toml(
+    path: Path, what: str, raw: bytes | None = None
+) -> tuple[dict[str, Any], bytes]:
+    """The tables of a TOML file, and its bytes, which are read unless they are given.
 
     Raises:
       ValueError: the file cannot be read or is malformed.
     """
-    raw = read_bytes(path, what)
+    raw = read_bytes(path, what) if raw is None else raw
     try:
         return tomllib.loads(raw.decode()), raw
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -33,6 +33,7 @@ class EnvironmentTask:
       settings: the table of the method's name.
       evaluation: ``[evaluation]``.
       digest: a fingerprint of the file and of every file beside it that it names.
+      text: what it held when it was read.
     """
 
     path: Path
@@ -44,6 +45,7 @@ class EnvironmentTask:
     settings: Mapping[str, Any]
     evaluation: Mapping[str, Any]
     digest: str
+    text: str
 
     @property
     def method(self) -> str:
@@ -128,24 +130,33 @@ def is_environment_task(path: str | Path) -> bool:
     return simulated or (isinstance(learner, dict) and learner.get("method") in METHODS)
 
 
-def read_task(path: str | Path) -> EnvironmentTask:
+def read_task(path: str | Path, raw: bytes | None = None) -> EnvironmentTask:
     """Reads a task file of a simulated world.
+
+    Args:
+      path: the file.
+      raw: its bytes, where they were kept elsewhere: then no file is read, and there is no digest.
 
     Raises:
       ValueError: the file, or one that it names, is missing or malformed, or a key is unknown,
         missing or wrong. The message names the file, the table, the key and the fix.
     """
     path = Path(path)
-    data, raw = tables.read_tables(path, "the task file", _KEYS, _REQUIRED)
+    data, found = tables.read_tables(path, "the task file", _KEYS, _REQUIRED, raw)
     world, task, method = data["world"], dict(data["task"]), data["learner"]["method"]
     _check_method(path, data, method)
-    named = [name for key in ("environment", "labels") if key in world
-             and (name := world[key].rpartition(":")[0]).endswith(".py")]
     return EnvironmentTask(
         path=path, name=data.get("name", path.stem), world=world, formula=task.pop("formula"),
         reward=task, learner=data["learner"], settings=data.get(method, {}),
         evaluation=data.get("evaluation", {}),
-        digest=tables.digest(path, raw, dict.fromkeys(named)))
+        digest=tables.digest(path, found, named_files(world)) if raw is None else "",
+        text=found.decode())
+
+
+def named_files(world: Mapping[str, Any]) -> list[str]:
+    """The files beside a task file that its table ``[world]`` names, each once."""
+    named = [world[key].rpartition(":")[0] for key in ("environment", "labels") if key in world]
+    return [name for name in dict.fromkeys(named) if name.endswith(".py")]
 
 
 def _check_method(path: Path, data: Mapping[str, Any], method: str) -> None:
