@@ -47,10 +47,13 @@ class SequenceNetwork(nn.Module):
 
     Attributes:
       num_actions, shape, hidden, activation, initial_deviation: as of PPO's default network.
-      events_seen: ``observation -> float[..., E]``, or None; a function of a module.
+      events_seen: ``observation -> float[..., E]``, or None; hashable, such as a function of a
+        module.
+      by_name: whether, where `events_seen` is given, the observation and the sequence's rows are
+        told as they are too: for a world that stays the same.
       detailed: how many steps of the sequence are told so; of those that follow the network knows
         only how many events they ask for and avoid.
-      embedding: width of the layer that reads a step's events, without `events_seen`.
+      embedding: width of the layer that reads a step's events as they are.
     """
 
     num_actions: int = 0
@@ -59,6 +62,7 @@ class SequenceNetwork(nn.Module):
     activation: str = "relu"
     initial_deviation: float = 1.0
     events_seen: Callable[[Any], jax.Array] | None = None
+    by_name: bool = False
     detailed: int = 4
     embedding: int = 32
 
@@ -69,16 +73,17 @@ class SequenceNetwork(nn.Module):
         depth = reach.shape[0]
         asked = jnp.stack([reach, avoid]).astype(kind)
         ahead = (jnp.arange(depth) < length).astype(kind)
-        if self.events_seen is None:
+        parts = []
+        if self.by_name or self.events_seen is None:
             rows = jnp.concatenate([asked[0], asked[1]], -1)
             layer = nn.Dense(self.embedding, param_dtype=kind, name="events")
-            parts = [flat_observation(world), jnp.ravel(nn.relu(layer(rows)) * ahead[:, None])]
-        else:
+            parts += [flat_observation(world), jnp.ravel(nn.relu(layer(rows)) * ahead[:, None])]
+        if self.events_seen is not None:
             seen = self.events_seen(world)
             seen = seen.reshape(-1, seen.shape[-1]).astype(kind)
             told = asked[:, : self.detailed]
-            parts = [jnp.ravel(seen @ told.reshape(-1, told.shape[-1]).T),
-                     jnp.ravel(asked.mean(-1))]
+            parts += [jnp.ravel(seen @ told.reshape(-1, told.shape[-1]).T),
+                      jnp.ravel(asked.mean(-1))]
         x = jnp.concatenate([*parts, ahead])
         for i, width in enumerate(self.hidden):
             x = getattr(nn, self.activation)(dense(width, np.sqrt(2), f"hidden_{i}")(x))
@@ -155,10 +160,12 @@ def stack_plans(plans: Sequence[Plan]) -> Plan:
 
 
 class Choice(NamedTuple):
-    """What an agent has taken up: a state of the automaton, and which of its sequences."""
+    """What an agent has taken up: a state of the automaton, which of its sequences, and what that
+    one was worth then."""
 
     state: jax.Array
     sequence: jax.Array
+    worth: jax.Array
 
 
 def sequence_agent(
@@ -172,8 +179,10 @@ def sequence_agent(
     """The agent of one formula, of a network that was trained on sequences.
 
     In each state of the automaton that it comes to, it takes the sequence that the network values
-    most, and does what the network does for that one until the state changes: choosing anew at
-    every step, it might go to and fro between two that are worth the same.
+    most, and does what the network does for that one until the state changes, or until another is
+    worth more than this one was when it was taken up: a way that turns out to be none is left.
+    What is taken up is worth more each time, so that nothing goes to and fro in one state, as it
+    might if every step chose anew.
 
     Args:
       network: ``observation -> (parameters of the action, value)`` of a trained network; a
@@ -196,7 +205,7 @@ def sequence_agent(
     if actions is not None:
         given.instance("actions", actions, Finite | Box, "the environment's, environment.actions")
     how = _How(given.one_of("squash", squash, action_distributions.SQUASHES), bool(sampled))
-    begin = Choice(jnp.int32(-1), jnp.int32(0))
+    begin = Choice(jnp.int32(-1), jnp.int32(0), jnp.asarray(0.0))
     return Agent(Partial(_act, how, actions, as_partial(network, "network"), plan), begin)
 
 
@@ -209,8 +218,8 @@ def sequence_policy(
     ``Partial(sequence_policy, network, plan)`` is a policy for
     :func:`~jaxltl.core.values.optimality_gap.tabulate_policy`.
     """
-    actions, best = _judged(network, plan, observation, jnp.asarray(memory))
-    return jax.nn.softmax(actions[best])
+    actions, values = _judged(network, plan, observation, jnp.asarray(memory))
+    return jax.nn.softmax(actions[jnp.argmax(values)])
 
 
 @jax.tree_util.register_static
@@ -257,13 +266,13 @@ def _actions_of(parameters: Any) -> Finite:
 def _judged(
     network: Callable[..., Any], plan: Plan, seen: Any, state: jax.Array
 ) -> tuple[Any, jax.Array]:
-    """What the network would do for each sequence of a state, and which it values most."""
+    """What the network would do for each sequence of a state, and what it values each at."""
     rows = sequence_task.Sequence(
         jnp.asarray(plan.reach)[state], jnp.asarray(plan.avoid)[state],
         jnp.asarray(plan.length)[state])
     actions, values = jax.vmap(
         lambda row: network(sequence_task.SequenceObservation(seen, row)))(rows)
-    return actions, jnp.argmax(jnp.where(rows.length > 0, values, -jnp.inf))
+    return actions, jnp.where(rows.length > 0, values, -jnp.inf)
 
 
 def _act(
@@ -271,13 +280,17 @@ def _act(
     observation: Any, allowed: Any, key: chex.PRNGKey,
 ) -> tuple[Any, Any]:
     seen, state = observation.world, jnp.argmax(observation.memory).astype(jnp.int32)
-    actions, best = _judged(network, plan, seen, state)
-    taken = jnp.where(memory.state == state, memory.sequence, best).astype(jnp.int32)
+    actions, values = _judged(network, plan, seen, state)
+    best = jnp.argmax(values)
+    better = (best != memory.sequence) & (values[best] > memory.worth)
+    kept = (memory.state == state) & ~better
+    taken = jnp.where(kept, memory.sequence, best).astype(jnp.int32)
+    worth = jnp.where(kept, memory.worth, values[best]).astype(memory.worth.dtype)
     said = jax.tree.map(lambda x: x[taken], actions)
     action = action_distributions.chosen(
         key, _actions_of(said) if space is None else space, said, allowed,
         sampled=how.sampled, squash=how.squash)
-    return action, Choice(state, taken)
+    return action, Choice(state, taken, worth)
 
 
 @dataclass(frozen=True)
@@ -329,11 +342,7 @@ def train_in_stages(
     Raises:
       ValueError: no problem, or a number of thresholds that does not fit.
     """
-    problems = given.listed("problems", problems)
-    for name, function in (("init", init), ("run", run), ("report", report)):
-        if function is not None or name != "report":
-            given.called(name, function)
-    count = len(problems)
+    count = len(given.listed("problems", problems))
     num_chunks = given.whole("num_chunks", num_chunks, least=1)
     bars = given.numbers("enough", enough)
     bars = np.full(max(count - 1, 0), bars) if bars.ndim == 0 else bars

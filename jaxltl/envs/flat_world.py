@@ -11,6 +11,7 @@ were drawn so beforehand.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import chex
@@ -19,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax.tree_util import Partial
+from numpy.typing import ArrayLike
 
 from jaxltl.core.host import given
 from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
@@ -107,7 +109,7 @@ def flat_world(
                          "above zero.")
     extent, time_step = given.number("extent", extent), given.number("time_step", time_step)
     num_starts = given.whole("num_starts", num_starts, least=1, most=2**26)
-    seed, discrete = given.whole("seed", seed), given.truth("discrete", discrete)
+    seed = given.whole("seed", seed)
     if not (0 < extent < 1e6 and 0 < time_step < 1e6):
         raise ValueError(
             f"extent={extent}, time_step={time_step}; both must be positive, and below a million.")
@@ -134,6 +136,85 @@ def flat_world(
 def discs_of(environment: Environment) -> Discs:
     """The discs of a flat world."""
     return without_time_limit(environment)[0].labels.args[0]  # type: ignore[attr-defined]
+
+
+@dataclass(frozen=True)
+class EventsAround:
+    """Which event holds where, around the agent; made by :func:`events_around`.
+
+    Attributes:
+      events: of each its propositions, as Booleans.
+      discs: ``(x, y, radius, number of the colour)`` of each.
+      extent: half a side of the square.
+      radii: how far away one looks.
+      directions: into how many directions.
+    """
+
+    events: tuple[tuple[bool, ...], ...]
+    discs: tuple[tuple[float, float, float, int], ...]
+    extent: float
+    radii: tuple[float, ...]
+    directions: int
+
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        """``float[1 + R K, E]``, of the agent's place and R distances in each of K directions."""
+        turn = np.arange(self.directions) * (2 * np.pi / self.directions)
+        ways = np.stack([np.cos(turn), np.sin(turn)], -1)
+        there = np.concatenate([[[0.0, 0.0]], *(ways * r for r in self.radii)]).astype(np.float32)
+        place = observation + there
+        rows = np.array([row[:3] for row in self.discs], np.float32)
+        events = np.array(self.events, np.float32)
+        color = np.eye(events.shape[1], dtype=np.float32)[[row[3] for row in self.discs]]
+        apart = ((place[:, None] - rows[:, :2]) ** 2).sum(-1)
+        held = ((apart < rows[:, 2] ** 2).astype(jnp.float32) @ color > 0).astype(jnp.float32)
+        # A label is an event where all of the event's propositions hold, and none besides.
+        same = held @ (2 * events - 1).T > events.sum(-1) - 0.5
+        return (same & (jnp.abs(place) <= self.extent).all(-1, keepdims=True)).astype(jnp.float32)
+
+
+def events_around(
+    environment: Environment,
+    events: ArrayLike,
+    *,
+    radii: Sequence[float] = (0.08, 0.16, 0.28, 0.45, 0.7, 1.0, 1.4, 1.9, 2.5),
+    directions: int = 16,
+) -> EventsAround:
+    """What an agent that knows the discs would see around itself: ``observation -> float[X, E]``.
+
+    It is a function of the place alone, since the discs never move, and tells of the agent's own
+    place and of some around it which event holds there; outside of the square none does. For
+    :class:`~jaxltl.algos.many_tasks.SequenceNetwork`'s `events_seen`.
+
+    Args:
+      environment: a flat world.
+      events: ``bool[E, P]``, as the sequences have them.
+      radii, directions: how far away and into how many directions it looks.
+
+    Returns:
+      :class:`EventsAround`, a hashable function.
+
+    Raises:
+      ValueError: events that do not fit the world, distances that are not positive, no direction.
+
+    Example:
+      >>> world = flat_world()
+      >>> look = events_around(world, np.eye(7, dtype=bool), radii=[0.5], directions=4)
+      >>> look(jnp.array([-1.0, -1.2])).astype(int).sum(0).tolist()  # in the yellow disc
+      [0, 0, 0, 0, 0, 0, 1]
+    """
+    scene, rows = discs_of(environment), given.numbers("events", events).astype(bool)
+    if rows.ndim != 2 or not len(rows) or rows.shape[1] != len(environment.propositions):
+        raise ValueError(f"events has shape {list(rows.shape)}; give Booleans "
+                         f"[E, {len(environment.propositions)}], a column for each colour.")
+    far = given.numbers("radii", radii)
+    if far.ndim != 1 or not ((far > 0) & np.isfinite(far)).all():
+        raise ValueError(f"radii={far.tolist()}; give distances, all positive.")
+    discs = [(*center, radius, color) for center, radius, color in zip(
+        np.asarray(scene.center).tolist(), np.asarray(scene.radius).tolist(),
+        np.argmax(scene.color, -1).tolist(), strict=True)]
+    return EventsAround(
+        tuple(map(tuple, rows.tolist())), tuple(discs), float(scene.extent), tuple(far.tolist()),
+        given.whole("directions", directions, least=1, most=2**10))
 
 
 def _free_places(scene: Discs, extent: float, count: int, seed: int) -> np.ndarray:

@@ -135,6 +135,20 @@ def test_without_it_the_events_are_embedded():
     assert scores.shape == (3,) and value.shape == ()
 
 
+def test_both_are_told_where_asked_for():
+    network = many_tasks.SequenceNetwork(
+        num_actions=3, hidden=(8,), embedding=5, detailed=2, by_name=True, events_seen=four_places)
+    rows = jnp.ones((2, DEPTH, 4), bool)
+    seen = SequenceObservation(jnp.ones(2), Sequence(*rows, jnp.int32(2)))
+    parameters = network.init(jax.random.key(0), seen)["params"]
+    width = 2 + DEPTH * 5 + 4 * 2 * 2 + 2 * DEPTH + DEPTH
+    assert parameters["hidden_0"]["kernel"].shape[0] == width
+
+
+def four_places(observation):
+    return jnp.ones((4, 4)) * observation[0]
+
+
 def test_an_agent_keeps_to_what_it_has_taken_up():
     plan = many_tasks.make_plan("F a & F b", EVENTS, NAMES, depth=DEPTH)
     worth = jnp.array([0.0, 1.0])
@@ -152,6 +166,25 @@ def test_an_agent_keeps_to_what_it_has_taken_up():
         action, memory = agent.act(memory, seen, None, jax.random.key(0))
         taken.append(int(action))
     assert taken == [1, 1]
+
+
+def test_what_is_worth_more_than_the_choice_was_is_taken_up():
+    """Also where the choice itself has become worth less; what is worth less than it was is not."""
+    plan = many_tasks.make_plan("F a & F b", EVENTS, NAMES, depth=DEPTH)
+
+    def said(observation):
+        first_is_a = observation.sequence.reach[0, 1]
+        return (jnp.where(first_is_a, jnp.array([5.0, 0.0]), jnp.array([0.0, 5.0])),
+                jnp.where(first_is_a, *observation.world))
+
+    agent = many_tasks.sequence_agent(said, plan, sampled=False)
+    initial = to_automaton("F a & F b").initial
+    memory, taken = agent.memory, []
+    for values in [(0.5, 0.4), (0.9, 0.1), (0.2, 0.45), (0.3, 0.6), (0.55, 0.1)]:
+        seen = SimpleNamespace(world=jnp.array(values), memory=jnp.eye(len(plan.length))[initial])
+        action, memory = agent.act(memory, seen, None, jax.random.key(0))
+        taken.append(int(action))
+    assert taken == [0, 0, 0, 1, 1]
 
 
 def one_state_plan():

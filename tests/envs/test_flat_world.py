@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.envs.flat_world import DISCS, discs_of, flat_world
+from jaxltl.envs.flat_world import DISCS, discs_of, events_around, flat_world
 
 NAMES = ("aqua", "blue", "green", "magenta", "orange", "red", "yellow")
 
@@ -70,6 +70,28 @@ def test_nine_directions():
     assert len(np.unique(moves.round(2), axis=0)) == 9
 
 
+def test_events_around_a_place_are_those_of_the_slow_world():
+    world, radii = flat_world(), (0.3, 1.1)
+    events = np.unique(
+        [colors_at(x) for x in np.random.default_rng(5).uniform(-2, 2, (5000, 2))], axis=0)
+    look = events_around(world, events, radii=radii, directions=6)
+    assert look == events_around(world, events, radii=radii, directions=6) and hash(look)
+    places = np.random.default_rng(6).uniform(-2, 2, (40, 2)).astype(np.float32)
+    found, met = np.asarray(jax.jit(jax.vmap(look))(places)), 0
+    assert found.shape == (40, 13, len(events))
+    turn = np.arange(6) * np.pi / 3
+    for place, seen in zip(places, found, strict=True):
+        there = [place, *(place + r * np.array([np.cos(t), np.sin(t)])
+                          for r in radii for t in turn)]
+        for x, row in zip(there, seen, strict=True):
+            if (np.abs(x) > 2).any():
+                assert not row.any()
+            else:
+                met += row[1:].any()
+                assert events[row.astype(bool)].tolist() == [colors_at(x)]
+    assert met > 50
+
+
 @pytest.mark.parametrize(("options", "said"), [
     ({"discs": []}, "at least one"),
     ({"discs": [("red", 0, 0, 0)]}, "radii above zero"),
@@ -81,3 +103,13 @@ def test_nine_directions():
 def test_what_does_not_fit_is_named(options, said):
     with pytest.raises(ValueError, match=said):
         flat_world(**options)
+
+
+@pytest.mark.parametrize(("options", "said"), [
+    ({"events": [[True]]}, "a column for each colour"),
+    ({"radii": [0.1, -1]}, "all positive"),
+    ({"directions": 0}, "directions=0"),
+])
+def test_what_cannot_be_seen_around_is_named(options, said):
+    with pytest.raises(ValueError, match=said):
+        events_around(flat_world(), **{"events": np.eye(7, dtype=bool), **options})

@@ -166,8 +166,9 @@ def _booleans(table: ArrayLike) -> np.ndarray:
 def draw_sequence(key: chex.PRNGKey, sampler: SequenceSampler) -> Sequence:
     """A sequence: for each step some sets to reach and others to avoid, without repetition.
 
-    A set is not avoided if any of its events is to be reached, or may have ended the step before:
-    who has just done that step could not help it.
+    Of the sets to avoid the events that are to be reached are taken out, as automata do. A set is
+    left out if any of its events may have ended the step before: who has just done that step could
+    not help it.
     """
     keys = jax.random.split(key, 4)
     depth, count = sampler.length.shape[0], sampler.sets.shape[0]
@@ -183,9 +184,8 @@ def draw_sequence(key: chex.PRNGKey, sampler: SequenceSampler) -> Sequence:
     asked = (jnp.arange(depth) < length)[:, None]
     reach = asked & ((rank < wanted)[..., None] & sets).any(1)
     before = jnp.concatenate([jnp.zeros_like(reach[:1]), reach[:-1]])
-    clear = ~((before | reach)[:, None] & sets).any(-1)
-    chosen = clear & (rank >= wanted) & (rank < wanted + shunned)
-    return Sequence(reach, asked & (chosen[..., None] & sets).any(1), length)
+    chosen = (rank >= wanted) & (rank < wanted + shunned) & ~(before[:, None] & sets).any(-1)
+    return Sequence(reach, asked & (chosen[..., None] & sets).any(1) & ~reach, length)
 
 
 def sequence_environment(

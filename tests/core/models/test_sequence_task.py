@@ -106,7 +106,7 @@ def test_sets_of_events_are_drawn_whole():
     for reach, avoid in zip(np.asarray(drawn.reach), np.asarray(drawn.avoid), strict=True):
         (before, wanted), shunned = reach, avoid[1]
         assert (union(sets, wanted) == wanted).all()
-        free = [part for part in sets if not (part & (before | wanted)).any()]
+        free = [part & ~wanted for part in sets if not (part & before).any()]
         assert (union(free, shunned) == shunned).all()
 
 
