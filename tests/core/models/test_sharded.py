@@ -190,9 +190,9 @@ def test_parts_equal_the_whole():
     (lambda: shard(world(0), mesh_of(2), order="far"), r'order=.far.; it must be "given", "near"'),
     (lambda: shard(world(0), mesh_of(2), order=np.zeros(S, int)), r"each of the 21 states once"),
     (lambda: shard(3, mesh_of(2)), r"int has no transitions; give an MDP"),
-    (lambda: to_mesh(shard(world(0), mesh_of(2)), np.ones(5)), r"shape \(5,\); expected \(21, ...\)"),
+    (lambda: to_mesh(shard(world(0), mesh_of(2)), np.ones(5)), r"\(5,\); expected \(21, ...\)"),
     (lambda: model_from_parts(None, 0, mesh_of(2)), r"num_states is 0"),
-    (lambda: model_from_parts(lambda a, b: 3, 3, mesh_of(4)), r"3 states cannot lie on 4 devices"),
+    (lambda: model_from_parts(lambda a, b: 3, 3, mesh_of(4)), r"3 states cannot lie on 4"),
     (lambda: model_from_parts(lambda a, b: 3, 4, mesh_of(2)), r"part\(0, 2\) is 3"),
     (lambda: model_from_parts(
         lambda a, b: Part(np.arange(3), np.array([0, a + 9]), np.ones(2)), 4, mesh_of(2)),

@@ -1,4 +1,4 @@
-"""Every solver gives of a model over a mesh what it gives of the model: values, bounds, statuses."""
+"""Solvers give of a model over a mesh what they give of the model: values, bounds, statuses."""
 
 from __future__ import annotations
 
@@ -32,19 +32,22 @@ MESHES = [(4, 2), *(pytest.param(count, reach, marks=pytest.mark.exhaustive)
 FORMULAS = ("F (a & X F b)", "G F a & F G !b", "G !a")
 
 
+def quantities(mdp):
+    """A reward, a target and a policy."""
+    rng, available = np.random.default_rng(0), np.asarray(mdp.available)
+    reward = np.where(available, rng.normal(size=(S, A)), 0)
+    policy = available * rng.random((S, A))
+    return reward, np.asarray(mdp.label)[:, 0], policy / policy.sum(-1, keepdims=True)
+
+
 class Case:
     """A model, the same over a mesh, and quantities of both."""
 
     def __init__(self, count, reach, seed=0):
         self.mdp = world(seed, reach)
         self.sharded = shard(self.mdp, mesh_of(count))
-        rng = np.random.default_rng(seed)
-        available = np.asarray(self.mdp.available)
-        self.reward = np.where(available, rng.normal(size=(S, A)), 0)
-        self.policy = available * rng.random((S, A))
-        self.policy /= self.policy.sum(-1, keepdims=True)
-        self.target = np.asarray(self.mdp.label)[:, 0]
-        self.system = rng.random(S) < 0.5
+        self.reward, self.target, self.policy = quantities(self.mdp)
+        self.system = np.random.default_rng(seed).random(S) < 0.5
 
     def there(self, x):
         return to_mesh(self.sharded, x)
