@@ -159,6 +159,9 @@ def surely(
     """
     mdp = model.mdp
     while True:
+        # Who cannot keep to the set goes all the way back, not by one step a round.
+        inside = inside & ~(compelled(model, ~inside, every=maximize) if helpful else
+                            forced(mdp, ~inside))
         kept = model.may_stay(inside) if helpful else ~mdp.support.lead_to(~inside)
         if maximize:
             kept &= inside[mdp.state]
@@ -198,8 +201,10 @@ def joint_components(
             return Components(np.arange(mdp.num_states), kept), used
         alive = np.zeros(mdp.num_states, bool)
         alive[mdp.state[kept]] = True
-        label = strong_components(source[used], mdp.successor[used], mdp.num_states)
-        now = used & alive[mdp.successor] & (label[source] == label[mdp.successor])
+        stays = ~_compelled(model, ~alive, True, kept)[0]
+        now = used & stays[mdp.successor] & stays[source]
+        label = strong_components(source[now], mdp.successor[now], mdp.num_states)
+        now &= label[source] == label[mdp.successor]
         if (now == used).all():
             break
         used = now

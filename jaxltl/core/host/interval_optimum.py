@@ -9,7 +9,7 @@ with almost all mass then lose no precision.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -279,6 +279,8 @@ class _Search:
             z = choice.value - self.extra * choice.steps
             if self.nodes.attains(z, choice):
                 return choice._replace(z=z)
+            if not choice.steps.all() and (near := self.finely(choice)) is not None:
+                return near
             if self.nodes.against:
                 choice = self.nodes.improved(choice, z, -self.extra)[0]
             found = self.timed(choice, self.extra)
@@ -287,13 +289,51 @@ class _Search:
             choice, self.extra = found
         return None
 
+    def finely(self, choice: Choice) -> Choice | None:
+        """A bound that choices attain, of steps that cost a share of what is lacked where they are.
+
+        Who goes round for long where hardly anything is lacking, and so need not leave for more,
+        then pays hardly anything. What is lacked of the ceiling is what is computed.
+        """
+        top = self.nodes.ceiling
+        if self.relative or self.nodes.mixes or not np.isfinite(top):
+            return None
+        known = self.nodes.known - top
+        if top and not ((known == 0) | (self.nodes.known == 0)).all():
+            return None  # what is lacked would be rounded
+        nodes, share = replace(self.nodes, known=known), self.rounding
+        for _ in range(_NEAR if nodes.against else 1):
+            chain = nodes.chain(choice)
+            self.rounds += 1
+            value = None if chain is None else self.systems.direct(chain.matrix, chain.earned)
+            if chain is None or value is None:
+                return None
+            cost = self.systems.direct(chain.matrix, share * np.abs(value) + _LEAST)
+            if cost is None or not np.isfinite(cost).all():
+                return None
+            z = value - cost
+            if nodes.attains(z, choice):
+                if cost.max(initial=0) > self.tolerance / 4:
+                    return None
+                # The sum is rounded, and may be so upwards.
+                lower = np.nextafter(z + top, -np.inf) if top else z
+                self.last = choice._replace(value=value + top, z=lower)
+                return self.last
+            choice = nodes.improved(choice, z, 0.0)[0]
+        return None
+
+    @property
+    def rounding(self) -> float:
+        """What a step must earn for each unit of value, so that rounding cannot hide it."""
+        return 64 * (self.nodes.widest + 8) * _EPS
+
     def more(self, found: Choice) -> float:
         """How much more a step earns: little beside the tolerance, and more than rounding."""
         nodes = self.nodes
         most = np.abs(found.steps).max(initial=1)
         size = max(np.abs(found.value).max(initial=0), np.abs(nodes.known).max(initial=0))
         aim = _AIM * self.tolerance * self.scale(found.value) / most
-        return float(max(aim, 64 * (nodes.widest + 8) * _EPS * size, _LEAST))
+        return float(max(aim, self.rounding * size, _LEAST))
 
 
 def _nodes(problem: Joint, sign: int, against: bool) -> Nodes:

@@ -59,6 +59,10 @@ class Systems:
             found = _krylov(matrix, b, start, left, _LIKE, self.factors.solve)
             if found is not None:
                 return found
+        return self.direct(matrix, b)
+
+    def direct(self, matrix: Any, b: Floats) -> Floats | None:
+        """The solution by factors of this very system; None where there is none."""
         if self.matrix is not matrix and not self._renew(matrix):
             return None
         assert self.factors is not None
