@@ -35,6 +35,7 @@ from jaxltl.core.automata.translate import Task
 from jaxltl.core.graphs.acceptance import accepting_bottom_components, accepting_end_components
 from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor
 from jaxltl.core.graphs.end_components import bottom_components, end_components
+from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.convert import to_padded, to_sparse
 from jaxltl.core.models.game import as_game
 from jaxltl.core.models.mdp import support
@@ -194,23 +195,29 @@ def make_problem(world: Any, task: Task) -> Problem:
     world = to_padded(to_sparse(getattr(world, "mdp", world) if system.all() else world))
     model = product(world, task, label_on="exit")
     accepting = accepting_end_components(model)
-    won = almost_surely_reaching(model, accepting.region).region
-    lost = ~attractor(model, won).region
+    won = np.asarray(almost_surely_reaching(model, accepting.region).region)
+    lost = ~np.asarray(attractor(model, won).region)
     between = end_components(model, ~won & ~lost)
-    safe = forall_successor(model, won) & model.available & won[..., None]
-    inside = jnp.where(accepting.region[..., None], accepting.inside, safe)
     outcomes = support(world).sum(-1)
     claims = np.where(outcomes > 2, outcomes, outcomes > 1).sum()
     return Problem(
         model=model,
-        won=won,
-        lost=lost,
-        allowed=jnp.where(won[..., None], inside, model.available),
-        component=jnp.asarray(between.component, jnp.int32).reshape(-1),
-        staying=between.inside,
-        start_table=jnp.asarray(cumulative(np.asarray(world.initial, float))),
-        num_claims=jnp.asarray(max(int(claims), 1), jnp.int32),
+        won=to_jax(won),
+        lost=to_jax(lost),
+        allowed=_allowed(model, won, accepting.region, accepting.inside),
+        component=to_jax(np.asarray(between.component, np.int32).reshape(-1)),
+        staying=to_jax(between.inside),
+        start_table=to_jax(np.asarray(cumulative(np.asarray(world.initial, float)))),
+        num_claims=to_jax(np.int32(max(int(claims), 1))),
     )
+
+
+@jax.jit
+def _allowed(model: Product, won: jax.Array, region: jax.Array, inside: jax.Array) -> jax.Array:
+    """Where the task is won, the moves in an accepting end component, or else those that stay."""
+    safe = forall_successor(model, won) & model.available & won[..., None]
+    safe = jnp.where(region[..., None], inside, safe)
+    return jnp.where(won[..., None], safe, model.available)
 
 
 # --- the learner ----------------------------------------------------------------------------
@@ -295,12 +302,14 @@ def _known_within(width: Any, before: State, after: State, metrics: Metrics) -> 
     return (metrics.upper - metrics.lower <= width) & (metrics.status == Status.CONVERGED)
 
 
+@jax.jit
 def behavior(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     """What is sampled, ``float[S, Q, A]``: preferred moves, and now and then any allowed one."""
     dtype = problem.model.dtype
     return pac.hat_strategy(state.best, problem.allowed, hparams.exploration).astype(dtype)
 
 
+@jax.jit
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     """What was learned, ``float[S, Q, A]``: best with nature against it.
 
@@ -356,11 +365,16 @@ def wins_almost_surely(problem: Problem, play: jax.Array) -> bool:
       problem: the problem.
       play: ``float[S, Q, A]``; only what is positive counts.
     """
+    return bool(_wins(problem, play))
+
+
+@jax.jit
+def _wins(problem: Problem, play: jax.Array) -> jax.Array:
     model, used = problem.model, play > 0
     kept = used.any(-1) & (~used | forall_successor(model, problem.won)).all(-1)
     ends = bottom_components(model, used).inside.any(-1)
     good = kept & (~ends | accepting_bottom_components(model, used.astype(model.dtype)))
-    return bool(jnp.all(good | ~problem.won))
+    return jnp.all(good | ~problem.won)
 
 
 # --- samples ----------------------------------------------------------------------------------

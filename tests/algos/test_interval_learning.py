@@ -3,7 +3,6 @@
 from functools import cache, partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
@@ -34,10 +33,12 @@ def random_world(rng):
 
 @cache
 def worlds(number):
-    """Worlds of which none decides all tasks by its graph."""
+    """Worlds of all four letters, for one program; none decides all tasks by its graph."""
     rng, found = np.random.default_rng(0), []
     while len(found) < number:
         world = random_world(rng)
+        if len(np.unique(np.asarray(world.label), axis=0)) < 4:
+            continue
         open_ = [~(p.won | p.lost) for p in (learning.make_problem(world, t) for t in TASKS)]
         if sum(bool(x.any()) for x in open_) >= 2:
             found.append(world)
@@ -100,21 +101,22 @@ def test_every_policy_on_the_way_wins_almost_surely(task):
         problem, hparams, (states, _) = on_the_way(task, "linear", i)
         sure = np.asarray(optimal_satisfaction(problem.model).lower) == 1
         np.testing.assert_array_equal(problem.won, sure)
+        allowed = np.asarray(problem.allowed)
         for number in (0, 1, 2, 5, 39):
             state = lane(states, number)
             for play in (
-                learning.behavior(state, problem, hparams),
-                learning.policy(state, problem, hparams),
+                np.asarray(learning.behavior(state, problem, hparams)),
+                np.asarray(learning.policy(state, problem, hparams)),
             ):
                 np.testing.assert_allclose(play.sum(-1), 1, rtol=1e-6)
-                assert (~(play > 0) | problem.allowed).all()
+                assert (~(play > 0) | allowed).all()
                 assert wins(problem, play)
                 assert learning.wins_almost_surely(problem, play)
-            assert (learning.behavior(state, problem, hparams) > 0)[problem.allowed].all()
+            assert (np.asarray(learning.behavior(state, problem, hparams)) > 0)[allowed].all()
         for _ in range(10):
             some = np.asarray(problem.model.available) & (rng.random(problem.allowed.shape) < 0.7)
             refused += not wins(problem, some)
-            assert learning.wins_almost_surely(problem, jnp.asarray(some, float)) == wins(
+            assert learning.wins_almost_surely(problem, some.astype(float)) == wins(
                 problem, some
             )
     assert refused > 3
@@ -132,10 +134,11 @@ def test_a_risk_is_not_taken_where_there_is_a_sure_way():
     state, metrics = learning.train(
         jax.random.key(0), problem, settings(exploration=1.0), num_steps=5
     )
-    assert state.counts[0, 0].tolist() == [0, 0]
-    assert state.counts[0, 1].sum() > 20 and state.counts.sum() == 5 * 4 * 16
+    counts, metrics = np.asarray(state.counts), jax.tree.map(np.asarray, metrics)
+    assert counts[0, 0].tolist() == [0, 0]
+    assert counts[0, 1].sum() > 20 and counts.sum() == 5 * 4 * 16
     assert metrics.lower[-1] == metrics.upper[-1] == 1
-    assert not learning.wins_almost_surely(problem, jnp.full(problem.allowed.shape, 0.5))
+    assert not learning.wins_almost_surely(problem, np.full(problem.allowed.shape, 0.5))
 
 
 def test_where_a_task_is_won_only_what_may_be_done_for_ever_is_done():
@@ -148,7 +151,7 @@ def test_where_a_task_is_won_only_what_may_be_done_for_ever_is_done():
         propositions=["a", "b"],
     )
     problem = learning.make_problem(world, "F G a | G F b")
-    assert problem.won.all()
+    assert np.asarray(problem.won).all()
     state = learning.init(jax.random.key(0), problem, settings())
     for play in (
         learning.behavior(state, problem, settings()),
@@ -156,7 +159,7 @@ def test_where_a_task_is_won_only_what_may_be_done_for_ever_is_done():
     ):
         assert wins(problem, play) and learning.wins_almost_surely(problem, play)
     assert not wins(problem, np.ones(problem.allowed.shape))
-    assert not learning.wins_almost_surely(problem, jnp.full(problem.allowed.shape, 0.5))
+    assert not learning.wins_almost_surely(problem, np.full(problem.allowed.shape, 0.5))
 
 
 def test_who_may_stay_has_the_value_of_the_best_way_out():
@@ -172,10 +175,12 @@ def test_who_may_stay_has_the_value_of_the_best_way_out():
     state, metrics = learning.train(jax.random.key(0), problem, hparams, num_steps=60)
     q = int(problem.model.automaton.initial)
     for value, end in ((state.pessimistic, state.lower), (state.optimistic, state.upper)):
-        np.testing.assert_allclose(value[:2, q], end[1, 1, 0], rtol=1e-6)
+        np.testing.assert_allclose(
+            np.asarray(value)[:2, q], np.asarray(end)[1, 1, 0], rtol=1e-6)
+    metrics = jax.tree.map(np.asarray, metrics)
     assert 0.6 < metrics.lower[-1] < metrics.upper[-1] < 0.8
     play = learning.policy(state, problem, hparams)
-    reached = satisfaction_probability(problem.model, play).value
+    reached = np.asarray(satisfaction_probability(problem.model, play).value)
     np.testing.assert_allclose(reached[0, q], 0.7, rtol=1e-6)
 
 
@@ -198,10 +203,11 @@ def test_samples_are_of_the_world():
 
 def test_counters_end_before_they_are_full():
     problem, hparams, (states, _) = on_the_way(TASKS[0], "linear", 0)
-    last = lane(states, 39).replace(samples=jnp.int32(learner.MOST - 70))
-    state, metrics = learning.step(last, problem, hparams)
+    last = lane(states, 39).replace(samples=np.int32(learner.MOST - 70))
+    step = jax.jit(learning.step)
+    state, metrics = step(last, problem, hparams)
     assert state.samples == learner.MOST - 6 and metrics.status == Status.MAX_STEPS
-    after, metrics = learning.step(state, problem, hparams)
+    after, metrics = step(state, problem, hparams)
     assert after.samples == state.samples and metrics.status == Status.MAX_STEPS
     np.testing.assert_array_equal(after.counts, state.counts)
     np.testing.assert_array_equal(after.lower, state.lower)
@@ -250,12 +256,13 @@ def test_intervals_with_a_confidence_hold_those_of_any_time_and_only_shrink():
         assert (np.asarray(state.upper) >= high - 1e-4 - 1e-9)[used].all()
     seen = (np.asarray(state.counts).sum(-1) > 100)[..., None] & used
     assert seen.any()
-    width, best = (state.upper - state.lower)[seen], (sets.upper - sets.lower)[seen]
+    width = (np.asarray(state.upper) - np.asarray(state.lower))[seen]
+    best = (sets.upper - sets.lower)[seen]
     assert np.mean(width) < 1.6 * np.mean(best)
 
 
 def test_frequencies_that_are_rounded_beyond_one_make_no_nan():
-    ends = learning._least(jnp.array([-3e-16, 0.0, 0.5, 1.0, 1 + 3e-16]), jnp.float64(0.01))
+    ends = np.asarray(jax.jit(learning._least)(np.array([-3e-16, 0.0, 0.5, 1.0, 1 + 3e-16]), 0.01))
     assert (ends[:2] == 0).all() and (ends[3:] > 0.9).all() and 0.4 < ends[2] < 0.45
 
 
@@ -266,9 +273,9 @@ def test_frequencies_that_are_rounded_beyond_one_make_no_nan():
 def test_settled_values_are_the_robust_values_of_the_intervals(task):
     """By another solver, from all states; from values of other intervals, 40 steps on end."""
     for i in range(3):
-        problem, _, (states, metrics) = on_the_way(task, "linear", i, sweeps=4000)
+        problem, _, (states, metrics) = on_the_way(task, "linear", i, sweeps=1000)
         model = problem.model
-        assert metrics.status[39] == Status.CONVERGED
+        assert np.asarray(metrics.status)[39] == Status.CONVERGED
         for number in (0, 39):
             state = lane(states, number)
             intervals = make_interval(model.mdp, state.lower, state.upper)
@@ -277,7 +284,9 @@ def test_settled_values_are_the_robust_values_of_the_intervals(task):
                     intervals, model.automaton, nature=nature, states=np.arange(S)
                 )
                 np.testing.assert_allclose(
-                    value[:, int(model.automaton.initial)], exact.solution.value, atol=2e-3
+                    np.asarray(value)[:, int(model.automaton.initial)],
+                    exact.solution.value,
+                    atol=2e-3,
                 )
 
 
@@ -292,8 +301,9 @@ def test_values_come_near_the_optimum(kind):
             assert (lower <= best + 1e-9).all() and (upper >= best - 1e-9).all()
             assert (np.diff(lower) >= -1e-9).all() and (np.diff(upper) <= 1e-9).all()
         long, metrics = learning.run(lane(states, 39), problem, hparams, num_steps=2000, max_rows=1)
-        assert metrics.upper[0] - metrics.lower[0] < 0.08
-        assert abs(metrics.lower[0] - best) < 0.08
+        (lower,), (upper,) = np.asarray(metrics.lower), np.asarray(metrics.upper)
+        assert upper - lower < 0.08
+        assert abs(lower - best) < 0.08
         play = learning.policy(long, problem, hparams)
         reached = np.sum(start * np.asarray(satisfaction_probability(problem.model, play).value))
         assert reached > best - 0.02
@@ -345,7 +355,8 @@ def test_a_successor_that_stands_twice_is_one():
     problem = learning.make_problem(world, "F home")
     state, _ = learning.train(jax.random.key(0), problem, settings(), num_steps=20)
     assert state.counts.shape == (3, 1, 2) and problem.num_claims == 1
-    assert min(state.counts[0, 0]) > 0.3 * max(state.counts[0, 0])
+    counts = np.asarray(state.counts)[0, 0]
+    assert min(counts) > 0.3 * max(counts)
 
 
 def test_what_makes_no_sense_is_refused():
