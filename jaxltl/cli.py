@@ -412,10 +412,13 @@ def _render(result: Automaton, form: str, formula: str) -> str:
               type=click.FloatRange(0, 1, min_open=True),
               help="The width of the bounds: absolute of probabilities, else relative.")
 @click.option("--json", "as_json", is_flag=True, help="End with the results as one JSON line.")
+@click.option("--checkpoint", type=click.Path(path_type=Path), metavar="DIRECTORY",
+              help="With --mesh: keep the bounds of long solves here, and go on from them.")
+@_over_devices
 @_plain_errors
 def solve(
     model_file: Path, properties: tuple[str, ...], strategy: Path | None, tolerance: float,
-    as_json: bool,
+    as_json: bool, checkpoint: Path | None, asked: several.Asked,
 ) -> None:
     """Solve properties of a Markov chain or decision process, with certified bounds.
 
@@ -425,29 +428,52 @@ def solve(
 
     Values are those of the initial states. The exit status is 0 where all were solved, 1 where
     some value did not converge or threshold was not decided, 2 for mistakes in what was asked.
+
+    With --mesh the model lies over devices, also over those of several processes, each of which is
+    started with the same arguments; see docs/devices.md.
     """
-    _begin(f"solving {model_file}")
+    launch = several.launched(asked)
+    say = _first_says(launch)
+    say(_first_line(f"solving {model_file}"))
+    for option, given, with_mesh in (
+            ("--strategy", strategy, False), ("--checkpoint", checkpoint, True)):
+        if given is not None and (asked.mesh is not None) != with_mesh:
+            raise ValueError(f"{option} goes {'with' if with_mesh else 'without'} --mesh alone.")
+    if asked.mesh is not None:
+        programs.keep_programs(True)
     from jaxltl.app import solve as solving
 
-    asked = solving.asked_for(properties)
-    if all(one.parsed is None for one in asked):
-        raise ValueError("\n".join(str(one.error) for one in asked))
+    questions = solving.asked_for(properties)
+    if all(one.parsed is None for one in questions):
+        raise ValueError("\n".join(str(one.error) for one in questions))
     from jaxltl.algos.checkpoint import atomic_write
 
     # A place that cannot be written to must be known before the work, not after.
-    place = contextlib.nullcontext() if strategy is None else atomic_write(strategy)
-    with place as file:
+    written = contextlib.nullcontext() if strategy is None else atomic_write(strategy)
+    double = contextlib.nullcontext if asked.mesh is None else _float64
+    with written as file, several.taking_part(asked, launch, say) as place, double():
         begin = time.perf_counter()
-        model = solving.load(model_file)
+        model = place.together(lambda: solving.load(model_file))
         entry = solving.model_entry(model, time.perf_counter() - begin)
-        click.echo("{kind} of {states} states, {choices} choices, {transitions} transitions, read "
-                   "in {seconds:.3f} s".format(**entry))
+        if place.is_first:
+            click.echo("{kind} of {states} states, {choices} choices, {transitions} transitions, "
+                       "read in {seconds:.3f} s".format(**entry))
+        if place.mesh is None:
+            found = solving.solve(model, questions, tolerance)
+        else:
+            from jaxltl.app import solve_on_mesh
+
+            found = solve_on_mesh.solve_in(
+                place, model, questions, tolerance, checkpoint, list(properties))
         results = []
-        for result in solving.solve(model, asked, tolerance):
+        for result in found:
             results.append(result)
-            click.echo(f"\n{solving.text(result)}")
+            if place.is_first:
+                click.echo(f"\n{solving.text(result)}")
         if file is not None:
             file.write(solving.strategies(model, results, model_file))
+    if not place.is_first:
+        as_json = False
     if as_json:
         _print_json({"model": entry, "results": [solving.result_entry(r) for r in results]})
     if status := max(result.exit_status for result in results):

@@ -257,7 +257,7 @@ def taking_part(
         say(f"on {_devices_of(place)} of {launch.processes} processes")
         yield place
     except Exception as error:
-        if not _is_loss(error):
+        if not is_loss(error):
             raise
         _be_quiet()
         line = f"process {launch.process} stops, for another process has ended; {_teller.AGAIN}."
@@ -275,6 +275,9 @@ def _choose_devices(asked: Asked, launch: Launch) -> None:
 
     if launch.processes > 1:
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
+        # Whose handler of SIGTERM notes that the end is near, and lets the process go on.
+        with contextlib.suppress(AttributeError):
+            jax.config.update("jax_enable_preemption_service", False)
     if asked.mesh and "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
         jax.config.update("jax_num_cpu_devices", asked.mesh // launch.processes)
 
@@ -290,10 +293,12 @@ def _mesh(asked: Asked, launch: Launch) -> Mesh:
     per = asked.mesh // launch.processes if asked.mesh else min(map(len, each))
     short = next((p for p, x in enumerate(each) if len(x) < per), None)
     if short is not None:
-        there = f"process {short} has" if launch.processes > 1 else "there are"
+        takes, has = "", "there are"
+        if launch.processes > 1:
+            takes, has = f" takes {per} devices of each process", f"process {short} has"
         raise ValueError(
-            f"--mesh {asked.mesh} takes {per} devices of each process, and {there} "
-            f"{len(each[short])} ({jax.default_backend()}); give fewer, or --mesh alone for all.")
+            f"--mesh {asked.mesh}{takes}: {has} {len(each[short])} ({jax.default_backend()}); give "
+            "fewer, or --mesh alone for all.")
     return Mesh(np.array([d for x in each for d in x[:per]]), ("devices",))
 
 
@@ -397,7 +402,7 @@ def _be_quiet() -> None:
     os.write(2, f"{_teller.QUIET}\n".encode())
 
 
-def _is_loss(error: Exception) -> bool:
+def is_loss(error: Exception) -> bool:
     """Whether an error says that a process could not reach another one."""
     text = str(error)
     return "Gloo" in text or "coordination" in text.lower() or "NCCL" in text

@@ -170,6 +170,15 @@ def answer(
     return _answer(prop, states, found, verdicts, tolerance)
 
 
+def as_answer(
+    prop: Property, states: np.ndarray, solution: Solution, tolerance: float, method: str
+) -> Answer:
+    """What bounds say of a property at the states that were asked for, without a strategy."""
+    found = _Found(solution, method, None)
+    holds = None if prop.relation is None else _verdicts(prop, found)
+    return _answer(prop, states, found, holds, tolerance)
+
+
 def _answer(
     prop: Property, states: np.ndarray, found: _Found, holds: list[bool | None] | None,
     tolerance: float,

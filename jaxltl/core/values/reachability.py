@@ -73,6 +73,7 @@ def reachability_probability(
     method: str = "auto",
     tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int = 1_000_000,
+    start: tuple[jax.Array, jax.Array] | None = None,
 ) -> Solution:
     """Probability of ever reaching a set of states.
 
@@ -100,6 +101,8 @@ def reachability_probability(
         allows, until a round of sweeps gains less than rounding takes. Of a sparse model, or with
         `stay`: the whole width, 1e-6 by default (1e-3 in single precision).
       max_steps: sweeps at most.
+      start: bounds of the optimum from below and above to go on from, such as those of a solution
+        that ended after `max_steps`; used where bounds are found by sweeps. They are believed.
 
     Returns:
       :class:`Solution`; `value` is ``float[S]``, exactly 0 or 1 where the graph says so. An
@@ -132,7 +135,7 @@ def reachability_probability(
     if is_sparse(model) or stay is not None:
         return reachability(
             model, target, stay=stay, policy=policy, objective=objective, tolerance=tolerance)
-    traced = is_traced((model, target, policy, tolerance, max_steps))
+    traced = is_traced((model, target, policy, tolerance, max_steps, start))
     readable = not traced and is_table(model)
     small = readable and math.prod(model.state_shape) <= _HOST_LIMIT
     if policy is not None:
@@ -144,7 +147,7 @@ def reachability_probability(
             found = _evaluate(model, target, policy, tolerance, max_steps, method=method)
         return found
     if traced:
-        return _inside_jit(model, target, tolerance, max_steps, objective=objective)
+        return _inside_jit(model, target, tolerance, max_steps, start, objective=objective)
     found = _by_layers(model, target, tolerance, objective)
     if found is not None:
         return found
@@ -157,7 +160,7 @@ def reachability_probability(
         found, ties = _optimum_on_host(model, graph, sets, components, tolerance, objective)
     if found is None:
         arguments = to_jax((sets, components))
-        found = _optimize(model, *arguments, tolerance, max_steps, objective=objective)
+        found = _optimize(model, *arguments, tolerance, max_steps, start, objective=objective)
     if not readable:
         return found
     decided = sets.zero | (np.asarray(target) if objective == "max" else sets.one)
@@ -167,9 +170,9 @@ def reachability_probability(
 
 
 @partial(jax.jit, static_argnames=("objective",))
-def _inside_jit(model, target, tolerance, max_steps, *, objective) -> Solution:
+def _inside_jit(model, target, tolerance, max_steps, start, *, objective) -> Solution:
     sets, components = in_turn(partial(_decided, objective=objective), model, target)
-    return _optimize(model, sets, components, tolerance, max_steps, objective=objective)
+    return _optimize(model, sets, components, tolerance, max_steps, start, objective=objective)
 
 
 def _decided(model: Any, target: Any, *, objective: str) -> tuple[Sets, EndComponents | None]:
@@ -547,7 +550,7 @@ def _ended(finest: bool, carry: _Bounds, search: _Search) -> jax.Array:
 
 
 @partial(jax.jit, static_argnames=("objective",))
-def _optimize(model, sets: Sets, components, tolerance, max_steps, *, objective) -> Solution:
+def _optimize(model, sets: Sets, components, tolerance, max_steps, start, *, objective) -> Solution:
     """Encloses an optimum between a bound that a policy attains and one that is proven.
 
     The attained bound ("near") is the lower one of a maximum and the upper one of a
@@ -560,12 +563,13 @@ def _optimize(model, sets: Sets, components, tolerance, max_steps, *, objective)
     goal = jnp.asarray(jnp.sqrt(eps) if tolerance is None else tolerance, model.dtype)
     search = _Search(model, undecided, one, components, goal)
     top = jnp.where(undecided, 1, one)
-    near, far = (one, top) if objective == "max" else (top, one)
+    low, high = (one, top) if start is None else (
+        jnp.where(undecided, jnp.clip(x, 0, 1), one) for x in start)
+    near, far = (low, high) if objective == "max" else (high, low)
     finest, no = tolerance is None, jnp.bool_(False)
-    start = _Bounds(near, far, no, ~no, no)
     bounds, n = iterate(
-        partial(_tighter, sign, finest), partial(_ended, finest), None, start, search,
-        max_steps=max_steps)
+        partial(_tighter, sign, finest), partial(_ended, finest), None,
+        _Bounds(near, far, no, ~no, no), search, max_steps=max_steps)
     near, far = bounds.near, bounds.far
     still = lax.stop_gradient(search)
     action = still.best(sign, near)[1]

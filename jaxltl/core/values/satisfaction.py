@@ -91,6 +91,7 @@ def optimal_satisfaction(
     nature: str | None = None,
     tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int = 1_000_000,
+    start: tuple[jax.Array, jax.Array] | None = None,
 ) -> Solution:
     """Largest or smallest probability of satisfying the product's task, with its policy.
 
@@ -124,6 +125,7 @@ def optimal_satisfaction(
       tolerance: half the width of the enclosure asked for; default as in
         :func:`reachability_probability`, as closely as the dtype allows.
       max_steps: sweeps at most.
+      start: bounds to go on from, as for :func:`reachability_probability`.
 
     Returns:
       :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``, memoryless in
@@ -141,14 +143,19 @@ def optimal_satisfaction(
     if objective in ("max", "min") and is_sparse(model):
         return product_satisfaction(model, objective=objective, tolerance=tolerance)
     run = _over_mesh if is_sharded(model) else _optimal
-    return run(model, tolerance, max_steps, objective=objective)
+    return run(model, tolerance, max_steps, start, objective=objective)
 
 
-def _optimal(model: Product, tolerance: Any, max_steps: Any, *, objective: str) -> Solution:
+def _optimal(
+    model: Product, tolerance: Any, max_steps: Any, start: Any, *, objective: str
+) -> Solution:
     problem = as_reachability(model, objective)
+    if start is not None and problem.opposite:  # rounded outwards
+        eps = np.finfo(model.dtype).eps
+        start = 1 - start[1] - eps, 1 - start[0] + eps
     found = reachability_probability(
         problem.model, problem.target, objective=problem.objective, tolerance=tolerance,
-        max_steps=max_steps)
+        max_steps=max_steps, start=start)
     if problem.accepting is not None:
         xp, region, action, chosen = namespace(
             problem.accepting.region, _visiting(problem, found), found.policy)
