@@ -195,8 +195,8 @@ def make_problem(world: Any, task: Task) -> Problem:
     world = to_padded(to_sparse(getattr(world, "mdp", world) if system.all() else world))
     model = product(world, task, label_on="exit")
     accepting = accepting_end_components(model)
-    won = np.asarray(almost_surely_reaching(model, accepting.region).region)
-    lost = ~np.asarray(attractor(model, won).region)
+    sure = almost_surely_reaching(model, accepting.region).region
+    won, lost = np.asarray(sure), ~np.asarray(attractor(model, sure).region)
     between = end_components(model, ~won & ~lost)
     outcomes = support(world).sum(-1)
     claims = np.where(outcomes > 2, outcomes, outcomes > 1).sum()
