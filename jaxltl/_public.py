@@ -71,6 +71,8 @@ from jaxltl.core.models.sequence_task import (
     sequence_environment,
     sequence_sampler,
 )
+from jaxltl.core.models.shard import ModelPart, from_mesh, model_from_parts, shard, to_mesh
+from jaxltl.core.models.sharded import ShardedMDP
 from jaxltl.core.models.simulated_model import environment_of
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse, row_reward
 from jaxltl.core.models.tabulate import Table, tabulate
@@ -173,6 +175,7 @@ __all__ = [
     "Formula",
     "Game",
     "IntervalMDP",
+    "ModelPart",
     "Monitor",
     "NotConverged",
     "Objective",
@@ -186,6 +189,7 @@ __all__ = [
     "Product",
     "Rewards",
     "Sequences",
+    "ShardedMDP",
     "ShieldedWorld",
     "Solution",
     "SparseMDP",
@@ -236,6 +240,7 @@ __all__ = [
     "from_gymnasium",
     "from_gymnax",
     "from_jumanji",
+    "from_mesh",
     "from_navix",
     "from_pgx",
     "from_stormpy",
@@ -269,6 +274,7 @@ __all__ = [
     "make_trajectories",
     "mean_payoff",
     "minimax_value",
+    "model_from_parts",
     "monitor_step",
     "multi",
     "next_probability",
@@ -317,6 +323,7 @@ __all__ = [
     "satisfaction_probability",
     "sequence_environment",
     "sequence_sampler",
+    "shard",
     "shield",
     "shielded",
     "soft_value",
@@ -336,6 +343,7 @@ __all__ = [
     "task_performances",
     "to_automaton",
     "to_dense",
+    "to_mesh",
     "to_padded",
     "to_sparse",
     "to_stormpy",

@@ -14,9 +14,11 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxltl.core.host import given
 from jaxltl.core.host.given import shown
 from jaxltl.core.host.rows import spans, starts_of
 from jaxltl.core.models.convert import to_sparse
+from jaxltl.core.models.lanes import automatic, axes_of, on_host
 from jaxltl.core.models.padded import action_of
 from jaxltl.core.models.sharded import RowTable, ShardedMDP
 from jaxltl.core.models.sparse import SparseMDP, check_entries, checked_starts, row_reward, scaled
@@ -27,7 +29,7 @@ _HALO = 0.6  # share of the others' values from which on all of them are sent
 
 
 @dataclass(frozen=True)
-class Part:
+class ModelPart:
     """The states of a range, with their choices and where those lead.
 
     Attributes:
@@ -90,13 +92,13 @@ def shard(
     rewards = {name: row_reward(sparse, name) for name in sparse.rewards}
     initial, label = np.asarray(sparse.initial, np.float64), np.asarray(sparse.label)
 
-    def part(start: int, stop: int) -> Part:
+    def part(start: int, stop: int) -> ModelPart:
         state = ordered[start:stop]
         choices = np.diff(host.row_start)[state]
         row = spans(host.row_start[state], choices)
         width = np.diff(host.entry_start)[row]
         entry = spans(host.entry_start[row], width)
-        return Part(
+        return ModelPart(
             row_start=starts_of(choices), entry_start=starts_of(width),
             successor=place[host.successor[entry]], probability=host.probability[entry],
             action=column[row], initial=initial[state], label=label[state],
@@ -110,13 +112,13 @@ def shard(
 
 
 def model_from_parts(
-    part: Callable[[int, int], Part], num_states: int, mesh: Mesh, *, axis: str | None = None,
+    part: Callable[[int, int], ModelPart], num_states: int, mesh: Mesh, *, axis: str | None = None,
     propositions: tuple[str, ...] = (),
 ) -> ShardedMDP:
     """A model on a mesh that is too large for one process, made where its parts are to be.
 
     Args:
-      part: from the range of states of a device, first and last but one, its :class:`Part`. Called
+      part: from the range of states of a device, ``(start, stop)``, its :class:`ModelPart`. Called
         in each process for the devices of that process only.
       num_states: S.
       mesh, axis: as for :func:`shard`.
@@ -131,7 +133,7 @@ def model_from_parts(
     Example:
       >>> def cycle(start, stop):  # from each state to the next
       ...     state = np.arange(start, stop)
-      ...     return Part(np.arange(state.size + 1), (state + 1) % 10, np.ones(state.size))
+      ...     return ModelPart(np.arange(state.size + 1), (state + 1) % 10, np.ones(state.size))
       >>> model = model_from_parts(cycle, 10, jax.make_mesh((1,), ("states",)))
       >>> model.num_states, model.num_successors
       (10, 1)
@@ -190,19 +192,10 @@ def from_mesh(model: ShardedMDP, quantity: jax.Array) -> np.ndarray:
 
     In several processes all of them call it, and each gets all of it.
     """
-    number, found = whole(model.number), whole(quantity)
+    number, found = on_host((model.number, quantity))
     result = np.zeros((model.num_given, *found.shape[1:]), found.dtype)
     result[number[number >= 0]] = found[number >= 0]
     return result
-
-
-def whole(x: jax.Array) -> np.ndarray:
-    """A global array on the host; in several processes all of them call it."""
-    if x.is_fully_addressable or x.is_fully_replicated:
-        return np.asarray(x)
-    from jax.experimental import multihost_utils
-
-    return np.asarray(multihost_utils.process_allgather(x, tiled=True))
 
 
 # --- what stands where ----------------------------------------------------------------------------
@@ -293,19 +286,15 @@ class _Layout(NamedTuple):
 
 
 def _layout(num_states: int, mesh: Mesh, axis: str | None) -> _Layout:
-    if not isinstance(mesh, Mesh):
-        raise ValueError(f'mesh is {shown(mesh)}; give a jax.sharding.Mesh, such as '
-                         'jax.make_mesh((jax.device_count(),), ("states",)).')
-    if axis is None and len(mesh.axis_names) != 1:
+    given.instance("mesh", mesh, Mesh, "a jax.sharding.Mesh, such as jax.make_mesh makes")
+    names = axes_of(mesh, axis)
+    if len(names) != 1:
         raise ValueError(f"the mesh has axes {mesh.axis_names}; name one of them as axis.")
-    axis = mesh.axis_names[0] if axis is None else axis
-    if axis not in mesh.axis_names:
-        raise ValueError(f"the mesh has no axis {axis!r}; it has {mesh.axis_names}.")
-    auto = (jax.sharding.AxisType.Auto,) * len(mesh.axis_names)
+    axis = names[0]
     if num_states < mesh.shape[axis]:
         raise ValueError(f"{num_states} states cannot lie on {mesh.shape[axis]} devices; give a "
                          "mesh of fewer.")
-    return _Layout(Mesh(mesh.devices, mesh.axis_names, axis_types=auto), axis, num_states)
+    return _Layout(automatic(mesh), axis, num_states)
 
 
 def _order(model: SparseMDP, order: Any) -> np.ndarray:
@@ -384,8 +373,8 @@ class _Range(NamedTuple):
 def _checked(part: Any, layout: _Layout, d: int, num_labels: int) -> _Range:
     start, stop = layout.span(d)
     found = part(start, stop)
-    if not isinstance(found, Part):
-        raise ValueError(f"part({start}, {stop}) is {shown(found)}; it must return a Part.")
+    if not isinstance(found, ModelPart):
+        raise ValueError(f"part({start}, {stop}) is {shown(found)}; it must return a ModelPart.")
     successor, probability = np.asarray(found.successor), np.asarray(found.probability, np.float64)
     entry_start = checked_starts("entry_start", found.entry_start, successor.size, "transitions")
     row_start = found.row_start

@@ -9,9 +9,10 @@ import pytest
 
 from jaxltl.core.models import operators
 from jaxltl.core.models.convert import to_sparse
+from jaxltl.core.models.lanes import on_host
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.product import product
-from jaxltl.core.models.shard import Part, from_mesh, model_from_parts, shard, to_mesh, whole
+from jaxltl.core.models.shard import ModelPart, from_mesh, model_from_parts, shard, to_mesh
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from tests.sparse_models import random_sparse
 
@@ -126,7 +127,8 @@ def test_halos_are_what_is_needed():
     def walk(start, stop):  # on a grid whose rows are numbered one after another
         here = state[start:stop]
         ahead = np.stack([here, (here + width).clip(0, state.size - 1)], 1)
-        return Part(np.arange(0, 2 * here.size + 1, 2), ahead.ravel(), np.full(2 * here.size, 0.5))
+        return ModelPart(
+            np.arange(0, 2 * here.size + 1, 2), ahead.ravel(), np.full(2 * here.size, 0.5))
 
     model = model_from_parts(walk, state.size, mesh_of(4))
     assert model.num_exchanged == 3 * width  # what the first of the next range needs of it
@@ -151,11 +153,11 @@ def test_rows_of_sparse_models_and_their_rewards_keep_their_names():
     model = random_sparse(rng, 9, rewards={"cost": Rewards(state=rng.random(9))})
     sharded = shard(model, mesh_of(2))
     quantity = rng.random(model.num_rows)
-    there = whole(to_mesh(sharded, quantity, fill=-1.0))
-    rows = whole(sharded.row)
+    there = on_host(to_mesh(sharded, quantity, fill=-1.0))
+    rows = on_host(sharded.row)
     np.testing.assert_array_equal(there[rows >= 0], quantity[rows[rows >= 0]])
     assert (there[rows < 0] == -1).all() and (rows >= 0).sum() == model.num_rows
-    earned = whole(sharded.rewards["cost"])
+    earned = on_host(sharded.rewards["cost"])
     state = model.host.state[rows[rows >= 0]]
     np.testing.assert_array_equal(
         earned[rows >= 0], np.asarray(model.rewards["cost"].state)[state])
@@ -170,7 +172,7 @@ def test_parts_equal_the_whole():
     def part(start, stop):
         row = slice(host.row_start[start], host.row_start[stop])
         entry = slice(host.entry_start[row.start], host.entry_start[row.stop])
-        return Part(
+        return ModelPart(
             host.entry_start[row.start:row.stop + 1] - entry.start, host.successor[entry],
             host.probability[entry], host.row_start[start:stop + 1] - row.start,
             np.asarray(model.action)[row], np.asarray(model.initial)[start:stop],
@@ -185,8 +187,8 @@ def test_parts_equal_the_whole():
 
 
 @pytest.mark.parametrize(("call", "message"), [
-    (lambda: shard(world(0), "cpu"), r"mesh is 'cpu'; give a jax.sharding.Mesh"),
-    (lambda: shard(world(0), mesh_of(2), axis="lanes"), r"no axis 'lanes'; it has \('states',\)"),
+    (lambda: shard(world(0), "cpu"), r"mesh is str; give a jax"),
+    (lambda: shard(world(0), mesh_of(2), axis="lanes"), r"axis='lanes'; the mesh has"),
     (lambda: shard(world(0), mesh_of(2), order="far"), r'order=.far.; it must be "given", "near"'),
     (lambda: shard(world(0), mesh_of(2), order=np.zeros(S, int)), r"each of the 21 states once"),
     (lambda: shard(3, mesh_of(2)), r"int has no transitions; give an MDP"),
@@ -195,20 +197,21 @@ def test_parts_equal_the_whole():
     (lambda: model_from_parts(lambda a, b: 3, 3, mesh_of(4)), r"3 states cannot lie on 4"),
     (lambda: model_from_parts(lambda a, b: 3, 4, mesh_of(2)), r"part\(0, 2\) is 3"),
     (lambda: model_from_parts(
-        lambda a, b: Part(np.arange(3), np.array([0, a + 9]), np.ones(2)), 4, mesh_of(2)),
+        lambda a, b: ModelPart(np.arange(3), np.array([0, a + 9]), np.ones(2)), 4, mesh_of(2)),
      r"state 1, choice 0: successor 9 is out of range; states are 0 to 3"),
     (lambda: model_from_parts(
-        lambda a, b: Part(np.arange(3), np.array([0, 1]), np.array([1, 1 - a / 4])), 4, mesh_of(2)),
-     r"state 3, choice 0: the probabilities sum to 0.5, not 1"),
+        lambda a, b: ModelPart(np.arange(3), np.array([0, 1]), np.array([1, 1 - a / 4])), 4,
+        mesh_of(2)), r"state 3, choice 0: the probabilities sum to 0.5, not 1"),
     (lambda: model_from_parts(
-        lambda a, b: Part(np.arange(2), np.array([0]), np.ones(1)), 4, mesh_of(2)),
+        lambda a, b: ModelPart(np.arange(2), np.array([0]), np.ones(1)), 4, mesh_of(2)),
      r"part\(0, 2\) has 1 states; it must have 2"),
     (lambda: model_from_parts(
-        lambda a, b: Part(np.arange(3), np.zeros(2, int), np.ones(2), initial=np.ones(2)), 4,
+        lambda a, b: ModelPart(np.arange(3), np.zeros(2, int), np.ones(2), initial=np.ones(2)), 4,
         mesh_of(2)), r"the initial distribution sums to 4"),
     (lambda: model_from_parts(
-        lambda a, b: Part(np.arange(3), np.zeros(2, int), np.ones(2), label=np.ones(2, bool)), 4,
-        mesh_of(2)), r"part\(0, 2\): label has shape \(2,\); expected \(2, 0\)"),
+        lambda a, b: ModelPart(
+            np.arange(3), np.zeros(2, int), np.ones(2), label=np.ones(2, bool)), 4, mesh_of(2)),
+     r"part\(0, 2\): label has shape \(2,\); expected \(2, 0\)"),
 ])
 def test_what_is_wrong_is_told(call, message):
     with pytest.raises(ValueError, match=message):
