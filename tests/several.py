@@ -1,6 +1,7 @@
 """A run of several processes that saves its way: started, killed, and what became of it.
 
-As a program: ``several.py DIRECTORY COORDINATOR PROCESS PROCESSES``.
+As a program: ``several.py WHAT DIRECTORY COORDINATOR PROCESS PROCESSES``; what to do is to learn
+or to solve.
 """
 
 import contextlib
@@ -11,6 +12,8 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 ROOT = Path(__file__).parent.parent
 STEPS, LANES = 4000, 4
@@ -52,8 +55,8 @@ def start(number: int, *command: str, places: bool = True) -> list[subprocess.Po
     return found
 
 
-def start_run(number: int, directory: Path) -> list[subprocess.Popen]:
-    return start(number, str(Path(__file__)), str(directory))
+def start_run(number: int, directory: Path, what: str = "learn") -> list[subprocess.Popen]:
+    return start(number, str(Path(__file__)), what, str(directory))
 
 
 def ended(processes: list[subprocess.Popen], seconds: float) -> list[Ended]:
@@ -71,12 +74,12 @@ def ended(processes: list[subprocess.Popen], seconds: float) -> list[Ended]:
 # --- the program ------------------------------------------------------------------------------
 
 
-def main(directory: Path, coordinator: str, process: int, processes: int) -> None:
+def main(what: str, directory: Path, coordinator: str, process: int, processes: int) -> None:
     from jaxltl.app.processes import Asked, launched, taking_part
 
     asked = Asked(0, coordinator, process, processes, wait=15)
     with taking_part(asked, launched(asked, {}), print) as place:
-        run(directory, place)
+        {"learn": run, "solve": solve}[what](directory, place)
 
 
 def problem_and_state() -> tuple[Any, Any, Any]:
@@ -125,9 +128,48 @@ def run(directory: Path, place: Any) -> None:
         print(f"ended: {state.position.tobytes().hex()}")
 
 
+def walk(size: int = 41) -> Any:
+    """A walk between ruin and what is won, from 0.4 of the way: sure numbers take many sweeps."""
+    from jaxltl.core.models.sparse import make_sparse
+
+    ends = [[s] if s in (0, size - 1) else [s - 1, s + 1] for s in range(size)]
+    return make_sparse(
+        None, np.cumsum([0] + [len(x) for x in ends]), [t for x in ends for t in x],
+        [1 / len(x) for x in ends for _ in x], initial=np.eye(size)[2 * (size // 5)],
+        label={"win": [size - 1]})
+
+
+def solve(directory: Path, place: Any) -> None:
+    """The probability of winning, with bounds that are saved again and again."""
+    import jax
+
+    from jaxltl.app import solve_on_mesh
+    from jaxltl.app.solve import asked_for
+
+    made: list[int] = []
+    save = solve_on_mesh.files.save
+
+    def noted(path: Path, state: Any, given: Any) -> None:
+        save(path, state, given)
+        made.append(int(state["made"]))
+
+    solve_on_mesh.steps_between = lambda model: 4
+    solve_on_mesh.files.save = noted  # type: ignore[assignment]
+    text = 'Pmax=? [ F "win" ]'
+    with jax.enable_x64(True):
+        (found,) = solve_on_mesh.solve_in(
+            place, walk(), asked_for([text]), 1e-9, directory, [text])
+    if place.is_first:
+        print(f"went on: {bool(made) and made[0] > 4}")
+        print(f"saved: {len(made)}")
+        print(f"ended: {found.answer.lower.tobytes().hex()}, {found.answer.upper.tobytes().hex()}, "
+              f"{found.answer.status.name}, {found.answer.value[0]!r}")
+
+
 if __name__ == "__main__":
     from tests.several import main as of_that_name  # by which what is saved knows its functions
 
-    of_that_name(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
+    where, number, of = sys.argv[3], int(sys.argv[4]), int(sys.argv[5])
+    of_that_name(sys.argv[1], Path(sys.argv[2]), where, number, of)
     sys.stdout.flush()
     os._exit(0)
