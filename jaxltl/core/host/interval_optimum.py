@@ -32,6 +32,7 @@ _LARGE = 500  # nodes from which choices of a model that does not mix are improv
 _STARTS = 40  # so many times,
 _SWEEPS = 40  # after so many sweeps of each,
 _SLOW = 1e-5  # or until one changes so little, as a share of the values,
+_LOOKS = 4  # of which one in so many is looked at,
 _STILL = 1e-2  # and as long as all of them together change more
 _ROUNDS = 200
 _NEAR = 20  # rounds for the other bound
@@ -232,9 +233,10 @@ class _Search:
             before, chain = z, nodes.chain(choice)
             if chain is None:
                 break
-            for _ in range(_SWEEPS):
-                last, z = z, chain.matrix @ z + chain.earned
-                if np.abs(z - last).max() <= _SLOW * np.abs(z).max():
+            for i in range(_SWEEPS):
+                last, z = z, chain.matrix @ z
+                z += chain.earned
+                if i % _LOOKS == 0 and np.abs(z - last).max() <= _SLOW * np.abs(z).max():
                     break
             choice, _ = nodes.improved(choice, z, 0.0)
             if np.abs(z - before).max() <= _STILL * np.abs(z).max():
