@@ -67,6 +67,26 @@ def test_the_page_on_worlds_runs(tmp_path, monkeypatch, capsys):
     assert 0 <= gap.mean[1] - gap.mean[0] < 1e-9
 
 
+def devices_page(blocks):
+    page = (ROOT / "docs" / "devices.md").read_text()
+    names: dict = {}
+    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL)[:blocks]:
+        exec(compile(code, "devices.md", "exec"), names)
+    return names
+
+
+def test_the_page_on_devices_runs(capsys):
+    states = devices_page(1)["states"]
+    assert capsys.readouterr().out == f"{[40] * 8} 0\n".replace(",", "")
+    assert len(states.q.sharding.device_set) == 4
+
+
+@pytest.mark.exhaustive
+def test_one_seed_over_several_devices_runs(capsys):
+    devices_page(2)
+    assert capsys.readouterr().out.splitlines()[1].split() == ["[0.5", "1.", "]"]
+
+
 NEEDS = {"08_from_a_simulator_to_an_interval": ["gymnax"]}  # by a notebook, beside the tests' own
 
 
