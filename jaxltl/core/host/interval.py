@@ -2,8 +2,11 @@
 
 A row is the set of all distributions p with ``lower <= p <= upper``. Each time that it is taken,
 nature picks one of them. A linear function is extreme where mass goes first to the best successors
-(Nilim and El Ghaoui 2005; Givan, Leach and Dean 2000). Sums that miss one by no more than the
-rounding of their terms count as one. Where there is a ball too, p lies in both.
+(Nilim and El Ghaoui 2005; Givan, Leach and Dean 2000). Where there is a ball too, p lies in both.
+
+Numbers are what they are to the last bit: nature may do without a successor if the upper ends of
+the others sum to one or more exactly, and has to give it the last 1e-17 otherwise. A row whose ends
+are all equal is in proportion to them, however they add up.
 """
 
 from __future__ import annotations
@@ -16,11 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.host.ball import Ball, share_of
-from jaxltl.core.host.interval_table import Table, tables
+from jaxltl.core.host.interval_table import Table, row_sums, tables
 from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 
 _EPS = float(np.finfo(np.float64).eps)
+_READ = 2 * _EPS  # by how much a sum of decimals, or of what was rounded once, may miss one
 
 
 @dataclass(frozen=True)
@@ -31,12 +35,14 @@ class HostInterval:
       mdp: its rows; probabilities are one distribution of each, positive where upper is.
       lower, upper: ``float64[T]``; each end is met by some distribution of the row.
       ball: how far from its center each row may be besides; None: as far as the ends allow.
+      nearly: whether sums that miss one by rounding count as one: of ends that are computed.
     """
 
     mdp: HostMDP
     lower: Floats
     upper: Floats
     ball: Ball | None = None
+    nearly: bool = False
 
     @cached_property
     def rounding(self) -> Floats:
@@ -46,12 +52,42 @@ class HostInterval:
     @cached_property
     def rest(self) -> Floats:
         """``float64[R]``, the mass that the lower ends leave to nature."""
-        return np.maximum(1 - self.total(self.lower), 0)
+        return np.maximum(-row_sums(self.lower, self.mdp.entry_start, -self._ones), 0)
+
+    @property
+    def _ones(self) -> Floats:
+        return np.ones(self.mdp.num_rows)
+
+    def over(self, found: Floats) -> Booleans:
+        """Whether sums less one are at least zero: ``bool[R]``, up to rounding if that counts."""
+        return found >= (-self.rounding if self.nearly else 0)
 
     @cached_property
     def firm(self) -> bool:
         """Whether nature must give something to every successor."""
         return bool((self.lower > 0).all())
+
+    @cached_property
+    def widened(self) -> HostInterval | None:
+        """The model with upper ends, and balls, that are larger by two roundings of one.
+
+        Nature may drop in it all that it may drop where sums that miss one by these count as one.
+        None where that is clearly no more than it may drop anyway.
+        """
+        if self.firm:
+            return None
+        start = self.mdp.entry_start
+        free = (self.lower == 0) & (self.upper > 0)
+        count = np.add.reduceat(free.astype(np.int64), start[:-1])
+        kept = self.total(np.where(free, 0, self.upper)) - 1 - self.rounding
+        # Where one may be dropped alone, the others' sum is clear; where several may be, none is.
+        near = (count > 0) & (kept <= 0) & ((count > 1) | (np.abs(kept) <= 3 * self.rounding))
+        if self.ball is None and not near.any():
+            return None
+        upper = np.where(self.upper > 0, np.minimum(self.upper + _READ, 1), 0)
+        ball = self.ball
+        ball = None if ball is None else ball._replace(most=ball.most + _READ)
+        return HostInterval(self.mdp, self.lower, upper, ball)
 
     @cached_property
     def tables(self) -> list[Table]:
@@ -64,12 +100,13 @@ class HostInterval:
         for row, entry, used in tables(self.mdp.entry_start):
             lower, upper = (x[entry] if used is None else np.where(used, x[entry], 0)
                             for x in (self.lower, self.upper))
-            table = Table(row, entry, used, lower, upper, self.rest[row], self.rounding[row])
+            ball: dict[str, Floats] = {}
             if self.ball is not None and lack is not None:
                 center = self.ball.center[entry]
                 center = center if used is None else np.where(used, center, 0)
-                table = table._replace(center=center, most=self.ball.most[row], lack=lack[row])
-            found.append(table)
+                ball = {"center": center, "most": self.ball.most[row], "lack": lack[row]}
+            found.append(Table.of(
+                row, entry, used, lower, upper, self.rest[row], self.rounding[row], **ball))
         return found
 
     def total(self, quantity: NDArray[Any]) -> NDArray[Any]:
@@ -94,19 +131,16 @@ class HostInterval:
 
     def may_keep(self, entries: Booleans) -> Booleans:
         """Whether nature may put all mass on some entries: ``bool[R]`` from ``bool[T]``."""
+        start = self.mdp.entry_start
         if self.firm:
-            return np.logical_and.reduceat(entries, self.mdp.entry_start[:-1])
-        room = self.total(np.where(entries, self.upper, 0))
-        needed = np.logical_or.reduceat(
-            ~entries & (self.lower > 0), self.mdp.entry_start[:-1])
-        return (room >= 1 - self.rounding) & ~needed & self._near(entries)
-
-    def _near(self, entries: Booleans) -> Booleans:
-        """Whether a ball holds something that keeps to some entries: ``bool[R]``."""
-        if self.ball is None:
-            return np.ones(self.mdp.num_rows, bool)
-        gained = 1 - self.total(np.where(entries, self.ball.center, 0))
-        return gained <= self.ball.most + self.rounding
+            return np.logical_and.reduceat(entries, start[:-1])
+        every = np.logical_and.reduceat(entries | (self.upper == 0), start[:-1])
+        needed = np.logical_or.reduceat(~entries & (self.lower > 0), start[:-1])
+        room = self.over(row_sums(np.where(entries, self.upper, 0), start, -self._ones))
+        if self.ball is not None:
+            center, most = self.ball
+            room &= self.over(row_sums(np.where(entries, center, 0), start, most, -self._ones))
+        return every | (room & ~needed)
 
     def may_stay(self, region: Booleans) -> Booleans:
         """Whether nature may keep to a region: ``bool[R]`` from ``bool[S]``."""
@@ -121,12 +155,14 @@ class HostInterval:
         entry = spans(mdp.entry_start[row], count)
         start = count.cumsum() - count
         inside = region[mdp.successor[entry]]
-        room = np.add.reduceat(np.where(inside, 0, self.upper[entry]), start)
-        sure = np.logical_or.reduceat(inside & (self.lower[entry] > 0), start)
+        start, one = np.append(start, entry.size), np.ones(row.size)
+        room = row_sums(np.where(inside, 0, self.upper[entry]), start, -one) >= 0
+        sure = np.logical_or.reduceat(inside & (self.lower[entry] > 0), start[:-1])
+        some = np.logical_or.reduceat(inside & (self.upper[entry] > 0), start[:-1])
         if self.ball is not None:
-            gained = 1 - np.add.reduceat(np.where(inside, 0, self.ball.center[entry]), start)
-            sure |= gained > self.ball.most[row] + self.rounding[row]
-        return sure | (room < 1 - self.rounding[row])
+            center, most = self.ball.center[entry], self.ball.most[row]
+            room &= row_sums(np.where(inside, 0, center), start, most, -one) >= 0
+        return some & (sure | ~room)
 
     def within(self, entries: Booleans) -> Floats:
         """Distributions with all of some entries as their support, where nature may keep to them.
@@ -157,6 +193,23 @@ class HostInterval:
         share = share_of((ball.most - least) / 2, gained - least)
         far = (gained > ball.most)[self.mdp.row]
         return np.where(far, near + (found - near) * share[self.mdp.row], found)
+
+    def settled(self, probability: Floats) -> tuple[Floats, bool]:
+        """Distributions next to those that were computed, each mass right to its last digits.
+
+        Args:
+          probability: ``float64[T]``, from which rows miss distributions by rounding.
+
+        Returns:
+          ``float64[T]``, and whether that could be done in all rows.
+        """
+        found, able = probability.copy(), True
+        for table in self.tables:
+            p, fits = table.settled(probability[table.entry])
+            able &= bool(fits.all())
+            kept = np.ones(p.shape, bool) if table.used is None else table.used
+            found[table.entry[kept]] = p[kept]
+        return found, able
 
     def fixed(self, probability: Floats) -> HostMDP:
         """The decision process that is left when nature's choices are known.

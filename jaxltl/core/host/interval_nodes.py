@@ -213,15 +213,18 @@ class Nodes:
     def improved(self, found: Choice, z: Floats, extra: float) -> tuple[Choice, float]:
         """The choices that are better at some values, and by how much they are."""
         values, chosen, p = self.values(z), found.chosen, []
-        gain, now = np.empty(self.row.size), np.empty(self.row.size)
+        gain, now, noise = (np.empty(self.row.size) for _ in range(3))
         for block, before in zip(self.blocks, found.p, strict=True):
             ahead = block.gain(values, extra)
             mass, row = self.answer(block, ahead), block.table.row
             gain[row] = np.einsum("wn,wn->n", mass, ahead)
             now[row] = np.einsum("wn,wn->n", before, ahead)
-            size = np.abs(z[block.owner])
-            fresh = np.abs(gain[row] - now[row]) > 4 * _EPS * (size + block.table.rounding)
-            p.append(np.where(fresh, mass, before))
+            noise[row] = 4 * _EPS * (np.abs(z[block.owner]) + block.table.rounding)
+            if (fine := block.table.fine).size:  # what hardly leaves gains little
+                noise[row[fine]] = np.einsum(
+                    "wn,wn->n", (mass + before)[:, fine], np.abs(ahead[:, fine])
+                ) * block.table.rounding[fine]
+            p.append(np.where(np.abs(gain[row] - now[row]) > noise[row], mass, before))
         more = gain + self.cost
         first = self.part.mdp.row_start[:-1]
         best = np.maximum.reduceat(more, first)
@@ -229,7 +232,7 @@ class Nodes:
         # Against nature the row itself is worth what nature leaves of it.
         own = (more if self.against else now + self.cost)[chosen]
         row = self.part.mdp.first_choice(more == best[self.part.mdp.state])[1]
-        better = best - own > 4 * _EPS * (np.abs(z) + self.part.rounding[row])
+        better = best - own > np.maximum(noise[row], noise[chosen])
         change = np.maximum(best - own, mine if self.against else 0)
         return (found._replace(chosen=np.where(better, row, chosen), p=p),
                 float(change.max(initial=0)))
@@ -240,21 +243,19 @@ class Nodes:
 
         taken = np.zeros(self.row.size, bool)
         taken[choice.chosen] = True
-        earned, parts = np.zeros(self.size), []
+        earned, values, parts = np.zeros(self.size), self.values(np.zeros(self.size)), []
         for block, p in zip(self.blocks, choice.p, strict=True):
             mine = np.flatnonzero(taken[block.table.row])
-            index, owner, share = block.leads[:, mine], block.owner[mine], p[:, mine]
+            index, owner, share = block.leads.take(mine, 1), block.owner[mine], p.take(mine, 1)
             if block.out is not None:
-                share = share * block.out[:, mine]
+                share *= block.out.take(mine, 1)
             leaving = share.sum(0)
             if not leaving.all():
                 return None
-            share = share / leaving
-            outer = index >= self.size
-            ahead = self.known[np.where(outer, index - self.size, 0)]
-            earned[owner] = (share * np.where(outer, ahead, 0)).sum(0) + (
+            share /= leaving
+            earned[owner] = np.einsum("wn,wn->n", share, values.take(index)) + (
                 self.cost[block.table.row[mine]] / leaving)
-            kept = ~outer & (share > 0)
+            kept = (index < self.size) & (share > 0)
             parts.append((
                 np.broadcast_to(owner, kept.shape)[kept], index[kept], share[kept]))
         source, target, share = (np.concatenate(x) for x in zip(*parts, strict=True))
@@ -271,7 +272,7 @@ class Nodes:
         for block in self.blocks:
             gain = block.gain(values, 0.0)
             mass = self.answer(block, gain)
-            most = self._sums(block, gain, mass, 1)
+            most = self._sums(block, gain, mass, 1, every=not self.against)
             less = (most < 0) if self.against else (most <= 0)
             if not (less | (z[block.owner] >= self.ceiling)).all():
                 return None
@@ -289,20 +290,24 @@ class Nodes:
         for block, p in zip(self.blocks, choice.p, strict=True):
             gain = block.gain(values, 0.0)
             mass = self.answer(block, gain) if self.against else p
-            least = self._sums(block, gain, mass, -1)
+            least = self._sums(block, gain, mass, -1, every=self.against)
             if not (least > 0)[taken[block.table.row]].all():
                 return False
         return True
 
-    def _sums(self, block: Block, gain: Floats, p: Floats, sign: int) -> Floats:
-        """What rows gain, at most (sign 1) or at least (-1)."""
+    def _sums(
+        self, block: Block, gain: Floats, p: Floats, sign: int, *, every: bool
+    ) -> Floats:
+        """What rows gain, at most (sign 1) or at least (-1).
+
+        Args:
+          block, gain: rows, and what each entry gains.
+          p: distributions up to rounding: the extreme ones on that side where `every`.
+          every: whether of all distributions of a row, else of one that is next to p.
+        """
         table, size, cost = block.table, np.abs(gain), self.cost[block.table.row]
-        terms = 2 * (np.diff(self.part.mdp.entry_start)[table.row]) + self.depth + 8
-        # Who is given the rest of the mass may miss some of it, or have too much.
-        partly = (table.lower < p) & (p < table.upper)
-        if table.center is not None:
-            partly &= p != table.center
-        last = (partly * size).sum(0) * table.rounding
-        slack = terms * _EPS * (np.einsum("wn,wn->n", p, size) + np.abs(cost)) + last
+        terms = 3 * (np.diff(self.part.mdp.entry_start)[table.row]) + self.depth + 12
+        slack = terms * _EPS * (np.einsum("wn,wn->n", p, size) + np.abs(cost))
         slack += terms * _TINY * (slack > 0)
+        slack += table.more(p, sign * gain, every=every)
         return np.einsum("wn,wn->n", p, gain) + cost + sign * slack

@@ -64,6 +64,7 @@ def parity_against_nature(
     nature = almost_surely(_tight(model, value, gain), priority + 1, leader="nature")
     kept = nature.region[mdp.state] & (gain >= -_CLASS)
     p = np.where(kept[mdp.row], nature.probability, p)
+    p, able = model.settled(p)
     mdp_ = model.fixed(p)
     region = accepting_region(mdp_, priority[mdp_.state[mdp_.row]]).region
     other = optimal.reachability(
@@ -71,7 +72,7 @@ def parity_against_nature(
         depth=terms(mdp_))
     lower = np.clip(1 - answer.upper - 1e-16, 0, 1)
     lower = np.where(answer.upper == 0, 1, np.where(answer.upper >= 1, 0, lower))
-    upper = np.maximum(other.upper, lower)
+    upper = np.maximum(other.upper if able else 1, lower)
     return Robust(
         np.clip(value, lower, upper), lower, upper, row, p, rounds, float(best.max(initial=0)),
         "strategy improvement against nature")

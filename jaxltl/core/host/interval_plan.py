@@ -21,6 +21,7 @@ from jaxltl.core.host.interval_graph import (
     joint_components,
     surely,
 )
+from jaxltl.core.host.interval_table import row_sums
 from jaxltl.core.host.rows import Booleans, Integers, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import reaching, towards
@@ -206,7 +207,7 @@ class _Asking(HostInterval):
         asked &= some & ~needed & ~every
         if not asked.any():
             return
-        room = self.total(np.where(entries, self.upper, 0)) >= 1 - self.rounding
+        room = row_sums(np.where(entries, self.upper, 0), start, -self._ones) >= 0
         entry = np.flatnonzero(entries & asked[self.mdp.row])
         group = (np.cumsum(asked) - 1)[self.mdp.row[entry]]
         self.log.append(_Question(self.origin[entry], group, room[asked]))

@@ -58,6 +58,11 @@ class Robust(NamedTuple):
     residual: float
     method: str
 
+    def covering(self, other: Robust) -> Robust:
+        """The same with bounds that enclose what is enclosed by others too."""
+        return self._replace(
+            lower=np.minimum(self.lower, other.lower), upper=np.maximum(self.upper, other.upper))
+
 
 class _Solve(NamedTuple):
     """How a question is answered: of a decision process, and of policy and nature together.
@@ -88,6 +93,9 @@ def reachability(
 ) -> Robust:
     """The probability of reaching a target, optimal for policy and nature.
 
+    Where sums that miss one by rounding would decide what is 0 or 1 in another way if they counted
+    as one, bounds enclose what the probability is then too.
+
     Args:
       model: the model.
       target: ``bool[S]``.
@@ -97,8 +105,24 @@ def reachability(
       tolerance: the width of the enclosure asked for.
       depth: how many roundings stand behind each number of the model.
     """
-    blocked = np.zeros(target.size, bool) if stay is None else ~stay & ~target
-    halted, row = model.halted(target | blocked)
+    ask: Any = {"maximize": maximize, "helpful": helpful}
+    stop = target if stay is None else target | ~stay
+    found = _reachability(model, target, stop, tolerance=tolerance, depth=depth, **ask)
+    wide = model.widened
+    if wide is None:
+        return found
+    mine, other = (decided(x.halted(stop)[0], target, **ask) for x in (model, wide))
+    if (mine.zero == other.zero).all() and (mine.one == other.one).all():
+        return found
+    return found.covering(
+        _reachability(wide, target, stop, tolerance=tolerance, depth=depth, **ask))
+
+
+def _reachability(
+    model: HostInterval, target: Booleans, stop: Booleans, *, maximize: bool, helpful: bool,
+    tolerance: float, depth: int,
+) -> Robust:
+    halted, row = model.halted(stop)
 
     def exact(mdp: HostMDP, _: Floats, up: bool) -> Enclosed:
         return optimal.reachability(
@@ -118,7 +142,7 @@ def reachability(
     else:
         _, p = _started(halted, target, maximize=False)
         found = _led_by_nature(halted, p, solve, 1)
-    return _unhalted(model, halted, row, target | blocked, found)
+    return _unhalted(model, halted, row, stop, found)
 
 
 def total_reward(
@@ -128,7 +152,8 @@ def total_reward(
     """The expected reward until a target is reached, optimal for policy and nature.
 
     Infinite where the target is not surely reached: by both sides' choice if they make the reward
-    small, by the choice of that side which does, or at all if none does.
+    small, by the choice of that side which does, or at all if none does. Where sums that miss one
+    by rounding would decide that in another way if they counted as one, bounds enclose both.
 
     Args:
       model: the model.
@@ -139,15 +164,34 @@ def total_reward(
       tolerance: the width of the enclosure asked for, as a share of the value.
       depth: how many roundings stand behind each number of the model.
     """
+    ask: Any = {"maximize": maximize, "large": large}
+    found = _total_reward(model, reward, target, tolerance=tolerance, depth=depth, **ask)
+    wide = model.widened
+    if wide is None or (_finite(wide.halted(target)[0], target, **ask)[0]
+                        == _finite(model.halted(target)[0], target, **ask)[0]).all():
+        return found
+    return found.covering(
+        _total_reward(wide, reward, target, tolerance=tolerance, depth=depth, **ask))
+
+
+def _finite(
+    model: HostInterval, target: Booleans, *, maximize: bool, large: bool
+) -> tuple[Booleans, Booleans]:
+    """Where a reward until a target is finite, and the rows that keep it so."""
+    if maximize and large:
+        one = decided(model, target, maximize=False, helpful=False).one
+        return one, one[model.mdp.state]
+    return surely(
+        model, target, np.ones(target.size, bool), maximize=not maximize, helpful=not large)
+
+
+def _total_reward(
+    model: HostInterval, reward: Floats, target: Booleans, *, maximize: bool, large: bool,
+    tolerance: float, depth: int,
+) -> Robust:
     halted, row = model.halted(target)
     cost = np.where(target[halted.mdp.state], 0, reward[row])
-    if maximize and large:
-        one = decided(halted, target, maximize=False, helpful=False).one
-        finite, kept = one, one[halted.mdp.state]
-    else:
-        finite, kept = surely(
-            halted, target, np.ones(target.size, bool), maximize=not maximize,
-            helpful=not large)
+    finite, kept = _finite(halted, target, maximize=maximize, large=large)
     part, origin, entry = _restricted(halted, finite, kept)
 
     def exact(mdp: HostMDP, earned: Floats, up: bool) -> Enclosed:
@@ -217,7 +261,7 @@ def _joint_reachability(
     row = np.where(keep, some, row)
     if of is None:
         chain, entry = model.chain(row)
-        of = exact(chain.fixed(chance[entry]), np.zeros(0), up)
+        of = _pinned(exact, chain, chance[entry], np.zeros(0), up)
     low, high = (of.lower, np.maximum(bound, of.lower)) if up else (
         np.minimum(bound, of.upper), np.minimum(of.upper, 1))
     return Robust(of.value, low, high, row, chance, rounds + of.rounds, of.residual, _METHOD)
@@ -279,13 +323,26 @@ def _joint_reward(
             row, chance = _inner(model, row, chance, component, inside, used)
     if of is None:
         chain, entry = model.chain(row)
-        of = exact(chain.fixed(chance[entry]), cost[row], up)
+        of = _pinned(exact, chain, chance[entry], cost[row], up)
     low, high = (of.lower, np.maximum(bound, of.lower)) if up else (
         np.minimum(bound, of.upper), of.upper)
     return Robust(of.value, low, high, row, chance, rounds + of.rounds, of.residual, _METHOD)
 
 
 _METHOD = "policy iteration with nature"
+
+
+def _pinned(
+    exact: Callable[[HostMDP, Floats, bool], Enclosed], model: HostInterval, p: Floats,
+    cost: Floats, up: bool,
+) -> Enclosed:
+    """The policy's optimum where nature picks what is next to some distributions."""
+    settled, able = model.settled(p)
+    found = exact(model.fixed(settled), cost, up)
+    if able:
+        return found
+    return found._replace(
+        lower=np.zeros_like(found.lower), upper=np.full_like(found.upper, np.inf))
 
 
 def _components(
@@ -334,13 +391,13 @@ def _led_by_policy(
         if rounds == _ROUNDS or not better.any():
             break
         if _is_tried(rounds):
-            other = solve.exact(model.fixed(p), solve.cost, up)
+            other = _pinned(solve.exact, model, p, solve.cost, up)
             low, high = (inner.lower, other.upper) if up else (other.lower, inner.upper)
             if solve.narrow(low, high):
                 break
         new = mdp.first_choice(sign * gain == best[mdp.state])[1]
         row = np.where(better, new, row)
-    other = solve.exact(model.fixed(p), solve.cost, up)
+    other = _pinned(solve.exact, model, p, solve.cost, up)
     low, high = (inner.lower, other.upper) if up else (other.lower, inner.upper)
     return _between(inner.value, low, high, row, p, rounds + other.rounds, float(best.max()))
 
@@ -357,7 +414,7 @@ def _led_by_nature(
     rounds = 0
     while True:
         rounds += 1
-        found = solve.exact(model.fixed(p), solve.cost, not up)
+        found = _pinned(solve.exact, model, p, solve.cost, not up)
         gain, q = gains(model, found.value, solve.cost, up=up)
         now = model.total(p * _differences(model, found.value)) + solve.cost
         more = sign * (gain - now)

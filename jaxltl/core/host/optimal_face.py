@@ -30,7 +30,7 @@ def face_of(model: HostInterval, rank: Integers) -> HostInterval:
     free = loose & (rank == last[row])
     lower, upper = np.where(free, model.lower, p), np.where(free, model.upper, p)
     if model.ball is None:
-        return HostInterval(model.mdp, lower, upper)
+        return HostInterval(model.mdp, lower, upper, nearly=True)
     center, most = model.ball
     off = p - center
     gainer = np.maximum.reduceat(np.where(off > 0, rank, -1), start)
@@ -48,7 +48,7 @@ def face_of(model: HostInterval, rank: Integers) -> HostInterval:
     inner = np.where(full, lower, np.where(free, center, p))
     most = np.where(np.logical_or.reduceat(full, start), 1, spare)
     mass = model.total(np.where(gains, p, 0))
-    return _Parted(model.mdp, lower, upper, Ball(inner, most), gains=gains, mass=mass)
+    return _Parted(model.mdp, lower, upper, Ball(inner, most), nearly=True, gains=gains, mass=mass)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,7 @@ from flax import struct
 from jaxltl.core.host.ball import Ball
 from jaxltl.core.host.given import numbers, shown
 from jaxltl.core.host.interval import HostInterval
+from jaxltl.core.host.interval_table import row_sums
 from jaxltl.core.host.rows import starts_of
 from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.models.mdp import MDP
@@ -286,12 +287,13 @@ def interval_rows(
     if ball is not None:
         _check_ball(starts, entry_start, row, lower, upper, *ball)
         lower, upper, ball = _around(entry_start, row, lower, upper, *ball)
+    lower, upper = _pointed(entry_start, row, lower, upper, ball)
     states: Any = np.zeros(entry_start.size, np.int64)  # the host's rows need no states here
     ends = HostInterval(
         HostMDP(states, entry_start, successor, lower), lower, upper,
         None if ball is None else Ball(ball[0], ball[1] / 2))
     # Nature has nothing left to give where lower ends add up to one.
-    possible = (upper > 0) & ((lower > 0) | (ends.rest > ends.rounding)[row])
+    possible = (upper > 0) & ((lower > 0) | (ends.rest > 0)[row])
     nominal = np.where(possible, ends.within(possible), 0)
     extra = _travelling(lower, upper, *(ball or (None, None)))
     return _taken_apart(make_sparse(
@@ -348,9 +350,37 @@ def _around(
     lower, upper = np.minimum(lower, center), np.maximum(upper, center)
     radius = np.minimum(radius, 2)
     half = (radius / 2)[row]
-    least = center - half
+    least, most = (_outwards(center, side * half, side) for side in (-1, 1))
     least = np.where((half > 0) & (least <= 4 * rounding[row]), 0, least)
-    return np.maximum(lower, least), np.minimum(upper, center + half), (center, radius)
+    return np.maximum(lower, least), np.minimum(upper, most), (center, radius)
+
+
+def _outwards(x: np.ndarray, y: np.ndarray, side: int) -> np.ndarray:
+    """``x + y``, rounded down (-1) or up (1)."""
+    total = x + y
+    part = total - x
+    off = (x - (total - part)) + (y - part)
+    return np.where(side * off > 0, np.nextafter(total, side * np.inf), total)
+
+
+def _pointed(
+    entry_start: np.ndarray, row: np.ndarray, lower: np.ndarray, upper: np.ndarray,
+    ball: tuple[np.ndarray, np.ndarray] | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The ends, equal in rows that hold no distribution, by rounding: these are in proportion.
+
+    To the upper ends where these sum to less than one, to the lower ones where these sum to more,
+    and to the center of a ball that is farther from all distributions than its radius.
+    """
+    one = np.ones(entry_start.size - 1)
+    short = row_sums(upper, entry_start, -one) < 0
+    full = row_sums(lower, entry_start, -one) > 0
+    lower, upper = np.where(short[row], upper, lower), np.where(full[row], lower, upper)
+    if ball is not None:
+        center, radius = ball
+        apart = row_sums(-center, entry_start, one, -radius / 2) > 0
+        lower, upper = (np.where(apart[row], center, x) for x in (lower, upper))
+    return lower, upper
 
 
 def _check_ends(

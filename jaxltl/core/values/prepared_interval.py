@@ -307,9 +307,17 @@ def _checked(
         valid &= jnp.all((high > 0) == (prepared.upper > 0))
         entry, group, room, width = prepared.answers
         if room.shape[0]:
-            given = jax.ops.segment_sum(
-                high[entry], group, room.shape[0], indices_are_sorted=True)
-            valid &= jnp.all((given >= 1 - rounding(width, low.dtype)) == room)
+            parts = partial(jax.ops.segment_sum, segment_ids=group,
+                            num_segments=room.shape[0], indices_are_sorted=True)
+            asked = high[entry]
+            given = parts(asked)
+            # A sum near one has the right sign if no addition rounds, and the same one if nothing
+            # has changed; else it does not tell.
+            grain = 1 / float(jnp.finfo(low.dtype).eps)
+            coarse = parts(jnp.where(asked * grain == jnp.floor(asked * grain), 0, 1)) == 0
+            same = parts(jnp.where(asked == prepared.upper[entry], 0, 1)) == 0
+            clear = jnp.abs(given - 1) > rounding(width, low.dtype)
+            valid &= jnp.all(same | ((clear | coarse) & ((given >= 1) == room)))
     if reward is not None:
         finite &= jnp.all(jnp.isfinite(reward))
         valid &= jnp.all(reward >= 0) & jnp.all((reward > 0) == (prepared.reward > 0))

@@ -286,6 +286,17 @@ def _of_sides(
 def _largest(
     host: HostInterval, priority: Integers, helpful: bool, tolerance: float
 ) -> Robust:
+    """The largest probability, and in doubt also if sums that miss one by rounding are one."""
+    found = _as_read(host, priority, helpful, tolerance)
+    wide = host.widened
+    if wide is None:
+        return found
+    return found.covering(_as_read(wide, priority, helpful, tolerance))
+
+
+def _as_read(
+    host: HostInterval, priority: Integers, helpful: bool, tolerance: float
+) -> Robust:
     if not helpful:
         return parity_against_nature(host, priority, tolerance=tolerance)
     mdp = host.mdp

@@ -126,7 +126,8 @@ def test_what_rows_gain_is_bounded_with_its_rounding(against):
     (block,) = nodes.blocks
     gain = block.gain(nodes.values(value), 0.0)
     least, most = (
-        nodes._sums(block, gain, nodes.answer(block, gain), sign) for sign in (-1, 1))
+        nodes._sums(block, gain, nodes.answer(block, gain), sign, every=(sign > 0) != against)
+        for sign in (-1, 1))
     ahead = [Fraction(float(x)) - Fraction(float(value[0])) for x in (value[0], 0.83, 0.1)]
     order = sorted(range(3), key=lambda k: ahead[k], reverse=not against)
     for i, r in enumerate(block.table.row):
