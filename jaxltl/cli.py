@@ -186,7 +186,8 @@ def learn(
     launch = several.launched(asked)
     say = _first_says(launch)
     say(_first_line(f"learning from {task_file}"))
-    apart = programs.is_alone() and launch.process == 0
+    # Of several processes none has others of its own, which could outlive it.
+    apart = programs.is_alone() and launch.processes == 1
     # Before anything else, so that it can load.
     with artist(apart=apart) as begin, several.taking_part(asked, launch, say) as place:
         job = place.together(lambda: run_job.job_of(task_file))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import inspect
 import io
 import json
 import os
@@ -279,7 +280,8 @@ def _choose_devices(asked: Asked, launch: Launch) -> None:
         with contextlib.suppress(AttributeError):
             jax.config.update("jax_enable_preemption_service", False)
     if asked.mesh and "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
-        jax.config.update("jax_num_cpu_devices", asked.mesh // launch.processes)
+        with contextlib.suppress(RuntimeError):  # there are devices already, from which to choose
+            jax.config.update("jax_num_cpu_devices", asked.mesh // launch.processes)
 
 
 def _mesh(asked: Asked, launch: Launch) -> Mesh:
@@ -352,10 +354,12 @@ def _join(launch: Launch, wait: float) -> None:
     address, bind = launch.coordinator, None
     if address is not None and _host_and_port(address)[0] in ("127.0.0.1", "localhost"):
         bind = address  # of no use to other machines, and so not open to them
+    later: dict[str, Any] = {
+        "heartbeat_timeout_seconds": seconds, "shutdown_timeout_seconds": _TO_THE_END}
+    known = inspect.signature(jax.distributed.initialize).parameters  # by the version of JAX
     jax.distributed.initialize(
         address, launch.processes, launch.process, initialization_timeout=seconds,
-        heartbeat_timeout_seconds=seconds, shutdown_timeout_seconds=_TO_THE_END,
-        coordinator_bind_address=bind)
+        coordinator_bind_address=bind, **{k: v for k, v in later.items() if k in known})
 
 
 def _leave() -> None:

@@ -1,15 +1,20 @@
 """Solving over a mesh, left and gone on from: to the same bits there, to as good bounds elsewhere.
 """
 
+import json
+
 import jax
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from jaxltl.algos import checkpoint
 from jaxltl.app import solve_on_mesh
 from jaxltl.app.processes import Place
 from jaxltl.app.solve import asked_for
+from jaxltl.cli import main
 from jaxltl.core.types import Status
+from jaxltl.io.model_files import write_model
 from tests.several import walk
 
 PROPERTY = 'Pmax=? [ F "win" ]'
@@ -68,3 +73,23 @@ def test_bounds_of_another_question_are_left_alone(often, tmp_path, monkeypatch)
     assert left.answer.lower < 0.4 < left.answer.upper
     refused = solved(2, tmp_path, 'Pmax=? [ F<=3 "win" ]')
     assert refused.answer is None and "not solved for over a mesh" in refused.error
+
+
+def test_from_the_command_line(tmp_path):
+    assert len(jax.devices()) == 4  # made before, so that no other test has fewer
+    write_model(tmp_path / "walk.umb", walk(16))
+    model = str(tmp_path / "walk.umb")
+    bounds = ["--checkpoint", str(tmp_path / "bounds")]
+    done = CliRunner().invoke(main, ["solve", model, PROPERTY, "--json", *bounds, "--mesh", "2"])
+    assert done.exit_code == 0 and "on 2 CPU devices\n" in done.stderr, done.stderr
+    (result,) = json.loads(done.stdout.splitlines()[-1])["results"]
+    assert result["lower"] <= 0.4 <= result["upper"] <= result["lower"] + 1e-6
+    assert result["method"] == "interval iteration on the mesh"
+    for options, message in (
+            (["--mesh", "99"], "--mesh 99: there are 4 (cpu); give fewer, or --mesh alone for all"),
+            (["--mesh", "--strategy", "x.json"], "--strategy goes without --mesh alone"),
+            (bounds, "--checkpoint goes with --mesh alone"),
+            (["--mesh", "two"], "--mesh two: give a number of devices, or all"),
+            (["--process", "1"], "--process is of use with --mesh alone")):
+        wrong = CliRunner().invoke(main, ["solve", model, PROPERTY, *options])
+        assert wrong.exit_code == 2 and f"error: {message}" in wrong.stderr
