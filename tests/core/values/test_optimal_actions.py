@@ -24,8 +24,10 @@ LETTERS = [[bool(n & 1), bool(n >> 1)] for n in range(L)]
 FRACTIONS = np.array([[6, 0, 0], [6, 0, 0], [3, 3, 0], [3, 3, 0], [2, 4, 0]]) / 6
 
 
-def random_case(rng, kind, label_on):
-    """Halves and thirds, so that ties are exact; many loops, and an action may be missing.
+def random_case(rng, kind):
+    """What a world and an automaton are made of; of most cases no model is needed.
+
+    Halves and thirds, so that ties are exact; many loops, and an action may be missing.
 
     Where action 1 is lazy, it does what action 0 does half of the time, and else stays.
     """
@@ -40,10 +42,8 @@ def random_case(rng, kind, label_on):
     probability[lazy, 1] = probability[lazy, 0] / 2 + np.array([0, 0, 1 / 2])
     available = rng.random((S, A)) < 0.9
     available[np.arange(S), rng.integers(A, size=S)] = True
-    world = make_mdp(
-        successor, probability, available=available,
-        initial=np.full(S, 1 / S), label=rng.random((S, 2)) < 0.5, propositions=["a", "b"],
-    )
+    world = {"successor": successor, "probability": probability, "available": available,
+             "label": rng.random((S, 2)) < 0.5}
     delta = np.where(rng.random((Q, L)) < 0.4, rng.integers(0, Q, (Q, L)), np.arange(Q)[:, None])
     if kind in ("cosafe", "safety"):
         delta[-1] = Q - 1
@@ -53,22 +53,26 @@ def random_case(rng, kind, label_on):
         table = {"accepting": rng.random((Q, L)) < 0.3}
     else:
         table = {"priority": rng.integers(0, 5, (Q, L)), "acceptance": "parity"}
-    automaton = make_automaton(delta, 0, LETTERS, ["a", "b"], **table)
-    return product(world, automaton, label_on=label_on)
+    return world, make_automaton(delta, 0, LETTERS, ["a", "b"], **table)
 
 
-def explicit(model):
+def model_of(world, automaton, label_on):
+    mdp = make_mdp(**world, initial=np.full(S, 1 / S), propositions=["a", "b"])
+    return product(mdp, automaton, label_on=label_on)
+
+
+def explicit(world, automaton, label_on):
     """Transitions ``[N, A, N]`` and the priority of each pair of states, by loops."""
-    world, task = jax.tree.map(np.asarray, (model.mdp, model.automaton))
-    letter = np.asarray(model.letter)
+    delta, priorities = np.asarray(automaton.delta), np.asarray(automaton.priority)
+    letter = world["label"] @ [1, 2]
     matrix, priority = np.zeros((N, A, N)), np.full((N, N), 99)
     for s, q, a, k in every(range(S), range(Q), range(A), range(3)):
-        if world.available[s, a] and world.probability[s, a, k] > 0:
-            t = int(world.successor[s, a, k])
-            read = letter[t] if model.label_on == "entry" else letter[s]
-            row, column = s * Q + q, t * Q + int(task.delta[q, read])
-            matrix[row, a, column] += world.probability[s, a, k]
-            priority[row, column] = task.priority[q, read]
+        if world["available"][s, a] and world["probability"][s, a, k] > 0:
+            t = int(world["successor"][s, a, k])
+            read = letter[t] if label_on == "entry" else letter[s]
+            row, column = s * Q + q, t * Q + int(delta[q, read])
+            matrix[row, a, column] += world["probability"][s, a, k]
+            priority[row, column] = priorities[q, read]
     return matrix, priority
 
 
@@ -114,12 +118,12 @@ def in_accepting_components(matrix, priority):
 
 def with_all_values(rng, kind, label_on, objective):
     """A case with its tables, all of its policies and what they attain."""
-    model = random_case(rng, kind, label_on)
-    matrix, priority = explicit(model)
+    parts = *random_case(rng, kind), label_on
+    matrix, priority = explicit(*parts)
     if objective == "min":
         priority = priority + 1  # the negation, to be attained with the largest probability
     policies = deterministic(matrix)
-    return model, matrix, priority, policies, *probabilities(policies, matrix, priority)
+    return parts, matrix, priority, policies, *probabilities(policies, matrix, priority)
 
 
 def case_that_matters(rng, kind, label_on, objective):
@@ -133,8 +137,9 @@ def case_that_matters(rng, kind, label_on, objective):
 
 
 def check_case(rng, kind, label_on, objective):
-    model, matrix, priority, policies, values, sure = case_that_matters(
+    parts, matrix, priority, policies, values, sure = case_that_matters(
         rng, kind, label_on, objective)
+    model = model_of(*parts)
     best, surely = values.max(0), sure.any(0)
     found = optimal_actions(model, objective=objective)
     allowed = np.asarray(found.allowed).reshape(N, A)
