@@ -50,7 +50,10 @@ def without_chains(mdp: HostMDP, fixed: Booleans, cost: Floats | None) -> Contra
     if np.count_nonzero(alias) * _WORTH < size:
         return None
     after = np.arange(size)
-    after[alias] = mdp.successor[mdp.entry_start[mdp.row_start[:-1][alias]]]
+    from_ = np.flatnonzero(alias)
+    to = mdp.successor[mdp.entry_start[mdp.row_start[from_]]]
+    alias[from_[to == from_]] = False  # where it stands still
+    after[from_] = to
     end, rounds = _ends(after)
     if (trapped := alias[end]).any():
         # A circle of single successors: what lies on it is kept, as nobody leaves it.
