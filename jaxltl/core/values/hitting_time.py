@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.graphs.graph import host_graph
+from jaxltl.core.graphs.reaching import policy_sets
 from jaxltl.core.host.reach import policy_row, steps_until
 from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.operators import is_deterministic
-from jaxltl.core.values.reachability import action_matrices, policy_sets
+from jaxltl.core.values.reachability import action_matrices
 
 
 def hitting_time(model: Any, policy: Any, target: Any) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.graphs.end_components import components_within
 from jaxltl.core.graphs.graph import graph_of
+from jaxltl.core.graphs.reaching import max_sets, min_sets
 from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Solution, Status
@@ -25,8 +26,6 @@ from jaxltl.core.values.opposite import opposite_event
 from jaxltl.core.values.reachability import (
     action_matrices,
     attaining_actions,
-    max_sets,
-    min_sets,
 )
 from jaxltl.core.values.satisfaction import (
     Reaching,

@@ -22,6 +22,7 @@ from jax import lax
 
 from jaxltl.core.graphs.acceptance import accepting_bottom_components
 from jaxltl.core.graphs.graph import TracedGraph, graph_of, take
+from jaxltl.core.graphs.reaching import max_sets, min_sets, policy_sets
 from jaxltl.core.models.batch import is_stacked, num_worlds
 from jaxltl.core.models.concrete import namespace, to_jax
 from jaxltl.core.models.operators import (
@@ -36,7 +37,6 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.types import Status, require_shape, status_code
 from jaxltl.core.values.evidence import m_matrix_error
 from jaxltl.core.values.linear import inverse
-from jaxltl.core.values.reachability import max_sets, min_sets, policy_sets
 from jaxltl.core.values.satisfaction import as_reachability, satisfaction_probability
 
 _BLOCK_LIMIT = 1024  # world states up to which a block is inverted

@@ -17,9 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxltl.core.graphs.attractor import attract, avoid, surely
+from jaxltl.core.graphs.attractor import attract, surely
 from jaxltl.core.graphs.end_components import EndComponents, components_within
 from jaxltl.core.graphs.graph import Graph, TracedGraph, graph_of, is_table, take
+from jaxltl.core.graphs.reaching import Sets, max_sets, min_sets, policy_sets
 from jaxltl.core.host import reach as host
 from jaxltl.core.host.layers import World, layered
 from jaxltl.core.host.quickest import quickest
@@ -37,6 +38,7 @@ from jaxltl.core.models.operators import (
     valid_policy,
 )
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.sharded import is_sharded
 from jaxltl.core.models.tables import action_columns, table
 from jaxltl.core.types import Solution, Status, require_shape, status_code
 from jaxltl.core.values.enclosed import is_sparse, reachability
@@ -52,14 +54,6 @@ _FAR_SWEEPS = 6  # sweeps of a guess, or of interval iteration after one that fa
 _HOST_LIMIT = 4096  # states up to which a concrete model is solved on the host, by elimination
 QUICK_LIMIT = 100_000  # states of a concrete model up to which its quickest policy is looked for
 _FILLED = 2048  # of these undecided, as elimination may fill a matrix of so many rows
-
-
-class Sets(NamedTuple):
-    """What the graph decides: probability one, probability zero, and witnessing actions."""
-
-    one: Any
-    zero: Any
-    action: Any
 
 
 def reachability_probability(
@@ -136,6 +130,7 @@ def reachability_probability(
         return reachability(
             model, target, stay=stay, policy=policy, objective=objective, tolerance=tolerance)
     traced = is_traced((model, target, policy, tolerance, max_steps, start))
+    traced |= is_sharded(model)
     readable = not traced and is_table(model)
     small = readable and math.prod(model.state_shape) <= _HOST_LIMIT
     if policy is not None:
@@ -183,34 +178,6 @@ def _decided(model: Any, target: Any, *, objective: str) -> tuple[Sets, EndCompo
         return min_sets(graph, target), None
     sets = max_sets(graph, target)
     return sets, components_within(graph, ~(sets.one | sets.zero))
-
-
-# --- what the graph decides ----------------------------------------------------------------
-
-
-def policy_sets(graph: Graph, target: Any, policy: Any) -> Sets:
-    """What a policy's support decides."""
-    allowed = graph.available & (policy > 0)
-    zero = ~attract(graph, target, allowed).region
-    doomed = attract(graph, zero, allowed, among=~target).region
-    return Sets(~doomed, zero, graph.xp.zeros(target.shape, np.int32))
-
-
-def max_sets(graph: Graph, target: Any) -> Sets:
-    """Where the largest probability is 1 or 0, with actions that attain it."""
-    some = attract(graph, target)
-    sure = surely(graph, target, reaching=some)
-    action = graph.xp.where(sure.region, sure.action, some.action)
-    return Sets(sure.region, ~some.region, action)
-
-
-def min_sets(graph: Graph, target: Any) -> Sets:
-    """Where the smallest probability is 1 or 0, with actions that attain it."""
-    zero = avoid(graph, target)
-    doomed = attract(graph, zero, among=~target).region
-    stays, action = graph.first(graph.available & graph.forall(zero))
-    first = graph.first(graph.available)[1]
-    return Sets(~doomed, zero, graph.xp.where(stays, action, first))
 
 
 # --- small concrete models: the host ---------------------------------------------------------
