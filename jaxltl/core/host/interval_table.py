@@ -238,8 +238,11 @@ class Table(NamedTuple):
     def _given(left: Floats, lower: Floats, upper: Floats, rounding: Floats) -> Floats:
         """What entries get of what better ones leave; what is given whole is the upper end."""
         room = upper - lower
-        given = np.clip(np.where(left > rounding, left, 0), 0, room)
-        return np.where(given == room, upper, lower + given)
+        given = np.minimum(left, room)
+        given *= left > rounding
+        found = lower + given
+        np.copyto(found, upper, where=given == room)
+        return found
 
 
 def _upward(x: Floats) -> Floats:
