@@ -21,6 +21,7 @@ def implicit(
     *,
     solve: LinearSolver | None = None,
     transpose_solve: LinearSolver | None = None,
+    linear: Callable[[Operator, jax.Array], jax.Array] = solve_linear,
 ) -> jax.Array:
     """A fixed point ``v = operator(v)`` with its implicit derivative attached.
 
@@ -32,8 +33,8 @@ def implicit(
     Args:
       operator: a differentiable map from values to values of the same shape.
       fixed_point: a value that satisfies the equation.
-      solve, transpose_solve: x with ``(I - J) x = b``, or of the transpose; default
-        :func:`~jaxltl.core.values.linear.solve_linear`.
+      solve, transpose_solve: x with ``(I - J) x = b``, or of the transpose; default `linear`.
+      linear: x with ``A(x) = b`` from A and b.
 
     Returns:
       `fixed_point`.
@@ -44,13 +45,13 @@ def implicit(
       4.0
     """
     if solve is None and transpose_solve is None:
-        return _seldom_differentiated(operator, lax.stop_gradient(fixed_point))
+        return _seldom_differentiated(operator, lax.stop_gradient(fixed_point), linear)
 
     def forward(jacobian: Operator, b: jax.Array) -> jax.Array:
-        return solve_linear(jacobian, b) if solve is None else solve(b)
+        return linear(jacobian, b) if solve is None else solve(b)
 
     def backward(jacobian: Operator, b: jax.Array) -> jax.Array:
-        return solve_linear(jacobian, b) if transpose_solve is None else transpose_solve(b)
+        return linear(jacobian, b) if transpose_solve is None else transpose_solve(b)
 
     def solve_tangent(jacobian: Operator, b: jax.Array) -> jax.Array:
         return lax.custom_linear_solve(jacobian, b, solve=forward, transpose_solve=backward)
@@ -63,10 +64,12 @@ def implicit(
     )
 
 
-def _seldom_differentiated(operator: Operator, fixed_point: jax.Array) -> jax.Array:
-    """The same with :func:`~jaxltl.core.values.linear.solve_linear`.
+def _seldom_differentiated(
+    operator: Operator, fixed_point: jax.Array, linear: Callable[[Operator, jax.Array], jax.Array]
+) -> jax.Array:
+    """The same with a linear solver for the system and its transpose.
 
-    That is traced only where a derivative is taken, which ``lax.custom_root`` does in any case:
+    It is traced only where a derivative is taken, which ``lax.custom_root`` does in any case:
     half of a solver's trace.
     """
     closed = jax.make_jaxpr(operator)(fixed_point)
@@ -85,6 +88,6 @@ def _seldom_differentiated(operator: Operator, fixed_point: jax.Array) -> jax.Ar
         _, change = jax.jvp(lambda c: image(c, v), (constants,), (tangents[0],))
         _, jacobian = jax.linearize(lambda x: image(constants, x), v)
         return v, lax.custom_linear_solve(
-            lambda x: x - jacobian(x), change, solve=solve_linear, transpose_solve=solve_linear)
+            lambda x: x - jacobian(x), change, solve=linear, transpose_solve=linear)
 
     return root(closed.consts, fixed_point)

@@ -5,12 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import chex
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core.host import optimal
 from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.sharded import ShardedMDP, is_sharded
 from jaxltl.core.models.sparse import Rewards, SparseMDP, row_reward
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values.enclosed import (
@@ -21,6 +26,7 @@ from jaxltl.core.values.enclosed import (
     solution_of,
 )
 from jaxltl.core.values.robust import refuse_nature, robust_total_reward
+from jaxltl.core.values.total_reward_by_sweeps import total_reward_by_sweeps
 
 
 def total_reward(
@@ -78,9 +84,8 @@ def total_reward(
             model, reward, target, policy=policy, objective=objective, nature=nature,
             tolerance=tolerance)
     refuse_nature(nature)
-    if is_traced((model, reward, target, policy)):
-        raise ValueError("total_reward reads its model, so it works on concrete arrays only; "
-                         "inside jit use prepare(model, target).")
+    if is_sharded(model) or is_traced((model, reward, target, policy, tolerance)):
+        return _by_sweeps(model, reward, target, policy, objective, tolerance)
     sparse = to_sparse(model)
     earned = _earned(model, sparse, reward)
     if (earned < 0).any():
@@ -119,3 +124,64 @@ def _earned(model: Any, sparse: SparseMDP, reward: Any) -> np.ndarray:
     require_shape("reward", reward, (*states, model.num_actions))
     flat = reward.reshape(sparse.num_states, -1)
     return flat[sparse.host.state, np.asarray(sparse.action)]
+
+
+# --- what no host reads -------------------------------------------------------------------------
+
+
+def _by_sweeps(
+    model: Any, reward: Any, target: Any, policy: Any, objective: str, tolerance: Any
+) -> Solution:
+    world = model.mdp if isinstance(model, Product) else model
+    if not isinstance(world, MDP | DenseMDP | ShardedMDP):
+        raise ValueError(
+            f"inside jit, or over a mesh, total_reward needs an MDP, a DenseMDP, a ShardedMDP or a "
+            f"product of one, not {type(world).__name__}; inside jit use prepare(model, target).")
+    if target is None:
+        raise ValueError(
+            "total rewards for ever are found on the host; inside jit, or over a mesh, give a "
+            "target.")
+    require_shape("target", target, model.state_shape)
+    reward = _on_choices(model, world, reward)
+    _require_rewards(model, world, reward)
+    asked = default_tolerance(model) if tolerance is None else tolerance
+    return total_reward_by_sweeps(model, reward, target, policy, asked, objective=objective)
+
+
+def _on_choices(model: Any, world: Any, reward: Any) -> Any:
+    """A reward as it was given, on choices: ``float[S, A]``."""
+    actions = (*model.state_shape, model.num_actions)
+    if reward is None or isinstance(reward, str | Rewards):
+        named = world.rewards if isinstance(world, ShardedMDP) else {}
+        if reward not in named:
+            known = f"; it has {', '.join(named)}" if named else ": give an array"
+            raise ValueError(f"reward={reward!r} is no reward of this {type(world).__name__}"
+                             f"{known}.")
+        found = named[reward]
+        return found if world is model else jnp.broadcast_to(found[:, None], actions)
+    if np.shape(reward) == model.state_shape:
+        return jnp.broadcast_to(jnp.asarray(reward)[..., None], actions)
+    require_shape("reward", reward, actions)
+    return reward
+
+
+def _require_rewards(model: Any, world: Any, reward: Any) -> None:
+    least, state = _least_reward(model, world, reward)
+    # Inside jit the status says it.
+    if not isinstance(least, jax.core.Tracer) and not least >= 0:
+        raise ValueError(
+            f"the reward of a choice of state {state} is {least:.6g}; expected total rewards need "
+            "rewards of at least 0.")
+
+
+@jax.jit
+def _least_reward(model: Any, world: Any, reward: Any) -> Any:
+    """The least reward of a choice, NaN if one is, and its state."""
+    least = jnp.min(jnp.where(model.available, reward, jnp.inf), axis=-1)
+    least = least.reshape(world.num_states, -1).min(-1)
+    if isinstance(world, ShardedMDP):
+        least = jnp.where(world.number >= 0, least, jnp.inf)
+        number = world.number
+    else:
+        number = jnp.arange(world.num_states)
+    return jnp.min(least), number[jnp.argmin(least)]
