@@ -138,7 +138,8 @@ def test_the_page_on_tasks_in_environments_runs(capsys):
     assert len(promised) == 4 and capsys.readouterr().out.splitlines() == promised
 
 
-def test_the_page_on_ppo_runs(capsys):
+def test_the_page_on_ppo_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "ppo.md").read_text()
     names: dict = {}
     for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
@@ -148,7 +149,8 @@ def test_the_page_on_ppo_runs(capsys):
     assert promised.endswith(f"at best {best:.3f}") and capsys.readouterr().out.endswith(
         f"at best {best:.3f}\n")
     assert found.lower <= best and found.mean > best - 0.1
-    assert names["curves"].shape == (4, 20)
+    assert names["metrics"].episode_return.shape == (3, 4, 60)
+    assert b"<svg" in (tmp_path / "rates.svg").read_bytes()
 
 
 def test_the_page_on_many_formulas_runs(capsys):

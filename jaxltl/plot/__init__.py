@@ -6,7 +6,7 @@ return the text of an SVG for pages that move.
 """
 
 from jaxltl.plot.automata import automaton
-from jaxltl.plot.curves import bands, curves, guarantees, lines, paths
+from jaxltl.plot.curves import bands, curves, guarantees, lines, paths, sweep
 from jaxltl.plot.games import compare, game_moves, game_region, game_values
 from jaxltl.plot.live import live_automaton, live_curve, live_map
 from jaxltl.plot.maps import grid, strategies
@@ -29,6 +29,7 @@ __all__ = [
     "live_map",
     "paths",
     "strategies",
+    "sweep",
     "temporal_gridworld",
     "to_bytes",
 ]

@@ -46,20 +46,27 @@ def curves(
     Raises:
       ValueError: there is nothing to show.
     """
-    if not isinstance(metrics, Mapping):
-        metrics = {name: getattr(metrics, name) for name in metrics.__dataclass_fields__}
-    series = {k: np.atleast_2d(np.asarray(v, float)) for k, v in metrics.items()}
-    chosen = [
-        k for k in (show or series) if k in series and np.isfinite(series[k]).any()
-    ]
-    if not chosen:
-        raise ValueError(f"curves: nothing to show among {', '.join(series) or 'no figures'}.")
+    series = {k: np.atleast_2d(v) for k, v in _shown("curves", metrics, show).items()}
+    chosen = list(series)
     figure = Figure(figsize=(3.1 * len(chosen) + 0.2, 2.5), layout="constrained", facecolor=PAPER)
     for i, (name, axes) in enumerate(
         zip(chosen, figure.subplots(1, len(chosen), squeeze=False)[0], strict=True)
     ):
         _curve(axes, series[name], steps, name.replace("_", " "), SERIES[i % len(SERIES)])
     return figure
+
+
+def _shown(
+    what: str, metrics: Mapping[str, ArrayLike] | Any, show: Sequence[str] | None
+) -> dict[str, NDArray[np.float64]]:
+    """The figures that are asked for and not wholly NaN, by name."""
+    if not isinstance(metrics, Mapping):
+        metrics = {name: getattr(metrics, name) for name in metrics.__dataclass_fields__}
+    every = {k: np.asarray(v, float) for k, v in metrics.items()}
+    found = {k: every[k] for k in (show or every) if k in every and np.isfinite(every[k]).any()}
+    if not found:
+        raise ValueError(f"{what}: nothing to show among {', '.join(every) or 'no figures'}.")
+    return found
 
 
 def _curve(
@@ -112,6 +119,47 @@ def bands(
     figure.legend(handles, names, loc="outside lower center", ncols=len(names), frameon=False,
                   fontsize=8.5, labelcolor=INK)
     return figure
+
+
+def sweep(
+    metrics: Mapping[str, ArrayLike] | Any,
+    settings: Sequence[str],
+    *,
+    steps: ArrayLike | None = None,
+    show: Sequence[str] | None = None,
+) -> Figure:
+    """Learning curves of several settings, one panel per figure: means over seeds, and spreads.
+
+    Args:
+      metrics: figures ``[H, N, T]`` of H settings and N seeds by name, or a learner's ``Metrics``
+        of a ``vmap`` over seeds within one over settings.
+      settings: the names of the H settings; at most six, which is as many as colours tell apart.
+      steps: ``[T]``, the step of each figure; default 1, 2, ...
+      show: names of figures in order; default all that are not wholly NaN.
+
+    Returns:
+      The figure. The line is the mean over seeds, and the band a standard deviation to either side
+      of it (of a single seed, none); seeds whose figure is not finite in a step are left out of it.
+
+    Raises:
+      ValueError: there is nothing to show, or figures of another number of axes or settings.
+    """
+    series, count = _shown("sweep", metrics, show), len(settings)
+    if count > len(SERIES):
+        raise ValueError(
+            f"sweep: {count} settings; show at most {len(SERIES)} at a time, whose colours differ.")
+    panels = {}
+    for name, found in series.items():
+        if found.ndim != 3 or len(found) != count:
+            raise ValueError(
+                f"sweep: {name} has shape {list(found.shape)}; give [{count}, N, T]: settings, "
+                "seeds, steps.")
+        place = np.arange(1, found.shape[2] + 1) if steps is None else steps
+        held = np.ma.masked_invalid(found)
+        mean, spread = (x.filled(np.nan) for x in (held.mean(axis=1), held.std(axis=1)))
+        panels[name.replace("_", " ")] = {
+            str(setting): (place, mean[i], spread[i]) for i, setting in enumerate(settings)}
+    return bands({"": panels})
 
 
 def lines(

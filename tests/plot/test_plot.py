@@ -446,6 +446,29 @@ def test_bands_have_means_spreads_and_limits():
     assert (first.get_xlabel(), second.get_xlabel()) == ("", "trajectories")
 
 
+def test_a_sweep_has_means_over_seeds_and_their_spread():
+    loss = np.random.default_rng(0).normal(size=(2, 3, 4))
+    loss[0, 1, 2], loss[1, :, 0] = np.nan, np.nan
+    figure = plot.sweep({"loss": loss, "none": loss * np.nan}, ["slow", "fast"], steps=[5, 6, 7, 8])
+    (axes,) = figure.axes
+    assert [t.get_text() for t in figure.legends[0].texts] == ["slow", "fast"]
+    for line, rows in zip(axes.get_lines(), loss, strict=True):
+        assert line.get_xdata().tolist() == [5, 6, 7, 8]
+        for drawn, column in zip(line.get_ydata(), rows.T, strict=True):
+            told = column[~np.isnan(column)]
+            assert drawn == pytest.approx(told.mean()) if told.size else np.isnan(drawn)
+    edge = axes.collections[0].get_paths()[0].vertices
+    for drawn in (loss[0, :, 0].mean() + loss[0, :, 0].std(), loss[0, [0, 2], 2].mean()
+                  - loss[0, [0, 2], 2].std()):
+        assert np.isclose(edge[:, 1], drawn).any()
+    for rows, names, message in (
+            (loss[0], ["a", "b"], r"loss has shape \[3, 4\]; give \[2, N, T\]"),
+            (loss, ["a"], r"loss has shape \[2, 3, 4\]; give \[1, N, T\]"),
+            (loss, list("abcdefg"), "7 settings; show at most 6")):
+        with pytest.raises(ValueError, match=message):
+            plot.sweep({"loss": rows}, names)
+
+
 def test_lines_beside_a_reference():
     figure = plot.lines(
         {"net": {"state": (np.zeros((5, 4)), np.ones(4)), "gap": ([[1.0, 2.0]], None)}},
@@ -468,7 +491,8 @@ def test_paths_on_a_map():
 
 
 @pytest.mark.parametrize("draw", [
-    lambda: plot.bands({}), lambda: plot.lines({"net": {}}),
+    lambda: plot.bands({}), lambda: plot.sweep({"loss": np.full((1, 2, 3), np.nan)}, ["a"]),
+    lambda: plot.lines({"net": {}}),
     lambda: plot.paths({}, {}, bounds=((0, 0), (1, 1))),
 ])
 def test_nothing_to_show_of_a_search(draw):
