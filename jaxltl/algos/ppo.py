@@ -277,6 +277,7 @@ def _check(problem: Problem, hparams: Hparams) -> None:
     given.one_of("squash", hparams.squash, actions_of.SQUASHES)
     for name in ("normalize_advantage", "normalize_observation", "normalize_reward"):
         given.truth(name, getattr(hparams, name))
+    given.whole("num_envs times num_steps", hparams.num_envs * hparams.num_steps, most=2**31 - 1)
     recurrent = has_memory(problem)
     size = hparams.num_envs * (1 if recurrent else hparams.num_steps)
     if size % hparams.num_minibatches:

@@ -61,12 +61,17 @@ def make_method(task: EnvironmentTask, environment: Environment, num_steps: int)
     make = {"ppo": _ppo, "cce": _cce, "cpo": _cpo}[task.method]
     spec = {k: _value(k, v, task.learner["steps"]) for k, v in task.settings.items()}
     found = make(spec, environment, num_steps)
+    if found.transitions > _MOST:
+        raise ValueError(
+            f"a step of the learner would make {found.transitions:,} simulated steps; at most "
+            f"{_MOST:,} are counted: simulate fewer side by side, or shorter.")
     # With numbers that are no tracers, so that the learner's own checks see them.
     jax.eval_shape(
         lambda key: found.algorithm.init(key, found.problem, found.hparams), jax.random.key(0))
     return found
 
 
+_MOST = 2**31 - 1
 _SCHEDULES = ("learning_rate", "clip", "value_clip", "rate", "noise")
 
 

@@ -170,7 +170,7 @@ def _theirs(name: str) -> Iterator[None]:
 def _told(name: str, problem: BaseException) -> str:
     """An error in one line: that of many says first what is wrong."""
     text = (str(problem).strip().splitlines() or [""])[0].rstrip(".: ")
-    if isinstance(problem, ValueError):
+    if isinstance(problem, ValueError) and text:
         return f"{name!r}: {text}."
     places = traceback.extract_tb(problem.__traceback__)
     # A SyntaxError names its own place.

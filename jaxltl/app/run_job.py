@@ -81,6 +81,19 @@ def run_job(
       say: takes lines on how far it is.
       place: the devices and processes.
     """
+    checkpoint = out / f"checkpoint-{mark}.npz"
+    try:
+        return _done(job, task, out, seeds, mark, begin, say, place, checkpoint)
+    except KeyboardInterrupt:
+        kept = "; the same command goes on from the last checkpoint"
+        say(f"interrupted{kept if checkpoint.exists() else ''}")
+        raise SystemExit(130) from None
+
+
+def _done(
+    job: Any, task: Any, out: Path, seeds: tuple[int, int], mark: str, begin: Artist,
+    say: Callable[[str], None], place: Place, checkpoint: Path,
+) -> dict[str, Any] | None:
     from jaxltl.algos import checkpoint as files
 
     start = time.perf_counter()
@@ -88,7 +101,6 @@ def run_job(
     say(job.describe(setup))
     if place.mesh is not None:
         say(spread(seeds[1], place))
-    checkpoint = out / f"checkpoint-{mark}.npz"
     place.together(lambda: _claim(out, task, place))
     if place.sees(str(checkpoint), checkpoint.exists()):
         say(f"going on from {checkpoint}")
@@ -102,14 +114,8 @@ def run_job(
             bar.update(step - bar.n)
             bar.set_postfix(job.postfix(figures))
 
-        try:
-            parts = job.learn(setup, *seeds, report=report, checkpoint=checkpoint,
-                              progress=bar.set_description_str, mesh=place.mesh)
-        except KeyboardInterrupt:
-            bar.close()
-            kept = "; the same command goes on from the last checkpoint"
-            say(f"interrupted{kept if checkpoint.exists() else ''}")
-            raise SystemExit(130) from None
+        parts = job.learn(setup, *seeds, report=report, checkpoint=checkpoint,
+                          progress=bar.set_description_str, mesh=place.mesh)
         if not place.is_first:
             return None
         files.remove(checkpoint)

@@ -59,6 +59,10 @@ def breaks():
     return {}["no"]
 
 
+def says_nothing():
+    raise ValueError
+
+
 nothing = 3
 '''
 TASK = """
@@ -104,6 +108,11 @@ def write(tmp_path):
 
 def run(*arguments):
     return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def arrays_of(path):
+    with np.load(path) as file:
+        return dict(file)
 
 
 def failure(*arguments):
@@ -159,7 +168,7 @@ def test_a_written_policy_is_used_without_its_task_file(learned, tmp_path):
     path, out, _ = learned
     world = load_environment(read_task(path))
     here = tmp_path / "policy.npz"
-    arrays = dict(np.load(out / "policy.npz"))
+    arrays = arrays_of(out / "policy.npz")
     assert arrays["task"].item() == path.read_text()
     np.savez(here, **arrays | {"task_file": np.array("/nowhere/task.toml")})
 
@@ -211,10 +220,21 @@ def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch, tmp_path):
     assert len(list(tmp_path.glob("checkpoint*"))) == 1
     went_on = run("learn", path, "--seeds", 2, "--out", tmp_path)
     assert "going on from" in went_on.stderr and went_on.exit_code == 0
-    one, other = (np.load(folder / "policy.npz") for folder in (out, tmp_path))
-    assert one.files == other.files
-    for name in one.files:
+    one, other = (arrays_of(folder / "policy.npz") for folder in (out, tmp_path))
+    assert list(one) == list(other)
+    for name in one:
         np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_interrupted_before_it_learns(learned, monkeypatch, tmp_path):
+    def interrupt(*given):
+        raise KeyboardInterrupt
+
+    for name in ("prepare", "task_pictures"):
+        with monkeypatch.context() as patch:
+            patch.setattr(job, name, interrupt)
+            told = run("learn", learned[0], "--out", tmp_path / "out")
+        assert told.exit_code == 130 and told.stderr.endswith("interrupted\n"), told.stderr
 
 
 @pytest.mark.parametrize(("method", "table", "boxed"), [
@@ -271,6 +291,8 @@ WORLD_ = 'environment = "own.py:corridor"'
      "returns a int, no Environment"),
     (WORLD_ + "\n[world.arguments]\nboxed = false", 'environment = "own.py:breaks"',
      "'own.py:breaks' raises KeyError: 'no' (own.py, line "),
+    (WORLD_ + "\n[world.arguments]\nboxed = false", 'environment = "own.py:says_nothing"',
+     "'own.py:says_nothing' raises ValueError (own.py, line "),
     ("boxed = false", "boxes = false", "does not take [world.arguments]: got an unexpected"),
     ("boxed = false", "ends = false", "[world] the environment's episodes never end"),
     (WORLD_ + "\n[world.arguments]\nboxed = false", 'environment = "own.py:bare"',
@@ -284,6 +306,7 @@ WORLD_ = 'environment = "own.py:corridor"'
     ('goal"', 'goal"\nreward = "keep"', "[task] "),
     ("hidden = [8]", "hiden = [8]", "[ppo] has no key 'hiden'; did you mean 'hidden'"),
     ("num_minibatches = 2", "num_minibatches = 5", "[ppo] num_minibatches=5 does not divide 64"),
+    ("num_envs = 8", "num_envs = 1000000000", "[ppo] a step of the learner would make 8,000,000,000 s"),
     ("[ppo]", "[cce]", "[cce] "),
     ('"ppo"', '"dqn"', '[learner] method = \'dqn\'; it must be "ppo" or "cce" or "cpo"'),
     ("episodes = 200", "episodes = 0", "[evaluation] episodes = 0; it must be a whole number"),
@@ -304,6 +327,8 @@ def test_mistakes_of_methods(write):
         "check", write(*cce, ("[cce]", "[cce]\nlimit = 0.1")))
     assert "[cce] rho=0.01 of population=20 leaves no elite" in failure(
         "check", write(*cce, ("[cce]", "[cce]\nrho = 0.01")))
+    assert "[cce] a step of the learner would make 16,000,000,000 simulated steps" in failure(
+        "check", write(*cce, ("population = 20", "population = 1000000000")))
 
 
 def test_labels_and_limits_of_the_file(write):
