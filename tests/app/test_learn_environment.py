@@ -306,7 +306,7 @@ WORLD_ = 'environment = "own.py:corridor"'
     ('goal"', 'goal"\nreward = "keep"', "[task] "),
     ("hidden = [8]", "hiden = [8]", "[ppo] has no key 'hiden'; did you mean 'hidden'"),
     ("num_minibatches = 2", "num_minibatches = 5", "[ppo] num_minibatches=5 does not divide 64"),
-    ("num_envs = 8", "num_envs = 1000000000", "[ppo] a step of the learner would make 8,000,000,000 s"),
+    ("num_envs = 8", "num_envs = 1000000000", "[ppo] a step of the learner would make 8,000"),
     ("[ppo]", "[cce]", "[cce] "),
     ('"ppo"', '"dqn"', '[learner] method = \'dqn\'; it must be "ppo" or "cce" or "cpo"'),
     ("episodes = 200", "episodes = 0", "[evaluation] episodes = 0; it must be a whole number"),
