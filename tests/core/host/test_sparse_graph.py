@@ -1,5 +1,6 @@
 """Sparse graph questions give the answers of the padded ones, whatever the sizes."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -34,6 +35,11 @@ def models(count=60):
 def on_rows(sparse, mask):
     """``bool[R]`` of a mask ``bool[S, A]``."""
     return np.asarray(mask)[sparse.host.state, sparse.action]
+
+
+def on_host(tree):
+    """In NumPy's arrays, of which a part is no program for each shape."""
+    return jax.tree.map(np.asarray, tree)
 
 
 @pytest.fixture(params=["python", "numpy", "scipy"])
@@ -91,23 +97,23 @@ def test_attractors_of_rows_are_those_of_actions():
         among, rule = (rng.random(host.num_states) < 0.8 for _ in range(2))
         allowed = np.asarray(padded.available) & (rng.random(padded.available.shape) < 0.8)
         for chance in ("some", "all"):
-            ours = attractor(
-                sparse, goal, on_rows(sparse, allowed), rule=rule, chance=chance, among=among)
-            theirs = attractor(padded, goal, allowed, rule=rule, chance=chance, among=among)
+            asked = {"rule": rule, "chance": chance, "among": among}
+            ours = on_host(attractor(sparse, goal, on_rows(sparse, allowed), **asked))
+            theirs = on_host(attractor(padded, goal, allowed, **asked))
             np.testing.assert_array_equal(ours.region, theirs.region)
-            joined = np.asarray(ours.region)
+            joined = ours.region
             np.testing.assert_array_equal(ours.rank[joined], theirs.rank[joined])
             moves = joined & ~goal & (rule | allowed.any(-1))
             np.testing.assert_array_equal(
-                sparse.action[np.asarray(ours.action)][moves], theirs.action[moves])
+                np.asarray(sparse.action)[ours.action][moves], theirs.action[moves])
         np.testing.assert_array_equal(avoidable(sparse, goal), avoidable(padded, goal))
         np.testing.assert_array_equal(
             almost_surely_reaching(sparse, goal).region,
             almost_surely_reaching(padded, goal).region)
-        mine, other = (f(m, goal) for f, m in ((end_components, sparse), (end_components, padded)))
+        mine, other = (on_host(end_components(m, goal)) for m in (sparse, padded))
         np.testing.assert_array_equal(mine.component, other.component)
         np.testing.assert_array_equal(mine.inside, on_rows(sparse, other.inside))
-        mine, other = (bottom_components(sparse, on_rows(sparse, allowed)),
-                       bottom_components(padded, allowed))
+        mine, other = on_host((bottom_components(sparse, on_rows(sparse, allowed)),
+                               bottom_components(padded, allowed)))
         np.testing.assert_array_equal(mine.component, other.component)
         np.testing.assert_array_equal(mine.inside, on_rows(sparse, other.inside))

@@ -14,6 +14,7 @@ from jaxltl.core.types import Status
 from jaxltl.core.values.enclosed import chain_of
 from jaxltl.core.values.prepared import prepare, solve_prepared
 from tests.sparse_models import random_sparse
+from tests.support import lane
 
 SIZE = 12
 
@@ -133,15 +134,15 @@ def test_policies_are_evaluated_in_lanes(seed, question):
     prepared = prepare(model, target, stay=stay, reward=reward, objective="policy")
     count = np.diff(model.row_start)
     rows = model.row_start[:-1] + rng.integers(0, count, (5, SIZE))
-    found = jax.vmap(lambda x: solve_prepared(prepared, policy=x))(rows.astype(np.int32))
+    solve = jax.jit(jax.vmap(lambda x: solve_prepared(prepared, policy=x)))
+    found = jax.tree.map(np.asarray, solve(rows.astype(np.int32)))
     weights = rng.random((5, model.num_rows)) * (rng.random((5, model.num_rows)) < 0.6)
     weights[:, model.row_start[:-1]] += 0.1
     weights /= np.add.reduceat(weights, model.row_start[:-1], 1)[:, model.host.state]
-    mixed = jax.vmap(lambda x: solve_prepared(prepared, policy=x))(weights)
+    mixed = jax.tree.map(np.asarray, solve(weights))
     for i in range(5):
         for several, policy in ((found, rows[i]), (mixed, weights[i])):
-            one = jax.tree.map(lambda x, i=i: x[i], several)
-            agree(one, of_policy(model, policy, target, stay, reward))
+            agree(lane(several, i), of_policy(model, policy, target, stay, reward))
 
 
 def test_wide_rows_and_many_choices_are_split():
@@ -220,13 +221,19 @@ def test_slopes_are_those_of_differences(seed, objective):
 
     x = np.concatenate([np.log(model.probability), reward, rng.normal(size=state.size)])
     along = rng.normal(size=x.size)
-    run = jax.jit(value)
-    expected = fourth_order(run, x, along, 1e-3)
-    forward = jax.jit(lambda x, along: jax.jvp(value, (x,), (along,))[1])(x, along)
-    backward = jax.jit(jax.grad(value))(x) @ along
+
+    @jax.jit
+    def derivatives(x):
+        """The value, its change on the way and its slope, of one linear program."""
+        found, forward = jax.linearize(value, x)
+        return found, forward(along), *jax.linear_transpose(forward, x)(1.0)
+
+    expected = fourth_order(lambda x: derivatives(x)[0], x, along, 1e-3)
+    _, forward, slope = jax.tree.map(np.asarray, derivatives(x))
+    backward = slope @ along
     np.testing.assert_allclose(forward, expected, rtol=1e-7)
     np.testing.assert_allclose(backward, forward, rtol=1e-9)
-    slopes = jax.jit(jax.vmap(jax.grad(value)))(np.stack([x, x]))
+    slopes = np.asarray(jax.jit(jax.vmap(jax.grad(value)))(np.stack([x, x])))
     np.testing.assert_allclose(slopes[1] @ along, backward, rtol=1e-9)
 
 
