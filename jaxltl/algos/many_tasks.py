@@ -159,9 +159,12 @@ def stack_plans(plans: Sequence[Plan]) -> Plan:
     return jax.tree.map(lambda *rows: jnp.stack([padded(x) for x in rows]), *plans)
 
 
+_FORGETS = 1 / 16  # share of what a choice has been worth that is forgotten in a step
+
+
 class Choice(NamedTuple):
     """What an agent has taken up: a state of the automaton, which of its sequences, and what that
-    one was worth then."""
+    one has been worth of late."""
 
     state: jax.Array
     sequence: jax.Array
@@ -180,9 +183,9 @@ def sequence_agent(
 
     In each state of the automaton that it comes to, it takes the sequence that the network values
     most, and does what the network does for that one until the state changes, or until another is
-    worth more than this one was when it was taken up: a way that turns out to be none is left.
-    What is taken up is worth more each time, so that nothing goes to and fro in one state, as it
-    might if every step chose anew.
+    worth more than this one has been of late (a mean that forgets in some 16 steps). So a way that
+    turns out to be none is left; and it does not go to and fro, as it might if every step chose
+    anew, between two that are nearly worth the same.
 
     Args:
       network: ``observation -> (parameters of the action, value)`` of a trained network; a
@@ -204,7 +207,8 @@ def sequence_agent(
     given.instance("plan", plan, Plan, "one of make_plan")
     if actions is not None:
         given.instance("actions", actions, Finite | Box, "the environment's, environment.actions")
-    how = _How(given.one_of("squash", squash, action_distributions.SQUASHES), bool(sampled))
+    how = _How(given.one_of("squash", squash, action_distributions.SQUASHES),
+               given.truth("sampled", sampled))
     begin = Choice(jnp.int32(-1), jnp.int32(0), jnp.asarray(0.0))
     return Agent(Partial(_act, how, actions, as_partial(network, "network"), plan), begin)
 
@@ -285,7 +289,8 @@ def _act(
     better = (best != memory.sequence) & (values[best] > memory.worth)
     kept = (memory.state == state) & ~better
     taken = jnp.where(kept, memory.sequence, best).astype(jnp.int32)
-    worth = jnp.where(kept, memory.worth, values[best]).astype(memory.worth.dtype)
+    late = memory.worth + _FORGETS * (values[taken] - memory.worth)
+    worth = jnp.where(kept, late, values[best]).astype(memory.worth.dtype)
     said = jax.tree.map(lambda x: x[taken], actions)
     action = action_distributions.chosen(
         key, _actions_of(said) if space is None else space, said, allowed,
@@ -342,7 +347,11 @@ def train_in_stages(
     Raises:
       ValueError: no problem, or a number of thresholds that does not fit.
     """
-    count = len(given.listed("problems", problems))
+    problems = given.listed("problems", problems)
+    for name, function in (("init", init), ("run", run), ("report", report)):
+        if function is not None or name != "report":
+            given.called(name, function)
+    count = len(problems)
     num_chunks = given.whole("num_chunks", num_chunks, least=1)
     bars = given.numbers("enough", enough)
     bars = np.full(max(count - 1, 0), bars) if bars.ndim == 0 else bars

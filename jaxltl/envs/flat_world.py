@@ -109,7 +109,7 @@ def flat_world(
                          "above zero.")
     extent, time_step = given.number("extent", extent), given.number("time_step", time_step)
     num_starts = given.whole("num_starts", num_starts, least=1, most=2**26)
-    seed = given.whole("seed", seed)
+    seed, discrete = given.whole("seed", seed), given.truth("discrete", discrete)
     if not (0 < extent < 1e6 and 0 < time_step < 1e6):
         raise ValueError(
             f"extent={extent}, time_step={time_step}; both must be positive, and below a million.")
