@@ -295,17 +295,20 @@ def test_the_multipliers_are_those_of_the_papers_comparison():
     assert len(seen) == 2
 
 
+def dual_and_weights(*numbers):
+    return cpo_dual(*numbers), cpo_weights(*numbers)
+
+
 def test_multipliers_certify_the_step():
     """The conditions of Karush, Kuhn and Tucker, which are sufficient here."""
     rng = np.random.default_rng(2)
     problems = [random_problem(rng, size=3) for _ in range(2000)]
     parts = [numbers_of(*p) for p in problems]
-    numbers = tuple(jnp.array([p[0][i] for p in parts]) for i in range(5))
-    duals = jax.vmap(cpo_dual)(*numbers)
-    weights = jax.vmap(cpo_weights)(*numbers)
+    numbers = tuple(np.array([p[0][i] for p in parts]) for i in range(5))
+    duals, weights = jax.tree.map(np.asarray, jax.vmap(dual_and_weights)(*numbers))
     for i, (g, b, h, c, delta) in enumerate(problems):
-        trust, cost, case = (np.asarray(x[i]) for x in duals)
-        step = np.asarray(weights[0][i]) * parts[i][1] + np.asarray(weights[1][i]) * parts[i][2]
+        trust, cost, case = (x[i] for x in duals)
+        step = weights[0][i] * parts[i][1] + weights[1][i] * parts[i][2]
         # Lengths in H, so that the tolerances have the scale of the problem.
         q, _, s, *_ = parts[i][0]
         edge = np.sqrt(2 * delta)
@@ -343,27 +346,31 @@ def test_multipliers_certify_the_step():
     ((4.0, 1.0, 1.0, -2.0, 0.5), Case.FREE, (0.5, 0.0)),
 ])
 def test_boundary_cases(numbers, case, weights):
-    assert cpo_dual(*numbers).case == case
-    np.testing.assert_allclose(cpo_weights(*numbers), weights, atol=1e-12)
-    single = [jnp.float32(x) for x in numbers]
-    assert cpo_dual(*single).trust.dtype == jnp.float32
-    np.testing.assert_allclose(cpo_weights(*single), weights, atol=1e-6)
-    assert np.isfinite(cpo_dual(*numbers)[:2]).all()
+    solve = jax.jit(dual_and_weights)
+    dual, found = solve(*numbers)
+    assert int(dual.case) == case
+    np.testing.assert_allclose(found, weights, atol=1e-12)
+    assert np.isfinite(dual[:2]).all()
+    dual, found = solve(*map(np.float32, numbers))
+    assert dual.trust.dtype == np.float32
+    np.testing.assert_allclose(found, weights, atol=1e-6)
 
 
 # --- products and estimates ---------------------------------------------------------------------
 
 
 def samples_of(state, batch, hparams=SMALL):
-    inputs = nets.normalized(state.moments, hparams, batch.observation)
-    return inputs.reshape(-1, inputs.shape[-1]), batch.action.reshape(-1, batch.action.shape[-1])
+    inputs, action = map(np.asarray, (
+        jax.jit(lambda m, x: nets.normalized(m, hparams, x))(state.moments, batch.observation),
+        batch.action))
+    return inputs.reshape(-1, inputs.shape[-1]), action.reshape(-1, action.shape[-1])
 
 
 def test_fisher_products_are_those_of_the_hessian(small):
     _, state, batch = small
     inputs, _ = samples_of(state, batch)
     flat, unravel = ravel_pytree(state.parameters)
-    old = nets.gaussian(state.parameters, SMALL, inputs)
+    old = jax.jit(lambda p: nets.gaussian(p, SMALL, inputs))(state.parameters)
 
     def divergence(x):
         new = nets.gaussian(unravel(x), SMALL, inputs)
@@ -374,18 +381,20 @@ def test_fisher_products_are_those_of_the_hessian(small):
         return jax.jit(jax.vmap(fisher_product(divergence, x)))(directions)
 
     hessian = jax.jit(jax.hessian(divergence))(flat)
-    np.testing.assert_allclose(products(flat, jnp.eye(flat.size)), hessian, atol=1e-12)
+    np.testing.assert_allclose(products(flat, np.eye(flat.size)), hessian, atol=1e-12)
     # The Fisher matrix as the mean square of the score, in closed form for a Gaussian.
     slope = jax.jit(jax.jacrev(
         lambda x: nets.gaussian(unravel(x), SMALL, inputs)[0]))(flat)
     spread = np.asarray(old[1])[0]
     fisher = np.einsum("bai,baj,a->ij", slope, slope, spread**-2.0) / len(inputs)
-    where = ravel_pytree({"mean": jax.tree.map(jnp.zeros_like, state.parameters["mean"]),
-                          "log_deviation": jnp.ones(1)})[0]
+    where = np.asarray(ravel_pytree({
+        "mean": jax.tree.map(np.zeros_like, state.parameters["mean"]),
+        "log_deviation": np.ones(1)})[0])
     np.testing.assert_allclose(hessian, fisher + 2 * np.diag(where), atol=1e-12)
-    direction = jax.random.normal(jax.random.key(2), flat.shape)
+    flat, direction = np.asarray(flat), np.random.default_rng(2).normal(size=flat.shape)
     slope = jax.jit(jax.grad(divergence))
-    change = (slope(flat + 1e-5 * direction) - slope(flat - 1e-5 * direction)) / 2e-5
+    ahead, behind = (np.asarray(slope(flat + h * direction)) for h in (1e-5, -1e-5))
+    change = (ahead - behind) / 2e-5
     np.testing.assert_allclose(
         products(flat, direction[None])[0], change, rtol=1e-5, atol=1e-7
     )
@@ -480,15 +489,12 @@ def test_new_moments_do_not_change_the_policy(hidden):
     old = Moments(jnp.float64(9.0), jnp.array([1.0, -2.0, 7.0]), jnp.array([4.0, 90.0, 0.0]))
     new = Moments(jnp.float64(20.0), jnp.array([0.5, 3.0, 6.0]), jnp.array([2e3, 1.0, 5.0]))
     network = nets.mean_network(hparams, 2, jnp.float64)
-    points = 3 * jax.random.normal(jax.random.key(0), (10, 3))
-    before = network.init(jax.random.key(1), points)["params"]
-    after = nets.refolded(before, old, new)
-    values = [
-        network.apply({"params": p}, nets.normalized(m, hparams, points))
-        for p, m in ((before, old), (after, new))
-    ]
-    np.testing.assert_allclose(*values, rtol=1e-9, atol=1e-12)
-    change = jax.tree.map(lambda x, y: jnp.abs(x - y).max(), before, after)
+    points = 3 * np.random.default_rng(0).normal(size=(10, 3))
+    before = jax.jit(network.init)(jax.random.key(1), points)["params"]
+    after = jax.jit(nets.refolded)(before, old, new)
+    said = jax.jit(lambda p, m: network.apply({"params": p}, nets.normalized(m, hparams, points)))
+    np.testing.assert_allclose(said(before, old), said(after, new), rtol=1e-9, atol=1e-12)
+    change = jax.tree.map(lambda x, y: np.abs(np.subtract(x, y)).max(), before, after)
     assert max(jax.tree.leaves(change)) > 0.1
 
 
@@ -547,25 +553,27 @@ def test_a_policy_runs_as_an_agent_on_trees_within_the_box():
     assert problem.horizon == 4
     hparams = SMALL.replace(initial_deviation=2.0)
     state = trust_region.init(jax.random.key(0), problem, hparams)
-    batch = trust_region.rollout(
-        jax.random.key(1), state, problem, hparams, num_trajectories=6)
+    batch = jax.tree.map(np.asarray, trust_region.rollout(
+        jax.random.key(1), state, problem, hparams, num_trajectories=6))
     assert batch.observation.shape == (4, 6, 3) and batch.action.shape == (4, 6, 2)
     late, _, time = batch.observation[:, 0].T
     np.testing.assert_array_equal([late, time], [[0, 0, 1, 1], [0, 1, 2, 3]])
-    assert jnp.abs(batch.action).max() > 1 and not batch.cost.any()
-    clipped = jnp.clip(batch.action, jnp.array([-0.5, -0.25]), 0.25)
+    assert np.abs(batch.action).max() > 1 and not batch.cost.any()
+    clipped = np.clip(batch.action, [-0.5, -0.25], 0.25)
     np.testing.assert_allclose(batch.reward, -clipped.sum(-1), atol=1e-12)
-    mean, deviation = trust_region.act(state, hparams, jnp.array([1.0, 0.0, 2.0]))
-    now = tree_observe(jnp.array([2.0, 0.0]))
+    mean, deviation = map(np.asarray, jax.jit(
+        lambda state: trust_region.act(state, hparams, np.array([1.0, 0.0, 2.0])))(state))
+    now = tree_observe(np.array([2.0, 0.0]))
     keys = jax.random.split(jax.random.key(3), 4000)
     drawn = {}
     for make in (trust_region.policy, trust_region.greedy):
         agent = make(state, problem, hparams)
-        drawn[make] = jax.vmap(lambda k, a=agent: a.act((), now, None, k)[0])(keys)
+        draw = jax.jit(jax.vmap(lambda k, a=agent: a.act((), now, None, k)[0]))
+        drawn[make] = np.asarray(draw(keys))
         assert drawn[make].shape == (4000, 2, 1)
-    fits = jnp.clip(mean, jnp.array([-0.5, -0.25]), 0.25).reshape(2, 1)
+    fits = np.clip(mean, [-0.5, -0.25], 0.25).reshape(2, 1)
     np.testing.assert_allclose(
-        drawn[trust_region.greedy], jnp.broadcast_to(fits, (4000, 2, 1)), atol=1e-12)
+        drawn[trust_region.greedy], np.broadcast_to(fits, (4000, 2, 1)), atol=1e-12)
     share = scipy.stats.norm(mean[1], deviation[1]).cdf(-0.25)
     assert abs((drawn[trust_region.policy][:, 1, 0] == -0.25).mean() - share) < 0.04
     episode = jax.jit(partial(run_episode, num_steps=5))(jax.random.key(2), world, agent)
@@ -588,35 +596,44 @@ def ended_step(ends, world, action, key):
         world + 1, 1.0 + action[0], time >= ends[0], time >= ends[1], 2.0, discount=0.5)
 
 
+@jax.jit
+def estimated(state, batch):
+    inputs = nets.normalized(state.moments, SMALL, batch.observation)
+    return trust_region._estimated(state, batch, inputs, SMALL)
+
+
+@jax.jit
+def values_of(state, observation, progress):
+    seen = nets.normalized(state.moments, SMALL, observation)
+    return nets.values_at(state.values, SMALL, jnp.append(seen, progress))
+
+
 @pytest.mark.parametrize(("ends", "length", "bootstrapped"), [
     ((9, 9), 5, False), ((3, 9), 3, False), ((9, 3), 3, True), ((3, 3), 3, False),
     ((9, 5), 5, True), ((5, 9), 5, False),
 ])
 def test_truncation_is_bootstrapped_and_termination_and_the_horizon_are_not(
         ends, length, bootstrapped):
-    step = Partial(ended_step, jnp.array(ends))
+    step = Partial(ended_step, np.array(ends))
     problem = trust_region.make_problem(
         free(ticking_reset, step, identity, 1), horizon=5, limit=9.0)
     state = trust_region.init(jax.random.key(0), problem, SMALL)
-    state = state.replace(value_moments=jnp.array([[3.0, 4.0], [2.0, 5.0]]))
-    batch = rollout(state, problem)
+    state = state.replace(value_moments=np.array([[3.0, 4.0], [2.0, 5.0]]))
+    batch = jax.tree.map(np.asarray, rollout(state, problem))
     np.testing.assert_array_equal(batch.valid.T, [np.arange(5) < length] * 6)
     np.testing.assert_array_equal(batch.truncated, bootstrapped)
     np.testing.assert_array_equal(batch.discount, 0.5 * batch.valid)
-    inputs = nets.normalized(state.moments, SMALL, batch.observation)
-    value, found = trust_region._estimated(state, batch, inputs, SMALL)
+    value, found = map(np.asarray, estimated(state, batch))
 
     def worth(time):
         """What the networks say of the observation after so many steps, on the host."""
-        seen = nets.normalized(state.moments, SMALL, jnp.array([float(time)]))
-        said = nets.values_at(
-            state.values, SMALL, jnp.append(seen, np.linspace(-1, 1, 5)[min(time, 4)]))
+        said = values_of(state, np.array([float(time)]), np.linspace(-1, 1, 5)[min(time, 4)])
         return np.asarray(said) * [2, 5] + [3, 4]
 
     values = np.array([worth(t) for t in range(length)])
     np.testing.assert_allclose(value[:, :length, 0].T, values, atol=1e-9)
     after = worth(length)[0] if bootstrapped else 0.0
-    signals = np.asarray(batch.reward[:, 0]), np.asarray(batch.cost[:, 0])
+    signals = batch.reward[:, 0], batch.cost[:, 0]
     given = [([0.9 * 0.5] * 5, SMALL.gae_lambda, after), ([1.0] * 5, SMALL.cost_gae_lambda, 0.0)]
     for i, (signal, (discount, gae_lambda, end)) in enumerate(zip(signals, given, strict=True)):
         plain = plain_advantages(signal, values[:, i], length, discount, gae_lambda, end)
