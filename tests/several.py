@@ -128,7 +128,7 @@ def run(directory: Path, place: Any) -> None:
         print(f"ended: {state.position.tobytes().hex()}")
 
 
-def walk(size: int = 41) -> Any:
+def walk(size: int = 11) -> Any:
     """A walk between ruin and what is won, from 0.4 of the way: sure numbers take many sweeps."""
     from jaxltl.core.models.sparse import make_sparse
 
@@ -153,14 +153,14 @@ def solve(directory: Path, place: Any) -> None:
         save(path, state, given)
         made.append(int(state["made"]))
 
-    solve_on_mesh.steps_between = lambda model: 4
+    solve_on_mesh.steps_between = lambda model: 16
     solve_on_mesh.files.save = noted  # type: ignore[assignment]
     text = 'Pmax=? [ F "win" ]'
     with jax.enable_x64(True):
         (found,) = solve_on_mesh.solve_in(
-            place, walk(), asked_for([text]), 1e-9, directory, [text])
+            place, walk(), asked_for([text]), 1e-6, directory, [text])
     if place.is_first:
-        print(f"went on: {bool(made) and made[0] > 4}")
+        print(f"went on: {bool(made) and made[0] > 16}")
         print(f"saved: {len(made)}")
         print(f"ended: {found.answer.lower.tobytes().hex()}, {found.answer.upper.tobytes().hex()}, "
               f"{found.answer.status.name}, {found.answer.value[0]!r}")
@@ -170,6 +170,11 @@ if __name__ == "__main__":
     from tests.several import main as of_that_name  # by which what is saved knows its functions
 
     where, number, of = sys.argv[3], int(sys.argv[4]), int(sys.argv[5])
-    of_that_name(sys.argv[1], Path(sys.argv[2]), where, number, of)
+    try:
+        of_that_name(sys.argv[1], Path(sys.argv[2]), where, number, of)
+    except ValueError as error:  # as the command line tells it
+        sys.exit(f"error: {error}")
+    except SystemExit as stop:
+        os._exit(int(stop.code or 0))
     sys.stdout.flush()
     os._exit(0)

@@ -6,13 +6,14 @@ process's number as argument, and its lines as standard input. It imports nothin
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import sys
 import threading
 
 FATAL = "Terminating process because the JAX distributed service detected"
-QUIET = "jaxltl: the end is told"
+END = "jaxltl ends: "  # what the process itself says, which may not live to see it printed
 AGAIN = ("what was saved is kept: start all processes again, as many or another number, and the "
          "run goes on")
 _CHATTER = ("[Gloo] Rank ",)
@@ -27,6 +28,8 @@ def told(text: str, process: int) -> str:
       ...      "(stopped sending heartbeats):\\n1\\nThe tasks have crashed.", 0)[:44]
       'process 0 stops, for process 1 gives no sign'
     """
+    if (own := re.search(f"^{END}(.+)$", text, re.MULTILINE)) is not None:
+        return own[1]
     silent = re.search(r"stopped sending heartbeats\):\n([\d,\s]+)", text)
     if silent is not None:
         names = re.findall(r"\d+", silent[1])
@@ -46,7 +49,7 @@ def told(text: str, process: int) -> str:
 
 
 def main() -> None:
-    """Passes lines on until the last words come, or the process has ended."""
+    """Passes lines on until the last words come, or the process has ended; of these one line."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that is read from decides
     process, last = int(sys.argv[1]), list[str]()
     done = threading.Event()
@@ -54,10 +57,7 @@ def main() -> None:
     def read() -> None:
         for raw in sys.stdin.buffer:
             line = raw.decode(errors="replace")
-            if QUIET in line:
-                last.clear()
-                break
-            if last or FATAL in line:
+            if last or END in line or FATAL in line:
                 last.append(line)
                 begun.set()
             elif not line.startswith(_CHATTER):
@@ -73,6 +73,7 @@ def main() -> None:
     if last:
         sys.stderr.write(f"error: {told(''.join(last), process)}\n")
         sys.stderr.flush()
+    os._exit(0)  # the thread may still be reading
 
 
 if __name__ == "__main__":

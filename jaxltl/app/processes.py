@@ -260,9 +260,8 @@ def taking_part(
     except Exception as error:
         if not is_loss(error):
             raise
-        _be_quiet()
         line = f"process {launch.process} stops, for another process has ended; {_teller.AGAIN}."
-        print(f"error: {line}", file=sys.stderr, flush=True)
+        os.write(2, f"{_teller.END}{line}\n".encode())
         raise SystemExit(LOST) from None
     _leave()
 
@@ -399,11 +398,6 @@ def _read_apart(launch: Launch) -> None:
         import resource
 
         resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
-
-
-def _be_quiet() -> None:
-    """The end is told here, and need not be told again."""
-    os.write(2, f"{_teller.QUIET}\n".encode())
 
 
 def is_loss(error: Exception) -> bool:

@@ -72,6 +72,8 @@ FATAL = ("F1122 16:30:07.588292   16822 client.h:80] Terminating process because
     ("UNAVAILABLE: Failed to send RPC to coordination service. Either the leader task was "
      "preempted\n:UNKNOWN:Error received from peer\n\nRPC: /xla.coordination.CoordinationService/"
      "PollForError", "process 0 stops, for process 0, which the others meet at, has ended"),
+    ("INTERNAL: Barrier failed\njaxltl ends: process 0 stops, for reasons.\n    @ 0x7f22",
+     "process 0 stops, for reasons."),
     ("INTERNAL: Shutdown barrier has failed.", "process 0 stops, for another process has ended"),
 ])
 def test_the_last_words_of_the_runtime_in_a_line(text, start):
@@ -227,6 +229,6 @@ def test_six_solves_go_on_after_kills_at_random(tmp_path):
         if i in (0, 2, 4, 5):
             assert found["ended"] == expected
         low, high = (np.frombuffer(bytes.fromhex(x))[0] for x in (lower, upper))
-        assert status == "CONVERGED" and low <= 0.4 <= high and high - low <= 1e-9
+        assert status == "CONVERGED" and low <= 0.4 <= high and high - low <= 1e-6
         assert not list(directory.iterdir())
     assert went_on > 2

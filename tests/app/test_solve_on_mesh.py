@@ -33,7 +33,7 @@ def solved(devices, directory, text=PROPERTY):
 
 @pytest.fixture
 def often(monkeypatch):
-    monkeypatch.setattr(solve_on_mesh, "steps_between", lambda model: 2)
+    monkeypatch.setattr(solve_on_mesh, "steps_between", lambda model: 40)
 
 
 class Left(Exception):
@@ -55,9 +55,9 @@ def test_bounds_are_gone_on_from_there_and_elsewhere(often, tmp_path, monkeypatc
     monkeypatch.setattr(solve_on_mesh.files, "save", save_and_leave)
     with pytest.raises(Left):
         solved(2, tmp_path)
-    assert made == [2, 4, 6] and len(list(tmp_path.iterdir())) == 1
+    assert made == [40, 80, 120] and len(list(tmp_path.iterdir())) == 1
     found = solved(other, tmp_path).answer
-    assert made[3] == 8 and not list(tmp_path.iterdir())
+    assert made[3] == 160 and not list(tmp_path.iterdir())
     assert found.status == Status.CONVERGED
     if other == 2:
         np.testing.assert_array_equal(found.lower, whole.lower)
@@ -67,7 +67,7 @@ def test_bounds_are_gone_on_from_there_and_elsewhere(often, tmp_path, monkeypatc
 
 
 def test_bounds_of_another_question_are_left_alone(often, tmp_path, monkeypatch):
-    monkeypatch.setattr(solve_on_mesh, "MAX_STEPS", 4)
+    monkeypatch.setattr(solve_on_mesh, "MAX_STEPS", 80)
     left = solved(2, tmp_path)
     assert left.answer.status == Status.MAX_STEPS and left.exit_status == 1
     assert left.answer.lower < 0.4 < left.answer.upper
