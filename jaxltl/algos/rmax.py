@@ -46,6 +46,7 @@ from jaxltl.core.games.objective import Parity, buchi
 from jaxltl.core.games.winning import solve
 from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.operators import forall_successor
 from jaxltl.core.models.restrict import restrict
@@ -266,18 +267,26 @@ def make_problem(
     played, accepting, origin = joint_game(game, spec, start)
     base, memory = origin
     played, reward = merge_successors(played, reward[base])
-    objective = buchi(played, jnp.asarray(accepting))
+    accepting = to_jax(np.asarray(accepting))
+    objective = buchi(played, accepting)
     region = solve(played, objective).region
     require_start(played, region, base, memory)
-    closed = played.available & region[:, None]
-    allowed = closed & (~played.system[:, None] | forall_successor(played, region))
+    allowed = _allowed(played, region)
     rows = environment_rows(game, base, played, reward, allowed, environment, discount)
     return Problem(
-        game=played, reward=reward, accepting=jnp.asarray(accepting), region=region,
-        allowed=allowed, environment=jnp.asarray(rows, played.dtype), start=played.initial,
-        start_table=jnp.asarray(cumulative(np.asarray(played.initial, float))),
-        base_state=jnp.asarray(base, jnp.int32), memory=jnp.asarray(memory, jnp.int32),
+        game=played, reward=reward, accepting=accepting, region=region, allowed=allowed,
+        environment=to_jax(np.asarray(rows, played.dtype)), start=played.initial,
+        start_table=to_jax(np.asarray(cumulative(np.asarray(played.initial, float)))),
+        base_state=to_jax(np.asarray(base, np.int32)),
+        memory=to_jax(np.asarray(memory, np.int32)),
     )
+
+
+@jax.jit
+def _allowed(game: Game, region: jax.Array) -> jax.Array:
+    """Moves that stay in the region: of the system those that do for sure."""
+    closed = game.available & region[:, None]
+    return closed & (~game.system[:, None] | forall_successor(game, region))
 
 
 # --- the learner ----------------------------------------------------------------------------
