@@ -137,3 +137,30 @@ def test_what_rows_gain_is_bounded_with_its_rounding(against):
             p[k] += min(ends[k] - p[k], 1 - sum(p))
         exact = sum(x * y for x, y in zip(p, ahead, strict=True)) + Fraction(float(nodes.cost[r]))
         assert Fraction(float(least[i])) <= exact <= Fraction(float(most[i]))
+
+
+def test_who_goes_round_where_nothing_is_lacking_attains_that(monkeypatch):
+    """A walk that is held in its middle, nearly worth one: its steps there need not be dear."""
+    size, goal = 60, np.arange(60) == 59
+    model = walks(size, np.random.default_rng(5), 0.1)
+    problem = interval_optimum.Joint(
+        model, (np.arange(size) > 0) & ~goal, goal.astype(float),
+        np.zeros(model.mdp.num_rows), np.arange(size))
+    nodes = interval_optimum._nodes(problem, 1, False)
+    search = interval_optimum._Search(nodes, 1e-6, False)
+    chosen, p = nodes.nearer(worth=True)
+    begin = Choice(chosen, p, np.zeros(nodes.size), np.ones(nodes.size))
+    far = search.beyond(search.risen(begin) or begin)
+    assert far is not None and not far.steps.all()
+    near = search.finely(far)
+    assert near is not None
+    chain = nodes.chain(near)
+    value = np.linalg.solve(np.eye(nodes.size) - chain.matrix.toarray(), chain.earned)
+    assert (near.z <= value + 1e-12).all() and (value - near.z).max() < 1e-9
+    found = interval_optimum.joint_bound(problem, maximize=True, tolerance=1e-6, relative=False)
+    open_ = problem.open
+    assert (found.bound - found.attained)[open_].max() < 6e-7
+    monkeypatch.setattr(interval_optimum._Search, "finely", lambda *_: None)
+    other = interval_optimum.joint_bound(problem, maximize=True, tolerance=1e-6, relative=False)
+    assert (found.attained <= other.bound + 1e-12)[open_].all()
+    assert (other.attained <= found.bound + 1e-12)[open_].all()
