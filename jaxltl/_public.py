@@ -147,6 +147,7 @@ from jaxltl.io.model_files import read_model, write_model
 from jaxltl.io.parametric import read_parametric
 from jaxltl.io.reward_machine import machine_reward, read_reward_machine
 from jaxltl.io.storm import from_stormpy, to_stormpy
+from jaxltl.io.umb_sharded import read_sharded
 
 
 @picture.register
@@ -305,6 +306,7 @@ __all__ = [
     "read_model",
     "read_parametric",
     "read_reward_machine",
+    "read_sharded",
     "restrict",
     "reward_bounded_reachability",
     "robust_bounded_reachability",

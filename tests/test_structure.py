@@ -61,7 +61,7 @@ PUBLIC = [
     "prepare_interval", "product", "project_policy", "project_trajectories", "proposition_sets",
     "pushforward", "reach", "reach_avoid_sequences", "reachability_probability", "read_hoa",
     "read_labels", "read_log", "read_model", "read_parametric", "read_reward_machine",
-    "restrict", "reward_bounded_reachability", "robust_bounded_reachability",
+    "read_sharded", "restrict", "reward_bounded_reachability", "robust_bounded_reachability",
     "robust_cumulative_reward", "robust_discounted_value", "robust_expectation",
     "robust_instantaneous_reward", "robust_next_probability", "robust_satisfaction",
     "robust_sensitivity", "rollout", "row_reward", "run_episode", "safety", "sample_successor",

@@ -66,7 +66,41 @@ def raw_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
     return data
 
 
-def pieces(data: bytes, name: str, limit: int = MAX_BYTES) -> Iterator[bytes]:
+class FileBytes:
+    """The bytes of an open file, read where and when they are asked for, by slices."""
+
+    def __init__(self, file: BinaryIO):
+        self._file, self._size = file, os.fstat(file.fileno()).st_size
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, place: slice) -> bytes:
+        start, stop, _ = place.indices(self._size)
+        self._file.seek(start)
+        return self._file.read(max(stop - start, 0))
+
+
+@contextlib.contextmanager
+def opened(path: str | os.PathLike[str]) -> Iterator[FileBytes]:
+    """A file of any size, of which nothing is read yet.
+
+    Raises:
+      ValueError: naming the file: it cannot be read, now or later on.
+    """
+    _check_path(path)
+    try:
+        file = open(path, "rb")  # noqa: SIM115 - a null byte in the name is a ValueError here only
+    except (OSError, ValueError) as error:
+        raise _unreadable(str(path), error) from None
+    try:
+        with file:
+            yield FileBytes(file)
+    except OSError as error:
+        raise _unreadable(str(path), error) from None
+
+
+def pieces(data: bytes | FileBytes, name: str, limit: int = MAX_BYTES) -> Iterator[bytes]:
     """What the bytes of a file hold, piece by piece, bounded as in :func:`read_bytes`.
 
     Raises:
@@ -145,9 +179,13 @@ def read_text(path: str | os.PathLike[str], expected: str) -> str:
         ) from None
 
 
-def compression_of(data: bytes) -> Compression | None:
+def compression_of(data: bytes | FileBytes) -> Compression | None:
     """How bytes are compressed, by how they begin."""
-    return next((kind for kind, begin in _BEGINS.items() if data.startswith(begin)), None)
+    return next((kind for kind in _BEGINS if _begins(data, 0, kind)), None)
+
+
+def _begins(data: bytes | FileBytes, place: int, kind: Compression) -> bool:
+    return data[place : place + len(_BEGINS[kind])] == _BEGINS[kind]
 
 
 def compression_by_name(path: str | os.PathLike[str]) -> Compression | None:
@@ -155,10 +193,12 @@ def compression_by_name(path: str | os.PathLike[str]) -> Compression | None:
     return _SUFFIX.get(Path(path).suffix.lower())
 
 
-def _decompressed(data: bytes, kind: Compression, allowed: int, name: str) -> Iterator[bytes]:
+def _decompressed(
+    data: bytes | FileBytes, kind: Compression, allowed: int, name: str
+) -> Iterator[bytes]:
     size = place = 0
     while place < len(data):  # several streams may follow one another, and zeros pad the last
-        if not data.startswith(_BEGINS[kind], place):
+        if not _begins(data, place, kind):
             rest = data[place:]
             if rest.count(0) == len(rest):
                 break
@@ -173,7 +213,7 @@ def _decompressed(data: bytes, kind: Compression, allowed: int, name: str) -> It
             yield part
 
 
-def _stream(data: bytes, place: int, kind: Compression) -> Iterator[tuple[bytes, int]]:
+def _stream(data: bytes | FileBytes, place: int, kind: Compression) -> Iterator[tuple[bytes, int]]:
     """The pieces of the stream that begins at a place, each with the place that is reached."""
     unpack: Any
     if kind == "gzip":

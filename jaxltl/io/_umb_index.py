@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 _SIZES = {  # of types, in bits, where none is given
     "bool": 1,
@@ -89,9 +89,35 @@ class Record:
     size: int
 
 
+class Items(NamedTuple):
+    """What a member holds: for each state, choice or branch so many bits.
+
+    Attributes:
+      part: of which of them.
+      bits: of one.
+      more: how many more there are than of these.
+    """
+
+    part: str
+    bits: int
+    more: int = 0
+
+    def size(self, count: int) -> int:
+        """The bytes of the member for so many."""
+        return bit_bytes(count) if self.bits == 1 else (count + self.more) * self.bits // 8
+
+    def span(self, begin: int, end: int) -> tuple[int, int]:
+        """The bytes that tell of a range."""
+        return begin * self.bits // 8, -(-(end + self.more) * self.bits // 8)
+
+
 @dataclass(frozen=True)
 class Index:
-    """What is said of a model: counts, types, annotations and variables."""
+    """What is said of a model: counts, types, annotations and variables.
+
+    That of a range of states has the counts of these, and where they, their choices and their
+    branches begin.
+    """
 
     players: int
     states: int
@@ -103,29 +129,44 @@ class Index:
     records: tuple[Record, ...]
     texts: int  # that variables have by their numbers
     player_names: tuple[str, ...] = ()
+    begins: tuple[int, int, int] = (0, 0, 0)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        return {"states": self.states, "choices": self.choices, "branches": self.branches}
+
+    def of(self, *ranges: tuple[int, int]) -> Index:
+        """Of a range of states, of their choices and of their branches."""
+        first, row, entry = (begin for begin, _ in ranges)
+        states, choices, branches = (end - begin for begin, end in ranges)
+        return replace(
+            self, states=states, choices=choices, branches=branches, begins=(first, row, entry)
+        )
+
+    def items(self) -> dict[str, Items]:
+        """What is in each member that tells of states, choices or branches one by one."""
+        found = {
+            "state-to-choices.bin": Items("states", 64, 1),
+            "state-is-initial.bin": Items("states", 1),
+            "choice-to-branches.bin": Items("choices", 64, 1),
+            "branch-to-target.bin": Items("branches", 64),
+        }
+        if self.players:
+            found["state-to-player.bin"] = Items("states", 32)
+        if self.probability:
+            found["branch-to-probability.bin"] = Items("branches", self.probability.size)
+        if self.actions:
+            found[f"{ACTIONS}/values.bin"] = Items("choices", 32)
+        for one in self.annotations:
+            for part in one.applies_to:
+                size = 1 if one.type.name == "bool" else one.type.size
+                found[one.member(part)] = Items(part, size)
+        return found
 
     def bounds(self) -> dict[str, tuple[int, int]]:
         """The least and the largest size in bytes of each member that is read."""
-        counts = {"states": self.states, "choices": self.choices, "branches": self.branches}
-        sizes = {
-            "state-to-choices.bin": 8 * (self.states + 1),
-            "state-is-initial.bin": bit_bytes(self.states),
-            "choice-to-branches.bin": 8 * (self.choices + 1),
-            "branch-to-target.bin": 8 * self.branches,
-        }
-        if self.players:
-            sizes["state-to-player.bin"] = 4 * self.states
-        if self.probability:
-            sizes["branch-to-probability.bin"] = self.branches * self.probability.size // 8
-        if self.actions:
-            sizes[f"{ACTIONS}/values.bin"] = 4 * self.choices
-        for one in self.annotations:
-            for part in one.applies_to:
-                sizes[one.member(part)] = (
-                    bit_bytes(counts[part])
-                    if one.type.name == "bool"
-                    else counts[part] * one.type.size // 8
-                )
+        counts = self.counts
+        sizes = {name: x.size(counts[x.part]) for name, x in self.items().items()}
         found = {name: (size, size) for name, size in sizes.items()}
         if self.records:
             widths = [record.size for record in self.records]

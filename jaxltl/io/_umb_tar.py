@@ -12,6 +12,8 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, BinaryIO
 
+from jaxltl.io._files import FileBytes
+
 _BLOCK = 512
 _LONGEST_NAME = 2**16  # bytes of an extended header
 _REGULAR = b"0\x007"
@@ -19,21 +21,31 @@ _RECORD = re.compile(rb"([0-9]{1,6}) ([^=\n]{1,200})=")
 _NO_DATA = b"123456"  # links, devices and directories
 
 
+_STEP = 2**20  # bytes of a file that are read at a time
+
+
 class Stream:
-    """Bytes that come in pieces, read in any portions.
+    """Bytes that come in pieces, or those of a file, read in any portions.
+
+    What is skipped of a file is not read.
 
     Attributes:
       place: what a message about the archive begins with.
       position: how many bytes were taken.
     """
 
-    def __init__(self, pieces: Iterator[bytes], place: str):
-        self._pieces, self._held, self.place, self.position = pieces, memoryview(b""), place, 0
+    def __init__(self, source: Iterator[bytes] | FileBytes, place: str):
+        self._source, self._held, self.place, self.position = source, memoryview(b""), place, 0
+
+    def _next(self) -> bytes | None:
+        if isinstance(self._source, FileBytes):
+            return self._source[self.position : self.position + _STEP] or None
+        return next(self._source, None)
 
     def _some(self, most: int) -> memoryview:
         """Between one byte and `most`; none at the end."""
         while not self._held:
-            piece = next(self._pieces, None)
+            piece = self._next()
             if piece is None:
                 return self._held
             self._held = memoryview(piece)
@@ -65,6 +77,8 @@ class Stream:
           ValueError: the bytes end before.
         """
         end = self.position + count
+        if isinstance(self._source, FileBytes) and count > len(self._held):
+            self._held, self.position = memoryview(b""), min(end, len(self._source))
         while self.position < end:
             if not self._some(end - self.position):
                 raise ValueError(f"{self.place}{what}: the archive ends within it; it is cut off.")

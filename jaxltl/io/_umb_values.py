@@ -22,6 +22,15 @@ def read_bits(content: Bytes, count: int) -> NDArray[np.bool_]:
     return np.unpackbits(content, count=count, bitorder="little").view(bool)
 
 
+def count_bits(content: Bytes, count: int) -> int:
+    """How many of the first `count` bits are set."""
+    step, found = 2**20, 0
+    for begin in range(0, count, 8 * step):
+        block = content[begin // 8 : begin // 8 + step]
+        found += int(read_bits(block, min(count - begin, 8 * step)).sum())
+    return found
+
+
 def write_bits(bits: NDArray[np.bool_]) -> Bytes:
     """Bits in words of 64."""
     content = np.zeros(bit_bytes(bits.size), np.uint8)
@@ -74,8 +83,8 @@ def read_ends(content: Bytes, kind: Type, place: str) -> NDArray[np.float64]:
     return read_numbers(content, kind.end, place).reshape(-1, 2)
 
 
-def read_points(content: Bytes, kind: Type, place: str) -> NDArray[np.float64]:
-    """Numbers, which may be written as intervals of one point.
+def read_points(content: Bytes, kind: Type, place: str, *, first: int = 0) -> NDArray[np.float64]:
+    """Numbers, which may be written as intervals of one point; `first` is the first one's number.
 
     Raises:
       ValueError: an interval is no point, or as of :func:`read_numbers`.
@@ -87,8 +96,8 @@ def read_points(content: Bytes, kind: Type, place: str) -> NDArray[np.float64]:
     if wrong.any():
         i = int(wrong.argmax())
         raise ValueError(
-            f"{place}number {i} is the interval [{ends[i, 0]:.9g}, {ends[i, 1]:.9g}]; single "
-            "numbers, or intervals of one point, are read."
+            f"{place}number {first + i} is the interval [{ends[i, 0]:.9g}, {ends[i, 1]:.9g}]; "
+            "single numbers, or intervals of one point, are read."
         )
     return ends[:, 0].copy()
 

@@ -19,7 +19,7 @@ from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows, refuse_ball
 from jaxltl.core.models.mdp import checked_initial
-from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.io._files import Compression, compression_by_name, pieces, raw_bytes, write_bytes
 from jaxltl.io._umb_index import (
     ACTIONS,
@@ -30,24 +30,31 @@ from jaxltl.io._umb_index import (
     VALUATIONS,
     Index,
     ids_for,
-    parse_index,
 )
-from jaxltl.io._umb_tar import Stream, members, tar_pieces, write_gzip
+from jaxltl.io._umb_members import (
+    actions_of,
+    check_chain,
+    check_memory,
+    known_members,
+    labels_of,
+    needed,
+    probability_of,
+    read_index,
+    rewards_of,
+    starts_of,
+    texts_of,
+    uniform,
+)
+from jaxltl.io._umb_tar import Stream, tar_pieces, write_gzip
 from jaxltl.io._umb_values import (
     Bytes,
     read_bits,
-    read_ends,
-    read_numbers,
-    read_points,
-    read_starts,
-    read_texts,
     read_variables,
     write_bits,
     write_texts,
     write_variables,
 )
 
-_LARGEST_INDEX = 2**26  # bytes
 _PLAYERS = ("system", "environment")
 _BOOL, _DOUBLE = {"type": "bool", "size": 1}, {"type": "double", "size": 64}
 _INTERVAL = {"type": "double-interval", "size": 128}
@@ -86,7 +93,7 @@ def read_umb(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
     place = f"{name!r}: "
     data = raw_bytes(path)
     try:
-        index = _read_index(data, name, place)
+        index = read_index(Stream(pieces(data, name), place))
         found = _read_members(data, index, name, place)
         del data
         return _model(found, index, place)
@@ -94,67 +101,30 @@ def read_umb(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
         raise ValueError(f"{place}the model does not fit into the memory.") from None
 
 
-def _read_index(data: bytes, name: str, place: str) -> Index:
-    stream = Stream(pieces(data, name), place)
-    for member, size in members(stream):
-        if member == "index.json":
-            if size > _LARGEST_INDEX:
-                raise ValueError(
-                    f"{place}index.json has {size} bytes; at most {_LARGEST_INDEX} are read."
-                )
-            content = bytearray(size)
-            stream.fill(content, member)
-            return parse_index(bytes(content), f"{place}index.json: ")
-    raise ValueError(f"{place}the archive has no index.json; it is no UMB file.")
-
-
 def _read_members(data: bytes, index: Index, name: str, place: str) -> dict[str, Bytes]:
     """The members that the index tells of; each has the size that follows from the index."""
-    bounds, found = index.bounds(), {}
-    _check_memory(sum(most for _, most in bounds.values()), place)
+    check_memory(sum(most for _, most in index.bounds().values()), place)
+    found: dict[str, Bytes] = {}
     stream = Stream(pieces(data, name), place)
-    for member, size in members(stream):
-        if member in found:
-            raise ValueError(f"{place}two members are named {member!r}.")
-        if member not in bounds:
-            continue
-        least, most = bounds[member]
-        if not least <= size <= most:
-            wanted = f"{most}" if least == most else f"{least} to {most}"
-            raise ValueError(
-                f"{place}{member} has {size} bytes; expected {wanted}, by the counts "
-                "and types of index.json."
-            )
+    for member, size in known_members(stream, index):
         found[member] = np.empty(size, np.uint8)
         stream.fill(found[member], member)
     return found
 
 
-def _check_memory(size: int, place: str) -> None:
-    try:
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):  # another system
-        return
-    if 2 * size > memory:
-        raise ValueError(
-            f"{place}index.json tells of a model of {size / 2**30:.3g} GB, which "
-            f"takes twice that; there are {memory / 2**30:.3g} GB."
-        )
-
-
 def _model(found: dict[str, Bytes], index: Index, place: str) -> SparseMDP | IntervalMDP | Game:
-    row_start = _starts(found, "state-to-choices.bin", index.states, index.choices, place)
-    entry_start = _starts(found, "choice-to-branches.bin", index.choices, index.branches, place)
-    target = _needed(found, "branch-to-target.bin", place).view("<u8")
+    row_start = starts_of(found, "state-to-choices.bin", index.states, index.choices, place)
+    entry_start = starts_of(found, "choice-to-branches.bin", index.choices, index.branches, place)
+    target = needed(found, "branch-to-target.bin", place).view("<u8")
     if index.players == 0:
-        _check_chain(row_start, place)
-    labels, names = _labels(found, index, place)
-    options: dict[str, Any] = {"rewards": _rewards(found, index, place)}
+        check_chain(row_start, place)
+    labels, names = labels_of(found, index, place)
+    options: dict[str, Any] = {"rewards": rewards_of(found, index, place)}
     if index.actions:
-        options |= _actions(found, index, place)
+        options |= actions_of(found, index, place)
     if f"{VALUATIONS}/valuations.bin" in found:
         options["valuation"] = _valuation(found, index, place)
-    probability = _probability(found, index, entry_start, place)
+    probability = probability_of(found, index, entry_start, place)
     initial = _initial(found, index)
     owner = _owners(found, index, row_start, place)
     rows = row_start, entry_start, target
@@ -176,92 +146,6 @@ def _model(found: dict[str, Bytes], index: Index, place: str) -> SparseMDP | Int
     return model if owner is None else make_game(model, owner)
 
 
-def _needed(found: dict[str, Bytes], member: str, place: str) -> Bytes:
-    if member not in found:
-        raise ValueError(f"{place}{member} is missing.")
-    return found[member]
-
-
-def _starts(
-    found: dict[str, Bytes], member: str, count: int, total: int, place: str
-) -> NDArray[np.int64]:
-    """Where the spans of a member start; without it, each has one."""
-    if member in found:
-        return read_starts(found.pop(member), total, f"{place}{member}: ")
-    if count != total:
-        raise ValueError(
-            f"{place}{member} is missing, so that {count} are mapped to {total} one "
-            "to one; expected the member, or equal counts."
-        )
-    return np.arange(count + 1)
-
-
-def _check_chain(row_start: NDArray[np.int64], place: str) -> None:
-    count = np.diff(row_start)
-    if (count != 1).any():
-        state = int(np.flatnonzero(count != 1)[0])
-        raise ValueError(
-            f"{place}state-to-choices.bin: state {state} has {count[state]} choices; "
-            "expected one, as #players is 0."
-        )
-
-
-def _labels(
-    found: dict[str, Bytes], index: Index, place: str
-) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
-    ours = {x.id: x for x in index.annotations if x.group == OTHER_LABELS}
-    others = iter([x for x in index.annotations if x.group == "aps"])
-    all_of = []
-    for i in range(len(index.annotations)):  # the ids of ours are their places
-        one = ours.pop(str(i), None) or next(others, None)
-        if one is not None:
-            all_of.append(one)
-    all_of += ours.values()
-    label = np.zeros((index.states, len(all_of)), bool)
-    for i, one in enumerate(all_of):
-        label[:, i] = read_bits(_needed(found, one.member("states"), place), index.states)
-    return label, tuple(one.name for one in all_of)
-
-
-def _rewards(found: dict[str, Bytes], index: Index, place: str) -> dict[str, Rewards]:
-    rewards = {}
-    for one in index.annotations:
-        if one.group == "rewards":
-            parts = {
-                PARTS[part]: read_points(
-                    found.pop(one.member(part)), one.type, f"{place}{one.member(part)}: "
-                )
-                for part in one.applies_to
-                if one.member(part) in found
-            }
-            rewards[one.name] = Rewards(**parts)
-    return rewards
-
-
-def _actions(found: dict[str, Bytes], index: Index, place: str) -> dict[str, Any]:
-    """The number of each choice's action, and the names."""
-    member = f"{ACTIONS}/values.bin"
-    action = np.zeros(index.choices, np.int32)
-    if member in found:
-        action = found.pop(member).view("<u4")
-        if action.size and action.max() >= index.actions:
-            raise ValueError(
-                f"{place}{member}: a choice has the action {action.max()}; expected 0 "
-                f"to {index.actions - 1}."
-            )
-    return {"action": action, "action_names": _texts(found, ACTIONS, place)}
-
-
-def _texts(found: dict[str, Bytes], folder: str, place: str) -> tuple[str, ...]:
-    """The texts of a folder by their numbers; none if it has none."""
-    mapping, strings = f"{folder}/string-mapping.bin", f"{folder}/strings.bin"
-    if mapping not in found:
-        return ()
-    content = _needed(found, strings, place)
-    start = read_starts(found[mapping], content.size, f"{place}{mapping}: ")
-    return read_texts(start, content, f"{place}{strings}: ")
-
-
 def _valuation(found: dict[str, Bytes], index: Index, place: str) -> dict[str, NDArray[Any]]:
     of_class = found.get(f"{VALUATIONS}/valuation-to-class.bin")
     return read_variables(
@@ -269,32 +153,9 @@ def _valuation(found: dict[str, Bytes], index: Index, place: str) -> dict[str, N
         None if of_class is None else of_class.view("<u4"),
         index.records,
         index.states,
-        _texts(found, VALUATIONS, place),
+        texts_of(found, VALUATIONS, place),
         f"{place}{VALUATIONS}/valuations.bin: ",
     )
-
-
-def _probability(
-    found: dict[str, Bytes], index: Index, entry_start: NDArray[np.int64], place: str
-) -> NDArray[np.float64]:
-    """The probability of each branch, or lower and upper ends ``[T, 2]``."""
-    member, kind = "branch-to-probability.bin", index.probability
-    if kind is not None and kind.end is not None and index.players > 1:
-        raise ValueError(
-            f"{place}the probabilities of this game are intervals; chains and decision processes "
-            "are read with them."
-        )
-    if kind is not None and member in found:
-        read = read_numbers if kind.end is None else read_ends
-        return read(found.pop(member), kind, f"{place}{member}: ")
-    several = np.flatnonzero(np.diff(entry_start) > 1)
-    if several.size:
-        count = int(np.diff(entry_start)[several[0]])
-        raise ValueError(
-            f"{place}{member} is missing, and choice {several[0]} has {count} "
-            "branches; without probabilities each choice may have one."
-        )
-    return np.ones(index.branches if kind is None or kind.end is None else (index.branches, 2))
 
 
 def _initial(found: dict[str, Bytes], index: Index) -> NDArray[np.float64] | None:
@@ -304,13 +165,7 @@ def _initial(found: dict[str, Bytes], index: Index) -> NDArray[np.float64] | Non
         return exact.view("<f8").astype(np.float64, copy=False)
     if "state-is-initial.bin" not in found:
         return None
-    return _uniform(read_bits(found["state-is-initial.bin"], index.states))
-
-
-def _uniform(initial: NDArray[np.bool_]) -> NDArray[np.float64] | None:
-    """The distribution over some states that a reader takes; None if these are all or none."""
-    count = int(initial.sum())
-    return None if count in (0, initial.size) else initial / count
+    return uniform(read_bits(found["state-is-initial.bin"], index.states))
 
 
 def _owners(
@@ -505,7 +360,7 @@ def _annotations(
         parts = parts or {"states": np.zeros(model.num_states)}
         packed = {k: _pairs(x, x) if points else _packed(x, "<f8") for k, x in parts.items()}
         add("rewards", key, name, _INTERVAL if points else _DOUBLE, packed)
-    if not np.array_equal(initial, checked_initial(_uniform(initial > 0), initial.size)):
+    if not np.array_equal(initial, checked_initial(uniform(initial > 0), initial.size)):
         add(
             INITIAL,
             "probability",

@@ -326,14 +326,19 @@ def checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
     initial = numbers("initial", initial)
     if initial.shape != (num_states,):
         raise ValueError(f"initial has shape {initial.shape}; expected ({num_states},).")
-    bad = ~(initial >= 0)
-    if bad.any():
-        s = np.flatnonzero(bad)[0]
-        raise ValueError(f"initial probability of state {s} is {initial[s]}; "
-                         "it must not be negative or NaN.")
+    refuse_negative(initial)
     if abs(initial.sum() - 1) > 1e-6:
         raise ValueError(f"the initial distribution sums to {initial.sum():.9g}, not 1.")
     return initial / initial.sum()
+
+
+def refuse_negative(initial: np.ndarray, *, first: int = 0) -> None:
+    """Raises a ValueError of a probability that is none; `first` is the first state's number."""
+    bad = ~(initial >= 0)
+    if bad.any():
+        s = np.flatnonzero(bad)[0]
+        raise ValueError(f"initial probability of state {first + s} is {initial[s]}; "
+                         "it must not be negative or NaN.")
 
 
 def checked_label(

@@ -41,6 +41,8 @@ class ModelPart:
       initial: ``float[n]``; default: runs start anywhere with the same probability.
       label: ``bool[n, P]``.
       rewards: expected rewards of rows by name, ``float[r]``.
+      row: ``int[r]``, the numbers of the rows among all rows of the model, so that quantities on
+        them can be put onto the mesh; default: none are.
     """
 
     entry_start: np.ndarray
@@ -51,6 +53,7 @@ class ModelPart:
     initial: np.ndarray | None = None
     label: np.ndarray | None = None
     rewards: Mapping[str, np.ndarray] = field(default_factory=dict)
+    row: np.ndarray | None = None
 
 
 def shard(
@@ -102,13 +105,9 @@ def shard(
             row_start=starts_of(choices), entry_start=starts_of(width),
             successor=place[host.successor[entry]], probability=host.probability[entry],
             action=column[row], initial=initial[state], label=label[state],
-            rewards={name: x[row] for name, x in rewards.items()})
+            rewards={name: x[row] for name, x in rewards.items()}, row=row)
 
-    def numbers(start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
-        state = ordered[start:stop]
-        return state, spans(host.row_start[state], np.diff(host.row_start)[state])
-
-    return _assembled(part, numbers, host.num_states, mesh, axis, sparse.propositions)
+    return _assembled(part, ordered, host.num_states, mesh, axis, sparse.propositions)
 
 
 def model_from_parts(
@@ -141,6 +140,16 @@ def model_from_parts(
     if not isinstance(num_states, int | np.integer) or num_states < 1:
         raise ValueError(f"num_states is {shown(num_states)}; give a whole number of at least 1.")
     return _assembled(part, None, int(num_states), mesh, axis, tuple(propositions))
+
+
+def ranges_of(num_states: int, mesh: Mesh, axis: str | None = None) -> list[tuple[int, int]]:
+    """The ranges of states, ``(start, stop)``, that this process is asked for parts of.
+
+    Raises:
+      ValueError: the axis is none, or there are fewer states than devices.
+    """
+    layout = _layout(num_states, mesh, axis)
+    return [layout.span(d) for d in layout.mine]
 
 
 def to_mesh(model: ShardedMDP, quantity: Any, fill: Any = 0) -> jax.Array:
@@ -334,7 +343,7 @@ class _Piece(NamedTuple):
 
 
 def _assembled(
-    part: Any, numbers: Any, num_states: int, mesh: Mesh, axis: str | None, propositions: Any
+    part: Any, ordered: Any, num_states: int, mesh: Mesh, axis: str | None, propositions: Any
 ) -> ShardedMDP:
     layout = _layout(num_states, mesh, axis)
     parts = {d: _checked(part, layout, d, len(propositions)) for d in layout.mine}
@@ -342,13 +351,13 @@ def _assembled(
     halo = _halo(layout, parts, facts)
     total = facts[:, _INITIAL].sum()
     if abs(total - 1) > 1e-6:
-        raise ValueError(f"the initial distribution sums to {total:.6g}; it must sum to one.")
+        raise ValueError(f"the initial distribution sums to {total:.9g}, not 1.")
     labels = np.unique(np.concatenate(layout.exchanged(
         {d: np.unique(x.label, axis=0) for d, x in parts.items()})), axis=0)
     pieces = {}
     for d, x in parts.items():
         tables, place = _tables(layout, halo, facts, d, x)
-        pieces[d] = _of_states(layout, facts, d, x, tables, place, labels, numbers)
+        pieces[d] = _of_states(layout, facts, d, x, tables, place, labels, ordered)
     whole: _Piece = jax.tree.map(
         lambda *each: layout.array(dict(zip(pieces, each, strict=True))), *pieces.values())
     return ShardedMDP(
@@ -368,6 +377,7 @@ class _Range(NamedTuple):
     initial: np.ndarray
     label: np.ndarray
     rewards: dict[str, np.ndarray]
+    row: np.ndarray | None
 
 
 def _checked(part: Any, layout: _Layout, d: int, num_labels: int) -> _Range:
@@ -394,13 +404,14 @@ def _checked(part: Any, layout: _Layout, d: int, num_labels: int) -> _Range:
     for name, x, shape in (
             ("action", action, (owner.size,)), ("initial", initial, (count,)),
             ("label", label, (count, num_labels)),
+            ("row", action if found.row is None else found.row, (owner.size,)),
             *((f"reward {n!r}", r, (owner.size,)) for n, r in found.rewards.items())):
         if np.shape(x) != shape:
             raise ValueError(f"part({start}, {stop}): {name} has shape {np.shape(x)}; expected "
                              f"{shape}.")
     return _Range(
         entry_start, successor, probability, row_start, np.asarray(action),
-        np.asarray(initial, np.float64), np.asarray(label, bool), dict(found.rewards))
+        np.asarray(initial, np.float64), np.asarray(label, bool), dict(found.rewards), found.row)
 
 
 _ACTIONS, _WIDEST, _TRANSITIONS, _INITIAL, _COUNTS = range(5)
@@ -516,7 +527,7 @@ def _tables(
 
 def _of_states(
     layout: _Layout, facts: np.ndarray, d: int, part: _Range, tables: Any, place: Any,
-    labels: np.ndarray, numbers: Any,
+    labels: np.ndarray, ordered: Any,
 ) -> _Piece:
     num_actions, here = int(facts[:, _ACTIONS].max()), part.initial.size
     state = np.repeat(np.arange(here), np.diff(part.row_start))
@@ -537,15 +548,12 @@ def _of_states(
     place_of = {shown.tobytes(): i for i, shown in enumerate(labels)}
     kind[:here] = np.array([place_of[x.tobytes()] for x in different], np.int32)[of.ravel()]
     start, stop = layout.span(d)
-    state_number, row_number = np.arange(start, stop), None
-    if numbers is not None:
-        state_number, row = numbers(start, stop)
-        row_number = on_choices(row, -1, np.int32)
     number = np.full(layout.size, -1, np.int32)
-    number[:here] = state_number
+    number[:here] = np.arange(start, stop) if ordered is None else ordered[start:stop]
+    row = None if part.row is None else on_choices(part.row, -1, np.int32)
     initial = np.zeros(layout.size)
     initial[:here] = part.initial
     kept = jax.dtypes.canonicalize_dtype(np.float64)
     tables = tuple(RowTable(x.successor, x.probability.astype(kept)) for x in tables)
     rewards = {name: on_choices(x, 0, kept) for name, x in part.rewards.items()}
-    return _Piece(tables, place, available, initial.astype(kept), kind, rewards, number, row_number)
+    return _Piece(tables, place, available, initial.astype(kept), kind, rewards, number, row)

@@ -271,6 +271,31 @@ def make_sparse(
       >>> model.num_states, model.num_rows, model.num_transitions, model.is_chain
       (2, 3, 4, False)
     """
+    model = sparse_part(
+        row_start, entry_start, successor, probability, label=label, propositions=propositions,
+        rewards=rewards, action=action, action_names=action_names, valuation=valuation)
+    return replace(model, initial=checked_initial(initial, model.num_states))
+
+
+def sparse_part(
+    row_start: chex.Array | None, entry_start: chex.Array, successor: chex.Array,
+    probability: chex.Array, *, label: Any = None, propositions: Sequence[str] = (),
+    rewards: Mapping[str, Rewards] | None = None, action: chex.Array | None = None,
+    action_names: Sequence[str] = (), valuation: Mapping[str, chex.Array] | None = None,
+    begins: tuple[int, int, int] = (0, 0, 0), num_states: int | None = None,
+) -> SparseMDP:
+    """What :func:`make_sparse` makes of a range of a model's states, without initial ones.
+
+    Args:
+      row_start, entry_start: where spans start, from 0.
+      successor: numbers among all states.
+      probability, label, propositions, rewards, action, action_names, valuation: as there.
+      begins: the numbers of the first state, choice and transition.
+      num_states: of the whole model; default: this is all of it.
+
+    Raises:
+      ValueError: as there, with numbers of the whole model.
+    """
     successor, probability = np.asarray(successor), np.asarray(probability, np.float64)
     if successor.ndim != 1 or successor.shape != probability.shape:
         raise ValueError(
@@ -283,28 +308,30 @@ def make_sparse(
     if row_start is None:
         row_start = np.arange(num_rows + 1)
     row_start = checked_starts("row_start", row_start, num_rows, "choices")
-    num_states = row_start.size - 1
-    if num_states == 0:
+    here, first = row_start.size - 1, begins[0]
+    if here == 0:
         raise ValueError("the model has no state; it needs at least one.")
-    check_entries(row_start, entry_start, successor, probability)
+    check_entries(
+        row_start, entry_start, successor, probability, first=first, num_states=num_states)
     for of, each in (("rewards", rewards), ("valuation", valuation)):
         if each is not None and not isinstance(each, Mapping):
             raise ValueError(f"{of} is {shown(each)}; give a dict, by name.")
     action_names = tuple(listed("action_names", action_names))
-    rewards = {name: _checked_rewards(name, x, num_states, num_rows, successor.size)
+    sizes = here, num_rows, successor.size
+    rewards = {name: _checked_rewards(name, x, sizes, begins)
                for name, x in (rewards or {}).items()}
-    label, names = checked_label(label, propositions, num_states)
+    label, names = checked_label(label, propositions, here)
     action = None if action is None else _checked_action(action, num_rows, action_names)
     for name, x in (valuation or {}).items():
-        if np.shape(x) != (num_states,):
+        if np.shape(x) != (here,):
             raise ValueError(f"valuation {name!r} has shape {np.shape(x)}; expected "
-                             f"({num_states},), a value for each state.")
-    parts = _canonical(row_start, entry_start, successor, probability, rewards)
+                             f"({here},), a value for each state.")
+    parts = _canonical(row_start, entry_start, successor, probability, rewards, first)
     start, successor, probability, rewards = parts
     return SparseMDP(
         row_start=row_start.astype(np.int32), entry_start=start, successor=successor,
-        probability=scaled(row_start, start, probability),
-        initial=checked_initial(initial, num_states), label=label, rewards=rewards,
+        probability=scaled(row_start, start, probability, first=first),
+        initial=np.zeros(here), label=label, rewards=rewards,
         action=action, valuation={n: np.asarray(x) for n, x in (valuation or {}).items()},
         propositions=names, action_names=action_names)
 
@@ -365,13 +392,12 @@ def check_entries(
 
 
 def _checked_rewards(
-    name: str, reward: Rewards, num_states: int, num_rows: int, num_transitions: int
+    name: str, reward: Rewards, sizes: tuple[int, int, int], begins: tuple[int, int, int]
 ) -> Rewards:
     if not isinstance(reward, Rewards):
         raise ValueError(f"reward {name!r} is {shown(reward)}; give Rewards.")
     parts: dict[str, Any] = {}
-    sizes = {"state": num_states, "choice": num_rows, "transition": num_transitions}
-    for part, size in sizes.items():
+    for part, size, first in zip(("state", "choice", "transition"), sizes, begins, strict=True):
         given = getattr(reward, part)
         if given is None:
             continue
@@ -380,7 +406,7 @@ def _checked_rewards(
             raise ValueError(f"reward {name!r} has shape {given.shape} on its {part} part; "
                              f"expected ({size},).")
         if np.isnan(given).any():
-            place = f"{part} {np.flatnonzero(np.isnan(given))[0]}"
+            place = f"{part} {first + np.flatnonzero(np.isnan(given))[0]}"
             raise ValueError(f"reward {name!r} is NaN at {place}; give a number.")
         parts[part] = given
     return Rewards(**parts)
@@ -399,9 +425,9 @@ def _checked_action(action: Any, num_rows: int, names: tuple[str, ...]) -> np.nd
 
 def _canonical(
     row_start: np.ndarray, entry_start: np.ndarray, successor: np.ndarray,
-    probability: np.ndarray, rewards: dict[str, Rewards],
+    probability: np.ndarray, rewards: dict[str, Rewards], state: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Rewards]]:
-    """Entries in ascending order, without repetitions and zeros."""
+    """Entries in ascending order, without repetitions and zeros; `state` is the first's number."""
     index: Any = np.int32 if successor.size < 2**31 else np.int64
     first = np.zeros(successor.size + 1, bool)
     first[entry_start] = True
@@ -427,7 +453,7 @@ def _canonical(
         found[name] = reward
     count = np.bincount(row[start], minlength=entry_start.size - 1)
     if (count == 0).any():
-        place = placed(row_start, int(np.flatnonzero(count == 0)[0]))
+        place = placed(row_start, int(np.flatnonzero(count == 0)[0]), state)
         raise ValueError(f"{place}: the probabilities sum to 0, not 1; correct the row.")
     starts = np.concatenate([[0], count.cumsum()]).astype(index)
     return starts, target[start].astype(np.int32), merged, found

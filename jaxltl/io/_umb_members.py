@@ -1,0 +1,201 @@
+"""What the members of a UMB file say of a model, or of a range of its states."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.models.sparse import Rewards
+from jaxltl.io._umb_index import ACTIONS, OTHER_LABELS, PARTS, Index, parse_index
+from jaxltl.io._umb_tar import Stream, members
+from jaxltl.io._umb_values import (
+    Bytes,
+    read_bits,
+    read_ends,
+    read_numbers,
+    read_points,
+    read_starts,
+    read_texts,
+)
+
+_LARGEST_INDEX = 2**26  # bytes
+
+
+def read_index(stream: Stream) -> Index:
+    """The index of an archive, from a stream at its beginning.
+
+    Raises:
+      ValueError: there is none, or as of :func:`~jaxltl.io._umb_index.parse_index`.
+    """
+    for member, size in members(stream):
+        if member == "index.json":
+            if size > _LARGEST_INDEX:
+                raise ValueError(
+                    f"{stream.place}index.json has {size} bytes; at most {_LARGEST_INDEX} are read."
+                )
+            content = bytearray(size)
+            stream.fill(content, member)
+            return parse_index(bytes(content), f"{stream.place}index.json: ")
+    raise ValueError(f"{stream.place}the archive has no index.json; it is no UMB file.")
+
+
+def known_members(stream: Stream, index: Index) -> Iterator[tuple[str, int]]:
+    """The members that the index tells of, and their sizes, which follow from it.
+
+    Raises:
+      ValueError: one has another size, or there are two of them.
+    """
+    bounds, seen = index.bounds(), set()
+    for member, size in members(stream):
+        if member in seen:
+            raise ValueError(f"{stream.place}two members are named {member!r}.")
+        if member not in bounds:
+            continue
+        least, most = bounds[member]
+        if not least <= size <= most:
+            wanted = f"{most}" if least == most else f"{least} to {most}"
+            raise ValueError(
+                f"{stream.place}{member} has {size} bytes; expected {wanted}, by the counts "
+                "and types of index.json."
+            )
+        seen.add(member)
+        yield member, size
+
+
+def check_memory(size: int, place: str) -> None:
+    """Raises a ValueError if twice so many bytes are more than the memory."""
+    try:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):  # another system
+        return
+    if 2 * size > memory:
+        raise ValueError(
+            f"{place}index.json tells of a model of {size / 2**30:.3g} GB, which "
+            f"takes twice that; there are {memory / 2**30:.3g} GB."
+        )
+
+
+def needed(found: dict[str, Bytes], member: str, place: str) -> Bytes:
+    """What a member holds, which must be there."""
+    if member not in found:
+        raise ValueError(f"{place}{member} is missing.")
+    return found[member]
+
+
+def starts_of(
+    found: dict[str, Bytes], member: str, count: int, total: int, place: str
+) -> NDArray[np.int64]:
+    """Where the spans of a member start; without it, each has one."""
+    if member in found:
+        return read_starts(found.pop(member), total, f"{place}{member}: ")
+    if count != total:
+        raise ValueError(
+            f"{place}{member} is missing, so that {count} are mapped to {total} one "
+            "to one; expected the member, or equal counts."
+        )
+    return np.arange(count + 1)
+
+
+def check_chain(row_start: NDArray[np.int64], place: str, *, first: int = 0) -> None:
+    """Raises a ValueError unless each state, of which `first` is the first, has one choice."""
+    count = np.diff(row_start)
+    if (count != 1).any():
+        state = int(np.flatnonzero(count != 1)[0])
+        raise ValueError(
+            f"{place}state-to-choices.bin: state {first + state} has {count[state]} choices; "
+            "expected one, as #players is 0."
+        )
+
+
+def labels_of(
+    found: dict[str, Bytes], index: Index, place: str
+) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
+    """Where each label holds, ``bool[S, P]``, and their names."""
+    ours = {x.id: x for x in index.annotations if x.group == OTHER_LABELS}
+    others = iter([x for x in index.annotations if x.group == "aps"])
+    all_of = []
+    for i in range(len(index.annotations)):  # the ids of ours are their places
+        one = ours.pop(str(i), None) or next(others, None)
+        if one is not None:
+            all_of.append(one)
+    all_of += ours.values()
+    label = np.zeros((index.states, len(all_of)), bool)
+    for i, one in enumerate(all_of):
+        label[:, i] = read_bits(needed(found, one.member("states"), place), index.states)
+    return label, tuple(one.name for one in all_of)
+
+
+def rewards_of(found: dict[str, Bytes], index: Index, place: str) -> dict[str, Rewards]:
+    """The rewards by their names."""
+    rewards, begins = {}, dict(zip(PARTS, index.begins, strict=True))
+    for one in index.annotations:
+        if one.group == "rewards":
+            parts = {
+                PARTS[part]: read_points(
+                    found.pop(one.member(part)),
+                    one.type,
+                    f"{place}{one.member(part)}: ",
+                    first=begins[part],
+                )
+                for part in one.applies_to
+                if one.member(part) in found
+            }
+            rewards[one.name] = Rewards(**parts)
+    return rewards
+
+
+def actions_of(found: dict[str, Bytes], index: Index, place: str) -> dict[str, Any]:
+    """The number of each choice's action, and the names."""
+    member = f"{ACTIONS}/values.bin"
+    action = np.zeros(index.choices, np.int32)
+    if member in found:
+        action = found.pop(member).view("<u4")
+        if action.size and action.max() >= index.actions:
+            raise ValueError(
+                f"{place}{member}: a choice has the action {action.max()}; expected 0 "
+                f"to {index.actions - 1}."
+            )
+    return {"action": action, "action_names": texts_of(found, ACTIONS, place)}
+
+
+def texts_of(found: dict[str, Bytes], folder: str, place: str) -> tuple[str, ...]:
+    """The texts of a folder by their numbers; none if it has none."""
+    mapping, strings = f"{folder}/string-mapping.bin", f"{folder}/strings.bin"
+    if mapping not in found:
+        return ()
+    content = needed(found, strings, place)
+    start = read_starts(found[mapping], content.size, f"{place}{mapping}: ")
+    return read_texts(start, content, f"{place}{strings}: ")
+
+
+def probability_of(
+    found: dict[str, Bytes], index: Index, entry_start: NDArray[np.int64], place: str
+) -> NDArray[np.float64]:
+    """The probability of each branch, or lower and upper ends ``[T, 2]``."""
+    member, kind = "branch-to-probability.bin", index.probability
+    if kind is not None and kind.end is not None and index.players > 1:
+        raise ValueError(
+            f"{place}the probabilities of this game are intervals; chains and decision processes "
+            "are read with them."
+        )
+    if kind is not None and member in found:
+        read = read_numbers if kind.end is None else read_ends
+        return read(found.pop(member), kind, f"{place}{member}: ")
+    several = np.flatnonzero(np.diff(entry_start) > 1)
+    if several.size:
+        count = int(np.diff(entry_start)[several[0]])
+        raise ValueError(
+            f"{place}{member} is missing, and choice {index.begins[1] + several[0]} has {count} "
+            "branches; without probabilities each choice may have one."
+        )
+    return np.ones(index.branches if kind is None or kind.end is None else (index.branches, 2))
+
+
+def uniform(initial: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+    """The distribution over some states that a reader takes; None if these are all or none."""
+    count = int(initial.sum())
+    return None if count in (0, initial.size) else initial / count

@@ -1,0 +1,370 @@
+"""UMB files onto the devices of a mesh, read by ranges of states.
+
+A process reads what the file says of the states of its own devices. Which choices a range of states
+has, and which branches these have, the file says in members of their own, so that a compressed
+archive is gone through again where it holds them in another order; of a plain one, nothing but the
+ranges is read.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax.sharding import Mesh
+from numpy.typing import NDArray
+
+from jaxltl.core.models.mdp import refuse_negative
+from jaxltl.core.models.padded import action_of
+from jaxltl.core.models.shard import ModelPart, model_from_parts, ranges_of
+from jaxltl.core.models.sharded import ShardedMDP
+from jaxltl.core.models.sparse import row_reward, sparse_part
+from jaxltl.io._files import FileBytes, compression_of, opened, pieces
+from jaxltl.io._umb_index import ACTIONS, INITIAL, Index, Items
+from jaxltl.io._umb_members import (
+    actions_of,
+    check_chain,
+    check_memory,
+    known_members,
+    labels_of,
+    needed,
+    probability_of,
+    read_index,
+    rewards_of,
+    starts_of,
+)
+from jaxltl.io._umb_tar import Stream
+from jaxltl.io._umb_values import Bytes, count_bits, read_bits, read_starts, write_bits
+
+_UNLIMITED = 2**62  # bytes that an archive may hold: little of it is held at a time
+_ROWS, _ENTRIES, _IS_INITIAL = (
+    "state-to-choices.bin",
+    "choice-to-branches.bin",
+    "state-is-initial.bin",
+)
+_EXACT = f"annotations/{INITIAL}/probability/states/values.bin"
+_WHOLE = (_IS_INITIAL, f"{ACTIONS}/string-mapping.bin", f"{ACTIONS}/strings.bin")
+_AHEAD = {"states": (_ROWS, "choices"), "choices": (_ENTRIES, "branches")}
+_Span = tuple[int, int]
+
+
+def read_sharded(
+    path: str | os.PathLike[str], mesh: Mesh, *, axis: str | None = None
+) -> ShardedMDP:
+    """The model of a UMB file on the devices of a mesh, each process reading its own states.
+
+    The same as ``shard(read_model(path), mesh)``, except that the initial distribution may differ
+    in its last bit, of a model that need not fit into one process. Of a plain archive each process
+    reads its ranges alone. One that is compressed it goes through as a whole, once if the members
+    stand in the order in which :func:`~jaxltl.io.model_files.write_model` writes them, and keeps
+    its ranges. Rewards become expected rewards of choices; variables of states and the names of
+    actions are left out.
+
+    Args:
+      path: the file, of a chain or a decision process; plain, or compressed by gzip or xz.
+      mesh, axis: as for :func:`~jaxltl.core.models.shard.shard`.
+
+    Returns:
+      :class:`~jaxltl.core.models.sharded.ShardedMDP`.
+
+    Raises:
+      ValueError: as of :func:`~jaxltl.core.models.shard.shard` for the mesh, and as of
+        :func:`~jaxltl.io.model_files.read_model` for the file, as far as this process reads it; or
+        it holds a game or probabilities that are intervals.
+
+    Example:
+      >>> import tempfile, jax
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl.io.umb import write_umb
+      >>> path = tempfile.mkdtemp() + "/coin.umb"
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> write_umb(path, coin, compression=None)
+      >>> read_sharded(path, jax.make_mesh((1,), ("states",))).num_given
+      3
+    """
+    name = str(path)
+    place = f"{name!r}: "
+    with opened(path) as data:
+        archive = _Archive(data, name, place)
+        index = read_index(archive.stream())
+        _check_kind(index, place)
+        ranges = ranges_of(index.states, mesh, axis)
+        _check_memory(index, ranges, place)
+        try:
+            parts: dict[_Span, ModelPart] = {}
+            # Of a plain archive the ranges are read one by one; a compressed one is read for all.
+            groups = [[x] for x in ranges] if archive.is_plain else [ranges]
+            names: tuple[str, ...] = ()
+            for group in groups:
+                for span, part, names in _parts(archive, index, group):  # noqa: B007
+                    parts[span] = part
+        except MemoryError:
+            raise ValueError(f"{place}the model does not fit into the memory.") from None
+    try:
+        return model_from_parts(
+            lambda start, stop: parts.pop((start, stop)),
+            index.states,
+            mesh,
+            axis=axis,
+            propositions=names,
+        )
+    except ValueError as error:
+        raise ValueError(f"{place}{error}") from None
+
+
+def _check_kind(index: Index, place: str) -> None:
+    """Raises a ValueError, by name, of what no mesh takes."""
+    what = None
+    if index.players > 1:
+        what = f"the model is a game of {index.players} players"
+    elif index.probability is not None and index.probability.end is not None:
+        what = "the probabilities are intervals"
+    if what is not None:
+        raise ValueError(
+            f"{place}{what}; onto a mesh go chains and decision processes whose probabilities are "
+            "numbers. Read it by read_model."
+        )
+
+
+def _check_memory(index: Index, ranges: list[_Span], place: str) -> None:
+    size = sum(x.size(index.counts[x.part]) for x in index.items().values())
+    here = sum(stop - start for start, stop in ranges)
+    check_memory(size * here // index.states, place)
+
+
+class _Archive(NamedTuple):
+    """An archive that can be gone through again and again."""
+
+    data: FileBytes
+    name: str
+    place: str
+
+    @property
+    def is_plain(self) -> bool:
+        return compression_of(self.data) is None
+
+    def stream(self) -> Stream:
+        if self.is_plain:
+            return Stream(self.data, self.place)
+        return Stream(pieces(self.data, self.name, _UNLIMITED), self.place)
+
+    def whole(self, index: Index, wanted: str) -> Bytes:
+        """All of a member that is there."""
+        stream = self.stream()
+        for member, size in known_members(stream, index):
+            if member == wanted:
+                return _taken(stream, member, [(0, size)]).arrays[0]
+        raise AssertionError(wanted)
+
+
+class _Runs(NamedTuple):
+    """Some runs of a member's bytes, in order."""
+
+    spans: list[_Span]
+    arrays: list[Bytes]
+
+    def of(self, span: _Span) -> Bytes:
+        """The bytes of a span within one of the runs."""
+        begin, end = span
+        if begin == end:
+            return np.empty(0, np.uint8)
+        i = next(i for i, (a, b) in enumerate(self.spans) if a <= begin and end <= b)
+        return self.arrays[i][begin - self.spans[i][0] : end - self.spans[i][0]]
+
+
+def _taken(stream: Stream, member: str, spans: Sequence[_Span]) -> _Runs:
+    """Some bytes of the member at which a stream stands; spans that touch become one."""
+    runs: list[_Span] = []
+    for begin, end in sorted(x for x in spans if x[0] < x[1]):
+        if runs and begin <= runs[-1][1]:
+            runs[-1] = runs[-1][0], max(end, runs[-1][1])
+        else:
+            runs.append((begin, end))
+    arrays, at = [], 0
+    for begin, end in runs:
+        stream.skip(begin - at, repr(member))
+        array = np.empty(end - begin, np.uint8)
+        stream.fill(array, member if begin == 0 else f"{member} from byte {begin}")
+        arrays.append(array)
+        at = end
+    return _Runs(runs, arrays)
+
+
+# --- what is read ---------------------------------------------------------------------------
+
+
+class _Held(NamedTuple):
+    """What was read of some ranges of states.
+
+    Attributes:
+      spans: the ranges of states, of their choices and of their branches.
+      starts: where the choices of each range's states begin, and the branches of their choices.
+      found: the bytes of members.
+    """
+
+    spans: dict[str, list[_Span]]
+    starts: dict[str, list[NDArray[np.int64]]]
+    found: dict[str, _Runs]
+
+
+def _read(archive: _Archive, index: Index, ranges: list[_Span]) -> _Held:
+    """All that is told of some ranges, as soon as it is known which choices and branches they have.
+
+    Where there are as many choices as states, each must have one, and so for branches; what is
+    read elsewhere in hope of that is read again if it is not so, and found to be wrong.
+    """
+    items, held = index.items(), _Held({"states": ranges}, {}, {})
+    _presume(index, held)
+    goes_on = True
+    while goes_on or "branches" not in held.spans:
+        goes_on, known = False, set(held.spans)
+        stream = archive.stream()
+        for member, size in known_members(stream, index):
+            if member in held.found:
+                continue
+            if member in _WHOLE:
+                held.found[member] = _taken(stream, member, [(0, size)])
+            elif member in items and items[member].part not in held.spans:
+                goes_on = True
+            elif member in items:
+                wanted = [items[member].span(*x) for x in held.spans[items[member].part]]
+                if items[member].more:
+                    wanted += [(0, 8), (size - 8, size)]
+                held.found[member] = _taken(stream, member, wanted)
+                if items[member].more:
+                    goes_on |= _lead_on(archive, index, held, items, member)
+        for part, (member, ahead) in _AHEAD.items():
+            if part in known and member not in held.found:  # it was not there, so it is not needed
+                starts_of({}, member, index.counts[part], index.counts[ahead], archive.place)
+    return held
+
+
+def _presume(index: Index, held: _Held) -> None:
+    for part, (_, ahead) in _AHEAD.items():
+        if part in held.spans and index.counts[part] == index.counts[ahead]:
+            held.spans.setdefault(ahead, held.spans[part])
+
+
+def _lead_on(
+    archive: _Archive, index: Index, held: _Held, items: dict[str, Items], member: str
+) -> bool:
+    """Notes which choices or branches some ranges have; whether something was taken in vain."""
+    part = items[member].part
+    ahead, total = _AHEAD[part][1], index.counts[_AHEAD[part][1]]
+    runs, size = held.found[member], items[member].size(index.counts[part])
+    ends = [int(runs.of(x).view("<u8")[0]) for x in ((0, 8), (size - 8, size))]
+    starts = [runs.of(items[member].span(*x)).view("<u8") for x in held.spans[part]]
+    rises = all((x[1:] >= x[:-1]).all() and x[-1] <= total for x in starts)
+    if ends != [0, total] or not rises:  # to be told where, all of it is read
+        read_starts(archive.whole(index, member), total, f"{archive.place}{member}: ")
+    held.starts[part] = [x.view("<i8").astype(np.int64, copy=False) for x in starts]
+    spans = [(int(x[0]), int(x[-1])) for x in starts]
+    in_vain = held.spans.get(ahead, spans) != spans
+    held.spans[ahead] = spans
+    if in_vain:
+        later = ("choices", "branches")[("choices", "branches").index(ahead) :]
+        for other in [x for x in held.found if x in items and items[x].part in later]:
+            del held.found[other]
+        if ahead == "choices":
+            held.spans.pop("branches", None)
+    _presume(index, held)
+    return in_vain
+
+
+# --- what follows from it -------------------------------------------------------------------
+
+
+def _parts(
+    archive: _Archive, index: Index, ranges: list[_Span]
+) -> Iterator[tuple[_Span, ModelPart, tuple[str, ...]]]:
+    """The parts of a model for some ranges of states, and the names of labels."""
+    place = archive.place
+    held, items = _read(archive, index, ranges), index.items()
+    whole = {x: held.found[x].arrays[0] for x in _WHOLE if x in held.found and x != _IS_INITIAL}
+    some = _some_initial(held, index)
+    for i, span in enumerate(ranges):
+        spans = {part: x[i] for part, x in held.spans.items()}
+        here = index.of(*(spans[part] for part in index.counts))
+        found = {
+            member: _of_range(runs, items[member], spans[items[member].part])
+            for member, runs in held.found.items()
+            if member in items and not items[member].more
+        }
+        starts = [
+            held.starts[part][i] - spans[ahead][0]
+            if part in held.starts
+            else np.arange(spans[part][1] - spans[part][0] + 1)
+            for part, (_, ahead) in _AHEAD.items()
+        ]
+        part, names = _part(found | whole, here, starts, index.states, some, place)
+        yield span, part, names
+
+
+def _of_range(runs: _Runs, item: Items, span: _Span) -> Bytes:
+    content = runs.of(item.span(*span))
+    if item.bits > 1 or span[0] % 8 == 0:
+        return content
+    first = span[0] % 8
+    return write_bits(read_bits(content, first + span[1] - span[0])[first:])
+
+
+def _some_initial(held: _Held, index: Index) -> int:
+    """How many states are initial; 0 if all are alike."""
+    if _IS_INITIAL not in held.found:
+        return 0
+    count = count_bits(held.found[_IS_INITIAL].arrays[0], index.states)
+    return 0 if count == index.states else count
+
+
+def _part(
+    found: dict[str, Bytes],
+    index: Index,
+    starts: list[NDArray[np.int64]],
+    num_states: int,
+    some: int,
+    place: str,
+) -> tuple[ModelPart, tuple[str, ...]]:
+    """A part from the members of its range, and the names of labels."""
+    row_start, entry_start = starts
+    target = needed(found, "branch-to-target.bin", place).view("<u8")
+    if index.players == 0:
+        check_chain(row_start, place, first=index.begins[0])
+    label, names = labels_of(found, index, place)
+    options: dict[str, Any] = {"rewards": rewards_of(found, index, place)}
+    if index.actions:
+        options |= actions_of(found, index, place)
+    probability = probability_of(found, index, entry_start, place)
+    initial = np.full(index.states, 1 / num_states)
+    if _EXACT in found:
+        initial = found[_EXACT].view("<f8").astype(np.float64, copy=False)
+    elif some:
+        initial = read_bits(found[_IS_INITIAL], index.states) / some
+    try:
+        model = sparse_part(
+            row_start,
+            entry_start,
+            target,
+            probability,
+            label=label,
+            propositions=names,
+            begins=index.begins,
+            num_states=num_states,
+            **options,
+        )
+        refuse_negative(initial, first=index.begins[0])
+    except ValueError as error:
+        raise ValueError(f"{place}{error}") from None
+    part = ModelPart(
+        row_start=model.row_start,
+        entry_start=model.entry_start,
+        successor=model.successor,
+        probability=model.probability,
+        action=action_of(model),
+        initial=initial,
+        label=label,
+        rewards={name: row_reward(model, name) for name in model.rewards},
+        row=np.arange(index.choices) + index.begins[1],
+    )
+    return part, names
