@@ -54,7 +54,7 @@ _MOST_INNER = 20_000  # applications of P for one
 _REFINEMENTS = 16  # systems for a derivative
 _SWEEPS = 128  # under the greedy policy, where it cannot be solved
 _ATTEMPTS = 8  # shares e that are tried
-_ROUNDINGS = 8  # of a backup, that the smallest e is
+_ROUNDINGS = 3  # of a backup, that the smallest e is
 _REST = 400  # steps of policy iteration that may pass without the error being halved
 _SAME = 80  # of these that one counts for in which the policy stays as it was
 _LARGEST = 0.1  # share e
@@ -202,8 +202,14 @@ def _of_policy(graph: TracedGraph, reward: jax.Array, target: jax.Array, policy:
 
 def _earning(graph: TracedGraph, reward: jax.Array, target: jax.Array, taken: Any) -> jax.Array:
     """From where something may be earned before the target."""
-    some = graph.first(taken & (reward > 0))[0] & ~target
+    some = graph.first(taken & _positive(reward))[0] & ~target
     return attract(graph, some, taken, among=~target).region & ~target
+
+
+def _positive(reward: jax.Array) -> jax.Array:
+    """Whether it is more than 0, also where it is so small that arithmetic takes it for 0."""
+    kind = jnp.int64 if reward.dtype.itemsize == 8 else jnp.int32
+    return lax.bitcast_convert_type(reward, kind) > 0
 
 
 def _largest(graph: TracedGraph, reward: jax.Array, target: jax.Array) -> _Problem:
@@ -223,7 +229,7 @@ def _smallest(graph: TracedGraph, reward: jax.Array, target: jax.Array) -> _Prob
     finite = sure.region
     allowed = graph.available & graph.forall(finite) & graph.on_choices(finite & ~target)
     # What can surely be done for nothing is worth nothing.
-    free = allowed & (reward == 0)
+    free = allowed & ~_positive(reward)
     nothing = surely(graph, target, free)
     open_ = finite & ~nothing.region
     circles = components_within(graph, open_, free)
