@@ -1,10 +1,11 @@
 """A run of several processes that saves its way: started, killed, and what became of it.
 
 As a program: ``several.py WHAT DIRECTORY COORDINATOR PROCESS PROCESSES``; what to do is to learn
-or to solve.
+to solve, or what solvers are held to.
 """
 
 import contextlib
+import json
 import os
 import signal
 import socket
@@ -79,7 +80,7 @@ def main(what: str, directory: Path, coordinator: str, process: int, processes: 
 
     asked = Asked(0, coordinator, process, processes, wait=15)
     with taking_part(asked, launched(asked, {}), print) as place:
-        {"learn": run, "solve": solve}[what](directory, place)
+        {"learn": run, "solve": solve, "laws": laws}[what](directory, place)
 
 
 def problem_and_state() -> tuple[Any, Any, Any]:
@@ -164,6 +165,38 @@ def solve(directory: Path, place: Any) -> None:
         print(f"saved: {len(made)}")
         print(f"ended: {found.answer.lower.tobytes().hex()}, {found.answer.upper.tobytes().hex()}, "
               f"{found.answer.status.name}, {found.answer.value[0]!r}")
+
+
+def laws(directory: Path, place: Any) -> None:
+    """What solvers find over the devices of all processes, as lines of JSON."""
+    import jax
+
+    from jaxltl.core.logic.properties import parse_property
+    from jaxltl.core.models.lanes import on_host
+    from jaxltl.core.models.shard import from_mesh, shard
+    from jaxltl.core.values.answer_on_mesh import first_bounds, question_on_mesh
+    from jaxltl.core.values.discounted import optimal_value
+    from jaxltl.core.values.soft import soft_value
+    from tests.core.values.test_answer_on_mesh import PROPERTIES, gambler
+
+    with jax.enable_x64(True):
+        model = shard(gambler(), place.mesh)
+        for text in PROPERTIES:
+            question = question_on_mesh(model, parse_property(text))
+            found = question.advance(
+                first_bounds(model, question), question.tolerance(1e-6), 10_000)
+            there = question.answer(found, 1e-6)
+            told = {"property": text, "lower": there.lower.tolist(),
+                    "upper": there.upper.tolist(), "holds": there.holds,
+                    "status": there.status.name}
+            if place.is_first:
+                print(json.dumps(told), flush=True)
+        for name, solve in (("optimal", optimal_value), ("soft", soft_value)):
+            found = jax.jit(lambda x, solve=solve: solve(x, x.rewards["games"], 0.9))(model)
+            told = {"property": name, "value": from_mesh(model, found.value).tolist(),
+                    "status": int(on_host(found.status))}
+            if place.is_first:
+                print(json.dumps(told), flush=True)
 
 
 if __name__ == "__main__":

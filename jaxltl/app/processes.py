@@ -19,7 +19,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -252,9 +252,7 @@ def taking_part(
     _read_apart(launch)
     try:
         _join(launch, asked.wait)
-        place = Place(launch.process, launch.processes)
-        mesh = place.together(lambda: _mesh(asked, launch))
-        place = replace(place, mesh=mesh)
+        place = Place(launch.process, launch.processes, _same_mesh(asked, launch))
         say(f"on {_devices_of(place)} of {launch.processes} processes")
         yield place
     except Exception as error:
@@ -283,6 +281,16 @@ def _choose_devices(asked: Asked, launch: Launch) -> None:
             jax.config.update("jax_num_cpu_devices", asked.mesh // launch.processes)
 
 
+def _same_mesh(asked: Asked, launch: Launch) -> Mesh:
+    """Of all processes, of which each sees the same devices, so that a mistake is told once."""
+    try:
+        return _mesh(asked, launch)
+    except ValueError:
+        if launch.process:
+            raise SystemExit(2) from None
+        raise
+
+
 def _mesh(asked: Asked, launch: Launch) -> Mesh:
     """The devices, as many of each process, on one axis."""
     import jax
@@ -291,15 +299,18 @@ def _mesh(asked: Asked, launch: Launch) -> Mesh:
 
     assert asked.mesh is not None
     each = [[d for d in jax.devices() if d.process_index == p] for p in range(launch.processes)]
-    per = asked.mesh // launch.processes if asked.mesh else min(map(len, each))
-    short = next((p for p, x in enumerate(each) if len(x) < per), None)
-    if short is not None:
-        takes, has = "", "there are"
-        if launch.processes > 1:
-            takes, has = f" takes {per} devices of each process", f"process {short} has"
+    number = len(each[0])
+    other = next((p for p, x in enumerate(each) if len(x) != number), None)
+    if other is not None:
+        raise ValueError(f"process {other} has another number of devices, {len(each[other])}, than "
+                         f"process 0, {number}; give all processes as many.")
+    per = asked.mesh // launch.processes if asked.mesh else number
+    if number < per:
+        several = launch.processes > 1
+        takes = f" takes {per} devices of each process" if several else ""
         raise ValueError(
-            f"--mesh {asked.mesh}{takes}: {has} {len(each[short])} ({jax.default_backend()}); give "
-            "fewer, or --mesh alone for all.")
+            f"--mesh {asked.mesh}{takes}: {'each has' if several else 'there are'} {number} "
+            f"({jax.default_backend()}); give fewer, or --mesh alone for all.")
     return Mesh(np.array([d for x in each for d in x[:per]]), ("devices",))
 
 

@@ -1,5 +1,6 @@
 """Several processes: who they are, what they agree on, and how a run ends and goes on."""
 
+import json
 import os
 import random
 import signal
@@ -12,7 +13,11 @@ import pytest
 from jaxltl.algos import checkpoint
 from jaxltl.app._teller import told
 from jaxltl.app.processes import Asked, Launch, Place, launched
+from jaxltl.core.values.answer import answer
+from jaxltl.core.values.discounted import optimal_value
+from jaxltl.core.values.soft import soft_value
 from tests import several
+from tests.core.values.test_answer_on_mesh import PROPERTIES, gambler
 
 SLURM = {"SLURM_NTASKS": "3", "SLURM_PROCID": "2", "SLURM_JOB_ID": "5",
          "SLURM_STEP_NODELIST": "n[1-3]", "SLURM_LOCALID": "0"}
@@ -180,6 +185,24 @@ def test_a_run_goes_on_when_a_process_has_died(tmp_path):
     assert expected["went on"] == "False" and lines(alone)["ended"] == expected["ended"]
     checkpoint.remove(tmp_path / "run.npz")
     assert list(tmp_path.iterdir()) == [whole]
+
+
+@pytest.mark.exhaustive
+def test_solvers_in_two_processes_find_what_the_host_finds(tmp_path):
+    first, second = at_once(tmp_path, 2, "laws")
+    assert first.status == second.status == 0 and not second.out, (first, second)
+    told = [json.loads(line) for line in first.out.splitlines() if line.startswith("{")]
+    model = gambler()
+    for there, text in zip(told, PROPERTIES, strict=False):
+        here = answer(model, text)
+        assert there["property"] == text and there["status"] == here.status.name
+        assert there["holds"] == here.holds
+        assert (np.array(there["lower"]) <= here.upper).all()
+        assert (np.array(there["upper"]) >= here.lower).all()
+    for there, solve in zip(told[len(PROPERTIES):], (optimal_value, soft_value), strict=True):
+        here = solve(model, "games", 0.9)
+        assert there["status"] == int(here.status)
+        np.testing.assert_allclose(there["value"], here.value, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.exhaustive

@@ -12,6 +12,9 @@ from jaxltl.core.values.answer import answer
 from jaxltl.core.values.answer_on_mesh import first_bounds, question_on_mesh
 
 S = 13
+PROPERTIES = (
+    'Pmax=? [ F "win" ]', 'Pmin=? [ !"mid" U "win" ]', 'Pmax=? [ G !"lose" ]',
+    'R{"games"}max=? [ F "over" ]', 'Tmin=? [ F "over" ]', 'P>=0.2 [ F "win" ]')
 
 
 def gambler():
@@ -51,9 +54,7 @@ def asked(sharded, text, steps=1000):
         bounds, times = (found.lower, found.upper), times + 1
 
 
-@pytest.mark.parametrize("text", [
-    'Pmax=? [ F "win" ]', 'Pmin=? [ !"mid" U "win" ]', 'Pmax=? [ G !"lose" ]',
-    'R{"games"}max=? [ F "over" ]', 'Tmin=? [ F "over" ]', 'P>=0.2 [ F "win" ]'])
+@pytest.mark.parametrize("text", PROPERTIES)
 def test_the_answers_are_those_of_the_host(model, sharded, text):
     there, _ = asked(sharded, text)
     here = answer(model, text)
