@@ -453,19 +453,20 @@ def solve(
     written = contextlib.nullcontext() if strategy is None else atomic_write(strategy)
     double = contextlib.nullcontext if asked.mesh is None else _float64
     with written as file, several.taking_part(asked, launch, say) as place, double():
-        begin = time.perf_counter()
-        model = place.together(lambda: solving.load(model_file))
-        entry = solving.model_entry(model, time.perf_counter() - begin)
-        if place.is_first:
-            click.echo("{kind} of {states} states, {choices} choices, {transitions} transitions, "
-                       "read in {seconds:.3f} s".format(**entry))
         if place.mesh is None:
+            begin = time.perf_counter()
+            model = solving.load(model_file)
+            entry = solving.model_entry(model, time.perf_counter() - begin)
             found = solving.solve(model, questions, tolerance)
         else:
             from jaxltl.app import solve_on_mesh
 
+            spread, known, entry = solve_on_mesh.read(model_file, questions, place)
             found = solve_on_mesh.solve_in(
-                place, model, questions, tolerance, checkpoint, list(properties))
+                place, spread, known, questions, tolerance, checkpoint, list(properties))
+        if place.is_first:
+            click.echo("{kind} of {states} states, {choices} choices, {transitions} transitions, "
+                       "read in {seconds:.3f} s".format(**entry))
         results = []
         for result in found:
             results.append(result)

@@ -159,7 +159,8 @@ def solve(directory: Path, place: Any) -> None:
     text = 'Pmax=? [ F "win" ]'
     with jax.enable_x64(True):
         (found,) = solve_on_mesh.solve_in(
-            place, walk(), asked_for([text]), 1e-6, directory, [text])
+            place, solve_on_mesh.on_mesh(walk(), place), {}, asked_for([text]), 1e-6, directory,
+            [text])
     if place.is_first:
         print(f"went on: {bool(made) and made[0] > 16}")
         print(f"saved: {len(made)}")

@@ -18,9 +18,11 @@ import jaxltl
 from jaxltl.algos import checkpoint as files
 from jaxltl.app.processes import Place, is_loss
 from jaxltl.app.run_job import make_directory
-from jaxltl.app.solve import MISTAKEN, NOT_CONVERGED, Asked, Result
+from jaxltl.app.solve import MISTAKEN, NOT_CONVERGED, Asked, Result, load
+from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.lanes import on_host
 from jaxltl.core.models.shard import shard, to_mesh
 from jaxltl.core.models.sharded import ShardedMDP
 from jaxltl.core.models.sparse import SparseMDP
@@ -28,6 +30,7 @@ from jaxltl.core.models.state_formulas import BUILT_IN, label_columns
 from jaxltl.core.types import NotConverged
 from jaxltl.core.values.answer import FINER, Answer
 from jaxltl.core.values.answer_on_mesh import Bounds, Question, first_bounds, question_on_mesh
+from jaxltl.io.umb_sharded import read_sharded
 
 _WORK = 1e9  # transitions that are gone over before bounds are saved
 _ROUND = 24  # sweeps in a step of interval iteration, about
@@ -50,16 +53,60 @@ def on_mesh(model: SparseMDP | IntervalMDP, place: Place) -> ShardedMDP:
     return shard(whole, place.mesh)
 
 
-def solve_in(
-    place: Place, model: SparseMDP | IntervalMDP, asked: Sequence[Asked], tolerance: float,
-    directory: Path | None, properties: list[str],
-) -> Iterator[Result]:
-    """The result of each property of a model that every process has read.
+def read(
+    path: Path, asked: Sequence[Asked], place: Place
+) -> tuple[ShardedMDP, dict[str, str], dict[str, Any]]:
+    """A model file over the devices: of a UMB file each process reads what its own ones hold.
+
+    Where a property mentions labels that no file has, each reads all of it.
+
+    Returns:
+      The model, what tells it apart from others, and its part of the JSON object.
 
     Raises:
-      ValueError: the processes were not asked the same, or the directory is not one of all.
+      ValueError: it is no chain or decision process, or cannot be spread.
     """
-    given = files.fingerprint(model=model)
+    begin, mesh = time.perf_counter(), place.mesh
+    assert mesh is not None
+    formulas = [one.parsed.path for one in asked if one.parsed is not None]
+    named = {name for x in formulas if isinstance(x, Formula) for name in x.propositions}
+    if path.suffix == ".umb" and not named & set(BUILT_IN):
+        model = place.together(lambda: read_sharded(path, mesh))
+        given = {"file": place.together(lambda: _digest(path))}
+    else:
+        whole = place.together(lambda: load(path))
+        model = place.together(lambda: on_mesh(whole, place))
+        given = files.fingerprint(model=whole)
+    return model, given, _entry(model, time.perf_counter() - begin)
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _entry(model: ShardedMDP, seconds: float) -> dict[str, Any]:
+    def count(x: jax.Array) -> int:
+        return int(on_host(jax.jit(lambda x: (x > 0).sum())(x)))
+
+    filled = model.num_states - model.num_given
+    choices = count(model.available) - filled
+    ours = filled if model.place is None else model.num_devices  # rows of what is filled
+    transitions = sum(count(table.probability) for table in model.tables) - ours
+    kind = "chain" if choices == model.num_given else "mdp"
+    return {"kind": kind, "states": model.num_given, "choices": choices,
+            "transitions": transitions, "seconds": seconds}
+
+
+def solve_in(
+    place: Place, model: ShardedMDP, given: Mapping[str, str], asked: Sequence[Asked],
+    tolerance: float, directory: Path | None, properties: list[str],
+) -> Iterator[Result]:
+    """The result of each property, when the processes have agreed on what is asked.
+
+    Raises:
+      ValueError: they were not asked the same, or the directory is not one of all.
+    """
     place.agree({"the model": hashlib.sha256(repr(sorted(given.items())).encode()).hexdigest(),
                  "the properties": properties, "--tolerance": tolerance,
                  "--checkpoint": directory, "jax": jax.__version__,
@@ -67,9 +114,7 @@ def solve_in(
     if directory is not None:
         place.together(lambda: make_directory(directory) if place.is_first else None)
         place.sees(str(directory), directory.is_dir())
-    yield from solve_on_mesh(
-        place.together(lambda: on_mesh(model, place)), given, asked, tolerance, place,
-        directory)
+    yield from solve_on_mesh(model, given, asked, tolerance, place, directory)
 
 
 def solve_on_mesh(

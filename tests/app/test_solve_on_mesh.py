@@ -26,8 +26,10 @@ def place_of(devices):
 
 
 def solved(devices, directory, text=PROPERTY):
+    place = place_of(devices)
     (result,) = solve_on_mesh.solve_in(
-        place_of(devices), walk(16), asked_for([text]), 1e-6, directory, [text])
+        place, solve_on_mesh.on_mesh(walk(16), place), {}, asked_for([text]), 1e-6, directory,
+        [text])
     return result
 
 
@@ -82,7 +84,10 @@ def test_from_the_command_line(tmp_path):
     bounds = ["--checkpoint", str(tmp_path / "bounds")]
     done = CliRunner().invoke(main, ["solve", model, PROPERTY, "--json", *bounds, "--mesh", "2"])
     assert done.exit_code == 0 and "on 2 CPU devices\n" in done.stderr, done.stderr
-    (result,) = json.loads(done.stdout.splitlines()[-1])["results"]
+    told = json.loads(done.stdout.splitlines()[-1])
+    del told["model"]["seconds"]
+    assert told["model"] == {"kind": "chain", "states": 16, "choices": 16, "transitions": 30}
+    (result,) = told["results"]
     assert result["lower"] <= 0.4 <= result["upper"] <= result["lower"] + 1e-6
     assert result["method"] == "interval iteration on the mesh"
     for options, message in (
