@@ -87,6 +87,18 @@ def test_one_seed_over_several_devices_runs(capsys):
     assert capsys.readouterr().out.splitlines()[1].split() == ["[0.5", "1.", "]"]
 
 
+def test_models_over_a_mesh_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "devices.md").read_text().split("## Models over a mesh")[1]
+    names: dict = {}
+    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL)[:2]:
+        exec(compile(code, "devices.md", "exec"), names)
+        promised = re.findall(r"print\(.*\)\s+# (\([^)]*\)|[0-9.]+)", code)
+        assert capsys.readouterr().out.splitlines() == promised
+    model, again = names["model"], names["again"]
+    assert again.num_given == model.num_given and again.rounds == model.rounds
+
+
 NEEDS = {"08_from_a_simulator_to_an_interval": ["gymnax"]}  # by a notebook, beside the tests' own
 
 
