@@ -47,12 +47,18 @@ def total_reward(
     under some policy, for ``"min"`` under every policy; without a target where reward is earned
     for ever. That is decided on the graph; where going round earns nothing, states are one.
 
+    Inside ``jit``, and of a :class:`~jaxltl.core.models.sharded.ShardedMDP`, inexact policy
+    iteration and two sweeps that prove the bounds answer, see
+    :mod:`~jaxltl.core.values.total_reward_by_sweeps`.
+
     Args:
-      model: a concrete MDP, DenseMDP, SparseMDP or product of one, or an IntervalMDP.
+      model: an MDP, DenseMDP, SparseMDP or product of one, or an IntervalMDP; inside ``jit`` an
+        MDP, DenseMDP, ShardedMDP or product of one.
       reward: at least 0. For a sparse model as of
         :func:`~jaxltl.core.models.sparse.row_reward`: a name, a structure, or an array on states,
-        choices or transitions; else ``float[S]`` or ``float[S, A]``, what a step earns.
-      target: ``bool[S]``.
+        choices or transitions; else ``float[S]`` or ``float[S, A]``, what a step earns, or of a
+        ShardedMDP the name of one.
+      target: ``bool[S]``; inside ``jit`` and over a mesh there has to be one.
       policy: evaluate this policy; default: optimise.
       objective: ``"max"`` or ``"min"``; ignored when a policy is given.
       nature: of interval models only, see
@@ -63,11 +69,15 @@ def total_reward(
     Returns:
       :class:`Solution`; `value` is ``float[S]``, infinite or 0 exactly where the graph says so. An
       optimum's `policy` attains its bound on the safe side: ``int32[S]``, rows of a sparse model,
-      else actions.
+      else actions. Inside ``jit`` bad rewards give the status ``NONFINITE``, a bad policy
+      ``INVALID``.
 
     Raises:
-      ValueError: a shape, the objective or a policy is wrong, a reward is negative, or something
-        is traced.
+      ValueError: a shape, the objective or a policy is wrong, a reward is negative, or inside
+        ``jit`` the model is sparse or there is no target.
+
+    Inside ``jit`` and over a mesh differentiable in the reward, the probabilities and the policy,
+    with the support held fixed.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
