@@ -142,7 +142,7 @@ def spread(num_seeds: int, place: Place) -> str:
     Example:
       >>> from types import SimpleNamespace
       >>> spread(6, SimpleNamespace(num_devices=4))
-      '6 seeds on 4 devices, at most 2 on each'
+      '6 seeds on 4 devices, at most 2 on each; 3 devices are enough for that'
     """
     number = place.num_devices
     if num_seeds == 1:
@@ -150,7 +150,7 @@ def spread(num_seeds: int, place: Place) -> str:
                 + ("" if number == 1 else ", and the others bring nothing; --seeds N uses them"))
     most = -(-num_seeds // number)
     used = -(-num_seeds // most)
-    idle = f"; {number - used} of them bring nothing" if used < number else ""
+    idle = f"; {used} device{'s are' if used > 1 else ' is'} enough for that" if used < number else ""
     many = "devices" if number > 1 else "device"
     return f"{num_seeds} seeds on {number} {many}, at most {most} on each{idle}"
 
