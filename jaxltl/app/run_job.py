@@ -150,7 +150,8 @@ def spread(num_seeds: int, place: Place) -> str:
                 + ("" if number == 1 else ", and the others bring nothing; --seeds N uses them"))
     most = -(-num_seeds // number)
     used = -(-num_seeds // most)
-    idle = f"; {used} device{'s are' if used > 1 else ' is'} enough for that" if used < number else ""
+    enough = f"{used} devices are" if used > 1 else "one device is"
+    idle = f"; {enough} enough for that" if used < number else ""
     many = "devices" if number > 1 else "device"
     return f"{num_seeds} seeds on {number} {many}, at most {most} on each{idle}"
 
