@@ -111,12 +111,12 @@ def _assemble(
         raise ValueError("no cell is a distractor, so that no run can start; use a larger grid.")
     mdp = replace(
         blank,
-        label=jnp.asarray(kind.reshape(-1, 1) == np.arange(len(kinds))),
-        initial=jnp.asarray(start / start.sum(), blank.dtype),
+        label=to_jax(kind.reshape(-1, 1) == np.arange(len(kinds))),
+        initial=to_jax(np.asarray(start / start.sum(), blank.dtype)),
         propositions=tuple(name for name, _ in kinds),
     )
     rows, columns = kind.shape
-    return World(mdp, jnp.asarray(colors, jnp.int32), margin, (rows, columns), kinds)
+    return World(mdp, to_jax(np.asarray(colors, np.int32)), margin, (rows, columns), kinds)
 
 
 def make_world(

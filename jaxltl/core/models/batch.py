@@ -19,6 +19,7 @@ import numpy as np
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.ltl import Formula, parse_ltl
+from jaxltl.core.models.concrete import is_traced, namespace, to_jax
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, allowed_steps, letters, memory_along, product
 from jaxltl.core.models.restrict import with_allowed
@@ -73,7 +74,7 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
         letter = np.concatenate([shown_here, np.repeat(shown_here[:1], extra)])
         padded = _pad_successors(pad_states(world, num_states), width)
         products.append(replace(lane, mdp=jax.tree.map(np.asarray, padded), letter=letter))
-    return jax.tree.map(lambda *x: jnp.asarray(np.stack([np.asarray(y) for y in x])), *products)
+    return to_jax(jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *products))
 
 
 def _like_first(world: Any, number: int, first: Any) -> MDP:
@@ -98,7 +99,7 @@ def _like_first(world: Any, number: int, first: Any) -> MDP:
             "every world the same ones, with labels that are false where nothing shows them."
         )
     column = [world.propositions.index(p) for p in first.propositions]
-    label = jnp.asarray(np.asarray(world.label)[:, column])
+    label = to_jax(np.asarray(world.label)[:, column])
     return replace(world, label=label, propositions=first.propositions)
 
 
@@ -136,7 +137,7 @@ def pad_states(mdp: MDP, num_states: int) -> MDP:
     stays[..., 0] = 1
 
     def below(array: Any, rows: np.ndarray) -> jax.Array:
-        return jnp.asarray(np.concatenate([np.asarray(array), rows]))
+        return to_jax(np.concatenate([np.asarray(array), rows]))
 
     return replace(
         mdp,
@@ -154,8 +155,8 @@ def _pad_successors(mdp: MDP, width: int) -> MDP:
     extra = ((0, 0), (0, 0), (0, width - mdp.num_successors))
     return replace(
         mdp,
-        successor=jnp.pad(mdp.successor, extra),
-        probability=jnp.pad(mdp.probability, extra),
+        successor=to_jax(np.pad(np.asarray(mdp.successor), extra)),
+        probability=to_jax(np.pad(np.asarray(mdp.probability), extra)),
     )
 
 
@@ -166,7 +167,12 @@ def is_stacked(model: Product) -> bool:
 
 def as_stacked(model: Product) -> Product:
     """The product with a leading axis of worlds: itself, or a single one as W = 1."""
-    return model if is_stacked(model) else jax.tree.map(lambda x: jnp.asarray(x)[None], model)
+    return model if is_stacked(model) else _stacked([model])
+
+
+def _stacked(models: Sequence[Product]) -> Product:
+    xp, *models = namespace(*models)
+    return to_jax(jax.tree.map(lambda *x: xp.stack(x), *models))
 
 
 def num_worlds(model: Product) -> int:
@@ -183,7 +189,9 @@ def world(model: Product, number: int) -> Product:
       >>> world(stack_products([one, one], "F goal"), 1).state_shape
       (2, 2)
     """
-    return jax.tree.map(lambda x: x[number], model)
+    if is_traced((model, number)):
+        return jax.tree.map(lambda x: x[number], model)
+    return to_jax(jax.tree.map(lambda x: np.asarray(x)[number], model))
 
 
 def narrow(models: Product, allowed: Any) -> Product:
@@ -204,7 +212,7 @@ def narrow(models: Product, allowed: Any) -> Product:
             with_allowed(world(models, w), np.asarray(mask))
         except ValueError as error:
             raise ValueError(f"world {w}: {error}") from error
-    return replace(models, allowed=jnp.asarray(np.stack([np.asarray(x) for x in masks])))
+    return replace(models, allowed=to_jax(np.stack([np.asarray(x) for x in masks])))
 
 
 def lift_memory(policy: jax.Array, task: Automaton | int) -> jax.Array:
@@ -258,7 +266,7 @@ def stack_models(models: Product | Sequence[Product]) -> Product:
                 f"world {i} does not have the shapes of world 0; stack_products(worlds, task) "
                 "pads worlds."
             )
-    return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(y) for y in x]), *models)
+    return _stacked(models)
 
 
 def _equal(one: Automaton, other: Automaton) -> bool:
@@ -365,7 +373,7 @@ def demonstrated_counts(
                 pair = pair + np.arange(pair.shape[1]) * (model.num_states * model.num_actions)
             counts = np.bincount(pair[inside], minlength=size)
         found.append(counts.reshape(shape))
-    return jnp.asarray(np.stack(found), models.dtype)
+    return to_jax(np.stack(found).astype(models.dtype))
 
 
 def stack_observations(models: Product, observation: Any) -> jax.Array:
@@ -386,7 +394,7 @@ def stack_observations(models: Product, observation: Any) -> jax.Array:
     rows = models.letter.shape
     if observation.ndim != 3 or observation.shape[:2] != rows:
         raise ValueError(f"observation has shape {observation.shape}; expected {(*rows, 'O')}.")
-    if not bool(jnp.all(jnp.isfinite(observation))):
+    if not np.isfinite(np.asarray(observation)).all():
         w, s, _ = np.argwhere(~np.isfinite(np.asarray(observation)))[0].tolist()
         raise ValueError(f"world {w}: the observation in state {s} is not finite.")
     return observation
@@ -415,7 +423,7 @@ def training_counts(
     if held_out is None or isinstance(held_out, int | float):
         demonstrations, test = split_trajectories(demonstrations, held_out or 0.0)
     counts = demonstrated_counts(models, demonstrations, horizon=horizon)
-    if not bool(jnp.any(counts > 0)):
+    if not (np.asarray(counts) > 0).any():
         raise ValueError(
             "demonstrations: no pair is left to learn from; give more, or a smaller held_out."
         )

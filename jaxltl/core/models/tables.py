@@ -19,6 +19,7 @@ from flax import struct
 from jaxltl.core.models import kernels, operators
 from jaxltl.core.models.choices import Columns
 from jaxltl.core.models.choices import action_columns as action_columns
+from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.entries import Entries, entries
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP
@@ -182,4 +183,4 @@ def predecessors(models: Sequence[Any]) -> Predecessors | None:
     probability = np.zeros(pairs.shape, weight.dtype)
     for w, (target, rank, pair, weight, _) in enumerate(lists):
         pairs[w, rank, target], probability[w, rank, target] = pair, weight
-    return Predecessors(jnp.asarray(pairs), jnp.asarray(probability))
+    return Predecessors(to_jax(pairs), to_jax(probability))

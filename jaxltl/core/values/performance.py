@@ -288,12 +288,13 @@ def task_performances(
         return found
     columns = jax.tree.map(np.array, found)
     for w in redone:
-        model, policy = jax.tree.map(lambda x, w=w: x[w], (models, policies))
+        model, policy = to_jax(
+            jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies)))
         bounds = _by_elimination(model, policy_distribution(model, policy))
-        value, lower, upper = (jnp.asarray(x, model.dtype) for x in bounds)
+        value, lower, upper = (to_jax(np.asarray(x, model.dtype)) for x in bounds)
         exact = _summarize(model, value, lower, upper, tolerance)
         jax.tree.map(lambda to, x, w=w: to.__setitem__(w, x), columns, exact)
-    return jax.tree.map(jnp.asarray, columns)
+    return to_jax(columns)
 
 
 def _batched(models: Product, policies: jax.Array, tolerance, *, batch: int) -> Performance:
@@ -307,7 +308,7 @@ def _batched(models: Product, policies: jax.Array, tolerance, *, batch: int) -> 
         lanes = jax.tree.map(lambda x, i=begin: x[i : i + size], (models, policies))
         found = jax.block_until_ready(_together(*lanes, tolerance))
         parts.append(jax.tree.map(lambda x, i=first - begin: np.asarray(x)[i:], found))
-    return jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *parts)
+    return to_jax(jax.tree.map(lambda *x: np.concatenate(x), *parts))
 
 
 def _one_by_one(models: Product, policies: jax.Array, tolerance) -> Performance:
@@ -317,7 +318,7 @@ def _one_by_one(models: Product, policies: jax.Array, tolerance) -> Performance:
         model, policy = jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies))
         found = satisfaction_probability(model, policy, tolerance=tolerance)
         parts.append(_summarized(model, found.value, found.lower, found.upper, tolerance))
-    return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *parts)
+    return to_jax(jax.tree.map(lambda *x: np.stack(x), *parts))
 
 
 _summarized = jax.jit(_summarize)
