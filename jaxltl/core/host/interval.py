@@ -156,12 +156,13 @@ class HostInterval:
         start = count.cumsum() - count
         inside = region[mdp.successor[entry]]
         start, one = np.append(start, entry.size), np.ones(row.size)
-        room = row_sums(np.where(inside, 0, self.upper[entry]), start, -one) >= 0
+        least = -self.rounding[row] if self.nearly else np.zeros(row.size)
+        room = row_sums(np.where(inside, 0, self.upper[entry]), start, -one) >= least
         sure = np.logical_or.reduceat(inside & (self.lower[entry] > 0), start[:-1])
         some = np.logical_or.reduceat(inside & (self.upper[entry] > 0), start[:-1])
         if self.ball is not None:
             center, most = self.ball.center[entry], self.ball.most[row]
-            room &= row_sums(np.where(inside, 0, center), start, most, -one) >= 0
+            room &= row_sums(np.where(inside, 0, center), start, most, -one) >= least
         return some & (sure | ~room)
 
     def within(self, entries: Booleans) -> Floats:
