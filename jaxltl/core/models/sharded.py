@@ -139,8 +139,8 @@ def over_devices(model: ShardedMDP, function: Any, *arguments: Any) -> Any:
     return jax.shard_map(function, mesh=model.mesh, in_specs=spec, out_specs=spec)(*arguments)
 
 
-def _seen(model: ShardedMDP, sent: tuple[jax.Array, ...], value: jax.Array) -> jax.Array:
-    """A device's values and those that it is sent, in the order of its tables' places."""
+def seen_by(model: ShardedMDP, sent: tuple[jax.Array, ...], value: jax.Array) -> jax.Array:
+    """On a device: its values and those that it is sent, in the order of its tables' places."""
     if model.rounds is None:
         return lax.all_gather(value, model.axis, tiled=True)
     parts = [value]
@@ -152,7 +152,7 @@ def _seen(model: ShardedMDP, sent: tuple[jax.Array, ...], value: jax.Array) -> j
 @operators.combined.register
 def _(model: ShardedMDP, value: jax.Array, term: Any, combine: Any) -> jax.Array:
     def one(tables: Any, place: Any, sent: Any, available: Any, value: jax.Array) -> jax.Array:
-        seen = _seen(model, sent, value)
+        seen = seen_by(model, sent, value)
         if place is None:
             shape = (*available.shape, -1)
             (successor, weight), = tables
@@ -260,7 +260,7 @@ def _(model: ShardedMDP, value: jax.Array) -> jax.Array:
 @operators.following.register
 def _(model: ShardedMDP, policy: jax.Array) -> Any:
     def one(tables: Any, place: Any, sent: Any, available: Any, policy: Any, value: Any) -> Any:
-        seen = _seen(model, sent, value)
+        seen = seen_by(model, sent, value)
         if place is None:
             shape = (*available.shape, -1)
             pick = policy[:, None, None]

@@ -24,6 +24,7 @@ from jaxltl.core.models.entries import Entries, entries
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.sharded import ShardedMDP, over_devices, seen_by
 from jaxltl.core.models.sparse import SparseMDP
 
 _LARGEST = 2**22  # transitions up to which a product's are written down, one by one
@@ -86,6 +87,35 @@ class Primitives:
         return jax.vmap(one, in_axes=-1, out_axes=-1)(value)
 
 
+@struct.dataclass
+class SpreadSuccessors:
+    """As :class:`Successors` of a model over a mesh, one table of all choices.
+
+    Attributes:
+      model: the model.
+      successor, probability: ``[N]`` by action and number of the successor; places, not states.
+    """
+
+    model: Any
+    successor: list[list[jax.Array]]
+    probability: list[list[jax.Array]]
+
+    @property
+    def choices(self) -> Columns:
+        """As of :class:`Successors`."""
+        return Columns()
+
+    def expectation(self, value: jax.Array) -> list[jax.Array]:
+        """As :meth:`Successors.expectation`."""
+        def one(successor: Any, probability: Any, sent: Any, value: jax.Array) -> list[jax.Array]:
+            seen = seen_by(self.model, sent, value)
+            pairs = zip(successor, probability, strict=True)
+            return [kernels.fold(targets, weights, seen) for targets, weights in pairs]
+
+        return over_devices(
+            self.model, one, self.successor, self.probability, self.model.sent, value)
+
+
 class Predecessors(NamedTuple):
     """The pairs that lead to each state, ``a * N + i``, padded with probability zero.
 
@@ -102,7 +132,7 @@ class Predecessors(NamedTuple):
         return kernels.fold(list(self.pair), list(self.probability), mass)
 
 
-def table(model: Any) -> Successors | Primitives | Entries:
+def table(model: Any) -> Successors | SpreadSuccessors | Primitives | Entries:
     """What sweeps a model: its successors where they can be written down, else its primitives.
 
     Of a sparse model, or a game on one, its entries.
@@ -110,7 +140,19 @@ def table(model: Any) -> Successors | Primitives | Entries:
     world = model.mdp if isinstance(model, Game) else model
     if isinstance(world, SparseMDP):
         return entries(world)
+    if isinstance(world, ShardedMDP) and (spread := _spread_out(world)):
+        return spread
     return successors(model) or Primitives(model)
+
+
+def _spread_out(model: ShardedMDP) -> SpreadSuccessors | None:
+    num_actions, width = model.num_actions, model.num_successors
+    if model.place is not None or num_actions * width > kernels.WRITTEN_OUT:
+        return None
+    successor, probability = (
+        [[x.reshape(-1, num_actions, width)[:, a, k] for k in range(width)]
+         for a in range(num_actions)] for x in model.tables[0])
+    return SpreadSuccessors(model, successor, probability)
 
 
 def successors(model: Any) -> Successors | None:

@@ -18,7 +18,7 @@ from jax import lax
 from jaxltl.core.models.entries import Entries
 from jaxltl.core.models.operators import transition_matrix
 from jaxltl.core.models.sharded import is_sharded
-from jaxltl.core.models.tables import Primitives, Successors
+from jaxltl.core.models.tables import Primitives, SpreadSuccessors, Successors
 from jaxltl.core.values.iterate import in_turn, iterate
 
 Operator = Callable[[jax.Array], jax.Array]
@@ -173,7 +173,7 @@ def solver(
 
 def is_small(table: Any, num_states: int) -> bool:
     """Whether systems of so many states are inverted; those on several devices never are."""
-    spread = isinstance(table, Primitives) and is_sharded(table.model)
+    spread = isinstance(table, Primitives | SpreadSuccessors) and is_sharded(table.model)
     return num_states <= DENSE_LIMIT and not spread
 
 

@@ -17,6 +17,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.product import product
 from jaxltl.core.models.shard import from_mesh, shard, to_mesh
+from jaxltl.core.models.tables import SpreadSuccessors, table
 from jaxltl.core.types import Status
 from jaxltl.core.values.boltzmann import boltzmann_value
 from jaxltl.core.values.discounted import optimal_value, policy_value
@@ -43,8 +44,8 @@ def quantities(mdp):
 class Case:
     """A model, the same over a mesh, and quantities of both."""
 
-    def __init__(self, count, reach, seed=0):
-        self.mdp = world(seed, reach)
+    def __init__(self, count, reach, seed=0, ragged=True):
+        self.mdp = world(seed, reach, ragged)
         self.sharded = shard(self.mdp, mesh_of(count))
         self.reward, self.target, self.policy = quantities(self.mdp)
         self.system = np.random.default_rng(seed).random(S) < 0.5
@@ -83,6 +84,17 @@ def test_solvers(count, reach, solver):
     given = case.reward, case.target, case.policy
     one = solve(case.mdp, *(jnp.asarray(x) for x in given))
     other = jax.jit(solve)(case.sharded, *(case.there(x) for x in given))
+    case.agree(one, other)
+
+
+@pytest.mark.parametrize("solver", [
+    "optimal", *(pytest.param(x, marks=pytest.mark.exhaustive) for x in SOLVERS)])
+def test_solvers_where_one_table_holds_all(solver):
+    case = Case(4, 1, ragged=False)
+    assert isinstance(table(case.sharded), SpreadSuccessors)
+    given = case.reward, case.target, case.policy
+    one = SOLVERS[solver](case.mdp, *(jnp.asarray(x) for x in given))
+    other = jax.jit(SOLVERS[solver])(case.sharded, *(case.there(x) for x in given))
     case.agree(one, other)
 
 
