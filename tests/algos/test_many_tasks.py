@@ -262,7 +262,7 @@ def test_stages_follow_when_one_is_mastered():
 
 def test_bad_input_is_named(plans):
     with pytest.raises(ValueError, match="one threshold fewer"):
-        many_tasks.train_in_stages(jax.random.key(0), "xy", None, init=None, run=None,
+        many_tasks.train_in_stages(jax.random.key(0), "xy", None, init=len, run=len,
                                    num_chunks=1, enough=[1, 2])
     with pytest.raises(ValueError, match="all of one depth"):
         many_tasks.stack_plans([])
