@@ -28,6 +28,7 @@ from jaxltl.core.models.concrete import namespace, to_jax
 from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.restrict import Restriction, restrict
+from jaxltl.core.models.sharded import refuse_sharded
 
 METHODS = ("auto", "stay", "rank", "counter", "parity")
 
@@ -211,6 +212,7 @@ class _Arena(NamedTuple):
 
 
 def _concrete_graph(game: Game, objective: Any = None) -> HostGraph:
+    refuse_sharded(game)
     graph = graph_of(game, objective)
     if not isinstance(graph, HostGraph):
         raise ValueError("permissive strategies are built on the host: call permissive_strategy "

@@ -196,6 +196,12 @@ def no_model(model: Any) -> str:
             "robust_satisfaction, robust_bounded_reachability), or give its nominal model, "
             "model.nominal, whose probabilities are one choice of nature."
         )
+    if hasattr(model, "num_exchanged"):
+        return (
+            f"{name} lies on a mesh of devices, where this is not to be had: give it the model on "
+            "one. Over a mesh there are discounted, soft, Boltzmann and minimax values, occupancy, "
+            "reachability, total rewards, formulas, end components and winning regions."
+        )
     return (
         f"{name} has no transitions; give an MDP, a DenseMDP, a SparseMDP, or a product of one of "
         "them."

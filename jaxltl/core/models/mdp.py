@@ -252,7 +252,7 @@ def to_dense(mdp: MDP) -> DenseMDP:
       >>> to_dense(mdp).transition.tolist()
       [[[0.5, 0.5]], [[0.0, 1.0]]]
     """
-    if not hasattr(mdp, "num_actions"):
+    if not hasattr(mdp, "num_actions") or not hasattr(mdp, "successor"):
         raise ValueError(no_model(mdp))
     num_states, num_actions = mdp.num_states, mdp.num_actions
     shape = num_states, num_actions, num_states

@@ -37,8 +37,7 @@ def to_padded(model: SparseMDP) -> MDP:
       ValueError: padding would take more than 8 GB, with the size; or two choices of a state have
         one number.
     """
-    host = model.host
-    column = action_of(model)
+    column, host = action_of(model), model.host
     width = int(np.diff(host.entry_start).max())
     num_actions = int(column.max()) + 1
     shape = (host.num_states, num_actions, width)

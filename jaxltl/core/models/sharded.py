@@ -18,6 +18,7 @@ from flax import struct
 from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxltl.core.host.given import no_model
 from jaxltl.core.models import kernels, operators
 from jaxltl.core.models.product import label_rows, shown_by
 
@@ -131,6 +132,18 @@ def is_sharded(model: Any) -> bool:
     while not isinstance(model, ShardedMDP) and hasattr(model, "mdp"):
         model = model.mdp
     return isinstance(model, ShardedMDP)
+
+
+def refuse_sharded(model: Any) -> None:
+    """Raises where something reads a model on the host, and it lies on a mesh.
+
+    Raises:
+      ValueError: it does, with what there is over a mesh.
+    """
+    while hasattr(model, "mdp"):
+        model = model.mdp
+    if isinstance(model, ShardedMDP):
+        raise ValueError(no_model(model))
 
 
 def over_devices(model: ShardedMDP, function: Any, *arguments: Any) -> Any:

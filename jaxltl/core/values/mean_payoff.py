@@ -21,6 +21,7 @@ from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.game import Game, as_game, as_padded_game, is_deterministic
 from jaxltl.core.models.operators import induced_chain
 from jaxltl.core.models.padded import padded_rows
+from jaxltl.core.models.sharded import refuse_sharded
 from jaxltl.core.models.sparse import SparseMDP, row_reward
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted import expected_reward
@@ -63,6 +64,7 @@ def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> S
       ([2.0, 2.0], [1, 0])
     """
     asked = as_game(game)
+    refuse_sharded(asked)
     if is_traced((asked, reward)):
         raise ValueError("mean_payoff works on the host; call it outside jit and vmap.")
     form, reward = compiled_form(asked, reward)

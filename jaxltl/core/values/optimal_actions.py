@@ -20,6 +20,7 @@ from jaxltl.core.graphs.graph import graph_of
 from jaxltl.core.graphs.reaching import max_sets, min_sets
 from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.sharded import refuse_sharded
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.evidence import rounding_unit
 from jaxltl.core.values.opposite import opposite_event
@@ -106,6 +107,7 @@ def optimal_actions(
       >>> optimal_actions(product(world, "F goal")).allowed[0].tolist()
       [[True, False], [True, True]]
     """
+    refuse_sharded(model)
     if is_traced((model, solution, tolerance)):
         raise ValueError("optimal_actions(model) reads values, so it works on the host only: "
                          "call it outside jit and vmap, and pass the mask in.")

@@ -18,6 +18,7 @@ from jaxltl.core.host.plan import Plan, plan_optimum, plan_policy
 from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.operators import is_deterministic
+from jaxltl.core.models.sharded import refuse_sharded
 from jaxltl.core.models.sparse import Rewards, row_reward
 from jaxltl.core.types import Solution, require_shape, row_tolerance, status_code
 from jaxltl.core.values.circles import SLACK, Problem, enclose_circles
@@ -122,6 +123,7 @@ def prepare(
     """
     if objective not in ("max", "min", "policy"):
         raise ValueError(f'objective={objective!r}; it must be "max", "min" or "policy".')
+    refuse_sharded(model)
     if is_traced((model, target, stay, reward)):
         raise ValueError("prepare reads its model, so it works on concrete arrays only; call it "
                          "before jit, and solve_prepared inside.")

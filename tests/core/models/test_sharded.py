@@ -7,13 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxltl.core.games.objective import safety
+from jaxltl.core.games.permissive import permissive_strategy
 from jaxltl.core.models import operators
-from jaxltl.core.models.convert import to_sparse
+from jaxltl.core.models.convert import to_padded, to_sparse
 from jaxltl.core.models.lanes import on_host
-from jaxltl.core.models.mdp import make_mdp
+from jaxltl.core.models.mdp import make_mdp, to_dense
 from jaxltl.core.models.product import product
 from jaxltl.core.models.shard import ModelPart, from_mesh, model_from_parts, shard, to_mesh
 from jaxltl.core.models.sparse import Rewards, make_sparse
+from jaxltl.core.values.mean_payoff import mean_payoff
+from jaxltl.core.values.optimal_actions import optimal_actions
+from jaxltl.core.values.prepared import prepare
 from tests.sparse_models import random_sparse
 
 S, A = 21, 2
@@ -194,6 +199,10 @@ def test_parts_equal_the_whole():
     (lambda: shard(3, mesh_of(2)), r"int has no transitions; give an MDP"),
     (lambda: to_mesh(shard(world(0), mesh_of(2)), np.ones(5)), r"\(5,\); expected \(21, ...\)"),
     (lambda: model_from_parts(None, 0, mesh_of(2)), r"num_states is 0"),
+    *((lambda ask=ask: ask(shard(world(0), mesh_of(2))), r"lies on a mesh of devices, where this")
+      for ask in (to_dense, to_padded, to_sparse, lambda m: mean_payoff(m, None),
+                  lambda m: prepare(m, None), lambda m: permissive_strategy(m, safety(m, "a")),
+                  lambda m: optimal_actions(product(m, "F a")))),
     (lambda: model_from_parts(lambda a, b: 3, 3, mesh_of(4)), r"3 states cannot lie on 4"),
     (lambda: model_from_parts(lambda a, b: 3, 4, mesh_of(2)), r"part\(0, 2\) is 3"),
     (lambda: model_from_parts(
