@@ -26,8 +26,10 @@ _APART = 500  # states from which a component is eliminated alone, if they are n
 _SAMPLED = 64  # rows in which what fills is counted where its bound is too large
 _PANEL = 2  # columns that are eliminated at once: each wants room for a full one
 _FILL = 4  # growth of the fill after which the order is sought anew
+_AGAIN = 8  # times, at most,
 _KRYLOV = 500  # steps of a Krylov method where elimination would fill
 _SWEEPS = 20_000  # and sweeps after it
+_ROUNDED = 4 * float(np.finfo(np.float64).eps)  # of the solution, which may be left of it
 _LEFT = 1e-14  # largest residual of what they find, as a share of the right side
 
 
@@ -301,12 +303,23 @@ def _swept(matrix: Any, b: Floats) -> Floats:
 
     size = np.abs(b).max(initial=0)
     system = linalg.LinearOperator(matrix.shape, matvec=lambda x: x - matrix @ x, dtype=float)
-    x, _ = linalg.bicgstab(system, b, rtol=0, atol=_LEFT * size, maxiter=_KRYLOV)
-    left = b - (x - matrix @ x)
-    if not np.isfinite(x).all() or np.abs(left).max() > size:
-        x, left = np.zeros(b.size), np.array(b)
+    x, left = np.zeros(b.size), np.array(b)
+
+    def enough() -> bool:
+        # Where x is far larger than b, its own rounding is left.
+        least = max(_LEFT * size, _ROUNDED * float(np.abs(x).max(initial=0)))
+        return bool(np.abs(left).max(initial=0) <= least)
+
+    for _ in range(_AGAIN):  # from what is left, where it stagnates or breaks down
+        more, _ = linalg.bicgstab(system, left, rtol=0, atol=_LEFT * size, maxiter=_KRYLOV)
+        after = left - (more - matrix @ more)
+        if not np.isfinite(more).all() or not np.abs(after).max() < np.abs(left).max():
+            break
+        x, left = x + more, after
+        if enough():
+            return x
     for _ in range(_SWEEPS):
-        if np.abs(left).max(initial=0) <= _LEFT * size:
+        if enough():
             return x
         x = x + left
         left = matrix @ left

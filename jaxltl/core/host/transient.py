@@ -445,10 +445,11 @@ def _solve_core(
                 break
         else:
             time = solver.solve(np.ones(core.size))
-        smaller = _extra(time, value, unit, aim, relative)
-        if smaller >= extra / 2:
+        other = _extra(time, value, unit, aim, relative)
+        # A better policy may be worth so much more that its rounding asks for more.
+        if extra / 2 <= other <= (2 * extra if found is None else np.inf):
             break
-        extra = smaller
+        extra = other
     narrow = best is not None and _narrow(best, sign, tolerance, relative)
     exact = None if narrow else _in_fractions(circles, core, label, chosen, unit)
     if exact is not None:

@@ -131,3 +131,17 @@ def test_what_would_fill_is_swept(converges, monkeypatch):
         assert found.method == "policy iteration by sweeps" and width <= 1e-6
     else:
         assert width > 1e-6
+
+
+def test_sweeps_end_where_the_solution_is_far_larger_than_the_right_side():
+    rng = np.random.default_rng(0)
+    size = 1000
+    target = (np.arange(size)[:, None] + rng.integers(-size, size + 1, (size, 3))) % size
+    weight = rng.dirichlet(np.ones(3), size)
+    weight[0] /= 2  # the only way out
+    matrix = sparse.csr_array(
+        (weight.ravel(), target.ravel(), np.arange(0, 3 * size + 1, 3)), shape=(size, size))
+    found = elimination._swept(matrix, np.ones(size))
+    exact = np.linalg.solve(np.eye(size) - matrix.toarray(), np.ones(size))
+    assert exact.max() > 1e5
+    np.testing.assert_allclose(found, exact, rtol=1e-10)
