@@ -169,7 +169,7 @@ def test_propositions_do_not_grow_with_the_grid():
 
 @pytest.mark.parametrize("size", [1, 0, -3, 2.0, True, "3"])
 def test_sizes_that_are_none(size):
-    with pytest.raises(ValueError, match=r"size=.*an integer from 2 on"):
+    with pytest.raises(ValueError, match=r"size=.*an integer from 2 to 181"):
         robots(size)
 
 

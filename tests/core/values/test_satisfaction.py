@@ -8,7 +8,14 @@ from scipy import sparse
 import jaxltl as jl
 from jaxltl.core.host import quickest as way_out
 from jaxltl.core.values.satisfaction import as_reachability
-from tests.core.values.test_optimal_actions import CASES, A, N, probabilities, with_all_values
+from tests.core.values.test_optimal_actions import (
+    CASES,
+    A,
+    N,
+    model_of,
+    probabilities,
+    with_all_values,
+)
 
 
 def expected_times(policy, matrix, open_):
@@ -39,7 +46,8 @@ def decided(model, objective, best, accepting):
 
 def races(case, objective):
     """Who is to be quick: the policies, their transitions, and the states to leave."""
-    model, matrix, priority, policies, values, sure = case
+    parts, matrix, priority, policies, values, sure = case
+    model = model_of(*parts)
     best, surely = values.max(0), sure.any(0)
     optimal = (np.abs(values - best) <= 1e-9).all(1) & (sure == surely).all(1)
     accepting = as_reachability(model, objective).accepting
@@ -60,7 +68,8 @@ def check_case(rng, kind, label_on, objective):
         found = [(expected_times(*race), *race) for race in races(case, objective)]
         times = found[rng.integers(len(found))][0]
         differs = (times > times.min(0) + 1e-9).any()
-    policy = np.eye(A)[np.asarray(jl.optimal_satisfaction(case[0], objective=objective).policy)]
+    best = jl.optimal_satisfaction(model_of(*case[0]), objective=objective)
+    policy = np.eye(A)[np.asarray(best.policy)]
     policy = policy.reshape(1, N, A)
     best, sure = case[4].max(0), case[5].any(0)
     attained, surely = probabilities(policy, *case[1:3])
