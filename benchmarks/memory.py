@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.models import random_mdp, risky_mdp
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.product import Product, letters, product
+from jaxltl.core.models.product import Product, letters_of, product
 from jaxltl.core.values.discounted import optimal_value
 from jaxltl.core.values.reachability import reachability_probability
 from jaxltl.core.values.satisfaction import optimal_satisfaction
@@ -54,7 +54,7 @@ def large_product(num_states: int) -> Product:
     world = MDP(world.successor, world.probability, world.available, world.initial,
                 jnp.asarray(label), names)
     formula = "F (g0 & F (g1 & F (g2 & F (g3 & F (g4 & F (g5 & F (g6 & F g7)))))))"
-    task = to_automaton(f"X {formula}", letters=letters(world))
+    task = to_automaton(f"X {formula}", letters=letters_of(world))
     return product(world, task)
 
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.types import Status
-from jaxltl.core.values.answer import answer
+from jaxltl.core.values.answer import solve_property
 from jaxltl.io.model_files import read_model
 
 LTL = (  # of a label a and another one b: recurrence, persistence, with safety, response
@@ -88,7 +88,7 @@ def measure(folder: Path, ltl: bool = False, only: str = "", with_storm: bool = 
             row: dict[str, Any] = {
                 "model": path.stem, "states": model.num_states, "property": text, "load": load}
             begin = time.process_time()
-            found = answer(model, text)
+            found = solve_property(model, text)
             row["seconds"] = time.process_time() - begin
             lower, upper = float(found.lower[0]), float(found.upper[0])
             if peer is not None:

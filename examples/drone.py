@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from jaxltl import Environment, Timestep, box, make_environment
+from jaxltl import Environment, Timestep, make_box, make_environment
 
 FIELDS = {"base": (0.0, 0.0), "field": (0.7, 0.4), "well": (-0.6, 0.5)}
 NEAR = 0.35
@@ -40,5 +40,5 @@ def make(wind: float = 0.01, horizon: int = 80) -> Environment:
         return jnp.append(near, out)
 
     return make_environment(
-        reset, step, observe, actions=box(-1.0, 1.0, (2,)), labels=labels,
+        reset, step, observe, actions=make_box(-1.0, 1.0, (2,)), labels=labels,
         propositions=[*FIELDS, "out"], horizon=horizon)

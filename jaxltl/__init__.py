@@ -11,6 +11,10 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from jaxltl import algos as algos
+    from jaxltl import envs as envs
+    from jaxltl import io as io
+    from jaxltl import plot as plot
     from jaxltl._public import *  # noqa: F403
     from jaxltl._public import __all__ as __all__
 else:
@@ -29,4 +33,4 @@ else:
         return globals()[name]
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *__getattr__("__all__")})
+        return sorted({*globals(), *__getattr__("__all__"), "algos", "envs", "io", "plot"})

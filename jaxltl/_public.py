@@ -1,7 +1,13 @@
-"""The public names of the package, which :mod:`jaxltl` shows as its own."""
+"""The public names of the package, which :mod:`jaxltl` shows as its own, by topic."""
 
-from jaxltl.core.automata.automaton import Automaton, complement, make_automaton, picture
-from jaxltl.core.automata.language import find_difference, is_equivalent
+from jaxltl.core.automata.automaton import (
+    Automaton,
+    accepts_lasso,
+    complement,
+    make_automaton,
+    picture,
+)
+from jaxltl.core.automata.language import find_difference, is_equivalent, is_included
 from jaxltl.core.automata.sequences import Sequences, reach_avoid_sequences
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.automata.translate import to_automaton
@@ -17,14 +23,20 @@ from jaxltl.core.games.objective import (
     safety,
     states_where,
 )
-from jaxltl.core.games.permissive import Permissive, apply_strategy, permissive_strategy, shield
-from jaxltl.core.games.shielded_environment import ShieldedWorld, shielded
+from jaxltl.core.games.permissive import (
+    Permissive,
+    apply_strategy,
+    permissive_strategy,
+    shield_policy,
+)
+from jaxltl.core.games.shielded_environment import ShieldedWorld, shield_environment
 from jaxltl.core.games.verify import Verification, verify
 from jaxltl.core.games.winning import Winning, almost_sure_buchi, winning_region
-from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor, avoidable
-from jaxltl.core.graphs.end_components import end_components
+from jaxltl.core.graphs.attractor import Attractor, almost_surely_reaching, attractor, avoidable
+from jaxltl.core.graphs.end_components import EndComponents, end_components
 from jaxltl.core.host.confidence import ConfidenceSets, intervals_from_counts
 from jaxltl.core.logic.ltl import Formula, holds_on_lasso, parse_ltl
+from jaxltl.core.logic.properties import Property, parse_properties, parse_property
 from jaxltl.core.models.batch import lift_memory, stack_products
 from jaxltl.core.models.convert import to_padded, to_sparse
 from jaxltl.core.models.counts import TransitionCounts, counted_model, counts_on, make_counts
@@ -36,16 +48,25 @@ from jaxltl.core.models.environment import (
     Finite,
     Timestep,
     agent_of,
-    box,
+    make_box,
     make_environment,
     run_episode,
     step_or_reset,
 )
+from jaxltl.core.models.finite_task import FiniteTask, Shares, finite_shares, make_finite_task
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows, make_interval
 from jaxltl.core.models.lanes import on_host, vmap_over_mesh
 from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp, to_dense
-from jaxltl.core.models.monitor import Monitor, Verdict, make_monitor, monitor_step, verdict
+from jaxltl.core.models.monitor import (
+    Monitor,
+    Verdict,
+    make_monitor,
+    monitor_step,
+    monitor_verdict,
+    trace_verdicts,
+    verdict,
+)
 from jaxltl.core.models.operators import (
     exists_successor,
     expectation,
@@ -57,15 +78,16 @@ from jaxltl.core.models.parametric import ParametricMDP, make_parametric
 from jaxltl.core.models.product import (
     FiniteMemoryPolicy,
     Product,
-    letters,
+    letters_of,
     lift_policy,
     lift_trajectories,
     product,
     project_policy,
     project_trajectories,
 )
-from jaxltl.core.models.restrict import restrict, with_allowed
+from jaxltl.core.models.restrict import Restriction, restrict, with_allowed
 from jaxltl.core.models.sequence_task import (
+    SequenceSampler,
     events_of,
     proposition_sets,
     sequence_environment,
@@ -78,6 +100,7 @@ from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse, row_rewar
 from jaxltl.core.models.tabulate import Table, tabulate
 from jaxltl.core.models.task_environment import (
     TaskObservation,
+    TaskTables,
     TaskWorld,
     stack_tasks,
     task_environment,
@@ -85,8 +108,8 @@ from jaxltl.core.models.task_environment import (
 )
 from jaxltl.core.models.time_limit import with_time_limit
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, rollout
-from jaxltl.core.types import NotConverged, Solution, Status, check
-from jaxltl.core.values.answer import answer
+from jaxltl.core.types import Method, NotConverged, Solution, Status, check
+from jaxltl.core.values.answer import Answer, PropertyStrategy, solve_property
 from jaxltl.core.values.average_reward import average_reward
 from jaxltl.core.values.boltzmann import boltzmann_fixed_points, boltzmann_value
 from jaxltl.core.values.bounded import (
@@ -99,34 +122,49 @@ from jaxltl.core.values.bounded import (
 from jaxltl.core.values.data_guarantee import DataGuarantee, guarantee_curve, learn_guarantee
 from jaxltl.core.values.discounted import optimal_value, policy_value
 from jaxltl.core.values.episode_scores import episode_evaluator
-from jaxltl.core.values.evaluation import Estimate, Evaluation, evaluate
+from jaxltl.core.values.evaluation import EpisodeTotals, Estimate, Evaluation, evaluate
+from jaxltl.core.values.hitting_time import hitting_time
 from jaxltl.core.values.mean_payoff import mean_payoff
 from jaxltl.core.values.minimax import minimax_value, strategy_value
-from jaxltl.core.values.multi_objective import achievable, multi, pareto
+from jaxltl.core.values.multi_objective import (
+    Achievable,
+    ConstrainedOptimum,
+    Front,
+    NearestMixture,
+    Pareto,
+    achievable,
+    multi_objective,
+    pareto,
+)
 from jaxltl.core.values.objectives import Objective
 from jaxltl.core.values.occupancy import feature_expectation, occupancy_measure
 from jaxltl.core.values.optimal_actions import OptimalActions, optimal_actions
 from jaxltl.core.values.optimality_gap import OptimalityGap, optimality_gap, tabulate_policy
-from jaxltl.core.values.performance import task_performance, task_performances
+from jaxltl.core.values.performance import Performance, task_performance, task_performances
 from jaxltl.core.values.prepared import Prepared, prepare, solve_prepared
 from jaxltl.core.values.prepared_interval import (
     PreparedInterval,
     prepare_interval,
-    solve_interval,
+    solve_prepared_interval,
 )
 from jaxltl.core.values.reachability import reachability_probability
-from jaxltl.core.values.robust import robust_discounted_value, robust_expectation
+from jaxltl.core.values.robust import (
+    robust_discounted_value,
+    robust_expectation,
+    robust_reachability,
+    robust_total_reward,
+)
 from jaxltl.core.values.robust_bounded import (
     robust_bounded_reachability,
     robust_cumulative_reward,
     robust_instantaneous_reward,
     robust_next_probability,
 )
-from jaxltl.core.values.robust_satisfaction import robust_satisfaction
-from jaxltl.core.values.robust_sensitivity import robust_sensitivity
+from jaxltl.core.values.robust_satisfaction import RobustSatisfaction, robust_satisfaction
+from jaxltl.core.values.robust_sensitivity import Sensitivity, robust_sensitivity
 from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
 from jaxltl.core.values.soft import soft_value
-from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
+from jaxltl.core.values.sparse_satisfaction import Satisfaction, sparse_satisfaction
 from jaxltl.core.values.total_reward import total_reward
 from jaxltl.envs.adapters.brax import from_brax
 from jaxltl.envs.adapters.craftax import from_craftax
@@ -142,10 +180,12 @@ from jaxltl.envs.letter_world import letter_world
 from jaxltl.envs.robots import grid_game
 from jaxltl.envs.zone_world import zone_world
 from jaxltl.io.hoa import read_hoa, write_hoa
+from jaxltl.io.hoa_game import HoaGame, read_hoa_game, write_hoa_game
 from jaxltl.io.log import read_labels, read_log
 from jaxltl.io.model_files import read_model, write_model
-from jaxltl.io.parametric import read_parametric
-from jaxltl.io.reward_machine import machine_reward, read_reward_machine
+from jaxltl.io.parametric import ParametricModel, RationalFunction, read_parametric
+from jaxltl.io.pgsolver import ParityGame, read_pgsolver, write_pgsolver
+from jaxltl.io.reward_machine import RewardMachine, machine_reward, read_reward_machine
 from jaxltl.io.storm import from_stormpy, to_stormpy
 from jaxltl.io.umb_sharded import read_sharded
 
@@ -158,206 +198,141 @@ def _(value: Automaton) -> str:
     return as_svg(value)
 
 
-__all__ = [
-    "GR1",
-    "MDP",
-    "Agent",
-    "Automaton",
-    "Box",
-    "ConfidenceSets",
-    "DataGuarantee",
-    "DenseMDP",
-    "Environment",
-    "Episode",
-    "Estimate",
-    "Evaluation",
-    "Finite",
-    "FiniteMemoryPolicy",
-    "Formula",
-    "Game",
-    "IntervalMDP",
-    "ModelPart",
-    "Monitor",
-    "NotConverged",
-    "Objective",
-    "OptimalActions",
-    "OptimalityGap",
-    "ParametricMDP",
-    "Parity",
-    "Permissive",
-    "Prepared",
-    "PreparedInterval",
-    "Product",
-    "Rewards",
-    "Sequences",
-    "ShardedMDP",
-    "ShieldedWorld",
-    "Solution",
-    "SparseMDP",
-    "Status",
-    "Table",
-    "TaskObservation",
-    "TaskWorld",
-    "Timestep",
-    "Trajectories",
-    "TransitionCounts",
-    "Verdict",
-    "Verification",
-    "Winning",
-    "achievable",
-    "agent_of",
-    "almost_sure_buchi",
-    "almost_surely_reaching",
-    "answer",
-    "apply_strategy",
-    "attractor",
-    "average_reward",
-    "avoidable",
-    "boltzmann_fixed_points",
-    "boltzmann_value",
-    "bounded_reachability",
-    "box",
-    "buchi",
-    "check",
-    "cobuchi",
-    "complement",
-    "counted_model",
-    "counts_on",
-    "cumulative_reward",
-    "end_components",
-    "environment_of",
-    "episode_evaluator",
-    "evaluate",
-    "events_of",
-    "exists_successor",
-    "expectation",
-    "feature_expectation",
-    "find_difference",
-    "flat_world",
-    "forall_successor",
-    "from_brax",
-    "from_craftax",
-    "from_dense",
-    "from_gymnasium",
-    "from_gymnax",
-    "from_jumanji",
-    "from_mesh",
-    "from_navix",
-    "from_pgx",
-    "from_stormpy",
-    "from_xminigrid",
-    "generalized_buchi",
-    "gr1",
-    "grid_game",
-    "gridworld",
-    "guarantee_curve",
-    "holds_on_lasso",
-    "instantaneous_reward",
-    "interval_rows",
-    "intervals_from_counts",
-    "is_equivalent",
-    "learn_guarantee",
-    "letter_world",
-    "letters",
-    "lift_memory",
-    "lift_policy",
-    "lift_trajectories",
-    "machine_reward",
-    "make_automaton",
-    "make_counts",
-    "make_environment",
-    "make_game",
-    "make_interval",
-    "make_mdp",
-    "make_monitor",
-    "make_parametric",
-    "make_sparse",
-    "make_trajectories",
-    "mean_payoff",
-    "minimax_value",
-    "model_from_parts",
-    "monitor_step",
-    "multi",
-    "next_probability",
-    "occupancy_measure",
-    "on_host",
-    "optimal_actions",
-    "optimal_satisfaction",
-    "optimal_value",
-    "optimality_gap",
-    "pareto",
-    "parity",
-    "parse_ltl",
-    "permissive_strategy",
-    "policy_value",
-    "prepare",
-    "prepare_interval",
-    "product",
-    "project_policy",
-    "project_trajectories",
-    "proposition_sets",
-    "pushforward",
-    "reach",
-    "reach_avoid_sequences",
-    "reachability_probability",
-    "read_hoa",
-    "read_labels",
-    "read_log",
-    "read_model",
-    "read_parametric",
-    "read_reward_machine",
-    "read_sharded",
-    "restrict",
-    "reward_bounded_reachability",
-    "robust_bounded_reachability",
-    "robust_cumulative_reward",
-    "robust_discounted_value",
-    "robust_expectation",
-    "robust_instantaneous_reward",
-    "robust_next_probability",
-    "robust_satisfaction",
-    "robust_sensitivity",
-    "rollout",
-    "row_reward",
-    "run_episode",
-    "safety",
-    "sample_successor",
-    "satisfaction_probability",
-    "sequence_environment",
-    "sequence_sampler",
-    "shard",
-    "shield",
-    "shielded",
-    "soft_value",
-    "solve_interval",
-    "solve_prepared",
-    "sparse_satisfaction",
-    "stack_products",
-    "stack_tasks",
-    "states_where",
-    "step_or_reset",
-    "strategy_value",
-    "synchronize",
-    "tabulate",
-    "tabulate_policy",
-    "task_environment",
-    "task_performance",
-    "task_performances",
-    "to_automaton",
-    "to_dense",
-    "to_mesh",
-    "to_padded",
-    "to_sparse",
-    "to_stormpy",
-    "total_reward",
-    "verdict",
-    "verify",
-    "vmap_over_mesh",
-    "what_is_left",
-    "winning_region",
-    "with_allowed",
-    "with_time_limit",
-    "write_hoa",
-    "write_model",
-    "zone_world",
+# In the order in which a user would read of them; a name is in one topic. `__all__` is all of them,
+# written out for those who only read the text, such as editors.
+TOPICS: dict[str, tuple[str, ...]] = {
+    "Logic and automata": (
+        "parse_ltl", "Formula", "holds_on_lasso", "to_automaton", "Automaton", "make_automaton",
+        "accepts_lasso", "is_equivalent", "is_included", "find_difference", "complement",
+        "synchronize", "make_monitor", "Monitor", "monitor_step", "monitor_verdict",
+        "trace_verdicts", "verdict", "Verdict", "make_finite_task", "FiniteTask", "finite_shares",
+        "Shares", "reach_avoid_sequences", "Sequences",
+    ),
+    "Models": (
+        "gridworld", "make_mdp", "MDP", "from_dense", "DenseMDP", "to_dense", "make_sparse",
+        "SparseMDP", "Rewards", "row_reward", "to_sparse", "to_padded", "make_trajectories",
+        "Trajectories", "rollout", "with_allowed", "restrict", "Restriction", "states_where",
+        "attractor", "Attractor", "avoidable", "almost_surely_reaching", "end_components",
+        "EndComponents", "expectation", "exists_successor", "forall_successor", "pushforward",
+        "sample_successor",
+    ),
+    "Interval and parametric models": (
+        "make_interval", "interval_rows", "IntervalMDP", "robust_reachability",
+        "robust_satisfaction", "RobustSatisfaction", "robust_total_reward",
+        "robust_discounted_value", "robust_expectation", "robust_next_probability",
+        "robust_bounded_reachability", "robust_cumulative_reward", "robust_instantaneous_reward",
+        "robust_sensitivity", "Sensitivity", "make_parametric", "ParametricMDP",
+    ),
+    "Products and policies": (
+        "product", "Product", "letters_of", "lift_policy", "project_policy", "FiniteMemoryPolicy",
+        "lift_trajectories", "project_trajectories", "lift_memory", "stack_products",
+    ),
+    "Values": (
+        "Solution", "Status", "check", "NotConverged", "Method", "policy_value", "optimal_value",
+        "soft_value", "boltzmann_value", "boltzmann_fixed_points", "total_reward", "average_reward",
+        "hitting_time", "occupancy_measure", "feature_expectation",
+    ),
+    "Probabilities": (
+        "optimal_satisfaction", "satisfaction_probability", "optimal_actions", "OptimalActions",
+        "reachability_probability", "sparse_satisfaction", "Satisfaction", "task_performance",
+        "task_performances", "Performance", "prepare", "Prepared", "solve_prepared",
+        "prepare_interval", "PreparedInterval", "solve_prepared_interval",
+    ),
+    "Properties": (
+        "solve_property", "Answer", "PropertyStrategy", "parse_property", "parse_properties",
+        "Property", "next_probability", "bounded_reachability", "reward_bounded_reachability",
+        "cumulative_reward", "instantaneous_reward", "Objective", "multi_objective",
+        "ConstrainedOptimum", "achievable", "Achievable", "pareto", "Pareto", "Front",
+        "NearestMixture",
+    ),
+    "Games": (
+        "make_game", "Game", "grid_game", "winning_region", "Winning", "verify", "Verification",
+        "safety", "reach", "buchi", "cobuchi", "parity", "Parity", "generalized_buchi", "gr1",
+        "GR1", "almost_sure_buchi", "permissive_strategy", "Permissive", "apply_strategy",
+        "shield_policy", "minimax_value", "strategy_value", "mean_payoff",
+    ),
+    "Environments and tasks": (
+        "make_environment", "Environment", "Timestep", "Finite", "Box", "make_box", "step_or_reset",
+        "Agent", "agent_of", "run_episode", "Episode", "task_environment", "TaskWorld",
+        "TaskObservation", "TaskTables", "stack_tasks", "what_is_left", "with_time_limit",
+        "shield_environment", "ShieldedWorld", "environment_of", "tabulate", "Table",
+        "sequence_environment", "sequence_sampler", "SequenceSampler", "events_of",
+        "proposition_sets", "flat_world", "letter_world", "zone_world", "from_gymnax", "from_navix",
+        "from_xminigrid", "from_jumanji", "from_brax", "from_craftax", "from_pgx",
+    ),
+    "Evidence": (
+        "evaluate", "Evaluation", "Estimate", "EpisodeTotals", "episode_evaluator",
+        "tabulate_policy", "optimality_gap", "OptimalityGap",
+    ),
+    "Data": (
+        "read_log", "read_labels", "make_counts", "TransitionCounts", "counts_on", "counted_model",
+        "intervals_from_counts", "ConfidenceSets", "learn_guarantee", "DataGuarantee",
+        "guarantee_curve",
+    ),
+    "Devices": (
+        "vmap_over_mesh", "on_host", "shard", "ShardedMDP", "to_mesh", "from_mesh", "ModelPart",
+        "model_from_parts", "read_sharded",
+    ),
+    "Files": (
+        "read_model", "write_model", "read_hoa", "write_hoa", "read_hoa_game", "write_hoa_game",
+        "HoaGame", "read_pgsolver", "write_pgsolver", "ParityGame", "read_parametric",
+        "ParametricModel", "RationalFunction", "read_reward_machine", "RewardMachine",
+        "machine_reward", "from_gymnasium", "from_stormpy", "to_stormpy",
+    ),
+}
+
+# Modules beside the top level, each with an `__all__` of its own.
+NAMESPACES: dict[str, str] = {
+    "jaxltl.algos": "Learners",
+    "jaxltl.envs": "Worlds",
+    "jaxltl.io": "Files of other tools, format by format",
+    "jaxltl.plot": "Pictures",
+}
+
+__all__ = [  # noqa: RUF022
+    "parse_ltl", "Formula", "holds_on_lasso", "to_automaton", "Automaton", "make_automaton",
+    "accepts_lasso", "is_equivalent", "is_included", "find_difference", "complement",
+    "synchronize", "make_monitor", "Monitor", "monitor_step", "monitor_verdict", "trace_verdicts",
+    "verdict", "Verdict", "make_finite_task", "FiniteTask", "finite_shares", "Shares",
+    "reach_avoid_sequences", "Sequences", "gridworld", "make_mdp", "MDP", "from_dense", "DenseMDP",
+    "to_dense", "make_sparse", "SparseMDP", "Rewards", "row_reward", "to_sparse", "to_padded",
+    "make_trajectories", "Trajectories", "rollout", "with_allowed", "restrict", "Restriction",
+    "states_where", "attractor", "Attractor", "avoidable", "almost_surely_reaching",
+    "end_components", "EndComponents", "expectation", "exists_successor", "forall_successor",
+    "pushforward", "sample_successor", "make_interval", "interval_rows", "IntervalMDP",
+    "robust_reachability", "robust_satisfaction", "RobustSatisfaction", "robust_total_reward",
+    "robust_discounted_value", "robust_expectation", "robust_next_probability",
+    "robust_bounded_reachability", "robust_cumulative_reward", "robust_instantaneous_reward",
+    "robust_sensitivity", "Sensitivity", "make_parametric", "ParametricMDP", "product", "Product",
+    "letters_of", "lift_policy", "project_policy", "FiniteMemoryPolicy", "lift_trajectories",
+    "project_trajectories", "lift_memory", "stack_products", "Solution", "Status", "check",
+    "NotConverged", "Method", "policy_value", "optimal_value", "soft_value", "boltzmann_value",
+    "boltzmann_fixed_points", "total_reward", "average_reward", "hitting_time",
+    "occupancy_measure", "feature_expectation", "optimal_satisfaction", "satisfaction_probability",
+    "optimal_actions", "OptimalActions", "reachability_probability", "sparse_satisfaction",
+    "Satisfaction", "task_performance", "task_performances", "Performance", "prepare", "Prepared",
+    "solve_prepared", "prepare_interval", "PreparedInterval", "solve_prepared_interval",
+    "solve_property", "Answer", "PropertyStrategy", "parse_property", "parse_properties",
+    "Property", "next_probability", "bounded_reachability", "reward_bounded_reachability",
+    "cumulative_reward", "instantaneous_reward", "Objective", "multi_objective",
+    "ConstrainedOptimum", "achievable", "Achievable", "pareto", "Pareto", "Front",
+    "NearestMixture", "make_game", "Game", "grid_game", "winning_region", "Winning", "verify",
+    "Verification", "safety", "reach", "buchi", "cobuchi", "parity", "Parity", "generalized_buchi",
+    "gr1", "GR1", "almost_sure_buchi", "permissive_strategy", "Permissive", "apply_strategy",
+    "shield_policy", "minimax_value", "strategy_value", "mean_payoff", "make_environment",
+    "Environment", "Timestep", "Finite", "Box", "make_box", "step_or_reset", "Agent", "agent_of",
+    "run_episode", "Episode", "task_environment", "TaskWorld", "TaskObservation", "TaskTables",
+    "stack_tasks", "what_is_left", "with_time_limit", "shield_environment", "ShieldedWorld",
+    "environment_of", "tabulate", "Table", "sequence_environment", "sequence_sampler",
+    "SequenceSampler", "events_of", "proposition_sets", "flat_world", "letter_world", "zone_world",
+    "from_gymnax", "from_navix", "from_xminigrid", "from_jumanji", "from_brax", "from_craftax",
+    "from_pgx", "evaluate", "Evaluation", "Estimate", "EpisodeTotals", "episode_evaluator",
+    "tabulate_policy", "optimality_gap", "OptimalityGap", "read_log", "read_labels", "make_counts",
+    "TransitionCounts", "counts_on", "counted_model", "intervals_from_counts", "ConfidenceSets",
+    "learn_guarantee", "DataGuarantee", "guarantee_curve", "vmap_over_mesh", "on_host", "shard",
+    "ShardedMDP", "to_mesh", "from_mesh", "ModelPart", "model_from_parts", "read_sharded",
+    "read_model", "write_model", "read_hoa", "write_hoa", "read_hoa_game", "write_hoa_game",
+    "HoaGame", "read_pgsolver", "write_pgsolver", "ParityGame", "read_parametric",
+    "ParametricModel", "RationalFunction", "read_reward_machine", "RewardMachine",
+    "machine_reward", "from_gymnasium", "from_stormpy", "to_stormpy",
 ]

@@ -33,7 +33,7 @@ from jaxltl.core.models import sequence_task as st
 from jaxltl.core.models import task_environment as te
 from jaxltl.core.models.time_limit import with_time_limit
 from jaxltl.core.values.evaluation import share_estimate
-from jaxltl.core.values.multi_objective import multi
+from jaxltl.core.values.multi_objective import multi_objective
 from jaxltl.core.values.objectives import Objective
 from jaxltl.core.values.robust import robust_reachability, robust_total_reward
 from jaxltl.envs import navigation
@@ -116,7 +116,7 @@ def things(folder):
                           "columns": ("state", "label")}),
         (jl.learn_guarantee, {**told, "rows": None, "num_claims": None, "tolerance": 1e-6}),
         (jl.guarantee_curve, {**told, "sizes": [1, 2], "seed": 0}),
-        (jl.answer, {"model": model, "prop": 'Pmaxmin=? [F "a"]', "states": None}),
+        (jl.solve_property, {"model": model, "prop": 'Pmaxmin=? [F "a"]', "states": None}),
         (jl.make_parametric, {"model": sparse, "numbers": coin, "low": [0.1], "high": [0.9],
                               "parameters": ["p"]}),
         (box.at, {"values": [0.5]}), (box.within, {"low": 0.2, "high": 0.8}),
@@ -272,8 +272,8 @@ def taught(world, key):
             "num_steps": 1, "enough": 0.9, "report": None}),
         (jl.environment_of, {"model": coin, **told}),
         (jl.environment_of, {"model": robots(2), **told}),
-        (jl.shielded, {"strategy": jl.permissive_strategy(coin, "F a"), **safe}),
-        (jl.shielded, {"strategy": np.ones((2, 1), bool), **safe}),
+        (jl.shield_environment, {"strategy": jl.permissive_strategy(coin, "F a"), **safe}),
+        (jl.shield_environment, {"strategy": np.ones((2, 1), bool), **safe}),
         (robots, {"size": 3}),
         (partial(grid_game, "a..\n..b"), {"system_stays": True, "environment_stays": False}),
         (partial(make_network, "2-3-1"), {"biases": True}),
@@ -363,7 +363,8 @@ def test_good_input_is_taken(tmp_path):
     (lambda m: jl.robust_bounded_reachability(m, "a", None), "num_steps=None; it must be a whole"),
     (lambda m: robust_reachability(m, "a", policy="x"), "policy is 'x'; give the number"),
     (lambda m: jl.average_reward(m, "r"), "robust_discounted_value, with a discount near 1"),
-    (lambda m: multi(m, [Objective(target="a"), Objective(target="a")]), "ask for one at a time"),
+    (lambda m: multi_objective(m, [Objective(target="a"), Objective(target="a")]),
+     "ask for one at a time"),
     (lambda m: jl.bounded_reachability(m, "a", 2), "ask what does .*robust_bounded_reachability"),
     (lambda m: jl.to_dense(m), "or give its nominal model, model.nominal"),
     (lambda m: jl.attractor(m, m.states_where("a")), "IntervalMDP has intervals"),

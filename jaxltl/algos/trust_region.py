@@ -243,14 +243,14 @@ def make_problem(
         that is no number.
 
     Example:
-      >>> from jaxltl.core.models.environment import box, make_environment
+      >>> from jaxltl.core.models.environment import make_box, make_environment
       >>> def reset(key):
       ...     return jax.random.uniform(key, (1,))
       >>> def move(place, action, key):
       ...     place = place + jnp.clip(action, -1, 1)
       ...     return Timestep(place, -abs(place[0]), place[0] > 9, cost=action[0] ** 2)
       >>> world = make_environment(
-      ...     reset, move, lambda place: place, actions=box(-jnp.inf, jnp.inf, (1,)))
+      ...     reset, move, lambda place: place, actions=make_box(-jnp.inf, jnp.inf, (1,)))
       >>> problem = make_problem(world, horizon=5, limit=1.0)
       >>> float(problem.limit)
       1.0

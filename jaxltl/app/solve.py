@@ -19,11 +19,11 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import NotConverged, Status
-from jaxltl.core.values.answer import Answer, Strategy, answer
+from jaxltl.core.values.answer import Answer, PropertyStrategy, solve_property
 from jaxltl.core.values.answer_several import answer_several
-from jaxltl.core.values.multi_objective import Achievable, Best, Pareto
+from jaxltl.core.values.multi_objective import Achievable, ConstrainedOptimum, Pareto
 
-Found = Answer | Achievable | Best | Pareto
+Found = Answer | Achievable | ConstrainedOptimum | Pareto
 
 PROPERTY_FILES = (".props", ".prop", ".pctl")
 SHOWN = 10  # initial states whose values are printed
@@ -142,7 +142,7 @@ def solve(
                             "probabilities are intervals; ask for one at a time.")
                     found = answer_several(model, one.parsed, tolerance=tolerance)
                 else:
-                    found = answer(model, one.parsed, tolerance=tolerance)
+                    found = solve_property(model, one.parsed, tolerance=tolerance)
             except ValueError as mistake:
                 error = str(mistake)
             except NotConverged as failure:
@@ -187,7 +187,7 @@ def result_entry(result: Result) -> dict[str, Any]:
     return entry | {"seconds": result.seconds}
 
 
-def _several_entry(found: Achievable | Best | Pareto) -> dict[str, Any]:
+def _several_entry(found: Achievable | ConstrainedOptimum | Pareto) -> dict[str, Any]:
     """Of several objectives: whether they are met, the best value, or the points of the curve."""
     entry: dict[str, Any] = {"status": Status(found.status).name}
     if isinstance(found, Pareto):
@@ -240,11 +240,11 @@ def text(result: Result) -> str:
     return "\n".join(lines)
 
 
-def _several_text(found: Achievable | Best | Pareto) -> list[str]:
+def _several_text(found: Achievable | ConstrainedOptimum | Pareto) -> list[str]:
     if isinstance(found, Pareto):
         head = f"  {len(found.points)} points, whose mixtures are the curve up to {found.gap:.1e}"
         return [head, *("  " + ", ".join(f"{x:.9g}" for x in p) for p in found.points.tolist())]
-    if isinstance(found, Best) and found.holds:
+    if isinstance(found, ConstrainedOptimum) and found.holds:
         return [f"  {found.value!r}, in [{found.lower!r}, {found.upper!r}]"]
     verdict = {True: "true", False: "false", None: "not decided"}[found.holds]
     lines = [f"  the thresholds can be met: {verdict}"]
@@ -282,7 +282,7 @@ def strategies(
     return (json.dumps(table, allow_nan=False) + "\n").encode()
 
 
-def _strategy(given: SparseMDP | IntervalMDP, strategy: Strategy) -> dict[str, Any]:
+def _strategy(given: SparseMDP | IntervalMDP, strategy: PropertyStrategy) -> dict[str, Any]:
     model = given.nominal if isinstance(given, IntervalMDP) else given
     host = model.host
     row = np.asarray(strategy.row)

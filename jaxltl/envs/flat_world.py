@@ -23,7 +23,7 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.core.host import given
-from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
+from jaxltl.core.models.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.models.time_limit import with_time_limit, without_time_limit
 
 # Colour, place and radius of each disc.
@@ -124,12 +124,12 @@ def flat_world(
         reset = Partial(_begin_at, np.asarray(start, np.float32))
     else:
         reset = Partial(_begin, _free_places(scene, extent, num_starts, seed))
-    velocity: Any = 9 if discrete else box(-1, 1, (2,), np.float32)
+    velocity: Any = 9 if discrete else make_box(-1, 1, (2,), np.float32)
     most = extent + time_step  # of the step that leaves the square the place outside is seen
     world = make_environment(
         reset, Partial(_move, number, np.array(_MOVES, np.float32) if discrete else None), _see,
         actions=velocity, labels=Partial(_labels, scene), propositions=names,
-        observations=box(-most, most, (2,), np.float32))
+        observations=make_box(-most, most, (2,), np.float32))
     return world if horizon is None else with_time_limit(world, horizon)
 
 

@@ -28,7 +28,7 @@ from jaxltl.core.host import given
 from jaxltl.core.models.environment import (
     Environment,
     Timestep,
-    box,
+    make_box,
     make_environment,
 )
 from jaxltl.core.models.time_limit import with_time_limit
@@ -132,7 +132,7 @@ def letter_world(
         reset, Partial(_move, _neighbors(size)), Partial(_see, views, np.zeros(shape, np.float32),
                                                          np.arange(count + 1, dtype=np.int8)),
         actions=4, labels=Partial(_labels, np.arange(count, dtype=np.int8)), propositions=names,
-        observations=box(0, 1, shape, np.float32), starts=starts)
+        observations=make_box(0, 1, shape, np.float32), starts=starts)
     return made if horizon is None else with_time_limit(made, horizon)
 
 

@@ -20,7 +20,7 @@ from flax import struct
 from jax import lax
 from numpy.typing import ArrayLike
 
-from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
+from jaxltl.core.models.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.envs.networks import Network, apply_lanes, make_network, weighted
 
 
@@ -329,7 +329,7 @@ def as_environment(world: LQR, dtype: Any = None) -> Environment:
     world = jax.tree.map(lambda x: np.asarray(x, dtype), world)
     reset, step = (jax.tree_util.Partial(f, world) for f in (_first_state, _controlled))
     return make_environment(
-        reset, step, _observed, actions=box(-np.inf, np.inf, world.control.shape[-1:], dtype),
+        reset, step, _observed, actions=make_box(-np.inf, np.inf, world.control.shape[-1:], dtype),
         horizon=world.horizon)
 
 

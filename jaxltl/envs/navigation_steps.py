@@ -17,7 +17,7 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.host import given
-from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
+from jaxltl.core.models.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.envs import navigation as nav
 from jaxltl.envs.navigation import Navigation, State
 
@@ -88,7 +88,7 @@ def as_environment(
     reset, step, observe, labels = (
         jax.tree_util.Partial(f, settings, world) for f in (_reset, _step, _observe, _labels))
     return make_environment(
-        reset, step, observe, actions=box(-1, 1, (2,), settings.dtype), labels=labels,
+        reset, step, observe, actions=make_box(-1, 1, (2,), settings.dtype), labels=labels,
         propositions=nav.PROPOSITIONS, horizon=world.horizon)
 
 

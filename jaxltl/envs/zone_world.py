@@ -26,7 +26,7 @@ from flax import struct
 from jax.tree_util import Partial
 
 from jaxltl.core.host import given
-from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
+from jaxltl.core.models.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.models.time_limit import with_time_limit
 
 COLORS = ("green", "yellow", "blue", "magenta")
@@ -127,9 +127,9 @@ def zone_world(
     count = len(names) * _BINS + 11
     world = make_environment(
         Partial(_begin, places.astype(np.float32), np.zeros((zones, len(names)))),
-        Partial(_move, numbers), Partial(_see, numbers), actions=box(-1, 1, (2,), np.float32),
+        Partial(_move, numbers), Partial(_see, numbers), actions=make_box(-1, 1, (2,), np.float32),
         labels=Partial(_labels, numbers), propositions=names,
-        observations=box(-np.inf, np.inf, (count,), np.float32))
+        observations=make_box(-np.inf, np.inf, (count,), np.float32))
     return world if horizon is None else with_time_limit(world, horizon)
 
 

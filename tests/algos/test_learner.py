@@ -35,7 +35,7 @@ from jaxltl.algos import (
     trust_region,
 )
 from jaxltl.algos.exponential_family import diagonal_gaussian
-from jaxltl.core.models.environment import Timestep, box, make_environment
+from jaxltl.core.models.environment import Timestep, make_box, make_environment
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.parametric import make_parametric
@@ -198,7 +198,7 @@ def trust(method, **networks):
         value_epochs=1, value_batches=2, **networks,
     )
     world = make_environment(
-        choice_reset, choice_step, choice_observe, actions=box(-jnp.inf, jnp.inf, (2,)))
+        choice_reset, choice_step, choice_observe, actions=make_box(-jnp.inf, jnp.inf, (2,)))
     problem = trust_region.make_problem(world, horizon=4, limit=6.0)
     return Case(
         trust_region, problem, setting(discount=0.9),
@@ -229,7 +229,7 @@ def proximal(squash="clip", **options):
     width = np.array(3.0)
     if squash == "tanh":
         world = make_environment(
-            choice_reset, choice_step, choice_observe, actions=box(-1, 1, (2,)))
+            choice_reset, choice_step, choice_observe, actions=make_box(-1, 1, (2,)))
         network = ppo.RecurrentActorCritic(shape=(2,), hidden=(), memory=2)
         problem = ppo.make_problem(world, network=network, memory=np.array([0.1, 0.2]))
     else:

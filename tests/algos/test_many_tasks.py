@@ -10,7 +10,7 @@ import pytest
 
 from jaxltl.algos import many_tasks, ppo
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.environment import Timestep, box, make_environment, run_episode
+from jaxltl.core.models.environment import Timestep, make_box, make_environment, run_episode
 from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.models.sequence_task import Sequence, SequenceObservation, events_of
 from jaxltl.core.models.tabulate import tabulate
@@ -205,7 +205,7 @@ def test_masks_are_kept():
 @pytest.mark.parametrize("squash", ["clip", "tanh"])
 def test_a_network_of_ppo_does_the_same_with_boxes(squash):
     """Scaled to its box, clipped or squashed, by normalised observations, as it was trained."""
-    space = box(jnp.array([0.0, -3.0]), jnp.array([10.0, 5.0]))
+    space = make_box(jnp.array([0.0, -3.0]), jnp.array([10.0, 5.0]))
     told = one_state_plan()
     sequence = Sequence(told.reach[0, 0], told.avoid[0, 0], jnp.int32(1))
     world = make_environment(

@@ -23,7 +23,7 @@ from jaxltl.algos.schedules import Linear
 from jaxltl.core.models.environment import (
     Finite,
     Timestep,
-    box,
+    make_box,
     make_environment,
     run_episode,
 )
@@ -248,7 +248,7 @@ def test_densities_and_entropies_are_those_of_distributions():
     slope = jax.grad(entropy)(logits)
     assert slope[1] == 0 and np.isfinite(slope).all() and (slope != 0).sum() == 3
     # Of a box: integrals on a fine grid; the second axis has no upper bound.
-    space = box([-1.0, 0.0], [3.0, np.inf])
+    space = make_box([-1.0, 0.0], [3.0, np.inf])
     mean, spread = jnp.array([0.4, 1.0]), jnp.log(jnp.array([0.6, 0.5]))
     grid = np.linspace(-12, 12, 200001)
     normal = np.exp(-((grid - 0.4) / 0.6) ** 2 / 2) / (0.6 * np.sqrt(2 * np.pi))
@@ -340,7 +340,7 @@ def drift_observe(world):
     return {"place": 100 + 7 * world, "side": world[0] > 0}
 
 
-DRIFT = make_environment(drift_reset, drift_step, drift_observe, actions=box(-1.0, 1.0, (2,)))
+DRIFT = make_environment(drift_reset, drift_step, drift_observe, actions=make_box(-1.0, 1.0, (2,)))
 DRIFTERS = {
     "perceptron": ppo.ActorCritic(shape=(2,), hidden=(4,)),
     "memory": ppo.RecurrentActorCritic(shape=(2,), hidden=(4,), memory=3),
@@ -502,7 +502,8 @@ class WithAxis(nn.Module):
     (lambda: ppo.make_problem(WALK, network=Table(3)), r"\(\(3,\), \(\)\).* expected \(\(2,\)"),
     (lambda: ppo.make_problem(WALK, network=WithAxis()), r"\(\(2,\), \(1,\)\) for one obs"),
     (lambda: ppo.make_problem(WALK, network=Counting()), r"keeps \['seen'\] beside its param"),
-    (lambda: ppo.make_problem(WALK.replace(actions=box(0, 5, (2,), int))), "box of int64; number"),
+    (lambda: ppo.make_problem(WALK.replace(actions=make_box(0, 5, (2,), int))),
+     "box of int64; number"),
 ])
 def test_problems_that_cannot_be_are_named(make, message):
     with pytest.raises(ValueError, match=message):

@@ -22,7 +22,7 @@ from jaxltl.algos.moments import Moments, scale_of, updated_moments
 from jaxltl.algos.trust_region import Hparams
 from jaxltl.core.models.environment import (
     Timestep,
-    box,
+    make_box,
     make_environment,
     run_episode,
 )
@@ -63,7 +63,7 @@ def circle_step(world, action, key):
 def free(reset, step, observe, num_actions):
     """An environment whose actions have no bounds."""
     return make_environment(
-        reset, step, observe, actions=box(-np.inf, np.inf, (num_actions,)))
+        reset, step, observe, actions=make_box(-np.inf, np.inf, (num_actions,)))
 
 
 def circle(limit=5.0):
@@ -548,7 +548,7 @@ def test_a_policy_runs_as_an_agent_on_trees_within_the_box():
         return Timestep(world.at[0].add(1), -jnp.sum(action), world[0] >= 3, cost=1.0 * out)
 
     world = make_environment(
-        counted_reset, step, tree_observe, actions=box([[-0.5], [-0.25]], 0.25), horizon=4)
+        counted_reset, step, tree_observe, actions=make_box([[-0.5], [-0.25]], 0.25), horizon=4)
     problem = trust_region.make_problem(world, limit=1.0)
     assert problem.horizon == 4
     hparams = SMALL.replace(initial_deviation=2.0)
@@ -861,7 +861,7 @@ def test_problems_that_do_not_fit_are_refused(change, message):
         trust_region.make_problem(world, **{"horizon": 3, **change})
 
 
-@pytest.mark.parametrize("actions", [2, box(0, 3, (1,), jnp.int32)])
+@pytest.mark.parametrize("actions", [2, make_box(0, 3, (1,), jnp.int32)])
 def test_actions_that_a_gaussian_cannot_draw_are_refused(actions):
     def step(world, action, key):
         return Timestep(world, 0.0, False)

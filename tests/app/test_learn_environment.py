@@ -21,7 +21,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 WORLD = '''
 import jax
 import jax.numpy as jnp
-from jaxltl import Timestep, box, make_environment
+from jaxltl import Timestep, make_box, make_environment
 
 
 def corridor(length=3, boxed=False, horizon=8, ends=True):
@@ -32,7 +32,7 @@ def corridor(length=3, boxed=False, horizon=8, ends=True):
 
     return make_environment(
         lambda key: jnp.int32(0), step, lambda place: place[None] / length,
-        actions=box(-1.0, 1.0, (1,)) if boxed else 2, horizon=horizon if ends else None,
+        actions=make_box(-1.0, 1.0, (1,)) if boxed else 2, horizon=horizon if ends else None,
         labels=lambda place: jnp.array([place == length, place == -length]),
         propositions=["goal", "pit"])
 

@@ -13,7 +13,7 @@ import pytest
 from jaxltl.algos import checkpoint
 from jaxltl.app._teller import told
 from jaxltl.app.processes import Asked, Launch, Place, launched
-from jaxltl.core.values.answer import answer
+from jaxltl.core.values.answer import solve_property
 from jaxltl.core.values.discounted import optimal_value
 from jaxltl.core.values.soft import soft_value
 from tests import several
@@ -194,7 +194,7 @@ def test_solvers_in_two_processes_find_what_the_host_finds(tmp_path):
     told = [json.loads(line) for line in first.out.splitlines() if line.startswith("{")]
     model = gambler()
     for there, text in zip(told, PROPERTIES, strict=False):
-        here = answer(model, text)
+        here = solve_property(model, text)
         assert there["property"] == text and there["status"] == here.status.name
         assert there["holds"] == here.holds
         assert (np.array(there["lower"]) <= here.upper).all()

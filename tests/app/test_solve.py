@@ -205,14 +205,14 @@ def test_a_strategy_that_cannot_be_written_is_said_first(model_file, tmp_path):
 
 
 def test_a_failure_of_ours_does_not_lose_the_other_answers(model_file, monkeypatch):
-    original = module.answer
+    original = module.solve_property
 
     def failing(model, prop, **options):
         if "ruin" in prop.text:
             raise ZeroDivisionError("for the test")
         return original(model, prop, **options)
 
-    monkeypatch.setattr(module, "answer", failing)
+    monkeypatch.setattr(module, "solve_property", failing)
     done = run(model_file, 'Pmax=? [ F "ruin" ]', 'Pmax=? [ F "rich" ]', "--json")
     found = json.loads(done.stdout.splitlines()[-1])["results"]
     assert done.exit_code == 1

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.models.environment import Timestep, box, make_environment
+from jaxltl.core.models.environment import Timestep, make_box, make_environment
 from jaxltl.envs.networks import (
     ACTIVATIONS,
     apply,
@@ -126,7 +126,7 @@ def test_networks_act():
     said = np.array([0.4, -0.3, 1.0, 0.0]) @ np.asarray(parameters[:16]).reshape(4, 4)
     said += np.asarray(parameters[16:])
     network = make_network("4-4")
-    agent = network_agent(network, world_of(box(-0.5, 0.5, (2, 2))))(parameters)
+    agent = network_agent(network, world_of(make_box(-0.5, 0.5, (2, 2))))(parameters)
     action, memory = agent.act((), seen, None, None)
     np.testing.assert_allclose(action, np.clip(said, -0.5, 0.5).reshape(2, 2))
     assert memory == () and np.abs(action).max() == 0.5

@@ -159,7 +159,7 @@ def apply_strategy(strategy: Permissive) -> Restriction:
     return restrict(strategy.game, initial / initial.sum(), allowed=strategy.allowed)
 
 
-def shield(policy: jax.Array, allowed: jax.Array) -> jax.Array:
+def shield_policy(policy: jax.Array, allowed: jax.Array) -> jax.Array:
     """A policy kept to the moves that a mask allows.
 
     Args:
@@ -176,7 +176,7 @@ def shield(policy: jax.Array, allowed: jax.Array) -> jax.Array:
       ValueError: the mask allows nothing at all, or the shapes differ.
 
     Example:
-      >>> shield(np.array([[0.5, 0.25, 0.25]]), np.array([[False, True, True]])).tolist()
+      >>> shield_policy(np.array([[0.5, 0.25, 0.25]]), np.array([[False, True, True]])).tolist()
       [[0.0, 0.5, 0.5]]
     """
     xp, policy, allowed = namespace(policy, allowed)

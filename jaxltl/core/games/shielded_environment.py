@@ -64,7 +64,7 @@ class _Guide:
     allowed: Any
 
 
-def shielded(
+def shield_environment(
     environment: Environment,
     strategy: Permissive | Winning | ArrayLike,
     state_of: Callable[..., Any] | None = None,
@@ -102,7 +102,7 @@ def shielded(
       >>> from jaxltl.core.models.simulated_model import environment_of
       >>> model = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]],
       ...                    label=[[0], [1]], propositions=["crash"], initial=[1, 0])
-      >>> safe = shielded(environment_of(model), permissive_strategy(model, "G !crash"))
+      >>> safe = shield_environment(environment_of(model), permissive_strategy(model, "G !crash"))
       >>> safe.allowed(safe.reset(jax.random.key(0))).tolist()
       [True, False]
     """

@@ -21,7 +21,7 @@ from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.models.concrete import is_traced, namespace, to_jax
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.product import Product, allowed_steps, letters, memory_along, product
+from jaxltl.core.models.product import Product, allowed_steps, letters_of, memory_along, product
 from jaxltl.core.models.restrict import with_allowed
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, require_states
 
@@ -58,7 +58,7 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
     if isinstance(task, str | Formula):
         formula = parse_ltl(task) if isinstance(task, str) else task
         known = set(formula.propositions)
-        shown = {x for world in worlds for x in letters(world, known & set(world.propositions))}
+        shown = {x for world in worlds for x in letters_of(world, known & set(world.propositions))}
         task = to_automaton(formula, letters=sorted(shown, key=sorted))
     num_states = max(world.num_states for world in worlds)
     width = max(world.num_successors for world in worlds)

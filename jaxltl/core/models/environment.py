@@ -47,7 +47,7 @@ class Finite:
 
 @struct.dataclass
 class Box:
-    """Arrays between two bounds; made by :func:`box`.
+    """Arrays between two bounds; made by :func:`make_box`.
 
     Attributes:
       low, high: arrays that broadcast to the shape; infinite where there is no bound.
@@ -61,7 +61,7 @@ class Box:
     dtype: str = struct.field(pytree_node=False, default="float32")
 
 
-def box(
+def make_box(
     low: ArrayLike, high: ArrayLike, shape: Sequence[int] | None = None, dtype: Any = None
 ) -> Box:
     """A :class:`Box`.
@@ -75,13 +75,13 @@ def box(
       ValueError: bounds that cross, are no numbers, or do not fit the shape.
 
     Example:
-      >>> box(-1.0, [1.0, 2.0]).shape
+      >>> make_box(-1.0, [1.0, 2.0]).shape
       (2,)
     """
     bounds = {"low": _bounds(low), "high": _bounds(high)}
     for name, bound in bounds.items():
         if bound.dtype.kind not in "biuf" or np.isnan(bound.astype(float)).any():
-            raise ValueError(f"box: {name}={bound.tolist()!r}; give numbers.")
+            raise ValueError(f"make_box: {name}={bound.tolist()!r}; give numbers.")
     least, most = bounds.values()
     try:
         full = np.broadcast_shapes(least.shape, most.shape) if shape is None else tuple(
@@ -91,17 +91,17 @@ def box(
         fits, full = False, ()
     if not fits:
         raise ValueError(
-            f"box: bounds of shapes {list(least.shape)} and {list(most.shape)} do not fit the "
+            f"make_box: bounds of shapes {list(least.shape)} and {list(most.shape)} do not fit the "
             f"shape {shape}; give numbers, or arrays of that shape.")
     if (least > most).any():
         place = np.argwhere(least > most)[0].tolist()
-        raise ValueError(f"box: low is above high at {place}; exchange them.")
+        raise ValueError(f"make_box: low is above high at {place}; exchange them.")
     try:
         kind = jnp.dtype(jnp.result_type(float) if dtype is None else dtype)
     except (TypeError, ValueError):
-        raise ValueError(f"box: dtype={given.shown(dtype)}; give a type of numbers.") from None
+        raise ValueError(f"make_box: dtype={given.shown(dtype)}; give a type of numbers.") from None
     if kind.kind not in "biuf":
-        raise ValueError(f"box: dtype={kind.name}; give a type of numbers.")
+        raise ValueError(f"make_box: dtype={kind.name}; give a type of numbers.")
     if kind.kind in "biu":  # an infinite bound is that of the type
         ends = (0, 1) if kind.kind == "b" else (jnp.iinfo(kind).min, jnp.iinfo(kind).max)
         least, most = (_clipped(x.astype(float), *ends).astype(kind) for x in (least, most))
@@ -221,7 +221,7 @@ def make_environment(
     if isinstance(actions, int | np.integer):
         actions = Finite(int(actions))
     if not isinstance(actions, Finite | Box):
-        raise ValueError(f"actions={actions!r}; give Finite(number), or box(low, high).")
+        raise ValueError(f"actions={actions!r}; give Finite(number), or make_box(low, high).")
     if isinstance(actions, Finite) and actions.num < 1:
         raise ValueError(f"actions: Finite({actions.num}); there must be at least one.")
     if labels is None:
@@ -238,7 +238,7 @@ def make_environment(
     seen = _check_functions(made)
     if observations is None:
         def free(x: Any) -> Box:
-            return box(-np.inf, np.inf, x.shape, x.dtype)
+            return make_box(-np.inf, np.inf, x.shape, x.dtype)
         made = replace(made, observations=jax.tree.map(free, seen))
     elif not _alike(found := _described(_as_arrays(observations)), _described(seen)):
         raise ValueError(f"observe returns {_described(seen)}, but observations is of {found}.")
@@ -538,7 +538,7 @@ def _is_bool(x: Any) -> bool:
 
 def _as_arrays(observations: Any) -> Any:
     for leaf in jax.tree.leaves(observations, is_leaf=lambda b: isinstance(b, Box)):
-        given.instance("observations", leaf, Box, "a tree of box(low, high)")
+        given.instance("observations", leaf, Box, "a tree of make_box(low, high)")
     return jax.tree.map(lambda b: jax.ShapeDtypeStruct(b.shape, jnp.dtype(b.dtype)), observations,
                         is_leaf=lambda b: isinstance(b, Box))
 

@@ -162,7 +162,9 @@ class Product:
         return to_jax(xp.broadcast_to(final, self.state_shape))
 
 
-def letters(world: MDP | DenseMDP, propositions: Collection[str] | None = None) -> list[frozenset]:
+def letters_of(
+    world: MDP | DenseMDP, propositions: Collection[str] | None = None
+) -> list[frozenset]:
     """The sets of propositions that occur at some state of a world, for ``to_automaton``.
 
     Args:
@@ -175,7 +177,7 @@ def letters(world: MDP | DenseMDP, propositions: Collection[str] | None = None) 
     Example:
       >>> from jaxltl.core.models.mdp import from_dense
       >>> world = from_dense([[[1.0, 0]], [[0, 1.0]]], label=[[0], [1]], propositions=["a"])
-      >>> [sorted(letter) for letter in letters(world)]
+      >>> [sorted(letter) for letter in letters_of(world)]
       [[], ['a']]
     """
     keep = [i for i, p in enumerate(world.propositions)
@@ -218,7 +220,7 @@ def product(world: Any, task: Automaton | Formula | str, *, label_on: str = "ent
     if isinstance(task, str | Formula):
         formula = parse_ltl(task) if isinstance(task, str) else task
         require_known(formula.propositions, world.propositions, "the task")
-        task = to_automaton(formula, letters=letters(world, formula.propositions))
+        task = to_automaton(formula, letters=letters_of(world, formula.propositions))
     if not isinstance(task, Automaton):
         raise ValueError(f"task is {shown(task)}; give a formula, its text, or an automaton.")
     require_known(task.propositions, world.propositions, "the task")
@@ -250,7 +252,7 @@ def _letter(automaton: Automaton, row: np.ndarray, state: int) -> int:
     except ValueError as error:
         raise ValueError(
             f"world state {state} shows the letter {{{', '.join(sorted(shown))}}}, which the "
-            "automaton was not built for; translate with letters=letters(world)."
+            "automaton was not built for; translate with letters=letters_of(world)."
         ) from error
 
 

@@ -21,7 +21,7 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.core.host import given
-from jaxltl.core.models.environment import Environment, Timestep, box, require_environment
+from jaxltl.core.models.environment import Environment, Timestep, make_box, require_environment
 from jaxltl.core.models.monitor import Verdict
 
 
@@ -228,8 +228,8 @@ def sequence_environment(
         raise ValueError(f"the sampler is of {width} events, but {len(rows)} are given; both must "
                          "be of the same events.")
     shape = (len(sampler.length), len(rows))
-    told: Any = Sequence(box(0, 1, shape, bool), box(0, 1, shape, bool),  # type: ignore[arg-type]
-                         box(0, np.inf, (), np.int32))  # type: ignore[arg-type]
+    told: Any = Sequence(make_box(0, 1, shape, bool), make_box(0, 1, shape, bool),  # type: ignore[arg-type]
+                         make_box(0, np.inf, (), np.int32))  # type: ignore[arg-type]
     numbers = np.array([given.number("violation", violation), given.number("progress", progress)])
     return replace(
         inner,

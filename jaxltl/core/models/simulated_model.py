@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from jaxltl.core.host import given
 from jaxltl.core.models.convert import to_padded
-from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
+from jaxltl.core.models.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.operators import sample_successor
@@ -77,7 +77,7 @@ def environment_of(
         outcomes = Partial(_outcomes_of_two, other, owner, outcomes)
     elif opponent is not None:
         raise ValueError("opponent is for games; make_game tells whose turn it is in a state.")
-    spaces = box(0, 1, (size,)) if observe is None else None
+    spaces = make_box(0, 1, (size,)) if observe is None else None
     return make_environment(
         Partial(_reset, model.initial), step,
         Partial(_one_hot, model.initial) if observe is None else observe,

@@ -32,7 +32,7 @@ from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.environment import (
     Environment,
     Timestep,
-    box,
+    make_box,
     make_environment,
     require_environment,
 )
@@ -394,9 +394,9 @@ def what_is_left(task: Environment | TaskTables | Automaton, memory: Any) -> str
 
 def _beside(inner: Environment, tables: TaskTables) -> Environment:
     if tables.embedding is None:
-        memory = box(0, 1, tables.delta.shape[-2:-1])
+        memory = make_box(0, 1, tables.delta.shape[-2:-1])
     else:
-        memory = box(-np.inf, np.inf, tables.embedding.shape[1:])
+        memory = make_box(-np.inf, np.inf, tables.embedding.shape[1:])
     spaces: Any = TaskObservation(inner.observations, memory)  # type: ignore[arg-type]
     return replace(
         inner, reset=Partial(_reset, tables, inner.labels, inner.reset),

@@ -50,7 +50,7 @@ TINY = 1e-12  # width of an interval of rewards that is narrow enough whatever t
 _OTHER = {"max": "min", "min": "max"}
 
 
-class Strategy(NamedTuple):
+class PropertyStrategy(NamedTuple):
     """What attains an answer.
 
     Attributes:
@@ -88,7 +88,7 @@ class Answer(NamedTuple):
     holds: list[bool | None] | None
     status: Status
     method: str
-    strategy: Strategy | None
+    strategy: PropertyStrategy | None
 
 
 class _Found(NamedTuple):
@@ -96,7 +96,7 @@ class _Found(NamedTuple):
 
     solution: Solution
     method: str
-    strategy: Strategy | None
+    strategy: PropertyStrategy | None
 
 
 class _Aim(NamedTuple):
@@ -115,7 +115,7 @@ class _Aim(NamedTuple):
         return {"objective": self.policy, "nature": self.nature}
 
 
-def answer(
+def solve_property(
     model: SparseMDP | IntervalMDP, prop: Property | str, *, states: Any = None,
     tolerance: float = TOLERANCE,
 ) -> Answer:
@@ -140,9 +140,9 @@ def answer(
       >>> from jaxltl.core.models.sparse import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
       ...                    initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["a"])
-      >>> answer(coin, 'P=? [ F "a" ]').value.tolist()
+      >>> solve_property(coin, 'P=? [ F "a" ]').value.tolist()
       [0.5]
-      >>> answer(coin, 'P>0.4 [ X "a" ]').holds
+      >>> solve_property(coin, 'P>0.4 [ X "a" ]').holds
       [True]
     """
     prop = parse_property(prop) if isinstance(prop, str) else prop
@@ -343,7 +343,7 @@ def _plain(states: np.ndarray, solution: Solution, by: str = "") -> _Found:
         "steps": "step by step", "reward": "level by level of the reward"}.get(by, "")
     nature = None if solution.nature is None else np.asarray(solution.nature)
     return _Found(at_states(solution, states), method,
-                  Strategy(np.asarray(solution.policy), by, nature=nature))
+                  PropertyStrategy(np.asarray(solution.policy), by, nature=nature))
 
 
 class _Probability(NamedTuple):
@@ -430,7 +430,7 @@ class _Probability(NamedTuple):
             method = str(result.solution.method)
             size = f"product of {result.product.host.num_states} states"
             return _Found(result.solution, f"{size}, {method}" if method else size,
-                          Strategy(row, memory=result, nature=nature))
+                          PropertyStrategy(row, memory=result, nature=nature))
 
         return found
 

@@ -23,18 +23,18 @@ from jaxltl.core.types import Status
 from jaxltl.core.values.answer import TOLERANCE
 from jaxltl.core.values.multi_objective import (
     Achievable,
-    Best,
-    Nearest,
+    ConstrainedOptimum,
+    NearestMixture,
     Objective,
     Pareto,
-    multi,
+    multi_objective,
     nearest_of,
 )
 
 
 def answer_several(
     model: SparseMDP, prop: Property | str, *, tolerance: float = TOLERANCE
-) -> Achievable | Best | Pareto:
+) -> Achievable | ConstrainedOptimum | Pareto:
     """What ``multi(...)`` asks for, from the initial distribution.
 
     A threshold is one on some strategy here, not on all: ``P>=0.9`` is to be reached, ``R<=3`` not
@@ -44,7 +44,7 @@ def answer_several(
     Args:
       model: the model.
       prop: a property or its text.
-      tolerance: as for :func:`~jaxltl.core.values.multi_objective.multi`.
+      tolerance: as for :func:`~jaxltl.core.values.multi_objective.multi_objective`.
 
     Raises:
       ValueError: an objective that is not solved for beside others, with the reason.
@@ -69,11 +69,13 @@ def answer_several(
             return loose._replace(
                 holds=None, share=None, status=Status.PRECISION, nearest=_missing(prop, loose))
         return loose
-    assert isinstance(strict, Best) and isinstance(loose, Best)
+    assert isinstance(strict, ConstrainedOptimum) and isinstance(loose, ConstrainedOptimum)
     return _between(prop, strict, loose)
 
 
-def _between(prop: Property, strict: Best, loose: Best) -> Best:
+def _between(
+    prop: Property, strict: ConstrainedOptimum, loose: ConstrainedOptimum
+) -> ConstrainedOptimum:
     """What is true of thresholds between these two."""
     if loose.holds is False or strict.holds is None:
         return loose if loose.holds is False else strict
@@ -85,7 +87,7 @@ def _between(prop: Property, strict: Best, loose: Best) -> Best:
         status=max(strict.status, loose.status))
 
 
-def _missing(prop: Property, loose: Achievable | Best) -> Nearest | None:
+def _missing(prop: Property, loose: Achievable | ConstrainedOptimum) -> NearestMixture | None:
     """What is attained where thresholds that are a little easier are met, or nearly met."""
     if loose.share is None:
         return loose.nearest
@@ -98,9 +100,9 @@ def _missing(prop: Property, loose: Achievable | Best) -> Nearest | None:
 
 def _solved(
     model: SparseMDP, prop: Property, tolerance: float, *, strict: bool
-) -> Achievable | Best | Pareto:
+) -> Achievable | ConstrainedOptimum | Pareto:
     parts = [_objective(model, x, strict) for x in prop.parts]
-    return multi(model, parts, tolerance=tolerance)
+    return multi_objective(model, parts, tolerance=tolerance)
 
 
 def _rounded(prop: Property, strict: bool) -> float | None:

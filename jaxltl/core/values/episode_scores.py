@@ -15,9 +15,9 @@ from jax.tree_util import Partial
 from jaxltl.core.host import given
 from jaxltl.core.models.environment import Environment, as_partial, require_environment
 from jaxltl.core.models.monitor import Verdict
-from jaxltl.core.values.evaluation import Totals, checked_steps, episode_totals, task_world
+from jaxltl.core.values.evaluation import EpisodeTotals, checked_steps, episode_totals, task_world
 
-Score = str | Callable[[Totals], chex.Numeric]
+Score = str | Callable[[EpisodeTotals], chex.Numeric]
 
 SUMS = ("reward", "discounted_reward", "cost", "length")
 OF_TASKS = ("success", "failure", "violation", "undecided", "visits", "discounted_visits")
@@ -46,9 +46,9 @@ def episode_evaluator(
     """``evaluate(parameters, key) -> (objective, costs)`` of a policy, means over episodes.
 
     For ``cce.make_problem(evaluate, family, limit=...)`` and any other search. Scores are the
-    fields of :class:`~jaxltl.core.values.evaluation.Totals` by name (``"reward"``, ``"cost"``,
-    ``"length"``, ...); of an environment with a task also ``"success"``, ``"violation"`` and
-    ``"undecided"``, shares of episodes by the verdict at their end, and ``"failure"``, which is
+    fields of :class:`~jaxltl.core.values.evaluation.EpisodeTotals` by name (``"reward"``,
+    ``"cost"``, ``"length"``, ...); of an environment with a task also ``"success"``,
+    ``"violation"`` and ``"undecided"``, shares of episodes by the verdict at their end, and ``"failure"``, which is
     ``1 - success``; or functions of the totals of one episode. A task to be done with a chance of
     at least .9 is the cost ``"failure"`` with the limit .1.
 
@@ -76,7 +76,7 @@ def episode_evaluator(
       ...     return Timestep(place + action, -jnp.sum(place**2), False, cost=jnp.sum(action**2))
       >>> cart = make_environment(
       ...     lambda key: jnp.ones(1), step, lambda place: place,
-      ...     actions=box(-1, 1, (1,)), horizon=3)
+      ...     actions=make_box(-1, 1, (1,)), horizon=3)
       >>> def proportional(gain):
       ...     return agent_of(jax.tree_util.Partial(lambda gain, place, key: -gain * place, gain))
       >>> evaluate = episode_evaluator(cart, proportional, costs="cost")

@@ -40,7 +40,7 @@ from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.types import Status
 
 
-class Totals(NamedTuple):
+class EpisodeTotals(NamedTuple):
     """What is counted of one episode; with a leading axis of many.
 
     Attributes:
@@ -72,7 +72,7 @@ def episode_totals(
     *,
     num_steps: int,
     discount: chex.Numeric = 1.0,
-) -> Totals:
+) -> EpisodeTotals:
     """What an episode adds up to, the one that ``run_episode`` gives for the same key.
 
     For ``jit`` and ``vmap``. Nothing is kept of a step, and it ends with the episode; side by side
@@ -114,7 +114,7 @@ def episode_totals(
     now, time, _, _, sums = lax.while_loop(going, move, (begin, jnp.int32(0), one, one, sums))
     reward, discounted, cost, visits, early = sums
     task = task_world(now.world)
-    return Totals(
+    return EpisodeTotals(
         reward, discounted, cost, time, now.terminated, now.truncated & ~now.terminated,
         None if task is None else jnp.asarray(task.verdict, jnp.int32),
         visits if counted else None, early if counted else None)
@@ -136,10 +136,15 @@ class Estimate:
     """A share or a mean with its interval.
 
     Attributes:
-      mean: over the episodes.
-      lower, upper: ends of the interval.
+      mean: over the episodes; a share is in [0, 1], else it has the unit of what is averaged.
+      lower, upper: ends of the interval, in the same unit.
       error: the standard error of the mean.
       method: what the interval rests on.
+
+    Example:
+      >>> found = share_estimate(8, 10, 0.05)
+      >>> found.mean, round(found.lower, 3), round(found.upper, 3)
+      (0.8, 0.444, 0.975)
     """
 
     mean: float
@@ -158,8 +163,8 @@ class Evaluation:
         None without a task.
       reward, discounted_reward, cost: of an episode; the second None without a discount.
       length: steps of an episode.
-      visits, discounted_visits: accepting readings of an episode, see :class:`Totals`; None without
-        a task, or without a discount.
+      visits, discounted_visits: accepting readings of an episode, see :class:`EpisodeTotals`; None
+        without a task, or without a discount.
       terminated, truncated, cut_off: how many episodes ended each way; at most `num_steps` steps
         were simulated of any.
       num_episodes: that were simulated.
@@ -168,6 +173,16 @@ class Evaluation:
         if that is open, or no threshold was given.
       status: CONVERGED; MAX_STEPS if a threshold was not decided; NONFINITE if a sum was not
         finite, whose mean is then not either.
+
+    Example:
+      >>> from jaxltl.core.models.environment import agent_of
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl.core.models.simulated_model import environment_of
+      >>> clock = environment_of(from_dense([[[0.0, 1.0]], [[1.0, 0.0]]]))
+      >>> agent = agent_of(lambda observation, key: jnp.int32(0))
+      >>> found = evaluate(jax.random.key(0), agent, clock, num_episodes=4, num_steps=3)
+      >>> found.length.mean, found.cut_off, found.success, found.status.name
+      (3.0, 4, None, 'CONVERGED')
     """
 
     success: Estimate | None
@@ -270,6 +285,8 @@ def evaluate(
       ValueError: episodes that never end, a number out of range, a threshold without a task, or an
         agent that is none, or whose actions do not fit.
 
+    Not differentiable: what is returned is numbers of Python, from concrete arguments.
+
     Example:
       >>> from jaxltl.core.models.environment import agent_of
       >>> from jaxltl.core.models.mdp import from_dense
@@ -319,8 +336,10 @@ def _batch(
     key: chex.PRNGKey, environment: Environment, agent: Agent, first: jax.Array,
     discount: chex.Numeric, *, num_steps: int, batch: int,
     sharding: NamedSharding | None = None,
-) -> Totals:
-    def one(key: chex.PRNGKey, environment: Environment, agent: Agent, discount: Any) -> Totals:
+) -> EpisodeTotals:
+    def one(
+        key: chex.PRNGKey, environment: Environment, agent: Agent, discount: Any
+    ) -> EpisodeTotals:
         return episode_totals(key, environment, agent, num_steps=num_steps, discount=discount)
 
     axes, keys = (0, None, None, None), jax.vmap(partial(jax.random.fold_in, key))(
@@ -340,7 +359,7 @@ def _decided(success: int, count: int, threshold: float, failure: float) -> bool
 
 
 def _told(
-    totals: Totals, num_steps: int, confidence: float, threshold: float | None,
+    totals: EpisodeTotals, num_steps: int, confidence: float, threshold: float | None,
     discount: float | None, decision: bool | None,
 ) -> Evaluation:
     count, failure, fixed = len(totals.length), 1 - confidence, threshold is None

@@ -24,8 +24,8 @@ from jaxltl.core.values.enclosed import chain_of
 from jaxltl.core.values.objectives import Objective, Part, sums_of
 from jaxltl.core.values.sparse_satisfaction import as_sparse
 
-__all__ = ["Achievable", "Best", "Front", "Nearest", "Objective", "Pareto", "achievable", "multi",
-           "pareto"]
+__all__ = ["Achievable", "ConstrainedOptimum", "Front", "NearestMixture", "Objective", "Pareto",
+           "achievable", "multi_objective", "pareto"]
 
 _SHARPEST = 1e-12  # to which sums are solved where the border is near
 
@@ -51,7 +51,7 @@ class Front(NamedTuple):
     product: HostProduct
 
 
-class Nearest(NamedTuple):
+class NearestMixture(NamedTuple):
     """What is attained nearest to thresholds of which it is not known whether they can be met.
 
     Attributes:
@@ -83,10 +83,10 @@ class Achievable(NamedTuple):
     normal: int | None
     front: Front
     status: Status
-    nearest: Nearest | None = None
+    nearest: NearestMixture | None = None
 
 
-class Best(NamedTuple):
+class ConstrainedOptimum(NamedTuple):
     """The best value of one objective when others meet thresholds.
 
     Attributes:
@@ -108,7 +108,7 @@ class Best(NamedTuple):
     share: np.ndarray | None
     front: Front
     status: Status
-    nearest: Nearest | None = None
+    nearest: NearestMixture | None = None
 
 
 class Pareto(NamedTuple):
@@ -152,6 +152,8 @@ def achievable(
     Raises:
       ValueError: an objective's name, reward or shape, or an expected reward that is infinite.
 
+    Concrete arrays only, on the host; not differentiable.
+
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
@@ -193,6 +195,8 @@ def pareto(
     Raises:
       ValueError: as for :func:`achievable`.
 
+    Concrete arrays only, on the host; not differentiable.
+
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
@@ -224,10 +228,10 @@ def _require(model: Any, objectives: Sequence[Objective]) -> None:
             raise ValueError(f"objectives[{i}] is {shown(each)}; give an Objective.")
 
 
-def multi(
+def multi_objective(
     model: Any, objectives: Sequence[Objective], *, tolerance: float = TOLERANCE,
     max_points: int = 200,
-) -> Achievable | Best | Pareto:
+) -> Achievable | ConstrainedOptimum | Pareto:
     """Several objectives, some with thresholds, as in ``multi(...)`` of PRISM and Storm.
 
     Args:
@@ -237,8 +241,8 @@ def multi(
       max_points: weighted sums at most.
 
     Returns:
-      :class:`Achievable` where all have thresholds, :class:`Best` where one has none, and
-      :class:`Pareto` where none has.
+      :class:`Achievable` where all have thresholds, :class:`ConstrainedOptimum` where one has
+      none, and :class:`Pareto` where none has.
 
     Raises:
       ValueError: some but not all of several objectives without a threshold; or as for
@@ -263,7 +267,7 @@ def multi(
 
 def nearest_of(
     front: Front, share: np.ndarray, thresholds: np.ndarray, signs: np.ndarray
-) -> Nearest:
+) -> NearestMixture:
     """What a mixture of a front's policies attains, and misses of thresholds.
 
     Args:
@@ -276,7 +280,7 @@ def nearest_of(
     lower = frontier.mixture(front.lower[used], share[used])
     upper = -frontier.mixture(-front.upper[used], share[used])
     missed = signs * (thresholds - np.where(signs > 0, lower, upper))
-    return Nearest(share, lower, upper, np.maximum(missed, 0))
+    return NearestMixture(share, lower, upper, np.maximum(missed, 0))
 
 
 class _Search:
@@ -449,7 +453,7 @@ class _Search:
             for x, exactness in zip(self.normals, self.exactness, strict=True)
             if exactness <= self.tolerance)
 
-    def nearest(self, wanted: np.ndarray, index: int | None = None) -> Nearest:
+    def nearest(self, wanted: np.ndarray, index: int | None = None) -> NearestMixture:
         """The mixture that comes nearest to thresholds, with the best of an objective if asked."""
         lower, asked = np.stack(self.lower), np.isfinite(wanted)
         apart = frontier.separation(lower[:, asked], wanted[asked], self.scale[asked])
@@ -461,7 +465,7 @@ class _Search:
             share = found.share if np.isfinite(found.lower) else share
         return nearest_of(self.front(), share, self.signs * wanted, self.signs)
 
-    def best(self, index: int, wanted: np.ndarray, max_points: int) -> Best:
+    def best(self, index: int, wanted: np.ndarray, max_points: int) -> ConstrainedOptimum:
         """The best value of one objective, the others being at least something."""
         sign, tolerance = self.signs[index], self.tolerance
         enough = wanted.copy()
@@ -469,7 +473,7 @@ class _Search:
         holds, share, _ = self.decide(enough, max_points)
         if holds is False:
             nan = float("nan")
-            return Best(nan, nan, nan, False, None, self.front(), Status.CONVERGED)
+            return ConstrainedOptimum(nan, nan, nan, False, None, self.front(), Status.CONVERGED)
         while True:
             lower = np.stack(self.lower)
             known = frontier.largest(
@@ -486,11 +490,13 @@ class _Search:
         if self.parts[index].kind == "sure":
             low, high = max(low, 0.0), min(high, 1.0)
         if met:
-            return Best((low + high) / 2, low, high, True, known.share, self.front(),
-                        Status.CONVERGED if narrow else Status.PRECISION)
+            status = Status.CONVERGED if narrow else Status.PRECISION
+            return ConstrainedOptimum(
+                (low + high) / 2, low, high, True, known.share, self.front(), status)
         near = self.nearest(wanted, index)
         value = float(np.clip((near.lower[index] + near.upper[index]) / 2, low, high))
-        return Best(value, low, high, holds, None, self.front(), Status.PRECISION, near)
+        return ConstrainedOptimum(
+            value, low, high, holds, None, self.front(), Status.PRECISION, near)
 
     def close(self, tolerance: float, max_points: int) -> float:
         """Asks until no value is farther beyond the mixtures than the tolerance; how far it is."""

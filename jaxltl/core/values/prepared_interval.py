@@ -41,9 +41,9 @@ _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
 class PreparedInterval:
     """A question about an interval model, put in order for solves with other ends.
 
-    Made by :func:`prepare_interval`, read by :func:`solve_interval`. Give it to a compiled function
-    as an argument. Open states are nodes, of which there are N; the node N is worth 0, N + 1 is
-    worth 1, and N + 2 infinity.
+    Made by :func:`prepare_interval`, read by :func:`solve_prepared_interval`. Give it to a
+    compiled function as an argument. Open states are nodes, of which there are N; the node N is
+    worth 0, N + 1 is worth 1, and N + 2 infinity.
 
     Attributes:
       table: ``int32[R', W]``, the entries of the rows that are left, T where there is none.
@@ -125,13 +125,13 @@ def prepare_interval(
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
       >>> model = make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
       >>> prepared = prepare_interval(model, [False, True, False])
-      >>> solve = jax.jit(lambda low: solve_interval(prepared, lower=low).value[0])
+      >>> solve = jax.jit(lambda low: solve_prepared_interval(prepared, lower=low).value[0])
       >>> round(solve(jnp.array([0.5, 0.3, 1, 1])).item(), 3)
       0.5
     """
     if is_traced((model, target, stay, reward, policy)):
         raise ValueError("prepare_interval reads its model, so it works on concrete arrays only; "
-                         "call it before jit, and solve_interval inside.")
+                         "call it before jit, and solve_prepared_interval inside.")
     refuse_ball(require_interval(model), "prepare_interval has no rule for its derivatives")
     if stay is not None and reward is not None:
         raise ValueError("expected rewards are until the target alone: leave stay out.")
@@ -211,7 +211,7 @@ def _prepared(
     return to_jax(found)
 
 
-def solve_interval(
+def solve_prepared_interval(
     prepared: PreparedInterval, *, lower: chex.Array | None = None,
     upper: chex.Array | None = None, reward: chex.Array | None = None,
     tolerance: chex.Array | float | None = None, max_steps: chex.Array | int = 100,

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from jaxltl.core.models.environment import Environment, Timestep, box, make_environment
+from jaxltl.core.models.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.envs.adapters.common import (
     Held,
     arrays,
@@ -60,7 +60,7 @@ def from_brax(
     length, repeat = getattr(env, "episode_length", None), getattr(env, "action_repeat", 1)
     return make_environment(
         Partial(_reset, held), Partial(_step, held), Partial(_observe),
-        actions=box(-1.0, 1.0, (size,), np.float32), labels=labels, propositions=propositions,
+        actions=make_box(-1.0, 1.0, (size,), np.float32), labels=labels, propositions=propositions,
         horizon=None if length is None else -(-int(length) // int(repeat)))
 
 

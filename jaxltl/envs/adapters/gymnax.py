@@ -14,7 +14,7 @@ from jaxltl.core.models.environment import (
     Environment,
     Finite,
     Timestep,
-    box,
+    make_box,
     make_environment,
 )
 from jaxltl.envs.adapters.common import (
@@ -76,7 +76,7 @@ def space_of_actions(root: str, space: Any) -> Finite | Box:
     if hasattr(space, "n"):
         return Finite(int(space.n))
     if hasattr(space, "low") and hasattr(space, "high"):
-        return box(space.low, space.high, space.shape, space.dtype)
+        return make_box(space.low, space.high, space.shape, space.dtype)
     raise ValueError(f"from_{root}: actions are {space!r}; they must be finite or in a box.")
 
 

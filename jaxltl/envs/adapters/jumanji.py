@@ -18,7 +18,7 @@ from jaxltl.core.models.environment import (
     Environment,
     Finite,
     Timestep,
-    box,
+    make_box,
     make_environment,
 )
 from jaxltl.envs.adapters.common import (
@@ -117,7 +117,7 @@ def _actions(spec: Any, parts: tuple[int, ...] | None) -> Finite | Box:
         return Finite(count)
     if not (hasattr(spec, "minimum") and jnp.issubdtype(spec.dtype, jnp.floating)):
         raise ValueError(f"from_jumanji: actions are {spec!r}; they must be finite or in a box.")
-    return box(spec.minimum, spec.maximum, spec.shape, spec.dtype)
+    return make_box(spec.minimum, spec.maximum, spec.shape, spec.dtype)
 
 
 def _mask(env: Any, parts: tuple[int, ...] | None) -> Partial | None:

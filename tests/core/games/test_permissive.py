@@ -10,7 +10,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.games import objective as goals
-from jaxltl.core.games.permissive import apply_strategy, budgets, permissive_strategy, shield
+from jaxltl.core.games.permissive import apply_strategy, budgets, permissive_strategy, shield_policy
 from jaxltl.core.games.verify import verify
 from jaxltl.core.games.winning import objective_at, winning_region
 from jaxltl.core.models.game import Game, make_game
@@ -290,7 +290,7 @@ def test_a_shield_keeps_to_the_mask():
     policy = rng.dirichlet(np.ones(4), size=50)
     policy[10] = [1, 0, 0, 0]
     mask[10] = [False, True, True, False]
-    kept = np.asarray(shield(jnp.asarray(policy), jnp.asarray(mask)))
+    kept = np.asarray(shield_policy(jnp.asarray(policy), jnp.asarray(mask)))
     np.testing.assert_array_equal(kept[:3], policy[:3])
     some = mask.any(1)
     assert (kept[some][~mask[some]] == 0).all()
@@ -302,13 +302,13 @@ def test_a_shield_keeps_to_the_mask():
         kept[rows], (policy * mask)[rows] / (policy * mask)[rows].sum(1, keepdims=True)
     )
     chosen = rng.integers(4, size=50)
-    sure = np.asarray(shield(jnp.asarray(chosen), jnp.asarray(mask)))
+    sure = np.asarray(shield_policy(jnp.asarray(chosen), jnp.asarray(mask)))
     assert mask[np.arange(50), sure][some].all()
     np.testing.assert_array_equal(sure[~some], chosen[~some])
     allowed = mask[np.arange(50), chosen]
     np.testing.assert_array_equal(sure[allowed], chosen[allowed])
     mask_ = jnp.asarray(mask)
-    slope = jax.jit(jax.grad(lambda p: shield(p, mask_)[5] @ jnp.arange(4.0)))(policy)
+    slope = jax.jit(jax.grad(lambda p: shield_policy(p, mask_)[5] @ jnp.arange(4.0)))(policy)
     assert np.isfinite(slope).all()
 
 
@@ -342,6 +342,6 @@ def test_bad_requests_are_refused():
     with pytest.raises(ValueError, match="memory states here; give a smaller bound"):
         budgets([2000, 2000], 4)
     with pytest.raises(ValueError, match="allows no move in any state"):
-        shield(jnp.ones((2, 2)) / 2, jnp.zeros((2, 2), bool))
+        shield_policy(jnp.ones((2, 2)) / 2, jnp.zeros((2, 2), bool))
     with pytest.raises(ValueError, match="policy has shape"):
-        shield(jnp.ones((3, 2)) / 2, jnp.ones((2, 2), bool))
+        shield_policy(jnp.ones((3, 2)) / 2, jnp.ones((2, 2), bool))

@@ -9,13 +9,13 @@ import pytest
 from jax.tree_util import Partial
 
 from jaxltl.core.games.permissive import permissive_strategy
-from jaxltl.core.games.shielded_environment import ShieldedWorld, shielded
+from jaxltl.core.games.shielded_environment import ShieldedWorld, shield_environment
 from jaxltl.core.games.winning import winning_region
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.environment import (
     Agent,
     Timestep,
-    box,
+    make_box,
     make_environment,
     random_action,
     run_episode,
@@ -57,7 +57,7 @@ def episodes(keys, environment, num_steps):
 ])
 def test_whatever_is_allowed_satisfies_the_formula(formula, options):
     strategy = permissive_strategy(game(), formula, **options)
-    table = tabulate(shielded(environment_of(game()), strategy))
+    table = tabulate(shield_environment(environment_of(game()), strategy))
     assert (np.asarray(table.world.state) >= 0).all()
     for model, least in ((table.model, 1), (to_sparse(game().mdp), 0)):
         joint = product(model, formula)
@@ -70,7 +70,7 @@ def test_a_random_walk_inside_a_shield_never_collides():
     strategy = permissive_strategy(game(), SAFE)
     keys = jax.random.split(jax.random.key(0), 100)
     violated = []
-    for environment in (inner, shielded(inner, strategy, lambda world: world.world)):
+    for environment in (inner, shield_environment(inner, strategy, lambda world: world.world)):
         found = episodes(keys, environment, 100)
         world = found.world.world if isinstance(found.world, ShieldedWorld) else found.world
         violated.append(np.mean(world.verdict[:, -1] == Verdict.VIOLATED))
@@ -81,7 +81,7 @@ def test_a_mask_follows_what_the_strategy_remembers():
     """With a bound on the system's moves between two visits, which takes a counter."""
     bound = 9
     strategy = permissive_strategy(game(), OFTEN, method="counter", bound=bound)
-    environment = shielded(environment_of(game()), strategy)
+    environment = shield_environment(environment_of(game()), strategy)
     found = episodes(jax.random.split(jax.random.key(1), 40), environment, 100)
     names = list(game().propositions)
     label = np.asarray(found.label)
@@ -100,8 +100,8 @@ def test_a_mask_follows_what_the_strategy_remembers():
 
 def test_a_winning_region_is_not_left():
     strategy = permissive_strategy(game(), SAFE)
-    won = shielded(environment_of(game()), winning_region(game(), SAFE))
-    stay = shielded(environment_of(game()), strategy)
+    won = shield_environment(environment_of(game()), winning_region(game(), SAFE))
+    stay = shield_environment(environment_of(game()), strategy)
     keys = jax.random.split(jax.random.key(2), 10)
     one, other = episodes(keys, won, 30), episodes(keys, stay, 30)
     np.testing.assert_array_equal(one.world.world, other.world.world)
@@ -115,7 +115,8 @@ def cliff():
 
 
 def test_where_nothing_is_sure_the_world_decides():
-    environment = shielded(environment_of(cliff()), permissive_strategy(cliff(), "G !fall"))
+    environment = shield_environment(
+        environment_of(cliff()), permissive_strategy(cliff(), "G !fall"))
     masks = {}
     for seed in range(8):
         world = environment.reset(jax.random.key(seed))
@@ -138,7 +139,7 @@ def test_a_mask_is_looked_up():
     inner = environment_of(as_mdp(model, label=rng.random((5, 1)) < .5, propositions=["a"]))
     task = task_environment(inner, "F (a & X a)")
     table = rng.random((5, 3, 2)) < .6
-    environment = shielded(task, table, lambda world: (world.world, world.memory))
+    environment = shield_environment(task, table, lambda world: (world.world, world.memory))
     for world in range(5):
         for memory in range(3):
             at = task.reset(jax.random.key(0))._replace(
@@ -146,15 +147,16 @@ def test_a_mask_is_looked_up():
             sure = table[world, memory] & model.available[world]
             expected = sure if sure.any() else model.available[world]
             assert environment.allowed(at).tolist() == expected.tolist()
-    assert shielded(inner, table[:, 0]).allowed(jnp.int32(2)).shape == (2,)
+    assert shield_environment(inner, table[:, 0]).allowed(jnp.int32(2)).shape == (2,)
     bare = make_environment(
         lambda key: jnp.int32(0), lambda s, a, k: Timestep(s, 0.0, False), lambda s: s[None],
         actions=2)
-    assert shielded(bare, np.array([[False, True]])).allowed(0).tolist() == [False, True]
+    assert shield_environment(bare, np.array([[False, True]])).allowed(0).tolist() == [False, True]
 
 
 def test_outcomes_are_those_of_the_steps():
-    environment = shielded(environment_of(cliff()), permissive_strategy(cliff(), "G !fall"))
+    environment = shield_environment(
+        environment_of(cliff()), permissive_strategy(cliff(), "G !fall"))
     worlds, chance = environment.starts()
     assert worlds.world.tolist() == [0, 1, 2] and chance.tolist() == [.5, .5, 0]
     assert (worlds.state >= 0).tolist() == [True, False, False]
@@ -175,12 +177,12 @@ def test_outcomes_are_those_of_the_steps():
 ])
 def test_bad_shields_are_named(make, options, text):
     with pytest.raises(ValueError, match=text):
-        shielded(environment_of(cliff()), make(), **options)
+        shield_environment(environment_of(cliff()), make(), **options)
 
 
 def test_a_box_of_actions_has_no_mask():
     world = make_environment(
         lambda key: jnp.zeros(()), lambda at, by, key: Timestep(at + by, 0.0, False),
-        lambda at: at[None], actions=box(-1, 1))
+        lambda at: at[None], actions=make_box(-1, 1))
     with pytest.raises(ValueError, match="finitely many actions"):
-        shielded(world, np.ones((1, 2), bool))
+        shield_environment(world, np.ones((1, 2), bool))

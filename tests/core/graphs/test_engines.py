@@ -196,7 +196,7 @@ def test_nothing_is_compiled_on_the_host():
             settled("apply_strategy", jl.apply_strategy(strategy))
             available = np.asarray(strategy.game.available)
             policy = available / available.sum(-1, keepdims=True)
-            settled("shield", jl.shield(policy, strategy.allowed))
+            settled("shield", jl.shield_policy(policy, strategy.allowed))
     assert len(set(done)) > 20
 
 

@@ -16,7 +16,7 @@ from jaxltl.core.models.environment import (
     Timestep,
     agent_of,
     allowed_in,
-    box,
+    make_box,
     make_environment,
     random_action,
     run_episode,
@@ -78,7 +78,7 @@ def test_what_is_made():
     assert float(world.observations["share"].low) == -np.inf
     bare = made()
     assert bare.labels(jnp.int32(0)).shape == (0,) and allowed_in(bare, 0) is None
-    assert made(actions=box(-1, 1, [2]), step=lambda place, action, key: Timestep(
+    assert made(actions=make_box(-1, 1, [2]), step=lambda place, action, key: Timestep(
         place + action.sum().astype(jnp.int32), 0.0, False)).actions.shape == (2,)
 
 
@@ -110,7 +110,7 @@ def branches(place, action, key):
     ({"horizon": 0}, "horizon=0"), ({"actions": 0}, r"Finite\(0\)"),
     ({"actions": "two"}, "give Finite"), ({"actions": True}, None),
     ({"observe": lambda place: ()}, "observe returns no array"),
-    ({"observations": box(0, 1, [3])}, r"observations is of float64\[3\]"),
+    ({"observations": make_box(0, 1, [3])}, r"observations is of float64\[3\]"),
     ({"step": lambda place, action, key: (place, 0.0)}, "step must return Timestep"),
     ({"step": lambda place, action, key: Timestep(place, jnp.zeros(3), False)},
      r"reward of shape \[3\]"),
@@ -118,7 +118,7 @@ def branches(place, action, key):
     ({"step": lambda place, action, key: Timestep(place * 1.0, 0.0, False)}, "the same structure"),
     ({"allowed": lambda place: jnp.ones(3, bool)}, "allowed"),
     ({"allowed": lambda place: jnp.ones(2)}, "return Booleans"),
-    ({"allowed": lambda place: jnp.ones(2, bool), "actions": box(0, 1),
+    ({"allowed": lambda place: jnp.ones(2, bool), "actions": make_box(0, 1),
       "step": lambda place, action, key: Timestep(place, action, False)}, "clip those of a box"),
     ({"step": remembers}, "step is not pure: it keeps"),
     ({"step": draws_by_itself}, "step is not pure: called twice"),
@@ -156,14 +156,14 @@ def test_worlds_are_made_of_traced_arrays_too():
 ])
 def test_bad_boxes_are_named(arguments, text):
     with pytest.raises(ValueError, match=text):
-        box(*arguments)
+        make_box(*arguments)
 
 
 def test_a_box_of_integers_has_their_bounds():
-    found = box(-np.inf, np.inf, (2,), jnp.int32)
+    found = make_box(-np.inf, np.inf, (2,), jnp.int32)
     assert found.low == jnp.iinfo(jnp.int32).min and found.high.dtype == np.int32
-    assert box(-np.inf, np.inf, (), jnp.int64).high == jnp.iinfo(jnp.int64).max
-    assert box([0, -5], 7, dtype=jnp.int64).low.tolist() == [0, -5]
+    assert make_box(-np.inf, np.inf, (), jnp.int64).high == jnp.iinfo(jnp.int64).max
+    assert make_box([0, -5], 7, dtype=jnp.int64).low.tolist() == [0, -5]
     assert isinstance(found, Box) and some_action(found).shape == (2,)
 
 
@@ -175,7 +175,7 @@ def test_random_actions_are_those_that_may_be_taken():
     drawn = jax.vmap(lambda key: random_action(key, Finite(3), jnp.array([1, 0, 1], bool)))(keys)
     assert np.bincount(drawn, minlength=3)[[0, 2]].min() > 60 and 1 not in drawn
     assert set(jax.vmap(lambda key: random_action(key, Finite(3)))(keys).tolist()) == {0, 1, 2}
-    space = box([-1, 0, -np.inf], [1, np.inf, np.inf])
+    space = make_box([-1, 0, -np.inf], [1, np.inf, np.inf])
     some = np.asarray(jax.vmap(lambda key: random_action(key, space))(keys))
     assert some.shape == (200, 3) and (some >= space.low).all() and (some[:, 0] <= 1).all()
     assert some[:, 2].min() < 0 and np.abs(some[:, 0].mean()) < .2

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from jax.tree_util import Partial
 
-from jaxltl.core.models.environment import Timestep, box, make_environment
+from jaxltl.core.models.environment import Timestep, make_box, make_environment
 from jaxltl.core.models.tabulate import reads_key, tabulate
 from jaxltl.core.models.time_limit import with_time_limit, without_time_limit
 from jaxltl.envs.letter_world import letter_world
@@ -296,7 +296,7 @@ def without_one(p):
     (lambda: simulated(P._replace(allowed=np.zeros((S, A), bool))), {}, "no action is allowed"),
     (lambda: simulated(P), {"worlds": {"state": jnp.arange(3), "rest": jnp.zeros(2)}},
      "worlds: give worlds as reset"),
-    (lambda: replace(simulated(P), actions=box(0.0, 1.0)), {}, "the actions are a box"),
+    (lambda: replace(simulated(P), actions=make_box(0.0, 1.0)), {}, "the actions are a box"),
 ])
 def test_what_cannot_be_listed_is_named(world, options, said):
     with pytest.raises(ValueError, match=said):

@@ -13,7 +13,7 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.models.environment import (
     Timestep,
     agent_of,
-    box,
+    make_box,
     make_environment,
     random_action,
     run_episode,
@@ -335,7 +335,7 @@ def test_what_cannot_be_stacked_is_named():
 def test_boxes_of_actions_do_as_well():
     world = make_environment(
         lambda key: jnp.zeros(2), lambda at, by, key: Timestep(at + by, 0.0, False), lambda at: at,
-        actions=box(-1, 1, [2]), labels=lambda at: (at[:1] > 1), propositions=["far"])
+        actions=make_box(-1, 1, [2]), labels=lambda at: (at[:1] > 1), propositions=["far"])
     task = task_environment(world, "F far")
     found = task.step(task.reset(jax.random.key(0)), jnp.array([2.0, 0]), jax.random.key(0))
     assert bool(found.terminated) and float(found.reward) == 1 and task.allowed is None

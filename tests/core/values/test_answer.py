@@ -8,7 +8,7 @@ import pytest
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
 from jaxltl.core.values import answer as module
-from jaxltl.core.values.answer import answer, meets
+from jaxltl.core.values.answer import meets, solve_property
 from tests.core.values.test_sparse_satisfaction import random_sparse
 from tests.storm_oracle import storm_model, storm_values
 
@@ -49,7 +49,7 @@ def test_storm_agrees(seed):
     asked += [f'T{sign}=? [ F "a" ]' for sign in signs]
     asked += [f'LRA{sign}=? [ "a" | "b" ]' for sign in signs]
     for text in asked:
-        found = answer(model, text)
+        found = solve_property(model, text)
         assert found.status == Status.CONVERGED, text
         for low, high, wanted in zip(
                 found.lower, found.upper, storm_values(storm, text), strict=True):
@@ -68,7 +68,7 @@ def test_storm_agrees_on_thresholds(seed):
                 for text in (f"P{relation}{threshold} [ {path} ]",
                              f"Pmax{relation}{threshold} [ {path} ]",
                              f"Pmin{relation}{threshold} [ {path} ]"):
-                    found = answer(model, text)
+                    found = solve_property(model, text)
                     assert found.holds == storm_values(storm, text), text
 
 
@@ -77,7 +77,7 @@ def test_storm_agrees_on_thresholds(seed):
 
 def both(model, text, same):
     """The answers to two properties that mean the same."""
-    found, wanted = answer(model, text), answer(model, same)
+    found, wanted = solve_property(model, text), solve_property(model, same)
     np.testing.assert_allclose(found.value, wanted.value, atol=2e-6)
     assert (found.lower <= wanted.upper).all() and (wanted.lower <= found.upper).all()
 
@@ -112,9 +112,9 @@ def chance(p, more=0):
 
 def test_a_threshold_that_the_bounds_touch_is_not_guessed():
     third = chance(1 / 3)  # a double just below 1/3
-    found = answer(third, 'P>=1/3 [ F "a" ]')
+    found = solve_property(third, 'P>=1/3 [ F "a" ]')
     assert found.holds in ([None], [False])
-    found = answer(third, 'P>=0.333 [ F "a" ]')
+    found = solve_property(third, 'P>=0.333 [ F "a" ]')
     assert found.holds == [True] and found.status == Status.CONVERGED
 
 
@@ -129,9 +129,9 @@ def test_undecided_thresholds_are_tried_again_more_narrowly(monkeypatch):
         return found.replace(lower=found.value - half, upper=found.value + half)
 
     monkeypatch.setattr(module, "reachability_probability", wide)
-    found = answer(model, 'P>0.2499999 [ F "a" ]', tolerance=1e-3)
+    found = solve_property(model, 'P>0.2499999 [ F "a" ]', tolerance=1e-3)
     assert found.holds == [True] and asked == [1e-3, 1e-6, 1e-9][: len(asked)] and len(asked) > 1
-    found = answer(model, 'P>=0.25 [ F "a" ]')
+    found = solve_property(model, 'P>=0.25 [ F "a" ]')
     assert found.holds == [None] and found.status == Status.PRECISION
     assert found.lower < 0.25 < found.upper
 
@@ -141,29 +141,29 @@ def test_zero_and_one_are_exact():
     for text, truth in (('P>0 [ F "a" ]', True), ('P>=1 [ F ("a" | !"a") ]', True),
                         ('P<1 [ F "deadlock" ]', False), ('P<=0 [ G F !"deadlock" ]', True),
                         ('P>=1 [ F G "deadlock" ]', True)):
-        found = answer(model, text)
+        found = solve_property(model, text)
         assert found.holds == [truth] and found.status == Status.CONVERGED, text
 
 
 def test_several_initial_states_have_a_value_each():
     model = random_rewarded(1)
-    found = answer(model, 'Pmax=? [ F "a" & "b" ]')
+    found = solve_property(model, 'Pmax=? [ F "a" & "b" ]')
     assert found.states.tolist() == [0, 1, 2] and found.value.shape == (3,)
-    every = answer(model, 'Pmax=? [ F "a" & "b" ]', states=np.arange(model.num_states))
+    every = solve_property(model, 'Pmax=? [ F "a" & "b" ]', states=np.arange(model.num_states))
     np.testing.assert_array_equal(found.value, every.value[:3])
-    later = answer(model, 'Pmax=? [ (G F "a") & (F "b") ]', states=[4, 2])
+    later = solve_property(model, 'Pmax=? [ (G F "a") & (F "b") ]', states=[4, 2])
     assert later.value.shape == (2,)
-    alone = answer(model, 'Pmax=? [ (G F "a") & (F "b") ]', states=[2])
+    alone = solve_property(model, 'Pmax=? [ (G F "a") & (F "b") ]', states=[2])
     assert abs(later.value[1] - alone.value[0]) < 1e-6
 
 
 def test_infinite_rewards_are_infinite():
     model = chance(0.25)
-    found = answer(model, 'R=? [ F "a" ]')
+    found = solve_property(model, 'R=? [ F "a" ]')
     assert found.value == found.lower == found.upper == np.inf
     assert found.status == Status.CONVERGED
-    assert answer(model, 'R{"r"}<=100 [ F "a" ]').holds == [False]
-    assert abs(answer(model, 'T=? [ F "deadlock" ]').value - 1) < 1e-9
+    assert solve_property(model, 'R{"r"}<=100 [ F "a" ]').holds == [False]
+    assert abs(solve_property(model, 'T=? [ F "deadlock" ]').value - 1) < 1e-9
 
 
 @pytest.mark.parametrize(("text", "message"), [
@@ -178,7 +178,7 @@ def test_infinite_rewards_are_infinite():
 ])
 def test_mistakes_are_named(text, message):
     with pytest.raises(ValueError, match=message):
-        answer(random_rewarded(1), text)
+        solve_property(random_rewarded(1), text)
 
 
 @pytest.mark.parametrize(("relation", "lower", "upper", "verdict"), [

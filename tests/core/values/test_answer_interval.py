@@ -9,7 +9,7 @@ import pytest
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
-from jaxltl.core.values.answer import answer
+from jaxltl.core.values.answer import solve_property
 from jaxltl.io.drn import read_drn
 from jaxltl.io.storm import to_stormpy
 from tests.core.host.test_interval_bounded import random_interval, vertices
@@ -50,7 +50,7 @@ def robot(tmp_path, p="[0.45, 0.55]", south="[0.1, 0.1]", rest="[0.8, 0.8]", haz
 
 
 def assert_enclosed(model, prop, value, *, width=1e-6, near=1e-9):
-    found = answer(model, prop, tolerance=width)
+    found = solve_property(model, prop, tolerance=width)
     lower, upper = float(found.lower[0]), float(found.upper[0])
     assert lower - near <= value <= upper + near, (prop, value, lower, upper)
     assert upper - lower <= width * max(1, abs(value)) and found.status == Status.CONVERGED, prop
@@ -109,13 +109,13 @@ def test_the_die_of_knuth_and_yao_with_a_coin_of_thirds(tmp_path):
     assert_enclosed(model, 'Pmin=? [ F "one" ]', 9 / 189)
     assert_enclosed(model, 'Pmax=? [ F "one" ]', 72 / 189)
     assert_enclosed(model, 'Pmaxmin=? [ F "one" ]', 9 / 189)  # nobody else chooses
-    assert answer(model, 'P>=0.04 [ F "one" ]').holds == [True]  # whatever nature picks
-    assert answer(model, 'P>=0.05 [ F "one" ]').holds == [False]
-    assert answer(model, 'P<=0.39 [ F "one" ]').holds == [True]
-    assert answer(model, 'Pmax>=0.38 [ F "one" ]').holds == [True]
+    assert solve_property(model, 'P>=0.04 [ F "one" ]').holds == [True]  # whatever nature picks
+    assert solve_property(model, 'P>=0.05 [ F "one" ]').holds == [False]
+    assert solve_property(model, 'P<=0.39 [ F "one" ]').holds == [True]
+    assert solve_property(model, 'Pmax>=0.38 [ F "one" ]').holds == [True]
     for text in ('P=? [ F "one" ]', 'P=? [ G F "one" ]'):
         with pytest.raises(ValueError, match=r"what nature picks .* ask for Pmin=\? or Pmax=\?"):
-            answer(model, text)
+            solve_property(model, text)
 
 
 def consensus(lower, upper, bound=2):
@@ -225,10 +225,10 @@ def test_any_formula_beside_all_that_nature_may_keep_to(seed):
         model = labelled(rng)
         worlds = list(islice(members(model), 17))
     for text in (*PLAIN, 'F ("a" & X "b")'):
-        each = {aim: [float(answer(w, f"P{aim}=? [ {text} ]").value[0]) for w in worlds]
+        each = {aim: [float(solve_property(w, f"P{aim}=? [ {text} ]").value[0]) for w in worlds]
                 for aim in ("max", "min")}
         for directions in BOTH:
-            found = answer(model, f"P{directions}=? [ {text} ]")
+            found = solve_property(model, f"P{directions}=? [ {text} ]")
             assert found.status == Status.CONVERGED
             assert found.upper[0] - found.lower[0] <= 1e-6
             policy, nature = directions[:3], directions[3:]
@@ -253,10 +253,10 @@ def test_rewards_beside_all_that_nature_may_keep_to(seed):
     worlds = [replace(world, rewards=rewards) for world in worlds]
     for text, directions in product(('R{}=? [ F "a" ]', 'T{}=? [ F "b" ]'), BOTH):
         policy, nature = directions[:3], directions[3:]
-        each = [float(answer(w, text.format(policy)).value[0]) for w in worlds]
+        each = [float(solve_property(w, text.format(policy)).value[0]) for w in worlds]
         best = (max if nature == "max" else min)(each)
         if best == np.inf:
-            found = answer(model, text.format(directions))
+            found = solve_property(model, text.format(directions))
             assert found.lower.tolist() == found.upper.tolist() == [np.inf]
         else:
             assert_enclosed(model, text.format(directions), best, near=2e-6 * max(1, best))
@@ -266,19 +266,19 @@ def test_rewards_beside_all_that_nature_may_keep_to(seed):
 def test_steps_lead_to_what_is_reached_without_bound(seed):
     model = labelled(np.random.default_rng(seed))
     for directions in BOTH:
-        free = answer(model, f'P{directions}=? [ "a" U "b" ]')
+        free = solve_property(model, f'P{directions}=? [ "a" U "b" ]')
         before = 0.0
         for steps in (0, 1, 2, 10, 400):
-            found = answer(model, f'P{directions}=? [ "a" U<={steps} "b" ]')
+            found = solve_property(model, f'P{directions}=? [ "a" U<={steps} "b" ]')
             assert found.lower[0] >= before - 1e-12 and found.lower[0] <= free.upper[0]
             before = float(found.lower[0])
             if steps > 10:
                 continue
-            other = answer(model, f'P{directions}=? [ !("a" U<={steps} "b") ]')
-            third = answer(model, f'P{opposite(directions)}=? [ "a" U<={steps} "b" ]')
+            other = solve_property(model, f'P{directions}=? [ !("a" U<={steps} "b") ]')
+            third = solve_property(model, f'P{opposite(directions)}=? [ "a" U<={steps} "b" ]')
             assert abs(other.value[0] - (1 - third.value[0])) <= 1e-9
         assert abs(before - free.value[0]) <= 1e-6
-        assert answer(model, f'P{directions}=? [ F[1,2] "b" ]').status == Status.CONVERGED
+        assert solve_property(model, f'P{directions}=? [ F[1,2] "b" ]').status == Status.CONVERGED
 
 
 def test_rewards_of_so_many_steps(tmp_path):
@@ -287,17 +287,17 @@ def test_rewards_of_so_many_steps(tmp_path):
     for directions in BOTH:
         assert_enclosed(model, f'R{{"time"}}{directions}=? [ C<=7 ]', 7)  # each step takes one
         assert_enclosed(model, f'R{{"time"}}{directions}=? [ I=7 ]', 1)
-        once = answer(model, f'P{directions}=? [ F<=1 "goal2" ]')
+        once = solve_property(model, f'P{directions}=? [ F<=1 "goal2" ]')
         assert once.lower[0] <= (0.8 if directions[:3] == "max" else 0) <= once.upper[0]
-    assert answer(model, f'Rminmax<=1.3 [ {first} ]').holds == [True]
-    assert answer(model, 'Rmaxmin<=7 [ C<=7 ]').holds in ([True], [None])
+    assert solve_property(model, f'Rminmax<=1.3 [ {first} ]').holds == [True]
+    assert solve_property(model, 'Rmaxmin<=7 [ C<=7 ]').holds in ([True], [None])
 
 
 def test_what_has_no_intervals_takes_one_direction():
     coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
                        label={"a": [1]})
     with pytest.raises(ValueError, match=r"no intervals from which nature .* ask for Pmax=\?"):
-        answer(coin, 'Pmaxmin=? [ F "a" ]')
+        solve_property(coin, 'Pmaxmin=? [ F "a" ]')
 
 
 @pytest.mark.parametrize(("text", "message"), [
@@ -314,18 +314,18 @@ def test_what_has_no_intervals_takes_one_direction():
 ])
 def test_what_is_not_offered_is_named(text, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        answer(robot(tmp_path), text)
+        solve_property(robot(tmp_path), text)
 
 
 def test_thresholds_are_for_all_strategies_and_all_of_nature(tmp_path):
     model = robot(tmp_path)
-    assert answer(model, 'P<=0.56 [ F "goal1" ]').holds == [True]
-    assert answer(model, 'P<=0.54 [ F "goal1" ]').holds == [False]
-    assert answer(model, 'Pmaxmin>0.44 [ F "goal1" ]').holds == [True]
-    assert answer(model, 'Pmaxmin>0.46 [ F "goal1" ]').holds == [False]
-    assert answer(model, 'P>=0 [ F "goal1" ]').holds == [True]
-    assert answer(model, 'P>0 [ F "goal1" ]').holds == [False]
-    assert answer(model, 'Rminmax<1.23 [ F "goal1" | "goal2" ]').holds == [True]
+    assert solve_property(model, 'P<=0.56 [ F "goal1" ]').holds == [True]
+    assert solve_property(model, 'P<=0.54 [ F "goal1" ]').holds == [False]
+    assert solve_property(model, 'Pmaxmin>0.44 [ F "goal1" ]').holds == [True]
+    assert solve_property(model, 'Pmaxmin>0.46 [ F "goal1" ]').holds == [False]
+    assert solve_property(model, 'P>=0 [ F "goal1" ]').holds == [True]
+    assert solve_property(model, 'P>0 [ F "goal1" ]').holds == [False]
+    assert solve_property(model, 'Rminmax<1.23 [ F "goal1" | "goal2" ]').holds == [True]
 
 
 def test_storm_finds_the_same():

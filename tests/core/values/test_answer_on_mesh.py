@@ -8,7 +8,7 @@ from jaxltl.core.logic.properties import parse_property
 from jaxltl.core.models.shard import shard
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
-from jaxltl.core.values.answer import answer
+from jaxltl.core.values.answer import solve_property
 from jaxltl.core.values.answer_on_mesh import first_bounds, question_on_mesh
 
 S = 13
@@ -57,7 +57,7 @@ def asked(sharded, text, steps=1000):
 @pytest.mark.parametrize("text", PROPERTIES)
 def test_the_answers_are_those_of_the_host(model, sharded, text):
     there, _ = asked(sharded, text)
-    here = answer(model, text)
+    here = solve_property(model, text)
     np.testing.assert_array_equal(there.states, here.states)
     np.testing.assert_allclose(there.value, here.value, rtol=1e-5)
     assert (there.lower <= here.upper).all() and (there.upper >= here.lower).all()
@@ -69,7 +69,7 @@ def test_bounds_are_gone_on_from(model, sharded, text):
     """Also of a task that is the opposite of what is reached."""
     there, times = asked(sharded, text, steps=3)
     assert times > 1
-    here = answer(model, text)
+    here = solve_property(model, text)
     np.testing.assert_allclose(there.value, here.value, rtol=1e-5)
     assert (there.lower <= here.upper).all() and (there.upper >= here.lower).all()
     assert there.status == Status.CONVERGED

@@ -6,7 +6,7 @@ import pytest
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.types import Status
 from jaxltl.core.values.answer_several import answer_several
-from jaxltl.core.values.multi_objective import Achievable, Best, Pareto
+from jaxltl.core.values.multi_objective import Achievable, ConstrainedOptimum, Pareto
 from tests.core.values.test_answer import random_rewarded
 from tests.storm_oracle import storm_model, storm_values
 
@@ -34,7 +34,7 @@ def test_what_can_be_met(text, verdict):
 
 def test_the_best_value_beside_thresholds():
     found = answer_several(fork(), 'multi(Pmax=? [ F "a" ], P>=0.25 [ F "b" ])')
-    assert isinstance(found, Best) and found.holds
+    assert isinstance(found, ConstrainedOptimum) and found.holds
     assert found.lower <= 0.75 <= found.upper and found.upper - found.lower <= 1e-6
     third = answer_several(fork(), 'multi(Pmax=? [ F "a" ], P>=1/3 [ F "b" ])')
     assert third.lower <= 2 / 3 <= third.upper and third.status == Status.CONVERGED

@@ -8,7 +8,13 @@ from jax.tree_util import Partial
 
 from jaxltl.algos import cce
 from jaxltl.algos.exponential_family import diagonal_gaussian
-from jaxltl.core.models.environment import Timestep, agent_of, box, make_environment, run_episode
+from jaxltl.core.models.environment import (
+    Timestep,
+    agent_of,
+    make_box,
+    make_environment,
+    run_episode,
+)
 from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.models.task_environment import task_environment
 from jaxltl.core.values.episode_scores import episode_evaluator
@@ -30,7 +36,7 @@ def labels(place):
 
 
 WORLD = make_environment(
-    reset, step, lambda place: place, actions=box(-1, 1, (2,)), labels=labels,
+    reset, step, lambda place: place, actions=make_box(-1, 1, (2,)), labels=labels,
     propositions=["right", "up"], horizon=8)
 TASK = task_environment(WORLD, "!up U right", ending="undecided")
 

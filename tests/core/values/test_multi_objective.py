@@ -5,7 +5,7 @@ import pytest
 
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
-from jaxltl.core.values.multi_objective import Objective, achievable, multi, pareto
+from jaxltl.core.values.multi_objective import Objective, achievable, multi_objective, pareto
 from jaxltl.core.values.reachability import reachability_probability
 from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
 from tests.sparse_models import random_sparse, storm_model, storm_values
@@ -133,7 +133,7 @@ def test_one_objective_is_what_its_own_solver_finds(seed):
         propositions=["a", "b"])
     for formula in ("G F a", "F G b", "a U b", "G (a -> F b)"):
         for direction in ("max", "min"):
-            alone = multi(model, [Objective(formula=formula, direction=direction)])
+            alone = multi_objective(model, [Objective(formula=formula, direction=direction)])
             expected = sparse_satisfaction(model, formula, objective=direction).solution
             assert alone.lower - 1e-6 <= expected.value[0] <= alone.upper + 1e-6
             assert alone.status == Status.CONVERGED
@@ -171,10 +171,10 @@ def test_mixtures_and_half_spaces_are_the_evidence():
     no = achievable(model, [Objective(target=a), Objective(target=b)], [0.4, 0.7])
     assert no.holds is False
     assert no.front.normals[no.normal] @ [0.4, 0.7] > no.front.bounds[no.normal]
-    best = multi(model, [Objective(target=a), Objective(target=b, threshold=0.25)])
+    best = multi_objective(model, [Objective(target=a), Objective(target=b, threshold=0.25)])
     assert best.holds and best.lower <= 0.75 <= best.upper
     assert best.upper - best.lower <= 1e-6
-    impossible = multi(model, [Objective(target=a), Objective(target=b, threshold=1.5)])
+    impossible = multi_objective(model, [Objective(target=a), Objective(target=b, threshold=1.5)])
     assert impossible.holds is False and np.isnan(impossible.value)
 
 
@@ -186,9 +186,11 @@ def test_thresholds_of_what_is_best(seed):
     target[0] = other[0] = False
     most = reachability_probability(model, target).value[0]
     least = reachability_probability(model, other, objective="min").value[0]
-    alone = multi(model, [Objective(target=target), Objective(target=other, threshold=0.0)])
+    alone = multi_objective(
+        model, [Objective(target=target), Objective(target=other, threshold=0.0)])
     assert alone.lower - 1e-6 <= most <= alone.upper + 1e-6
-    spared = multi(model, [Objective(avoid=other), Objective(target=target, threshold=0.0)])
+    spared = multi_objective(
+        model, [Objective(avoid=other), Objective(target=target, threshold=0.0)])
     assert spared.lower - 1e-6 <= 1 - least <= spared.upper + 1e-6
 
 
@@ -231,14 +233,14 @@ def test_storm_finds_the_same(seed):
     for text, objectives in questions.items():
         (question,) = stormpy.parse_properties(text)
         theirs = str(stormpy.model_checking(storm, question))
-        found = multi(model, objectives)
+        found = multi_objective(model, objectives)
         assert found.status == Status.CONVERGED
         assert ("false" in theirs) == (found.holds is False), text
         if found.holds:
             assert found.lower - 1e-3 <= float(theirs) <= found.upper + 1e-3, text
     (question,) = stormpy.parse_properties('Pmax=? [ F "a" ]')
     np.testing.assert_allclose(
-        multi(model, [Objective(target=sets["a"])]).value,
+        multi_objective(model, [Objective(target=sets["a"])]).value,
         storm_values(storm, 'Pmax=? [ F "a" ]')[0], atol=1e-6)
 
 
@@ -258,7 +260,8 @@ def test_a_border_of_many_corners(corners):
     model, x, y = arc(corners)
     for least in (0.28, 0.7, 0.99999):
         most = np.interp(least, y, x)  # mixtures of neighbours are the border
-        best = multi(model, [Objective(reward="x"), Objective(reward="y", threshold=least)])
+        best = multi_objective(
+            model, [Objective(reward="x"), Objective(reward="y", threshold=least)])
         assert best.status == Status.CONVERGED
         assert best.lower - 1e-12 <= most <= best.upper + 1e-12
         assert best.upper - best.lower <= 1e-6 * best.upper
@@ -281,7 +284,7 @@ def test_what_is_attained_nearest_to_a_border_is_told():
         assert (near.lower + near.gap >= thresholds - 1e-15).all() and (near.gap <= 1e-13).all()
         assert (near.share @ found.front.points >= thresholds - 1e-12).all()
     # All that can be had of y, and the most of x beside it, which is none.
-    best = multi(model, [Objective(reward="x"), Objective(reward="y", threshold=1.0)])
+    best = multi_objective(model, [Objective(reward="x"), Objective(reward="y", threshold=1.0)])
     assert best.holds is None and best.status == Status.PRECISION
     assert best.upper <= 1e-6 and best.value <= best.upper
     assert best.nearest.gap.tolist() == [0, pytest.approx(0, abs=1e-13)]
@@ -318,7 +321,7 @@ def test_what_is_wrong_is_named():
     with pytest.raises(ValueError, match="give one finite number for each"):
         achievable(model, [Objective(target=end), Objective(avoid=end)])
     with pytest.raises(ValueError, match="to all but one"):
-        multi(model, [Objective(target=end), Objective(avoid=end),
+        multi_objective(model, [Objective(target=end), Objective(avoid=end),
                       Objective(avoid=end, threshold=0.5)])
-    least = multi(model, [Objective(reward="r", direction="min", target=end)])
+    least = multi_objective(model, [Objective(reward="r", direction="min", target=end)])
     assert least.lower == least.upper == 0

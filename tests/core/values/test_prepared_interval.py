@@ -10,7 +10,7 @@ import pytest
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.types import Status
 from jaxltl.core.values.contest import chances
-from jaxltl.core.values.prepared_interval import prepare_interval, solve_interval
+from jaxltl.core.values.prepared_interval import prepare_interval, solve_prepared_interval
 from jaxltl.core.values.robust import robust_reachability, robust_total_reward
 from jaxltl.core.values.robust_sensitivity import robust_sensitivity
 from tests.reference_intervals import vertices
@@ -104,7 +104,7 @@ def test_all_ends_of_a_batch_are_enclosed_as_by_brute_force(seed, objective, nat
         prepared = prepare_interval(
             model, GOAL, reward=reward, objective=objective, nature=nature)
         solve = jax.jit(jax.vmap(
-            lambda a, b, p=prepared: solve_interval(p, lower=a, upper=b)))
+            lambda a, b, p=prepared: solve_prepared_interval(p, lower=a, upper=b)))
         found = solve(lower, upper)
         assert int(found.status[0]) == Status.CONVERGED
         assert set(np.asarray(found.status).tolist()) <= {Status.CONVERGED, Status.INVALID}
@@ -124,7 +124,7 @@ def test_all_ends_of_a_batch_are_enclosed_as_by_brute_force(seed, objective, nat
 def test_policy_and_nature_attain_what_they_are_shown_for(objective, nature):
     successor, lower, upper, _ = _cases(3, 1)
     model = _model(successor, lower[0], upper[0])
-    found = solve_interval(prepare_interval(
+    found = solve_prepared_interval(prepare_interval(
         model, GOAL, stay=STAY, objective=objective, nature=nature))
     host = robust_reachability(model, GOAL, stay=STAY, objective=objective, nature=nature)
     p = np.asarray(found.nature)
@@ -144,11 +144,11 @@ def test_given_policies_are_evaluated():
     policy = np.array([0, 1, 3, 4, 7], np.int32)
     for nature in ("min", "max"):
         question = {"policy": policy, "nature": nature}
-        found = solve_interval(prepare_interval(model, GOAL, **question))
+        found = solve_prepared_interval(prepare_interval(model, GOAL, **question))
         host = robust_reachability(model, GOAL, **question)
         np.testing.assert_allclose(found.value, host.value, atol=1e-6)
         np.testing.assert_array_equal(found.policy, policy)
-        found = solve_interval(prepare_interval(model, GOAL, reward=cost, **question))
+        found = solve_prepared_interval(prepare_interval(model, GOAL, reward=cost, **question))
         host = robust_total_reward(model, cost, GOAL, **question)
         np.testing.assert_allclose(found.value, host.value, rtol=1e-6)
 
@@ -178,7 +178,8 @@ def test_derivatives_in_the_ends_are_differences(objective, nature):
         def derivatives(ends, prepared=prepared):
             """The slope and the change on the way, both of one linear program."""
             _, forward = jax.linearize(
-                lambda a, b: solve_interval(prepared, lower=a, upper=b).value @ weight, *ends)
+                lambda a, b: solve_prepared_interval(prepared, lower=a, upper=b).value @ weight,
+                *ends)
             return jax.linear_transpose(forward, *ends)(1.0), forward(*way)
 
         ends = np.asarray(model.lower), np.asarray(model.upper)
@@ -201,7 +202,7 @@ def test_other_graphs_are_refused_inside_jit():
     prepared = prepare_interval(model, GOAL, objective="max", nature="min")
 
     def status(lower, upper):
-        return int(solve_interval(prepared, lower=lower, upper=upper).status)
+        return int(solve_prepared_interval(prepared, lower=lower, upper=upper).status)
 
     low, high = lower[0], upper[0]
     assert status(low, high) == Status.CONVERGED
@@ -221,11 +222,11 @@ def test_nature_that_may_drop_other_successors_is_refused():
     goal = np.array([True, False])
     prepared = prepare_interval(model(0.5), goal, objective="min", nature="min")
     ends = [(m.lower, m.upper) for m in map(model, (0.5, 0.75, 1.0))]
-    found = [solve_interval(prepared, lower=a, upper=b) for a, b in ends]
+    found = [solve_prepared_interval(prepared, lower=a, upper=b) for a, b in ends]
     assert [int(x.status) for x in found] == [Status.CONVERGED] * 2 + [Status.INVALID]
     assert float(found[0].value[1]) == 1
     again = prepare_interval(model(1.0), goal, objective="min", nature="min")
-    assert float(solve_interval(again).value[1]) == 0
+    assert float(solve_prepared_interval(again).value[1]) == 0
 
 
 @pytest.mark.parametrize("width", [3, 20])
