@@ -48,9 +48,9 @@ def episode_evaluator(
     For ``cce.make_problem(evaluate, family, limit=...)`` and any other search. Scores are the
     fields of :class:`~jaxltl.core.values.evaluation.EpisodeTotals` by name (``"reward"``,
     ``"cost"``, ``"length"``, ...); of an environment with a task also ``"success"``,
-    ``"violation"`` and ``"undecided"``, shares of episodes by the verdict at their end, and ``"failure"``, which is
-    ``1 - success``; or functions of the totals of one episode. A task to be done with a chance of
-    at least .9 is the cost ``"failure"`` with the limit .1.
+    ``"violation"`` and ``"undecided"``, shares of episodes by the verdict at their end, and
+    ``"failure"``, which is ``1 - success``; or functions of the totals of one episode. A task to be
+    done with a chance of at least .9 is the cost ``"failure"`` with the limit .1.
 
     Args:
       environment: plain or with a task; it travels as an argument.
@@ -71,7 +71,7 @@ def episode_evaluator(
         episodes.
 
     Example:
-      >>> from jaxltl.core.models.environment import Timestep, agent_of, box, make_environment
+      >>> from jaxltl.core.models.environment import Timestep, agent_of, make_box, make_environment
       >>> def step(place, action, key):
       ...     return Timestep(place + action, -jnp.sum(place**2), False, cost=jnp.sum(action**2))
       >>> cart = make_environment(
