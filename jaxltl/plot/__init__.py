@@ -7,6 +7,7 @@ return the text of an SVG for pages that move.
 
 from jaxltl.plot.automata import automaton
 from jaxltl.plot.curves import bands, curves, guarantees, lines, paths, sweep
+from jaxltl.plot.described import described
 from jaxltl.plot.games import compare, game_moves, game_region, game_values
 from jaxltl.plot.live import live_automaton, live_curve, live_map
 from jaxltl.plot.maps import grid, strategies
@@ -18,6 +19,7 @@ __all__ = [
     "bands",
     "compare",
     "curves",
+    "described",
     "game_moves",
     "game_region",
     "game_values",

@@ -1,0 +1,82 @@
+"""A figure with its text alternative, as notebooks and the pages made of them show it."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Collection
+from typing import Any, NamedTuple
+
+from matplotlib.figure import Figure
+from PIL import Image
+
+from jaxltl.plot.style import to_bytes
+
+_DPI, _SCREEN = 144, 96  # of what is saved, and of what a width in a page is told in
+
+
+class Described(NamedTuple):
+    """A picture that a notebook shows with a text for who does not see it.
+
+    Attributes:
+      figure: the figure.
+      text: what it shows, in a sentence or two.
+      page: HTML that shows the same and moves, or None. Notebooks show it in a frame where they
+        run; where it was not saved, or is not trusted, the picture stands in its place.
+    """
+
+    figure: Figure
+    text: str
+    page: str | None = None
+
+    def __repr__(self) -> str:
+        return self.text
+
+    def png(self) -> bytes:
+        """The picture in at most 256 colours, a third of the bytes of one with all."""
+        buffer = io.BytesIO()
+        with Image.open(io.BytesIO(to_bytes(self.figure, "png", dpi=_DPI))) as image:
+            image.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(
+                buffer, format="png", optimize=True)
+        return buffer.getvalue()
+
+    def _repr_mimebundle_(
+        self, include: Collection[str] | None = None, exclude: Collection[str] | None = None
+    ) -> tuple[dict[str, str], dict[str, Any]]:
+        data = {
+            "text/plain": self.text, "image/png": base64.b64encode(self.png()).decode("ascii")}
+        if self.page is not None:
+            data["text/html"] = (
+                f'<iframe title="{html.escape(self.text)}" srcdoc="{html.escape(self.page)}" '
+                'sandbox="allow-scripts" width="100%" height="640" style="border:0"></iframe>')
+        width, height = (round(x * _SCREEN) for x in self.figure.get_size_inches())
+        return data, {"image/png": {"alt": self.text, "width": width, "height": height}}
+
+
+def described(figure: Figure, text: str, *, page: str | None = None) -> Described:
+    """A figure with a text alternative.
+
+    As the last line of a notebook's cell it is shown as a picture, and the text goes where readers
+    of screens, and tools that make pages of notebooks, look for it.
+
+    Args:
+      figure: the figure.
+      text: what it shows, for who does not see it: what there is, and what is to be seen in it.
+      page: HTML that shows the same and moves, such as that of
+        :func:`~jaxltl.plot.episodes.play_episode`.
+
+    Returns:
+      Figure, text and page.
+
+    Raises:
+      ValueError: the text is empty or has brackets or line breaks, which such places do not take.
+
+    >>> from matplotlib.figure import Figure
+    >>> described(Figure(), "Nothing yet: white paper.")
+    Nothing yet: white paper.
+    """
+    if not text.strip() or any(x in text for x in "[]\n"):
+        raise ValueError(f"text: {text!r}; say in one line, without square brackets, what the "
+                         "figure shows.")
+    return Described(figure, text.strip(), page)
