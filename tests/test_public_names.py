@@ -1,9 +1,16 @@
 """Public names: each in one topic, their types public too, and documented for their users."""
 
+import ast
+import dataclasses
+import doctest
+import enum
+import functools
 import importlib
 import inspect
+import re
 import subprocess
 import sys
+import textwrap
 import typing
 from collections import Counter
 
@@ -86,3 +93,560 @@ def test_types_of_public_things_are_public():
                 if not known or not inspect.getdoc(kind):
                     hidden.append(f"{kind.__module__}.{kind.__name__} of {thing.__name__}")
     assert not hidden
+
+
+# --- what is documented -------------------------------------------------------------------------
+
+# Not as it should be yet, by where they are defined; nothing is added here.
+PENDING = frozenset("""
+jaxltl.algos.actor_critic.ActorCritic
+jaxltl.algos.actor_critic.Output
+jaxltl.algos.actor_critic.RecurrentActorCritic
+jaxltl.algos.actor_critic.default_network
+jaxltl.algos.actor_critic.dense
+jaxltl.algos.actor_critic.evaluated
+jaxltl.algos.actor_critic.fresh_parameters
+jaxltl.algos.actor_critic.has_memory
+jaxltl.algos.actor_critic.initial_memory
+jaxltl.algos.actor_critic.orthogonal
+jaxltl.algos.actor_critic.require_network
+jaxltl.algos.behavioral_cloning.ConvolutionalPolicy
+jaxltl.algos.behavioral_cloning.Metrics
+jaxltl.algos.behavioral_cloning.State
+jaxltl.algos.behavioral_cloning.init
+jaxltl.algos.behavioral_cloning.neg_log_likelihood
+jaxltl.algos.behavioral_cloning.policy_in_world
+jaxltl.algos.behavioral_cloning.run
+jaxltl.algos.behavioral_cloning.run_until
+jaxltl.algos.behavioral_cloning.step
+jaxltl.algos.behavioral_cloning.train_until
+jaxltl.algos.cce.Assessment
+jaxltl.algos.cce.Metrics
+jaxltl.algos.cce.State
+jaxltl.algos.cce.assess
+jaxltl.algos.cce.init
+jaxltl.algos.cce.run
+jaxltl.algos.cce.run_until
+jaxltl.algos.cce.step
+jaxltl.algos.cce.train_until
+jaxltl.algos.checkpoint.atomic_write
+jaxltl.algos.checkpoint.fingerprint
+jaxltl.algos.checkpoint.load
+jaxltl.algos.checkpoint.read_arrays
+jaxltl.algos.checkpoint.remove
+jaxltl.algos.checkpoint.save
+jaxltl.algos.early_stopping.Best
+jaxltl.algos.early_stopping.stop_early
+jaxltl.algos.exponential_family.DiagonalGaussian
+jaxltl.algos.exponential_family.FullGaussian
+jaxltl.algos.exponential_family.Gamma
+jaxltl.algos.exponential_family.at_least
+jaxltl.algos.exponential_family.center
+jaxltl.algos.exponential_family.from_mean_parameter
+jaxltl.algos.exponential_family.full_gaussian
+jaxltl.algos.exponential_family.gamma
+jaxltl.algos.exponential_family.log_density
+jaxltl.algos.exponential_family.mean_parameter
+jaxltl.algos.exponential_family.project
+jaxltl.algos.exponential_family.sample
+jaxltl.algos.exponential_family.sample_antithetic
+jaxltl.algos.exponential_family.standard_deviation
+jaxltl.algos.exponential_family.sufficient_statistics
+jaxltl.algos.exponential_family.widen
+jaxltl.algos.feasible.Best
+jaxltl.algos.feasible.Feasible
+jaxltl.algos.feasible.Hparams
+jaxltl.algos.feasible.Metrics
+jaxltl.algos.feasible.Problem
+jaxltl.algos.feasible.State
+jaxltl.algos.feasible.certify
+jaxltl.algos.feasible.evaluate
+jaxltl.algos.feasible.init
+jaxltl.algos.feasible.make_problem
+jaxltl.algos.feasible.policy
+jaxltl.algos.feasible.require_problem
+jaxltl.algos.feasible.run
+jaxltl.algos.feasible.run_until
+jaxltl.algos.feasible.start_at
+jaxltl.algos.feasible.step
+jaxltl.algos.feasible.train
+jaxltl.algos.feasible.train_until
+jaxltl.algos.feasible.within
+jaxltl.algos.interval_learning.Metrics
+jaxltl.algos.interval_learning.State
+jaxltl.algos.interval_learning.behavior
+jaxltl.algos.interval_learning.init
+jaxltl.algos.interval_learning.known_within
+jaxltl.algos.interval_learning.measure
+jaxltl.algos.interval_learning.run
+jaxltl.algos.interval_learning.run_until
+jaxltl.algos.interval_learning.step
+jaxltl.algos.interval_learning.train_until
+jaxltl.algos.interval_learning.wins_almost_surely
+jaxltl.algos.learner.Bound
+jaxltl.algos.learner.Chunks
+jaxltl.algos.learner.Learned
+jaxltl.algos.learner.bind
+jaxltl.algos.learner.choose
+jaxltl.algos.learner.count
+jaxltl.algos.learner.either
+jaxltl.algos.learner.gradient_vanishes
+jaxltl.algos.learner.has_stopped
+jaxltl.algos.learner.init_key
+jaxltl.algos.learner.optimizer
+jaxltl.algos.learner.run
+jaxltl.algos.learner.run_in_chunks
+jaxltl.algos.learner.run_until
+jaxltl.algos.learner.step_key
+jaxltl.algos.learner.strong
+jaxltl.algos.learner.trace_lanes
+jaxltl.algos.learner.while_active
+jaxltl.algos.many_tasks.Choice
+jaxltl.algos.many_tasks.Plan
+jaxltl.algos.many_tasks.SequenceNetwork
+jaxltl.algos.many_tasks.Staged
+jaxltl.algos.many_tasks.make_plan
+jaxltl.algos.many_tasks.sequence_agent
+jaxltl.algos.many_tasks.sequence_policy
+jaxltl.algos.many_tasks.stack_plans
+jaxltl.algos.many_tasks.train_in_stages
+jaxltl.algos.many_tasks.trained
+jaxltl.algos.maximin_q.Metrics
+jaxltl.algos.maximin_q.State
+jaxltl.algos.maximin_q.init
+jaxltl.algos.maximin_q.measure
+jaxltl.algos.maximin_q.recurrent_states
+jaxltl.algos.maximin_q.run
+jaxltl.algos.maximin_q.run_until
+jaxltl.algos.maximin_q.step
+jaxltl.algos.maximin_q.train_until
+jaxltl.algos.maximin_q.value_rests
+jaxltl.algos.mlirl.Objective
+jaxltl.algos.mlirl.init
+jaxltl.algos.mlirl.objective
+jaxltl.algos.mlirl.run
+jaxltl.algos.mlirl.run_until
+jaxltl.algos.mlirl.solve
+jaxltl.algos.mlirl.train_until
+jaxltl.algos.pac.accuracy
+jaxltl.algos.pac.action_tolerance
+jaxltl.algos.pac.approximation_gap
+jaxltl.algos.pac.epsilon_optimal_states
+jaxltl.algos.pac.exploration
+jaxltl.algos.pac.hat_gap
+jaxltl.algos.pac.mixing_gap
+jaxltl.algos.pac.recover_hat_strategy
+jaxltl.algos.pac.visits
+jaxltl.algos.ppo.Hparams
+jaxltl.algos.ppo.Metrics
+jaxltl.algos.ppo.Problem
+jaxltl.algos.ppo.State
+jaxltl.algos.ppo.greedy
+jaxltl.algos.ppo.init
+jaxltl.algos.ppo.policy
+jaxltl.algos.ppo.run
+jaxltl.algos.ppo.run_until
+jaxltl.algos.ppo.step
+jaxltl.algos.ppo.train
+jaxltl.algos.ppo.train_until
+jaxltl.algos.regions.Regions
+jaxltl.algos.regions.prove_around
+jaxltl.algos.regions.prove_regions
+jaxltl.algos.regions.verdict_of
+jaxltl.algos.rmax.Metrics
+jaxltl.algos.rmax.State
+jaxltl.algos.rmax.init
+jaxltl.algos.rmax.measure
+jaxltl.algos.rmax.observe
+jaxltl.algos.rmax.run
+jaxltl.algos.rmax.run_until
+jaxltl.algos.rmax.step
+jaxltl.algos.rmax.train
+jaxltl.algos.rmax.wins_almost_surely
+jaxltl.algos.schedules.Condition
+jaxltl.algos.schedules.Conditions
+jaxltl.algos.schedules.Polynomial
+jaxltl.algos.schedules.at
+jaxltl.algos.schedules.is_schedule
+jaxltl.algos.todirl.Concatenated
+jaxltl.algos.todirl.Metrics
+jaxltl.algos.todirl.Objective
+jaxltl.algos.todirl.State
+jaxltl.algos.todirl.init
+jaxltl.algos.todirl.objective
+jaxltl.algos.todirl.reward
+jaxltl.algos.todirl.run
+jaxltl.algos.todirl.run_until
+jaxltl.algos.todirl.solve
+jaxltl.algos.todirl.step
+jaxltl.algos.todirl.train_until
+jaxltl.algos.trust_region.Batch
+jaxltl.algos.trust_region.Hparams
+jaxltl.algos.trust_region.Metrics
+jaxltl.algos.trust_region.Problem
+jaxltl.algos.trust_region.State
+jaxltl.algos.trust_region.act
+jaxltl.algos.trust_region.greedy
+jaxltl.algos.trust_region.init
+jaxltl.algos.trust_region.policy
+jaxltl.algos.trust_region.rollout
+jaxltl.algos.trust_region.run
+jaxltl.algos.trust_region.run_until
+jaxltl.algos.trust_region.step
+jaxltl.algos.trust_region.train
+jaxltl.algos.trust_region.train_until
+jaxltl.core.automata.automaton.Automaton
+jaxltl.core.automata.automaton.accepts_lasso
+jaxltl.core.automata.language.is_included
+jaxltl.core.automata.sequences.Sequences
+jaxltl.core.games.objective.GR1
+jaxltl.core.games.objective.Parity
+jaxltl.core.games.objective.buchi
+jaxltl.core.games.objective.cobuchi
+jaxltl.core.games.objective.generalized_buchi
+jaxltl.core.games.objective.gr1
+jaxltl.core.games.objective.parity
+jaxltl.core.games.objective.reach
+jaxltl.core.games.objective.safety
+jaxltl.core.games.permissive.Permissive
+jaxltl.core.games.permissive.apply_strategy
+jaxltl.core.games.shielded_environment.ShieldedWorld
+jaxltl.core.games.verify.Verification
+jaxltl.core.games.winning.Winning
+jaxltl.core.graphs.attractor.Attractor
+jaxltl.core.graphs.attractor.almost_surely_reaching
+jaxltl.core.graphs.attractor.avoidable
+jaxltl.core.graphs.end_components.EndComponents
+jaxltl.core.graphs.end_components.end_components
+jaxltl.core.host.confidence.ConfidenceSets
+jaxltl.core.logic.properties.Property
+jaxltl.core.logic.properties.parse_properties
+jaxltl.core.logic.properties.parse_property
+jaxltl.core.models.counts.TransitionCounts
+jaxltl.core.models.environment.Agent
+jaxltl.core.models.environment.Box
+jaxltl.core.models.environment.Environment
+jaxltl.core.models.environment.Episode
+jaxltl.core.models.environment.Finite
+jaxltl.core.models.environment.Timestep
+jaxltl.core.models.environment.agent_of
+jaxltl.core.models.environment.make_box
+jaxltl.core.models.environment.make_environment
+jaxltl.core.models.environment.run_episode
+jaxltl.core.models.environment.step_or_reset
+jaxltl.core.models.finite_task.FiniteTask
+jaxltl.core.models.finite_task.Shares
+jaxltl.core.models.finite_task.make_finite_task
+jaxltl.core.models.game.Game
+jaxltl.core.models.interval.IntervalMDP
+jaxltl.core.models.interval.interval_rows
+jaxltl.core.models.lanes.on_host
+jaxltl.core.models.mdp.DenseMDP
+jaxltl.core.models.mdp.MDP
+jaxltl.core.models.mdp.to_dense
+jaxltl.core.models.monitor.Monitor
+jaxltl.core.models.monitor.Verdict
+jaxltl.core.models.monitor.monitor_verdict
+jaxltl.core.models.operators.exists_successor
+jaxltl.core.models.operators.forall_successor
+jaxltl.core.models.operators.sample_successor
+jaxltl.core.models.padded.to_padded
+jaxltl.core.models.parametric.ParametricMDP
+jaxltl.core.models.parametric.make_parametric
+jaxltl.core.models.product.FiniteMemoryPolicy
+jaxltl.core.models.product.Product
+jaxltl.core.models.product.lift_policy
+jaxltl.core.models.product.lift_trajectories
+jaxltl.core.models.product.project_policy
+jaxltl.core.models.product.project_trajectories
+jaxltl.core.models.restrict.Restriction
+jaxltl.core.models.restrict.restrict
+jaxltl.core.models.sequence_task.SequenceSampler
+jaxltl.core.models.sequence_task.events_of
+jaxltl.core.models.sequence_task.proposition_sets
+jaxltl.core.models.sequence_task.sequence_environment
+jaxltl.core.models.sequence_task.sequence_sampler
+jaxltl.core.models.shard.ModelPart
+jaxltl.core.models.shard.from_mesh
+jaxltl.core.models.shard.to_mesh
+jaxltl.core.models.sharded.ShardedMDP
+jaxltl.core.models.sparse.Rewards
+jaxltl.core.models.sparse.SparseMDP
+jaxltl.core.models.sparse.row_reward
+jaxltl.core.models.tabulate.Table
+jaxltl.core.models.task_environment.TaskObservation
+jaxltl.core.models.task_environment.TaskTables
+jaxltl.core.models.task_environment.TaskWorld
+jaxltl.core.models.task_environment.what_is_left
+jaxltl.core.models.time_limit.with_time_limit
+jaxltl.core.models.trajectories.Trajectories
+jaxltl.core.models.trajectories.rollout
+jaxltl.core.types.NotConverged
+jaxltl.core.types.Solution
+jaxltl.core.types.Status
+jaxltl.core.types.check
+jaxltl.core.values.performance.Performance
+jaxltl.core.values.prepared.Prepared
+jaxltl.core.values.prepared.solve_prepared
+jaxltl.core.values.prepared_interval.PreparedInterval
+jaxltl.core.values.prepared_interval.solve_prepared_interval
+jaxltl.core.values.robust.robust_discounted_value
+jaxltl.core.values.robust.robust_expectation
+jaxltl.core.values.robust.robust_total_reward
+jaxltl.core.values.robust_bounded.robust_instantaneous_reward
+jaxltl.core.values.robust_satisfaction.RobustSatisfaction
+jaxltl.core.values.robust_sensitivity.Sensitivity
+jaxltl.core.values.sparse_satisfaction.Satisfaction
+jaxltl.envs.adapters.brax.from_brax
+jaxltl.envs.adapters.craftax.from_craftax
+jaxltl.envs.adapters.gymnax.from_gymnax
+jaxltl.envs.adapters.jumanji.from_jumanji
+jaxltl.envs.adapters.navix.from_navix
+jaxltl.envs.adapters.pgx.from_pgx
+jaxltl.envs.adapters.xminigrid.from_xminigrid
+jaxltl.envs.flat_world.Discs
+jaxltl.envs.flat_world.EventsAround
+jaxltl.envs.flat_world.FlatState
+jaxltl.envs.flat_world.discs_of
+jaxltl.envs.letter_world.LetterState
+jaxltl.envs.letter_world.connected_cells
+jaxltl.envs.letter_world.is_connected
+jaxltl.envs.lqr.LQR
+jaxltl.envs.lqr.Optimum
+jaxltl.envs.lqr.Plant
+jaxltl.envs.lqr.Run
+jaxltl.envs.lqr.optimum
+jaxltl.envs.lqr.simulate
+jaxltl.envs.navigation.Navigation
+jaxltl.envs.navigation.Run
+jaxltl.envs.navigation.State
+jaxltl.envs.navigation.labels
+jaxltl.envs.navigation.move
+jaxltl.envs.navigation.observe
+jaxltl.envs.navigation.obstacle_distance
+jaxltl.envs.navigation.policy_network
+jaxltl.envs.navigation.reward
+jaxltl.envs.navigation.scores
+jaxltl.envs.navigation.start_states
+jaxltl.envs.navigation_steps.Place
+jaxltl.envs.navigation_steps.as_environment
+jaxltl.envs.networks.Network
+jaxltl.envs.networks.apply_layers
+jaxltl.envs.post_offices.Patrol
+jaxltl.envs.post_offices.patrol_reward
+jaxltl.envs.post_offices.surveillance
+jaxltl.envs.robots.diagonal_reward
+jaxltl.envs.robots.places
+jaxltl.envs.temporal_gridworld.World
+jaxltl.envs.temporal_gridworld.colored_world
+jaxltl.envs.temporal_gridworld.demonstrations
+jaxltl.envs.temporal_gridworld.expert_policy
+jaxltl.envs.temporal_gridworld.expert_reward
+jaxltl.envs.temporal_gridworld.is_over
+jaxltl.envs.temporal_gridworld.observations
+jaxltl.envs.temporal_gridworld.random_world
+jaxltl.envs.temporal_gridworld.random_worlds
+jaxltl.envs.temporal_gridworld.training_world
+jaxltl.envs.zone_world.ZoneState
+jaxltl.envs.zone_world.draw_places
+jaxltl.io.colored_world.load_world
+jaxltl.io.colored_world.save_world
+jaxltl.io.colored_world.write_world
+jaxltl.io.drn.write_drn
+jaxltl.io.hoa.write_hoa
+jaxltl.io.hoa_game.HoaGame
+jaxltl.io.hoa_game.write_hoa_game
+jaxltl.io.learned_reward.LearnedReward
+jaxltl.io.learned_reward.load_reward
+jaxltl.io.learned_reward.plan_in
+jaxltl.io.learned_reward.save_reward
+jaxltl.io.log.read_labels
+jaxltl.io.model_files.read_model
+jaxltl.io.npz.read_npz
+jaxltl.io.npz.write_npz
+jaxltl.io.parametric.ParametricModel
+jaxltl.io.parametric.RationalFunction
+jaxltl.io.parametric.read_parametric
+jaxltl.io.pgsolver.ParityGame
+jaxltl.io.pgsolver.objective_of
+jaxltl.io.pgsolver.read_pgsolver
+jaxltl.io.pgsolver.write_pgsolver
+jaxltl.io.prism_explicit.write_prism
+jaxltl.io.reward_machine.RewardMachine
+jaxltl.io.reward_machine.machine_reward
+jaxltl.io.storm.from_stormpy
+jaxltl.io.storm.to_stormpy
+jaxltl.io.umb.read_umb
+jaxltl.io.umb.write_umb
+jaxltl.plot.automata.automaton
+jaxltl.plot.curves.bands
+jaxltl.plot.curves.curves
+jaxltl.plot.curves.guarantees
+jaxltl.plot.curves.lines
+jaxltl.plot.curves.paths
+jaxltl.plot.curves.sweep
+jaxltl.plot.games.compare
+jaxltl.plot.games.game_moves
+jaxltl.plot.games.game_region
+jaxltl.plot.games.game_values
+jaxltl.plot.live.live_automaton
+jaxltl.plot.live.live_curve
+jaxltl.plot.live.live_map
+jaxltl.plot.maps.grid
+jaxltl.plot.maps.strategies
+jaxltl.plot.style.to_bytes
+jaxltl.plot.worlds.temporal_gridworld
+""".split())  # noqa: SIM905
+
+
+def defined_in(module):
+    """The public functions and classes that a module defines, and callables that it has built."""
+    for name, found in vars(module).items():
+        if name.startswith("_") or not callable(found) or typing.get_origin(found) is not None:
+            continue
+        if getattr(found, "__module__", None) == module.__name__:
+            yield name, found
+
+
+def everything_public():
+    """By where it is defined: each public name, and in namespaces what their modules define."""
+    found = {path_of(thing, name): thing for name, thing in PUBLIC.items()}
+    for path in _public.NAMESPACES:
+        space = importlib.import_module(path)
+        for name in space.__all__:
+            thing = getattr(space, name)
+            if inspect.ismodule(thing):
+                found |= {f"{thing.__name__}.{x}": y for x, y in defined_in(thing)}
+            else:
+                found[path_of(thing, name)] = thing
+    return found
+
+
+def path_of(thing, name):
+    return f"{thing.__module__}.{name}"
+
+
+EVERYTHING = everything_public()
+
+
+def sections_of(text):
+    """The sections of a docstring by their titles, and before them, by "", what it begins with."""
+    found, title = {"": []}, ""
+    for line in text.splitlines():
+        if line.rstrip() in ("Args:", "Attributes:", "Returns:", "Raises:", "Yields:", "Example:"):
+            title = line.strip()[:-1]
+            found[title] = []
+        else:
+            found[title].append(line)
+    return {title: "\n".join(lines) for title, lines in found.items()}
+
+
+def names_in(section):
+    """The names that a section tells of: ``low, high: ...`` tells of two."""
+    listed = re.findall(r"^ +(\*{0,2}\w+(?:, \*{0,2}\w+)*):(?=\s)", section, re.MULTILINE)
+    return {name.lstrip("*") for names in listed for name in names.split(", ")}
+
+
+def fields_of(kind):
+    """The public fields of a dataclass, a named tuple or an enumeration."""
+    if issubclass(kind, enum.Enum):
+        return [member.name for member in kind]
+    if dataclasses.is_dataclass(kind):
+        names = [field.name for field in dataclasses.fields(kind)]
+    else:
+        names = getattr(kind, "_fields", ())
+    return [name for name in names if not name.startswith("_") and name not in ("parent", "name")]
+
+
+def examples_in(text):
+    return doctest.DocTestParser().get_examples(text)
+
+
+def shown_by_module(path):
+    """Whether the example of a namespace's module uses a name, or has one of its kind returned."""
+    module, _, name = path.rpartition(".")
+    if not module.startswith(tuple(_public.NAMESPACES)):
+        return False
+    source = "".join(x.source for x in examples_in(inspect.getdoc(sys.modules[module]) or ""))
+    users = {other for other, thing in EVERYTHING.items() if other.startswith(f"{module}.")
+             and inspect.isfunction(inspect.unwrap(thing))
+             and re.search(rf"\b{name}\b", str(inspect.signature(thing).return_annotation))}
+    return any(re.search(rf"\b{used.rpartition('.')[2]}\b", source) for used in {path, *users})
+
+
+def lacking_in_function(function, text, short):
+    """What the text of a function does not tell; a short one names its parameters in sentences."""
+    lacks = []
+    parameters = inspect.signature(function).parameters
+    sections = sections_of(text)
+    told = names_in(sections.get("Args", ""))
+    for name, parameter in parameters.items():
+        if name in ("self", "cls") or name.startswith("_"):
+            continue
+        if name not in told and not (short and re.search(rf"\b{name}\b", text)):
+            lacks.append(f"Args: {name}")
+        if parameter.annotation is inspect.Parameter.empty:
+            lacks.append(f"the type of {name}")
+    returned = inspect.signature(function).return_annotation
+    if returned is inspect.Signature.empty:
+        lacks.append("the type that it returns")
+    elif returned not in (None, "None", "NoReturn") and not (
+            {"Returns", "Yields"} & {*sections}
+            or (short and text.startswith(("``", "Whether", "A ", "An ", "The ")))):
+        lacks.append("Returns")
+    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    if "Raises" not in sections and any(isinstance(node, ast.Raise) for node in ast.walk(tree)):
+        lacks.append("Raises")
+    return lacks
+
+
+def lacking_in_class(kind, text):
+    """What the text of a class, and those of its methods, do not tell."""
+    lacks = []
+    sections = sections_of(text)
+    told = names_in(sections.get("Attributes", "") + "\n" + sections.get("Args", ""))
+    for name in fields_of(kind):
+        if name not in told and not re.search(rf"`{name}`", text):
+            lacks.append(f"Attributes: {name}")
+    for name, part in vars(kind).items():
+        if name.startswith("_") or getattr(part, "__module__", "").startswith("flax"):
+            continue
+        function = getattr(part, "fget", getattr(part, "__func__", part))
+        if not inspect.isfunction(function) or function.__name__ == "<lambda>":
+            continue
+        if name == "replace" and dataclasses.is_dataclass(kind):
+            continue  # of flax
+        if not inspect.getdoc(function):
+            lacks.append(f"a text of {name}")
+        if "return" not in function.__annotations__:
+            lacks.append(f"the type of {name}")
+    return lacks
+
+
+def lacking(path):
+    """What the text of a public thing lacks, in words."""
+    thing, name = EVERYTHING[path], path.rpartition(".")[2]
+    if isinstance(thing, functools.partial) or not (
+            inspect.isfunction(inspect.unwrap(thing)) or isinstance(thing, type)):
+        text = inspect.getdoc(thing) or ""
+        return [] if len(text) > 20 else ["a text"]
+    text = inspect.getdoc(thing) or ""
+    if not text.strip() or text.startswith(f"{name}("):
+        return ["a text"]
+    lacks = [] if text.split("\n\n")[0].rstrip().endswith((".", ":", "``", "?")) else ["a sentence"]
+    if isinstance(thing, type):
+        lacks += lacking_in_class(thing, text)
+    else:
+        lacks += lacking_in_function(inspect.unwrap(thing), text, name not in PUBLIC)
+    examples = examples_in(text)
+    if not examples and not shown_by_module(path):
+        lacks.append("an example")
+    if any(x.want.count("\n") > 8 or len(max(x.want.split("\n"), key=len)) > 99 for x in examples):
+        lacks.append("an example that shows no more than is read")
+    return lacks
+
+
+@pytest.mark.parametrize("path", EVERYTHING)
+def test_help_is_enough(path):
+    lacks = lacking(path)
+    assert not lacks or path in PENDING, f"{path} lacks {'; '.join(lacks)}"
