@@ -27,8 +27,6 @@ class Dual(NamedTuple):
     case: jax.Array
 
 
-
-
 def cpo_dual(
     q: chex.Numeric, r: chex.Numeric, s: chex.Numeric, c: chex.Numeric, delta: chex.Numeric
 ) -> Dual:
@@ -127,8 +125,10 @@ def _plane(
 def _case(
     q: jax.Array, r: jax.Array, s: jax.Array, c: jax.Array, delta: jax.Array
 ) -> jax.Array:
-    room, _, _ = _plane(q, r, s, c, delta)
-    breaks = c + r * jnp.sqrt(ratio(2 * delta, q)) > 0
+    room, rest, _ = _plane(q, r, s, c, delta)
+    # Opposite gradients never break a limit that can be kept; their sum may, by rounding.
+    opposite = (rest == 0) & (r < 0)
+    breaks = (c + r * jnp.sqrt(ratio(2 * delta, q)) > 0) & ~opposite
     inside = jnp.where(breaks, Case.ACTIVE, Case.INACTIVE)
     outside = jnp.where(c > 0, Case.RECOVERY, Case.FREE)
     return jnp.where(room > 0, inside, outside).astype(jnp.int32)

@@ -299,6 +299,18 @@ def dual_and_weights(*numbers):
     return cpo_dual(*numbers), cpo_weights(*numbers)
 
 
+def test_opposite_gradients_at_the_edge_have_a_multiplier():
+    """Where the trust region just touches the limit, rounding decides what no case may be."""
+    rng = np.random.default_rng(5)
+    g = rng.normal(size=(2000, 2))
+    scale = rng.lognormal(size=2000)
+    delta = rng.lognormal(size=2000)
+    q, r, s = (g * g).sum(1), -(g * g).sum(1) * scale, (g * g).sum(1) * scale**2
+    edge = np.sqrt(2 * delta * s) * (1 + rng.integers(-3, 3, 2000) * 1.1e-16)
+    dual = jax.tree.map(np.asarray, jax.vmap(cpo_dual)(q, r, s, edge, delta))
+    assert (dual.case != Case.FREE).all() and (dual.trust + dual.cost > 0).all()
+
+
 def test_multipliers_certify_the_step():
     """The conditions of Karush, Kuhn and Tucker, which are sufficient here."""
     rng = np.random.default_rng(2)
