@@ -1,5 +1,7 @@
 """The public names of the package, which :mod:`jaxltl` shows as its own, by topic."""
 
+import importlib
+
 from jaxltl.core.automata.automaton import (
     Automaton,
     accepts_lasso,
@@ -190,12 +192,17 @@ from jaxltl.io.storm import from_stormpy, to_stormpy
 from jaxltl.io.umb_sharded import read_sharded
 
 
-@picture.register
-def _(value: Automaton) -> str:
+def _drawn(value: object) -> str | None:
     # Deferred, and replaced when it is imported: matplotlib is for those who look.
-    from jaxltl.plot.automata import as_svg
+    importlib.import_module("jaxltl.plot.notebook")
+    return picture(value)
 
-    return as_svg(value)
+
+for _kind in (
+    Automaton, DenseMDP, FiniteMemoryPolicy, Game, MDP, Permissive, Product, Solution, SparseMDP,
+    Winning,
+):
+    picture.register(_kind, _drawn)
 
 
 # In the order in which a user would read of them; a name is in one topic. `__all__` is all of them,

@@ -12,9 +12,11 @@ from jaxltl.core.host.rows import starts_of
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.models.sparse import Rewards
+from jaxltl.core.show import brief
 from jaxltl.core.values.robust import robust_discounted_value
 
 
+@brief
 @struct.dataclass
 class DataEvidence:
     """Bounds that hold with a confidence, all at once; NaN outside of the region.

@@ -10,8 +10,10 @@ from flax import struct
 from jax import lax
 
 from jaxltl.algos.schedules import SLACK
+from jaxltl.core.show import brief
 
 
+@brief
 @struct.dataclass
 class Sample:
     """One evaluated policy: ``float[D]``, its objective, costs ``float[C]``, and its excess.
@@ -26,6 +28,7 @@ class Sample:
     found: jax.Array
 
 
+@brief
 @struct.dataclass
 class Pool:
     """Evaluated policies: ``float[n, D]``, ``float[n]``, ``float[n, C]`` and which count."""
@@ -48,6 +51,7 @@ def num_elites(rho: float, num_samples: int) -> int:
 
 
 
+@brief
 @struct.dataclass
 class Elites:
     """Who was chosen among n samples.

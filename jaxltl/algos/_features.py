@@ -20,6 +20,7 @@ from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.operators import expectation
 from jaxltl.core.models.product import Product, expected_reads, lift_trajectories
 from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.show import brief
 from jaxltl.core.types import Solution
 from jaxltl.core.values.reachability import action_matrices
 from jaxltl.core.values.satisfaction import as_reachability, visiting
@@ -43,6 +44,7 @@ def pair_counts(
     return to_jax(flat.reshape(actions))
 
 
+@brief
 class Features(NamedTuple):
     """Named features: `values` is ``float[S, A, F]`` (``[S, Q, A, F]``).
 

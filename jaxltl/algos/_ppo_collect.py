@@ -19,8 +19,10 @@ from jaxltl.algos.advantages import generalized_advantages
 from jaxltl.algos.moments import Moments, normalized, scale_of, updated_moments
 from jaxltl.core.models import lanes
 from jaxltl.core.models.environment import Timestep, allowed_in
+from jaxltl.core.show import brief
 
 
+@brief
 @struct.dataclass
 class Walkers:
     """N environments on their way; all have a first axis of N.

@@ -13,8 +13,10 @@ from jax import lax
 
 from jaxltl.core.host import given
 from jaxltl.core.models.environment import Finite, flat_observation
+from jaxltl.core.show import brief
 
 
+@brief
 class Output(NamedTuple):
     """What a network says of one observation.
 

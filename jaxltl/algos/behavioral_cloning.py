@@ -8,6 +8,7 @@ learned holds where things look as they did in the demonstrations.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import chex
@@ -23,7 +24,8 @@ from jaxltl.algos.early_stopping import Best, stop_early
 from jaxltl.core.models.batch import stack_models, stack_observations, training_counts
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.types import status_code
+from jaxltl.core.show import brief, history
+from jaxltl.core.types import Status, status_code
 
 # --- policy networks -----------------------------------------------------------------------------
 
@@ -87,6 +89,7 @@ def _dense_layers(module: Any, seen: jax.Array, memory: jax.Array) -> jax.Array:
 # --- the learner's data --------------------------------------------------------------------------
 
 
+@brief
 @struct.dataclass
 class Problem:
     """What is given: what is seen in worlds, and which actions were demonstrated.
@@ -107,6 +110,7 @@ class Problem:
     network: nn.Module = struct.field(pytree_node=False, default=ConvolutionalPolicy())
 
 
+@brief
 @struct.dataclass
 class Hparams:
     """How to learn. Numbers are traced, so new values do not recompile.
@@ -124,6 +128,7 @@ class Hparams:
     batch: int = struct.field(pytree_node=False, default=128)
 
 
+@brief
 @struct.dataclass
 class State:
     """Parameters on their way; once `stopped`, only the step counter goes on.
@@ -144,6 +149,7 @@ class State:
     stopped: jax.Array
 
 
+@brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
     """Figures of the parameters before a step.

@@ -38,11 +38,13 @@ from jaxltl.algos._elites import Pool, Sample, better, elite_weights, num_elites
 from jaxltl.algos._evaluation import evaluate_all, per_cost, scores, split
 from jaxltl.algos.schedules import SLACK, Polynomial, Schedule, at
 from jaxltl.core.host import given
+from jaxltl.core.show import brief, history
 from jaxltl.core.types import Status, require_shape
 
 WEIGHTINGS = ("until_feasible", "literal", "uniform")
 
 
+@brief
 @struct.dataclass
 class Problem:
     """What is searched; made by :func:`make_problem`.
@@ -60,6 +62,7 @@ class Problem:
     scale: jax.Array
 
 
+@brief
 @struct.dataclass
 class Hparams:
     """How to search. Numbers are traced, so new values do not recompile; None is static.
@@ -113,6 +116,7 @@ class Hparams:
     sharding: Any = struct.field(pytree_node=False, default=None)
 
 
+@brief(codes={"status": Status})
 @struct.dataclass
 class State:
     """A distribution on its way, and the best that it has drawn.
@@ -143,6 +147,7 @@ class State:
     status: jax.Array
 
 
+@brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
     """Figures of a step.
@@ -386,6 +391,7 @@ def _restarted(family: Any, problem: Problem, hparams: Hparams) -> tuple[Any, ja
 # --- what was found -------------------------------------------------------------------------
 
 
+@brief
 @struct.dataclass
 class Assessment:
     """A policy evaluated anew.
@@ -411,6 +417,7 @@ class Assessment:
     confident: jax.Array
 
 
+@brief
 class Result(NamedTuple):
     """What a search found, by evaluations of its own.
 

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxltl.algos.learner import choose
+from jaxltl.core.show import brief
 
 
+@brief
 @struct.dataclass
 class Best:
     """The parameters with the best held-out likelihood; without held-out data the newest.

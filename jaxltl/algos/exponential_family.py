@@ -29,8 +29,10 @@ from jax import lax
 from jax.scipy.special import digamma, gammaln
 
 from jaxltl.algos import splitmix
+from jaxltl.core.show import brief
 
 
+@brief
 @struct.dataclass
 class DiagonalGaussian:
     """Independent normal entries; ``Gamma(x) = (x, x^2)``.
@@ -44,6 +46,7 @@ class DiagonalGaussian:
     variance: jax.Array
 
 
+@brief
 @struct.dataclass
 class FullGaussian:
     """Normal vectors with any covariance; ``Gamma(x) = (x, x x')``.
@@ -58,6 +61,7 @@ class FullGaussian:
     factor: jax.Array
 
 
+@brief
 @struct.dataclass
 class Gamma:
     """Independent gamma entries, which are positive; ``Gamma(x) = (x, log x)``.

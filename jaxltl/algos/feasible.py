@@ -15,6 +15,7 @@ that nothing was found says nothing.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import chex
@@ -33,6 +34,7 @@ from jaxltl.core.host.given import number, one_of, shown, whole
 from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.parametric import Ends, ParametricMDP
 from jaxltl.core.models.sparse import row_reward
+from jaxltl.core.show import brief, history
 from jaxltl.core.types import Status, require_shape
 from jaxltl.core.values.mixture import safe_mean
 from jaxltl.core.values.prepared import Prepared, prepare, solve_prepared
@@ -42,6 +44,7 @@ from jaxltl.core.values.robust import width_asked
 _FINEST = 1e-12  # the width asked for where the one that was asked for does not tell
 
 
+@brief
 @struct.dataclass
 class Problem:
     """A question about a parametric model; made by :func:`make_problem`.
@@ -75,6 +78,7 @@ class Problem:
         return 1.0 if self.bound == ">=" else -1.0
 
 
+@brief
 @struct.dataclass
 class Hparams:
     """How to search. Numbers are traced, so new values do not recompile.
@@ -92,6 +96,7 @@ class Hparams:
     tolerance: jax.Array | float | None = None
 
 
+@brief
 @struct.dataclass
 class Best:
     """A point, ``float[D]``, and its value; NaN before there is one."""
@@ -100,6 +105,7 @@ class Best:
     value: jax.Array
 
 
+@brief
 @struct.dataclass
 class State:
     """A search on its way.
@@ -120,6 +126,7 @@ class State:
     optimizer: Any
 
 
+@brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
     """Figures of the point before a step.
@@ -364,6 +371,7 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
 # --- many starts, and what is proven ----------------------------------------------------------
 
 
+@brief(codes={"status": Status})
 @struct.dataclass
 class Feasible:
     """What searches from N starts found.

@@ -41,6 +41,7 @@ from jaxltl.core.models.game import as_game
 from jaxltl.core.models.mdp import support
 from jaxltl.core.models.operators import forall_successor, sample_successor
 from jaxltl.core.models.product import Product, product
+from jaxltl.core.show import brief, history
 from jaxltl.core.types import Status, status_code
 from jaxltl.core.values.contest import chances
 from jaxltl.core.values.data_guarantee import DataGuarantee, learn_guarantee
@@ -48,6 +49,7 @@ from jaxltl.core.values.data_guarantee import DataGuarantee, learn_guarantee
 INTERVALS = ("linear", "confidence")
 
 
+@brief
 @struct.dataclass
 class Problem:
     """A world with a task; made by :func:`make_problem`.
@@ -75,6 +77,7 @@ class Problem:
     num_claims: jax.Array
 
 
+@brief
 @struct.dataclass
 class Hparams:
     """How to learn. Numbers are traced.
@@ -113,6 +116,7 @@ class Hparams:
     length: int = struct.field(pytree_node=False, default=64)
 
 
+@brief
 @struct.dataclass
 class State:
     """What has been seen, and what is made of it.
@@ -141,6 +145,7 @@ class State:
     residual: jax.Array
 
 
+@brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
     """Figures after a step.

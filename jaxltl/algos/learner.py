@@ -33,6 +33,7 @@ from jaxltl.algos._run_over_mesh import run_over_mesh
 from jaxltl.core.host.given import truth, whole
 from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.lanes import on_host
+from jaxltl.core.show import brief
 from jaxltl.core.types import Status, worst
 
 Init = Callable[..., Any]
@@ -101,6 +102,7 @@ def _no_metrics(step: Step, *arguments: Any) -> Any:
 # --- ended early ----------------------------------------------------------------------------
 
 
+@brief(codes={"status": Status})
 @struct.dataclass
 class Learned:
     """What a run that ends early ends with; ``check`` accepts it.
@@ -250,6 +252,7 @@ def while_active(
 # --- the functions of a learner --------------------------------------------------------------
 
 
+@brief
 class Bound(NamedTuple):
     """What follows from a learner's ``init`` and ``step``; each has its own help."""
 

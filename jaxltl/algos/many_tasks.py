@@ -34,6 +34,7 @@ from jaxltl.core.host import given
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models import sequence_task
 from jaxltl.core.models.environment import Agent, Box, Finite, as_partial, flat_observation
+from jaxltl.core.show import brief
 
 
 class SequenceNetwork(nn.Module):
@@ -96,6 +97,7 @@ class SequenceNetwork(nn.Module):
         return (scores.reshape(self.shape), spread), value
 
 
+@brief
 @struct.dataclass
 class Plan:
     """For each state of an automaton the sequences that lead to acceptance, shortest first.
@@ -162,6 +164,7 @@ def stack_plans(plans: Sequence[Plan]) -> Plan:
 _FORGETS = 1 / 16  # share of what a choice has been worth that is forgotten in a step
 
 
+@brief
 class Choice(NamedTuple):
     """What an agent has taken up: a state of the automaton, which of its sequences, and what that
     one has been worth of late."""
@@ -298,6 +301,7 @@ def _act(
     return action, Choice(state, taken, worth)
 
 
+@brief
 @dataclass(frozen=True)
 class Staged:
     """A run through stages.

@@ -51,9 +51,11 @@ from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.operators import action_argmax
 from jaxltl.core.models.restrict import restrict
-from jaxltl.core.types import require_shape, status_code
+from jaxltl.core.show import brief, history
+from jaxltl.core.types import Status, require_shape, status_code
 
 
+@brief
 @struct.dataclass
 class Problem:
     """A game to play, with what the learner may not see before it plays.
@@ -83,6 +85,7 @@ class Problem:
     method: str = struct.field(pytree_node=False, default="generalized")
 
 
+@brief
 @struct.dataclass
 class Hparams:
     """How to learn. Numbers are traced, so new values do not recompile; None is static.
@@ -119,6 +122,7 @@ class Hparams:
     moves_per_step: int = struct.field(pytree_node=False, default=64)
 
 
+@brief
 @struct.dataclass
 class State:
     """A table on its way, and the chains that fill it.
@@ -151,6 +155,7 @@ class State:
     held: Any
 
 
+@brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
     """Figures after a step.

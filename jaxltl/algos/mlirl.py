@@ -8,6 +8,7 @@ that the policy does the task (2.6).
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import chex
@@ -30,6 +31,7 @@ from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.product import Product, allowed_steps, lift_trajectories
 from jaxltl.core.models.restrict import with_allowed
 from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.show import brief, history
 from jaxltl.core.types import Solution, Status, require_shape, worst
 from jaxltl.core.values.boltzmann import boltzmann_value
 from jaxltl.core.values.iterate import in_turn
@@ -44,6 +46,7 @@ def linear_reward(weights: jax.Array, features: jax.Array) -> jax.Array:
     return features @ weights
 
 
+@brief
 @struct.dataclass
 class Problem:
     """What is given: a model, features, demonstrations, and a class of rewards.
@@ -65,6 +68,7 @@ class Problem:
     reward: Reward = struct.field(pytree_node=False, default=linear_reward)
 
 
+@brief
 @struct.dataclass
 class Hparams:
     """How to learn. Numbers are traced, so new values do not recompile.
@@ -90,6 +94,7 @@ class Hparams:
     optimizer: str = struct.field(pytree_node=False, default="lbfgs")
 
 
+@brief
 @struct.dataclass
 class State:
     """Parameters on their way, with the value that the next solve starts from.
@@ -108,6 +113,7 @@ class State:
     optimizer: Any
 
 
+@brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
     """Figures of the parameters before a step.
@@ -127,6 +133,7 @@ class Metrics:
     status: jax.Array
 
 
+@brief(codes={"status": Status})
 class Objective(NamedTuple):
     """The loss at some parameters, and what it was made of."""
 

@@ -8,7 +8,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxltl.core.show import brief
 
+
+@brief
 @struct.dataclass
 class Moments:
     """Of the numbers so far: how many, their mean, and summed squares around it.

@@ -53,9 +53,11 @@ from jaxltl.core.models.environment import (
     require_environment,
     require_key,
 )
+from jaxltl.core.show import brief, history
 from jaxltl.core.types import Status
 
 
+@brief
 @struct.dataclass
 class Problem:
     """An environment and a network, made by :func:`make_problem`.
@@ -71,6 +73,7 @@ class Problem:
     network: nn.Module = struct.field(pytree_node=False)
 
 
+@brief
 @struct.dataclass
 class Hparams:
     """How to learn. Numbers are traced, so new values do not recompile; None is static.
@@ -136,6 +139,7 @@ class Hparams:
     sharding: Any = struct.field(pytree_node=False, default=None)
 
 
+@brief
 @struct.dataclass
 class State:
     """A policy on its way.
@@ -161,6 +165,7 @@ class State:
     transitions: jax.Array
 
 
+@brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
     """Figures of a step. Those of episodes are of the policy before it.

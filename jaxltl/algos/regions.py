@@ -19,12 +19,14 @@ from jaxltl.core.host.given import numbers, shown
 from jaxltl.core.host.given import whole as count
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.parametric import box_of
+from jaxltl.core.show import brief
 from jaxltl.core.values.mixture import safe_mean
 
 ACCEPTED, REJECTED, OPEN = 1, -1, 0
 Problem = Any  # as jaxltl.algos.feasible.make_problem makes it
 
 
+@brief
 @dataclass(frozen=True)
 class Regions:
     """Boxes that cover a box.

@@ -50,13 +50,15 @@ from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.operators import forall_successor
 from jaxltl.core.models.restrict import restrict
-from jaxltl.core.types import Solution, require_shape, status_code
+from jaxltl.core.show import brief, history
+from jaxltl.core.types import Solution, Status, require_shape, status_code
 from jaxltl.core.values.minimax import minimax_value, strategy_value
 from jaxltl.core.values.warm_start import span_iteration
 
 UPDATES = ("every", "printed")
 
 
+@brief
 @struct.dataclass
 class Problem:
     """A game with a task and a reward; made by :func:`make_problem`.
@@ -85,6 +87,7 @@ class Problem:
     memory: jax.Array
 
 
+@brief
 @struct.dataclass
 class Hparams:
     """What is asked for, and how to learn. Numbers are traced; None is static.
@@ -114,6 +117,7 @@ class Hparams:
     moves_per_step: int = struct.field(pytree_node=False, default=128)
 
 
+@brief
 @struct.dataclass
 class State:
     """What has been seen, and what is made of it.
@@ -159,6 +163,7 @@ class State:
     fault: jax.Array
 
 
+@brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
     """Figures after a step.
@@ -183,6 +188,7 @@ class Metrics:
     status: jax.Array
 
 
+@brief(codes={"status": Status})
 @struct.dataclass
 class Evidence:
     """What is known of a learned strategy in the true game; made by :func:`evidence`.

@@ -9,10 +9,13 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxltl.core.show import brief
+
 # Products such as .07 * 100 come out a little above the integer that they are.
 SLACK = 1e-9
 
 
+@brief
 @struct.dataclass
 class Polynomial:
     """The schedule ``scale * (l + offset) ** power`` of the steps l = 1, 2, ...
@@ -29,6 +32,7 @@ class Polynomial:
     offset: jax.Array | float = 0.0
 
 
+@brief
 @struct.dataclass
 class Linear:
     """From `first` in the first step in a straight line to `last` after `num_steps` steps.
@@ -76,6 +80,7 @@ def at(schedule: Schedule, step: jax.Array | int) -> Any:
     return schedule(l) if callable(schedule) else schedule
 
 
+@brief
 class Condition(NamedTuple):
     """One of theorem 1's conditions, whether it holds (None: cannot be told), and why."""
 
@@ -84,6 +89,7 @@ class Condition(NamedTuple):
     reason: str
 
 
+@brief
 class Conditions(NamedTuple):
     """What :func:`theorem_conditions` tells.
 

@@ -30,6 +30,7 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.restrict import with_allowed
 from jaxltl.core.models.tables import Predecessors, predecessors
 from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.show import brief, history
 from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values.satisfaction import satisfaction_probability
 from jaxltl.core.values.soft import policy_logits, soft_policy_adjoint, soft_value
@@ -87,6 +88,7 @@ class Concatenated(nn.Module):
 # --- the learner's data --------------------------------------------------------------------------
 
 
+@brief
 @struct.dataclass
 class Problem:
     """What is given: worlds beside the task, what is seen in them, and demonstrations.
@@ -118,6 +120,7 @@ class Problem:
         return self.counts.shape[1] if self.counts.ndim == 5 else None
 
 
+@brief
 @struct.dataclass
 class Hparams:
     """How to learn. Numbers are traced, so new values do not recompile.
@@ -146,6 +149,7 @@ class Hparams:
     horizon: int | None = struct.field(pytree_node=False, default=None)
 
 
+@brief
 @struct.dataclass
 class State:
     """Parameters on their way; once `stopped`, only the step counter goes on.
@@ -168,6 +172,7 @@ class State:
     stopped: jax.Array
 
 
+@brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
     """Figures of the parameters before a step.
@@ -375,6 +380,7 @@ def _initial(problem: Problem, initial: jax.Array | None) -> jax.Array:
 # --- learning -------------------------------------------------------------------------------------
 
 
+@brief(codes={"status": Status})
 @struct.dataclass
 class Objective:
     """What the loss was made of, and the soft values with their evidence."""

@@ -62,11 +62,13 @@ from jaxltl.core.models.environment import (
     flat_observation,
     some_action,
 )
-from jaxltl.core.types import require_shape, status_code
+from jaxltl.core.show import brief, history
+from jaxltl.core.types import Status, require_shape, status_code
 
 METHODS = ("trpo", "cpo")
 
 
+@brief
 @struct.dataclass
 class Problem:
     """A world, made by :func:`make_problem`.
@@ -82,6 +84,7 @@ class Problem:
     horizon: int = struct.field(pytree_node=False)
 
 
+@brief
 @struct.dataclass
 class Hparams:
     """How to learn. Numbers are traced, so new values do not recompile; None is static.
@@ -131,6 +134,7 @@ class Hparams:
     value_batches: int = struct.field(pytree_node=False, default=8)
 
 
+@brief
 @struct.dataclass
 class State:
     """A policy on its way.
@@ -157,6 +161,7 @@ class State:
     trajectories: jax.Array
 
 
+@brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
     """Figures of a step. Means are of the policy before it, over its finite trajectories.
@@ -200,6 +205,7 @@ class Metrics:
     status: jax.Array
 
 
+@brief
 class Batch(NamedTuple):
     """Trajectories side by side, zero where they are over or left out.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterator
 from typing import Any, TypeVar
 
 import chex
@@ -10,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+
+from jaxltl.core.show import apart, array, brief, coded, is_array, lanes, span, told
 
 SolutionT = TypeVar("SolutionT", bound="Solution")
 
@@ -69,6 +72,20 @@ class Method:
         return 0
 
 
+def _facts(solution: Any) -> Iterator[str]:
+    more = solution.status.shape
+    yield f"{lanes(more)}: {coded(solution.status, Status)}" if more else (
+        coded(solution.status, Status))
+    yield f"value {told(solution.value)}"
+    yield apart(solution.lower, solution.upper)
+    yield f"{span(solution.num_steps)} steps"
+    yield f"residual {span(solution.residual)}"
+    yield f"by {solution.method}" if str(solution.method) else ""
+    yield f"policy {array(solution.policy)}" if is_array(solution.policy) else ""
+    yield f"nature {array(solution.nature)}" if is_array(solution.nature) else ""
+
+
+@brief(facts=_facts, drawn=True)
 @struct.dataclass
 class Solution:
     """A solver's answer with its evidence.

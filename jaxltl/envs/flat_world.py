@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 from jaxltl.core.host import given
 from jaxltl.core.models.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.models.time_limit import with_time_limit, without_time_limit
+from jaxltl.core.show import brief
 
 # Colour, place and radius of each disc.
 DISCS = (
@@ -37,12 +38,14 @@ _MOVES = ((0, 1), (1, 0), (0, -1), (-1, 0), (_ROOT, _ROOT), (_ROOT, -_ROOT), (-_
           (-_ROOT, -_ROOT), (0, 0))
 
 
+@brief
 class FlatState(NamedTuple):
     """Where one is: `place` is ``float32[2]``."""
 
     place: Any
 
 
+@brief
 @struct.dataclass
 class Discs:
     """Discs and their colours.
@@ -138,6 +141,7 @@ def discs_of(environment: Environment) -> Discs:
     return without_time_limit(environment)[0].labels.args[0]  # type: ignore[attr-defined]
 
 
+@brief
 @dataclass(frozen=True)
 class EventsAround:
     """Which event holds where, around the agent; made by :func:`events_around`.

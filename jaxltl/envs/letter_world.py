@@ -32,6 +32,7 @@ from jaxltl.core.models.environment import (
     make_environment,
 )
 from jaxltl.core.models.time_limit import with_time_limit
+from jaxltl.core.show import brief
 from jaxltl.envs.text_map import parse_map
 
 ACTIONS = ("up", "down", "left", "right")
@@ -39,6 +40,7 @@ _MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
 _NAMES = "abcdefghijklmnopqrstuvwxyz"
 
 
+@brief
 class LetterState(NamedTuple):
     """A map and a place on it.
 

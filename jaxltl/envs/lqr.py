@@ -21,9 +21,11 @@ from jax import lax
 from numpy.typing import ArrayLike
 
 from jaxltl.core.models.environment import Environment, Timestep, make_box, make_environment
+from jaxltl.core.show import brief
 from jaxltl.envs.networks import Network, apply_lanes, make_network, weighted
 
 
+@brief
 @struct.dataclass
 class LQR:
     """A regulator problem; made by :func:`lqr`.
@@ -48,6 +50,7 @@ class LQR:
     horizon: int = struct.field(pytree_node=False)
 
 
+@brief
 class Run(NamedTuple):
     """One run of a policy, with the lanes of its parameters as last axes.
 
@@ -64,6 +67,7 @@ class Run(NamedTuple):
     violation: jax.Array
 
 
+@brief
 class Optimum(NamedTuple):
     """The best controls, on the host in float64.
 
@@ -301,6 +305,7 @@ def _lanes_last(
 # --- by steps ---------------------------------------------------------------------------------
 
 
+@brief
 class Plant(NamedTuple):
     """A regulator on its way: its state, the largest violation so far, and steps made."""
 

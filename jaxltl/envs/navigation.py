@@ -39,6 +39,7 @@ from jax import lax
 from numpy.typing import ArrayLike
 
 from jaxltl.core.host import given
+from jaxltl.core.show import brief
 from jaxltl.envs.networks import Network, apply_layers, layers, make_network, padded
 
 TASKS = (1, 2, 3, 4)
@@ -48,6 +49,7 @@ PROPOSITIONS = ("goal", "obstacle")
 Scores = Callable[..., tuple[jax.Array, jax.Array]]
 
 
+@brief
 @struct.dataclass
 class Navigation:
     """A map, a robot and its sensors; made by :func:`navigation`.
@@ -83,6 +85,7 @@ class Navigation:
         return self.offset.shape[-2] + 2
 
 
+@brief
 class State(NamedTuple):
     """Positions and headings, in arrays of one shape ``float[...]``; headings in [-pi, pi)."""
 
@@ -91,6 +94,7 @@ class State(NamedTuple):
     heading: jax.Array
 
 
+@brief
 class Run(NamedTuple):
     """Trajectories.
 

@@ -28,6 +28,7 @@ from jaxltl.core.models.environment import (
     clipped_action,
     flat_observation,
 )
+from jaxltl.core.show import brief
 
 ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "relu": lambda x: jnp.maximum(x, 0),
@@ -36,6 +37,7 @@ ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
 }
 
 
+@brief
 @struct.dataclass
 class Network:
     """The shape of a network; it holds no numbers. Made by :func:`make_network`.

@@ -19,6 +19,7 @@ from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.product import product
 from jaxltl.core.models.restrict import restrict
+from jaxltl.core.show import brief
 from jaxltl.envs import gridworld as grid
 
 ACTIONS = (*grid.ACTIONS, "off", "on")
@@ -148,6 +149,7 @@ def _paid_moves() -> np.ndarray:
     return paid
 
 
+@brief
 class Patrol(NamedTuple):
     """The game with its task's memory, as it is learned; states are ``world * 4 + memory``.
 

@@ -32,6 +32,7 @@ from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, product, project_trajectories
 from jaxltl.core.models.trajectories import Trajectories, rollout
+from jaxltl.core.show import brief
 from jaxltl.core.values.performance import infeasible_starts
 from jaxltl.core.values.soft import soft_value
 from jaxltl.envs.cell_kinds import (
@@ -55,6 +56,7 @@ INCOMPLETE = "(!o2 & !o3) U (o1 & ((!o3) U (o2 & F o3)))"
 _ROUNDS = 10_000
 
 
+@brief
 @struct.dataclass
 class World:
     """A coloured grid world; made by :func:`make_world` and its relatives.

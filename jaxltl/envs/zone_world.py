@@ -28,6 +28,7 @@ from jax.tree_util import Partial
 from jaxltl.core.host import given
 from jaxltl.core.models.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.models.time_limit import with_time_limit
+from jaxltl.core.show import brief
 
 COLORS = ("green", "yellow", "blue", "magenta")
 _MASS = 4 / 3 * np.pi * 0.1**3 + 0.1**3
@@ -36,6 +37,7 @@ _ROBOT = 0.1  # its radius
 _BINS = 16
 
 
+@brief
 class ZoneState(NamedTuple):
     """A robot among zones.
 

@@ -22,6 +22,7 @@ from jaxltl.core.models.ranges import Ends as Ranges
 from jaxltl.core.models.ranges import ranges
 from jaxltl.core.models.rational import Rationals, make_rationals
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.core.show import brief
 from jaxltl.io._drn_body import names_of, read_body, read_header, rewards_of
 from jaxltl.io._files import read_bytes
 from jaxltl.io._tokens import Block, Integers, Text, as_fraction, numbered, refuse
@@ -38,6 +39,7 @@ Polynomial = dict[tuple[int, ...], Fraction]
 Term = tuple[Fraction, list[tuple[int, int]]]  # a coefficient, and parameters with their powers
 
 
+@brief
 @dataclass(frozen=True)
 class RationalFunction:
     """The quotient of two polynomials in the parameters of a model."""
@@ -60,6 +62,7 @@ class RationalFunction:
         return above, below
 
 
+@brief
 @dataclass(frozen=True)
 class ParametricModel:
     """A Markov chain or decision process whose numbers are functions of parameters.

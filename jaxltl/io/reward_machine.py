@@ -24,10 +24,12 @@ from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.product import Product, expected_reads
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.show import brief
 from jaxltl.io._files import read_text
 from jaxltl.io._hoa_table import alphabet_of
 
 
+@brief
 class RewardMachine(NamedTuple):
     """An automaton, and what it pays.
 

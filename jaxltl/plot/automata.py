@@ -15,10 +15,10 @@ from matplotlib.patches import Circle, FancyArrowPatch
 from matplotlib.path import Path
 from numpy.typing import NDArray
 
-from jaxltl.core.automata.automaton import Automaton, picture
+from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import edge_guards
 from jaxltl.plot import layout as drawing
-from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER, to_bytes
+from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER
 
 _NOTES = {
     "buchi": "●: accepting; a word is accepted if its run takes such arrows infinitely often",
@@ -83,12 +83,6 @@ def automaton(
             color=MUTED, va="center", family="monospace", parse_math=False,
         )
     return figure
-
-
-@picture.register
-def as_svg(value: Automaton) -> str:
-    """What a notebook shows of an automaton."""
-    return to_bytes(automaton(value), "svg").decode()
 
 
 def on_the_host(automaton: Automaton) -> Automaton:

@@ -5,8 +5,7 @@ An automaton reads one letter per step; a letter is the set of the propositions 
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,19 +13,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.logic.ltl import Letter, as_letters
+from jaxltl.core.show import brief, cut, lanes, over, readable
 
 ACCEPTANCES = ("cosafe", "safety", "buchi", "parity")
 
 
-DRAWN_STATES, DRAWN_ARROWS = 40, 120  # up to which a notebook shows a picture
+def _facts(automaton: Any) -> Iterator[str]:
+    *more, count, width = automaton.delta.shape
+    yield automaton.acceptance
+    yield lanes(more)
+    yield extent_text(automaton) if not more else (
+        f"{count} states, {width} letters {over(automaton.propositions)}")
+    start = readable(automaton.initial)
+    if automaton.state_names and start is not None and not start.ndim:
+        yield f"for {cut(automaton.state_names[int(start)])}"
 
 
-@functools.singledispatch
-def picture(value: object) -> str | None:
-    """A value as SVG, by whoever draws its type; None where nobody does."""
-    return None
-
-
+@brief(facts=_facts, drawn=True)
 @dataclass(frozen=True, eq=False)
 class Automaton:
     """A complete deterministic automaton; see `make_automaton` for checked construction.
@@ -76,16 +79,6 @@ class Automaton:
     def accepting(self) -> NDArray[np.bool_]:
         """bool `[Q, L]`, the transitions of even priority."""
         return self.priority % 2 == 0
-
-    def __repr__(self) -> str:
-        return f"Automaton({self.acceptance}, {extent_text(self)})"
-
-    def _repr_svg_(self) -> str | None:
-        """The picture that notebooks show; None, so that they show text, where it would crowd."""
-        arrows = sum(len(set(row)) for row in np.asarray(self.delta).tolist())
-        if len(self.delta) > DRAWN_STATES or arrows > DRAWN_ARROWS:
-            return None
-        return picture(self)
 
 
 def make_automaton(

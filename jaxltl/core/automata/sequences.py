@@ -21,10 +21,12 @@ from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.host import given
 from jaxltl.core.host.components import strong_components
 from jaxltl.core.logic.labels import require_known
+from jaxltl.core.show import brief
 
 _MOST_PATHS = 20_000  # looked at from each state
 
 
+@brief
 @dataclass(frozen=True)
 class Sequences:
     """For each state of an automaton at most M sequences of at most D steps, shortest first.

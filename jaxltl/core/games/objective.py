@@ -15,14 +15,17 @@ import jax
 import numpy as np
 from flax import struct
 
+from jaxltl.core.games import facts
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.concrete import is_traced, namespace, to_jax
 from jaxltl.core.models.product import label_rows, shown_by
+from jaxltl.core.show import brief
 
 States: TypeAlias = chex.Array | Formula | str  # a set of states
 
 
+@brief(facts=facts.parity)
 @struct.dataclass
 class Parity:
     """The least priority met infinitely often is even; some states decide the run at once.
@@ -40,6 +43,7 @@ class Parity:
     num_priorities: int = struct.field(pytree_node=False)
 
 
+@brief(facts=facts.gr1)
 @struct.dataclass
 class GR1:
     """Generalised reactivity of rank one (Piterman, Pnueli and Sa'ar 2006).

@@ -15,6 +15,7 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.games import facts
 from jaxltl.core.games.gr1 import NEVER, gr1_layers, solve_gr1
 from jaxltl.core.games.objective import GR1, Parity
 from jaxltl.core.games.winning import objective_at, on_states, solve_parity
@@ -29,10 +30,12 @@ from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.restrict import Restriction, restrict
 from jaxltl.core.models.sharded import refuse_sharded
+from jaxltl.core.show import brief
 
 METHODS = ("auto", "stay", "rank", "counter", "parity")
 
 
+@brief(facts=facts.permissive, drawn=True)
 @struct.dataclass
 class Permissive:
     """A permissive strategy: the moves it allows, on the game with the memory it needs.

@@ -32,8 +32,10 @@ from jaxltl.core.models.environment import (
     require_environment,
 )
 from jaxltl.core.models.mdp import MDP
+from jaxltl.core.show import brief
 
 
+@brief
 class ShieldedWorld(NamedTuple):
     """A world beside the state of the strategy that shields it.
 

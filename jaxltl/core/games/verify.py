@@ -18,11 +18,13 @@ from jaxltl.core.models.compiled import compiled_form
 from jaxltl.core.models.game import as_game
 from jaxltl.core.models.mdp import DenseMDP, support
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.show import brief
 
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.integer[Any]]
 
 
+@brief
 class Verification(NamedTuple):
     """What a check of both players' claims found; true if both hold.
 

@@ -15,6 +15,7 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.games import facts
 from jaxltl.core.games.gr1 import solve_gr1
 from jaxltl.core.games.objective import GR1, Parity, States, buchi
 from jaxltl.core.graphs.attractor import attract
@@ -26,8 +27,10 @@ from jaxltl.core.models.game import Game, as_game, as_padded_game
 from jaxltl.core.models.mdp import make_mdp, support
 from jaxltl.core.models.product import product
 from jaxltl.core.models.restrict import restrict
+from jaxltl.core.show import brief
 
 
+@brief(facts=facts.winning, drawn=True)
 @struct.dataclass
 class Winning:
     """The two players' regions, and a strategy of each that wins in its own.

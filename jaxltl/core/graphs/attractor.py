@@ -16,8 +16,10 @@ import numpy as np
 
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.concrete import to_jax
+from jaxltl.core.show import brief
 
 
+@brief
 class Attractor(NamedTuple):
     """A region that a goal attracts, with an action that makes progress.
 

@@ -9,8 +9,10 @@ import jax
 from jaxltl.core.graphs.attractor import avoid
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.concrete import to_jax
+from jaxltl.core.show import brief
 
 
+@brief
 class EndComponents(NamedTuple):
     """Maximal end components within a region.
 

@@ -7,7 +7,7 @@ makes all of them hold together.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -24,6 +24,7 @@ from jaxltl.core.host.binomial import (
 from jaxltl.core.host.given import number, one_of, whole
 from jaxltl.core.host.rows import Booleans, Integers
 from jaxltl.core.host.sparse import Floats
+from jaxltl.core.show import brief, count, span
 
 Method = Literal["clopper-pearson", "hoeffding", "weissman", "anytime"]
 
@@ -36,6 +37,15 @@ _EPS = float(np.finfo(np.float64).eps)
 _MOST = 2**53  # throws of a row, up to which doubles count
 
 
+def _facts(sets: Any) -> Iterator[str]:
+    yield count(sets.num_samples.size, "row")
+    yield count(sets.num_samples.sum(), "sample")
+    yield f"{sets.method}, confidence {sets.confidence:g} shared by {sets.num_claims:,}"
+    yield f"intervals {span(sets.upper - sets.lower)} wide"
+    yield f"radius {span(sets.radius)}" if sets.radius is not None else ""
+
+
+@brief(facts=_facts)
 @dataclass(frozen=True)
 class ConfidenceSets:
     """A set of distributions for each row; together they hold all true ones, with `confidence`.

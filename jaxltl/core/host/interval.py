@@ -22,11 +22,13 @@ from jaxltl.core.host.ball import Ball, share_of
 from jaxltl.core.host.interval_table import Table, row_sums, tables
 from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
+from jaxltl.core.show import brief
 
 _EPS = float(np.finfo(np.float64).eps)
 _READ = 2 * _EPS  # by how much a sum of decimals, or of what was rounded once, may miss one
 
 
+@brief
 @dataclass(frozen=True)
 class HostInterval:
     """A decision process with intervals, as NumPy arrays.

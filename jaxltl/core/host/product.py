@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.host.rows import Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import HostMDP
+from jaxltl.core.show import brief
 
 MAX_PAIRS = 2**31  # pairs of a state and a memory; a bit vector of them takes 2 GB
 _DENSE = 2**27  # pairs up to which the number of each is looked up in a table
@@ -17,6 +18,7 @@ _NARROW = 2000  # states a round, below which NumPy's overhead outweighs its wor
 _MAX_EDGES = 2**27  # of the whole product, that are written down for the search
 
 
+@brief
 class HostProduct(NamedTuple):
     """What is reached of a product, numbered by world state first and memory next.
 

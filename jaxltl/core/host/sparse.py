@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.host.rows import Booleans, Integers, Rows
+from jaxltl.core.show import brief
 
 Floats = NDArray[np.float64]
 
 
+@brief
 @dataclass(frozen=True)
 class HostMDP:
     """The transitions of a decision process, without padding, as NumPy arrays.

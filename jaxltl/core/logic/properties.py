@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula, pointed
+from jaxltl.core.show import brief
 
 Relation = Literal["<", "<=", ">", ">="]
 
@@ -75,6 +76,7 @@ class Earned:
                 "instantaneous": f"I={self.steps}", "average": "LRA"}[self.kind]
 
 
+@brief(facts=lambda self: [self.text])
 @dataclass(frozen=True)
 class Property:
     """A question about a model: a number, or whether a number meets a threshold.

@@ -17,6 +17,7 @@ from jax import lax
 from jaxltl.core.host.given import no_model, shown
 from jaxltl.core.models import kernels
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.show import brief
 
 
 def action_mean(policy: jax.Array, quantity: jax.Array) -> jax.Array:
@@ -80,6 +81,7 @@ def is_deterministic(policy: chex.Array) -> bool:
     return jnp.issubdtype(kind, jnp.integer)
 
 
+@brief
 class Actions(NamedTuple):
     """Choices that are padded to as many actions in every state.
 
@@ -156,6 +158,7 @@ class Actions(NamedTuple):
         return jnp.stack(columns, axis=-1).reshape(self.shape)
 
 
+@brief
 class Columns(NamedTuple):
     """Padded choices whose quantities are an array ``[N, ...]`` for each action.
 
@@ -207,6 +210,7 @@ class Columns(NamedTuple):
         return list(packed)
 
 
+@brief
 class Rows(NamedTuple):
     """Choices without padding; those of a state stand together.
 

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from jaxltl.core.host.given import listed as listed_items
 from jaxltl.core.host.given import numbers, one_of, shown
 from jaxltl.core.host.rows import Integers, starts_of
+from jaxltl.core.models import facts
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
+from jaxltl.core.show import brief
 
 _INTEGER = re.compile(r"-?[1-9][0-9]{0,17}|0")
 MOST_SAMPLES = 2**53  # up to which doubles count
@@ -23,6 +25,7 @@ _MOST_ENTRIES = 10**8
 _ANY = "any"  # the only action of a state in which nothing was tried
 
 
+@brief(facts=facts.counts)
 @dataclass(frozen=True)
 class TransitionCounts:
     """How often an action in a state led to a successor.
@@ -189,6 +192,7 @@ def _row_action(model: SparseMDP) -> Integers:
     return np.arange(host.num_rows) - host.row_start[host.state]
 
 
+@brief
 @dataclass(frozen=True)
 class Places:
     """Where the transitions of a model stand, by numbers.

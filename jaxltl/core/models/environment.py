@@ -34,10 +34,13 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.core.host import given
+from jaxltl.core.models import facts
 from jaxltl.core.models.purity import traced
+from jaxltl.core.show import brief
 from jaxltl.core.types import require_shape
 
 
+@brief
 @struct.dataclass
 class Finite:
     """The actions ``0 .. num - 1``; `num` is static."""
@@ -45,6 +48,7 @@ class Finite:
     num: int = struct.field(pytree_node=False)
 
 
+@brief(facts=facts.space)
 @struct.dataclass
 class Box:
     """Arrays between two bounds; made by :func:`make_box`.
@@ -121,6 +125,7 @@ def _clipped(x: np.ndarray, least: int, most: int) -> np.ndarray:
     return np.where(inside, np.where(inside, x, 0).astype(int), np.where(x > least, most, least))
 
 
+@brief
 class Timestep(NamedTuple):
     """What a step leads to; all but the world are scalars.
 
@@ -141,6 +146,7 @@ class Timestep(NamedTuple):
     discount: chex.Numeric = 1.0
 
 
+@brief(facts=facts.environment)
 @struct.dataclass
 class Environment:
     """A simulated world; made by :func:`make_environment`, whose text tells the functions.
@@ -311,6 +317,7 @@ def clipped_action(actions: Box, action: chex.Array) -> jax.Array:
 # --- episodes -------------------------------------------------------------------------------------
 
 
+@brief
 @struct.dataclass
 class Agent:
     """What acts in an environment, for :func:`run_episode` and evaluations.
@@ -337,6 +344,7 @@ def _without_memory(
     return function(observation, key), memory
 
 
+@brief(facts=facts.episode)
 class Episode(NamedTuple):
     """One trajectory of T steps, or with a leading axis many.
 
@@ -401,6 +409,7 @@ def run_episode(
         end.truncated, made.discount)
 
 
+@brief
 class Underway(NamedTuple):
     """An episode that goes on unless it is terminated or truncated."""
 
@@ -410,6 +419,7 @@ class Underway(NamedTuple):
     truncated: jax.Array
 
 
+@brief
 class Move(NamedTuple):
     """One row of an :class:`Episode`: what was there before a step, and what the step gave."""
 

@@ -23,8 +23,10 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.monitor import Monitor, Verdict, make_monitor, trace_verdicts
+from jaxltl.core.show import brief
 
 
+@brief
 @struct.dataclass
 class FiniteTask:
     """A formula to be read on rows of labels; made by :func:`make_finite_task`.
@@ -43,6 +45,7 @@ class FiniteTask:
     num_columns: int = struct.field(pytree_node=False)
 
 
+@brief
 class Shares(NamedTuple):
     """What part of some trajectories satisfies, violates or leaves undecided; the sum is 1."""
 

@@ -13,15 +13,17 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.host.given import no_model
-from jaxltl.core.models import operators
+from jaxltl.core.models import facts, operators
 from jaxltl.core.models.choices import choice_shape, choices
 from jaxltl.core.models.concrete import namespace, to_jax
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import support
 from jaxltl.core.models.padded import to_padded
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.show import brief
 
 
+@brief(facts=facts.game, drawn=True)
 @struct.dataclass
 class Game:
     """A turn-based game of the system against the environment, stochastic or deterministic.

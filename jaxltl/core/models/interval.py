@@ -16,6 +16,7 @@ from jaxltl.core.host.interval import HostInterval
 from jaxltl.core.host.interval_table import row_sums
 from jaxltl.core.host.rows import starts_of
 from jaxltl.core.host.sparse import HostMDP
+from jaxltl.core.models import facts
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.sparse import (
     Array,
@@ -26,6 +27,7 @@ from jaxltl.core.models.sparse import (
     make_sparse,
     placed,
 )
+from jaxltl.core.show import brief
 
 NEAR = 1e-6  # how far a row may miss a distribution and still be scaled to one
 # Names under which numbers of entries travel with the entries, and radii with the rows.
@@ -33,6 +35,7 @@ _ENTRIES = {"lower": "\0lower", "upper": "\0upper", "center": "\0center"}
 _RADIUS = "\0radius"
 
 
+@brief(facts=facts.interval)
 @struct.dataclass
 class IntervalMDP:
     """A labelled decision process with an interval for each probability.

@@ -12,9 +12,12 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.host.given import listed, no_model, numbers, shown
+from jaxltl.core.models import facts
 from jaxltl.core.models.concrete import is_traced, to_jax
+from jaxltl.core.show import brief
 
 
+@brief(facts=facts.padded, drawn=True)
 @struct.dataclass
 class MDP:
     """A labelled Markov decision process with padded successor lists.
@@ -66,6 +69,7 @@ class MDP:
         return self.probability.dtype
 
 
+@brief(facts=facts.padded, drawn=True)
 @struct.dataclass
 class DenseMDP:
     """The same process with a full matrix, ``transition[s, a, t]``, for small batched problems.

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Iterable
+from functools import partial
 
 import chex
 import jax
@@ -21,6 +22,8 @@ from flax import struct
 from jaxltl.core.automata.automaton import Automaton, run
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.logic.ltl import Letter
+from jaxltl.core.models import facts
+from jaxltl.core.show import brief
 
 
 class Verdict(enum.IntEnum):
@@ -31,6 +34,7 @@ class Verdict(enum.IntEnum):
     VIOLATED = 2  # none is
 
 
+@brief(facts=partial(facts.monitor, codes=Verdict))
 @struct.dataclass
 class Monitor:
     """An automaton that tells its verdict in every state.

@@ -15,13 +15,16 @@ from jax.tree_util import Partial
 
 from jaxltl.core.host.given import listed, shown
 from jaxltl.core.host.given import numbers as _numbers
+from jaxltl.core.models import facts
 from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.core.show import brief
 
 Ends = Any  # a number for all parameters, a number for each name, or float[D]
 _TRIALS = 64  # points that are tried for one at which the functions are a model
 
 
+@brief(facts=facts.parametric)
 @struct.dataclass
 class ParametricMDP:
     """A Markov chain or decision process for each point of a box of parameters.

@@ -22,11 +22,12 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.host.given import shown
 from jaxltl.core.logic.labels import distinct_rows, require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
-from jaxltl.core.models import kernels, operators
+from jaxltl.core.models import facts, kernels, operators
 from jaxltl.core.models.concrete import is_traced, namespace, to_jax
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.trajectories import Trajectories, require_states
+from jaxltl.core.show import brief
 
 
 class Names:
@@ -69,6 +70,7 @@ def _automaton(rest: Any, tables: Any) -> Automaton:
 jax.tree_util.register_pytree_with_keys(Automaton, _tables_with_keys, _automaton, _tables)
 
 
+@brief(facts=facts.product, drawn=True)
 @struct.dataclass
 class Product:
     """A world beside an automaton that remembers the task's progress.
@@ -556,6 +558,7 @@ def lift_policy(model: Product, policy: jax.Array) -> jax.Array:
     return jnp.repeat(policy[:, None], model.num_memory, axis=1)
 
 
+@brief(facts=facts.memory_policy)
 @struct.dataclass
 class FiniteMemoryPolicy:
     """A policy of the world whose memory is the automaton's state.

@@ -11,9 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core.show import brief
+
 Terms = Mapping[tuple[int, ...], Fraction]  # the coefficient of each monomial, by its powers
 
 
+@brief
 @struct.dataclass
 class Polynomials:
     """Sums of terms, a coefficient times a monomial.
@@ -96,6 +99,7 @@ def make_polynomials(polynomials: Sequence[Terms], num_parameters: int) -> Polyn
     )
 
 
+@brief
 @struct.dataclass
 class Rationals:
     """Quotients of polynomials; the denominator is None where all are constants."""

@@ -17,6 +17,7 @@ from jaxltl.core.models.mdp import MDP, make_mdp, support
 from jaxltl.core.models.part import part_of, reachable
 from jaxltl.core.models.product import Product, flat_successor
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.show import brief
 
 
 def with_allowed(model: Any, allowed: chex.Array) -> Any:
@@ -75,6 +76,7 @@ def _named(state: list[int]) -> str:
     return f"{state[0]}" + "".join(f" with memory {q}" for q in state[1:])
 
 
+@brief
 class Restriction(NamedTuple):
     """The reachable part of a model as an ordinary one.
 

@@ -23,8 +23,10 @@ from numpy.typing import ArrayLike
 from jaxltl.core.host import given
 from jaxltl.core.models.environment import Environment, Timestep, make_box, require_environment
 from jaxltl.core.models.monitor import Verdict
+from jaxltl.core.show import brief
 
 
+@brief
 class Sequence(NamedTuple):
     """What to do, step after step; rows from `length` on are False.
 
@@ -39,6 +41,7 @@ class Sequence(NamedTuple):
     length: jax.Array
 
 
+@brief
 @struct.dataclass
 class SequenceSampler:
     """A distribution of sequences; made by :func:`sequence_sampler`. Its numbers are traced.
@@ -56,6 +59,7 @@ class SequenceSampler:
     sets: chex.Array
 
 
+@brief(codes={"verdict": Verdict})
 class SequenceWorld(NamedTuple):
     """A world and how far its sequence has come.
 
@@ -72,6 +76,7 @@ class SequenceWorld(NamedTuple):
     verdict: jax.Array
 
 
+@brief
 class SequenceObservation(NamedTuple):
     """What an agent sees of the world, and what it still has to do, the next step first."""
 

@@ -17,17 +17,20 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxltl.core.host import given
 from jaxltl.core.host.given import shown
 from jaxltl.core.host.rows import spans, starts_of
+from jaxltl.core.models import facts
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.lanes import automatic, axes_of, on_host
 from jaxltl.core.models.padded import action_of
 from jaxltl.core.models.sharded import RowTable, ShardedMDP
 from jaxltl.core.models.sparse import SparseMDP, check_entries, checked_starts, row_reward, scaled
+from jaxltl.core.show import brief
 
 _WIDTHS = np.array(sorted({int(m * 2**e) for e in range(26) for m in (1, 1.5)} | {3}))
 _PADDED = 1.25  # times the transitions that one table of all rows may hold
 _HALO = 0.6  # share of the others' values from which on all of them are sent
 
 
+@brief(facts=facts.part)
 @dataclass(frozen=True)
 class ModelPart:
     """The states of a range, with their choices and where those lead.

@@ -19,8 +19,9 @@ from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxltl.core.host.given import no_model
-from jaxltl.core.models import kernels, operators
+from jaxltl.core.models import facts, kernels, operators
 from jaxltl.core.models.product import label_rows, shown_by
+from jaxltl.core.show import brief
 
 
 class RowTable(NamedTuple):
@@ -35,6 +36,7 @@ class RowTable(NamedTuple):
     probability: Any
 
 
+@brief(facts=facts.sharded)
 @struct.dataclass
 class ShardedMDP:
     """A labelled decision process whose states lie on the devices of a mesh axis.

@@ -16,9 +16,11 @@ from flax import struct
 from jaxltl.core.host.given import listed, numbers, shown
 from jaxltl.core.host.rows import LARGE
 from jaxltl.core.host.sparse import HostMDP
+from jaxltl.core.models import facts
 from jaxltl.core.models.concrete import is_traced
 from jaxltl.core.models.kernels import gather, owners, segment
 from jaxltl.core.models.mdp import checked_initial, checked_label
+from jaxltl.core.show import brief
 
 _PADDED = ("this takes models that are padded: give to_padded(model). Sparse models have choices "
            "in rows, and are taken by the primitives, the functions of graphs and games, the "
@@ -26,6 +28,7 @@ _PADDED = ("this takes models that are padded: give to_padded(model). Sparse mod
 Array = Any  # NumPy's in double precision as it is read, or JAX's
 
 
+@brief
 @struct.dataclass
 class Rewards:
     """A reward structure; what is absent is zero.
@@ -41,6 +44,7 @@ class Rewards:
     transition: Array | None = None
 
 
+@brief(facts=facts.sparse, drawn=True)
 @struct.dataclass
 class SparseMDP:
     """A labelled decision process whose states have as many choices as they have.

@@ -26,11 +26,13 @@ from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.sharded import ShardedMDP, over_devices, seen_by
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.show import brief
 
 _LARGEST = 2**22  # transitions up to which a product's are written down, one by one
 _WIDEST = 6  # predecessor lists are at most this many times wider than successor lists
 
 
+@brief
 class Successors(NamedTuple):
     """Where the pairs of a model lead, ``[A, K, N]``: an array ``[N]`` for each transition.
 
@@ -59,6 +61,7 @@ class Successors(NamedTuple):
         return [kernels.fold(targets, weights, value) for targets, weights in pairs]
 
 
+@brief
 @struct.dataclass
 class Primitives:
     """The same by a model's own primitive, for models that are too wide or too large to write down.
@@ -87,6 +90,7 @@ class Primitives:
         return jax.vmap(one, in_axes=-1, out_axes=-1)(value)
 
 
+@brief
 @struct.dataclass
 class SpreadSuccessors:
     """As :class:`Successors` of a model over a mesh, one table of all choices.
@@ -116,6 +120,7 @@ class SpreadSuccessors:
             self.model, one, self.successor, self.probability, self.model.sent, value)
 
 
+@brief
 class Predecessors(NamedTuple):
     """The pairs that lead to each state, ``a * N + i``, padded with probability zero.
 

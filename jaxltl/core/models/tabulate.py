@@ -14,6 +14,7 @@ from flax import struct
 
 from jaxltl.core.host import given
 from jaxltl.core.host.rows import starts_of
+from jaxltl.core.models import facts
 from jaxltl.core.models.environment import (
     Environment,
     Finite,
@@ -24,12 +25,14 @@ from jaxltl.core.models.environment import (
 )
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.models.time_limit import without_time_limit
+from jaxltl.core.show import brief
 
 _BATCH = 1024  # worlds that are stepped at once, and fewer
 _BYTES = 2**26  # if what they lead to takes more than this
 _LIVE, _TERMINATED, _TRUNCATED = range(3)
 
 
+@brief(facts=facts.table)
 @struct.dataclass
 class Table:
     """A world that was listed by :func:`tabulate`.

@@ -40,10 +40,12 @@ from jaxltl.core.models.finite_task import make_finite_task
 from jaxltl.core.models.monitor import Verdict, lasting_verdicts, verdicts
 from jaxltl.core.models.product import Names
 from jaxltl.core.models.task_reward import Pay, pay_of
+from jaxltl.core.show import brief
 
 ENDINGS = ("repeat", "violated", "undecided")
 
 
+@brief(codes={"verdict": Verdict})
 class TaskWorld(NamedTuple):
     """A world beside the automaton of a task.
 
@@ -65,6 +67,7 @@ class TaskWorld(NamedTuple):
     visits: jax.Array
 
 
+@brief
 class TaskObservation(NamedTuple):
     """What is seen of a :class:`TaskWorld`.
 
@@ -77,6 +80,7 @@ class TaskObservation(NamedTuple):
     memory: jax.Array
 
 
+@brief
 @struct.dataclass
 class TaskTables:
     """A task over the labels of a world, as arrays; made by :func:`make_task_tables`.

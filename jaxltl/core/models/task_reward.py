@@ -15,12 +15,14 @@ from numpy.typing import ArrayLike
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.host import given
 from jaxltl.core.models.monitor import Verdict
+from jaxltl.core.show import brief
 
 REWARDS = ("auto", "reach", "keep", "eventual", "two-discount", "parity")
 _BY_KIND = {"cosafe": "reach", "safety": "keep", "buchi": "eventual", "parity": "parity"}
 _DEFAULT = .99
 
 
+@brief
 class Pay(NamedTuple):
     """What the readings of an automaton earn.
 

@@ -12,11 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core.models import facts
 from jaxltl.core.models.concrete import is_traced, namespace, to_jax
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.operators import policy_distribution, sample_successor
+from jaxltl.core.show import brief
 
 
+@brief(facts=facts.trajectories)
 @struct.dataclass
 class Trajectories:
     """N sequences of state-action pairs, padded with zeros to length T.

@@ -23,8 +23,9 @@ from jaxltl.core.logic.properties import (
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.models.state_formulas import states_satisfying
+from jaxltl.core.show import brief
 from jaxltl.core.types import Solution, Status
-from jaxltl.core.values import bounded
+from jaxltl.core.values import bounded, facts
 from jaxltl.core.values.average_reward import average_reward
 from jaxltl.core.values.opposite import opposite_event
 from jaxltl.core.values.reachability import reachability_probability
@@ -50,6 +51,7 @@ TINY = 1e-12  # width of an interval of rewards that is narrow enough whatever t
 _OTHER = {"max": "min", "min": "max"}
 
 
+@brief
 class PropertyStrategy(NamedTuple):
     """What attains an answer.
 
@@ -69,6 +71,7 @@ class PropertyStrategy(NamedTuple):
     nature: np.ndarray | None = None
 
 
+@brief(facts=facts.answer)
 class Answer(NamedTuple):
     """What a property asked for.
 

@@ -15,11 +15,14 @@ from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.counts import TransitionCounts, counts_on
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.show import brief
+from jaxltl.core.values import facts
 from jaxltl.core.values.mixture import safe_mean
 from jaxltl.core.values.robust import require_direction
 from jaxltl.core.values.robust_satisfaction import RobustSatisfaction, robust_satisfaction
 
 
+@brief(facts=facts.guarantee)
 @dataclass(frozen=True)
 class DataGuarantee:
     """What data guarantee of a task.

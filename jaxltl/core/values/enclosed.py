@@ -17,6 +17,7 @@ from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.operators import is_deterministic, require_weights, row_weights
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.show import brief
 from jaxltl.core.types import (
     Method,
     Solution,
@@ -72,6 +73,7 @@ def solution_of(
     return Solution(**to_jax(parts), method=method)
 
 
+@brief
 class Chain(NamedTuple):
     """The Markov chain of a policy.
 

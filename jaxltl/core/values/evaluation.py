@@ -37,9 +37,12 @@ from jaxltl.core.models.environment import (
 )
 from jaxltl.core.models.lanes import on_host, require_split, vmap_split
 from jaxltl.core.models.monitor import Verdict
+from jaxltl.core.show import brief
 from jaxltl.core.types import Status
+from jaxltl.core.values import facts
 
 
+@brief(codes={"verdict": Verdict})
 class EpisodeTotals(NamedTuple):
     """What is counted of one episode; with a leading axis of many.
 
@@ -131,6 +134,7 @@ def task_world(world: Any) -> Any:
 # --- what is told ---------------------------------------------------------------------------------
 
 
+@brief(facts=facts.estimate)
 @dataclass(frozen=True)
 class Estimate:
     """A share or a mean with its interval.
@@ -154,6 +158,7 @@ class Estimate:
     method: str
 
 
+@brief(facts=facts.evaluation)
 @dataclass(frozen=True)
 class Evaluation:
     """What :func:`evaluate` found; printed as a table.

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.product import Product
+from jaxltl.core.show import brief
 from jaxltl.core.types import Solution
 from jaxltl.core.values.satisfaction import satisfaction_probability
 
@@ -21,6 +22,7 @@ _AIM = WINDOW / 4  # and is aimed to be
 _HALVINGS = 30
 
 
+@brief
 class Mixture(NamedTuple):
     """A policy, how much of a surer one is in it, and what it is certified to attain.
 

@@ -18,6 +18,7 @@ from jaxltl.core.host.sparse_graph import end_components
 from jaxltl.core.host.weighted import Ends, Sums, ends, weigh
 from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.show import brief
 from jaxltl.core.types import Status
 from jaxltl.core.values.bounded import TOLERANCE
 from jaxltl.core.values.enclosed import chain_of
@@ -30,6 +31,7 @@ __all__ = ["Achievable", "ConstrainedOptimum", "Front", "NearestMixture", "Objec
 _SHARPEST = 1e-12  # to which sums are solved where the border is near
 
 
+@brief
 class Front(NamedTuple):
     """What is known of n objectives.
 
@@ -51,6 +53,7 @@ class Front(NamedTuple):
     product: HostProduct
 
 
+@brief
 class NearestMixture(NamedTuple):
     """What is attained nearest to thresholds of which it is not known whether they can be met.
 
@@ -66,6 +69,7 @@ class NearestMixture(NamedTuple):
     gap: np.ndarray
 
 
+@brief
 class Achievable(NamedTuple):
     """Whether thresholds can be met together.
 
@@ -86,6 +90,7 @@ class Achievable(NamedTuple):
     nearest: NearestMixture | None = None
 
 
+@brief
 class ConstrainedOptimum(NamedTuple):
     """The best value of one objective when others meet thresholds.
 
@@ -111,6 +116,7 @@ class ConstrainedOptimum(NamedTuple):
     nearest: NearestMixture | None = None
 
 
+@brief
 class Pareto(NamedTuple):
     """The curve of values of which none can be bettered without another one's loss.
 

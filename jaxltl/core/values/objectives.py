@@ -12,12 +12,15 @@ from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.host.product import HostProduct, host_product
 from jaxltl.core.host.weighted import Sums
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.show import brief
+from jaxltl.core.values import facts
 from jaxltl.core.values.bounded import finite_reward, states
 from jaxltl.core.values.sparse_satisfaction import automaton_of
 
 _MOST = 8  # probabilities at once, of which all sets are looked at
 
 
+@brief(facts=facts.objective)
 @dataclass(frozen=True, eq=False)
 class Objective:
     """One of several objectives: a probability or an expected reward.
@@ -45,6 +48,7 @@ class Objective:
     threshold: float | None = None
 
 
+@brief
 class Part(NamedTuple):
     """How an objective is counted.
 

@@ -21,7 +21,9 @@ from jaxltl.core.graphs.reaching import max_sets, min_sets
 from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.sharded import refuse_sharded
+from jaxltl.core.show import brief
 from jaxltl.core.types import Solution, Status
+from jaxltl.core.values import facts
 from jaxltl.core.values.evidence import rounding_unit
 from jaxltl.core.values.opposite import opposite_event
 from jaxltl.core.values.reachability import (
@@ -38,6 +40,7 @@ from jaxltl.core.values.satisfaction import (
 Booleans = NDArray[np.bool_]
 
 
+@brief(facts=facts.optimal_actions)
 @struct.dataclass
 class OptimalActions:
     """A mask of actions inside which a task is done as well as it can be.

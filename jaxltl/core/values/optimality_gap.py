@@ -22,7 +22,9 @@ from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.models.product import product
 from jaxltl.core.models.tabulate import Table
 from jaxltl.core.models.time_limit import without_time_limit
+from jaxltl.core.show import brief
 from jaxltl.core.types import Solution
+from jaxltl.core.values import facts
 from jaxltl.core.values.bounded import enclosed
 from jaxltl.core.values.enclosed import chain_of
 from jaxltl.core.values.sparse_satisfaction import as_sparse, at_states, product_satisfaction
@@ -31,6 +33,7 @@ _BATCH = 4096  # pairs of a world and a memory that are shown to an agent at onc
 _SUM = 1e-4  # by how much a network's distribution may miss one; it is scaled
 
 
+@brief(facts=facts.gap)
 class OptimalityGap(NamedTuple):
     """What :func:`optimality_gap` found, for each of the N worlds where an episode may begin.
 

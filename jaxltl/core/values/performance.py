@@ -34,6 +34,7 @@ from jaxltl.core.models.operators import (
     valid_policy,
 )
 from jaxltl.core.models.product import Product
+from jaxltl.core.show import brief
 from jaxltl.core.types import Status, require_shape, status_code
 from jaxltl.core.values.evidence import m_matrix_error
 from jaxltl.core.values.linear import inverse
@@ -44,6 +45,7 @@ _MAX_SWEEPS = 1000  # of automata with cycles; one without needs at most Q
 _EXACT_LIMIT = 4096  # product states up to which a stiff chain is eliminated on the host
 
 
+@brief(codes={"status": Status})
 @struct.dataclass
 class Performance:
     """How well a policy does the task of a product; fields have a leading axis under ``vmap``.
@@ -440,6 +442,7 @@ def infeasible_starts(model: Product) -> jax.Array:
     return to_jax((initial > 0) & here)
 
 
+@brief
 class Summary(NamedTuple):
     """Performance over worlds.
 

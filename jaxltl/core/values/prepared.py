@@ -20,13 +20,16 @@ from jaxltl.core.models.convert import to_sparse
 from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.models.sharded import refuse_sharded
 from jaxltl.core.models.sparse import Rewards, row_reward
+from jaxltl.core.show import brief
 from jaxltl.core.types import Solution, require_shape, row_tolerance, status_code
+from jaxltl.core.values import facts
 from jaxltl.core.values.circles import SLACK, Problem, enclose_circles
 from jaxltl.core.values.fixed_point import implicit
 from jaxltl.core.values.iterate import in_turn
 from jaxltl.core.values.sweeps import Blocks, Chosen, chosen_names, meets, sweep
 
 
+@brief(facts=facts.prepared)
 @struct.dataclass
 class Prepared:
     """A question about a model, put in order for solves with other numbers.

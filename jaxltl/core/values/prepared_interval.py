@@ -19,7 +19,9 @@ from jaxltl.core.host.rows import spans
 from jaxltl.core.models.concrete import is_traced, to_jax
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball, require_interval
 from jaxltl.core.models.operators import is_deterministic, row_weights
+from jaxltl.core.show import brief
 from jaxltl.core.types import Method, Solution, Status, require_shape, status_code
+from jaxltl.core.values import facts
 from jaxltl.core.values.bounded import states
 from jaxltl.core.values.contest import (
     Bounds,
@@ -37,6 +39,7 @@ from jaxltl.core.values.robust import interval_reward, require_direction, width_
 _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
 
 
+@brief(facts=facts.prepared)
 @struct.dataclass
 class PreparedInterval:
     """A question about an interval model, put in order for solves with other ends.

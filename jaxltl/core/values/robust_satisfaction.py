@@ -21,11 +21,14 @@ from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.operators import is_deterministic, require_weights
 from jaxltl.core.models.product import Product
+from jaxltl.core.show import brief
 from jaxltl.core.types import Method, Solution, Status, require_shape, row_tolerance
+from jaxltl.core.values import facts
 from jaxltl.core.values.robust import Sides, host_sides, width_asked, world_of
 from jaxltl.core.values.sparse_satisfaction import automaton_of, starting_states
 
 
+@brief(facts=facts.satisfaction)
 class RobustSatisfaction(NamedTuple):
     """The probability of a task, with a policy that has a memory, and nature's choices.
 

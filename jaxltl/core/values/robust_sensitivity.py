@@ -12,11 +12,13 @@ from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import reaching
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball, require_interval
 from jaxltl.core.models.operators import is_deterministic
+from jaxltl.core.show import brief
 from jaxltl.core.types import Solution
 from jaxltl.core.values.bounded import states
 from jaxltl.core.values.robust import require_direction
 
 
+@brief
 class Sensitivity(NamedTuple):
     """Derivatives of a value in the ends, ``float64[T]`` each."""
 

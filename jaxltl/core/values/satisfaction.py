@@ -21,6 +21,7 @@ from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.operators import is_deterministic, require_policy
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.sharded import is_sharded
+from jaxltl.core.show import brief
 from jaxltl.core.types import Solution
 from jaxltl.core.values.enclosed import is_sparse
 from jaxltl.core.values.opposite import opposite_event
@@ -167,6 +168,7 @@ def _optimal(
 _over_mesh = jax.jit(_optimal, static_argnames=("objective",))
 
 
+@brief
 class Reaching(NamedTuple):
     """The optimal reachability problem that a task's optimum is.
 

@@ -18,11 +18,14 @@ from jaxltl.core.models.operators import is_deterministic
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.models.state_formulas import letters_of
+from jaxltl.core.show import brief
 from jaxltl.core.types import Solution, require_shape
+from jaxltl.core.values import facts
 from jaxltl.core.values.enclosed import Chain, chain_of, default_tolerance, solution_of
 from jaxltl.core.values.opposite import opposite_event
 
 
+@brief(facts=facts.satisfaction)
 class Satisfaction(NamedTuple):
     """The best probability of a task, with a policy that has a memory.
 

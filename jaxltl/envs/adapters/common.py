@@ -14,6 +14,7 @@ from jax.tree_util import Partial
 
 from jaxltl.core.host import given
 from jaxltl.core.models.environment import Timestep, as_partial
+from jaxltl.core.show import brief
 
 
 @jax.tree_util.register_static
@@ -34,6 +35,7 @@ class Held:
         return id(self.it)
 
 
+@brief
 class Seen(NamedTuple):
     """A world of a package that returns its observations beside its state.
 

@@ -13,6 +13,7 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.core.models.environment import Environment, Timestep, as_partial, make_environment
+from jaxltl.core.show import brief
 from jaxltl.envs.adapters.common import (
     Held,
     arrays,
@@ -25,6 +26,7 @@ from jaxltl.envs.adapters.common import (
 )
 
 
+@brief
 class Turn(NamedTuple):
     """A world of a game: the player is to move, or the game is over.
 

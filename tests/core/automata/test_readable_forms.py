@@ -110,6 +110,6 @@ def test_dot_marks_transitions():
 
 def test_an_automaton_says_in_one_line_what_it_is():
     assert repr(to_automaton("G F a & G F b")) == (
-        "Automaton(buchi, 2 states, 4 letters over a, b)"
+        "Automaton(buchi, 2 states, 4 letters over a, b, for G F a & G F b)"
     )
-    assert repr(to_automaton("true")).endswith("1 letter over no propositions)")
+    assert repr(to_automaton("true")).endswith("1 letter over no propositions, for true)")

@@ -1,0 +1,59 @@
+"""What games' objectives, regions and strategies tell of themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.show import array, count, head, readable, span, told
+
+_INNER = 92
+
+
+def parity(value: Any) -> Iterator[str]:
+    """Of a Parity objective."""
+    yield f"priorities below {value.num_priorities}"
+    yield count(value.priority.size, "state")
+    for name in ("won", "lost"):
+        yield f"{name} {span(getattr(value, name))}"
+
+
+def gr1(value: Any) -> Iterator[str]:
+    """Of a GR1 objective."""
+    yield count(value.assumptions.shape[-2], "assumption")
+    yield count(value.guarantees.shape[-2], "guarantee")
+    yield count(value.lost.shape[-1], "state")
+    yield f"lost {span(value.lost)}"
+
+
+def winning(value: Any) -> Iterator[str]:
+    """Of both players' regions."""
+    region = readable(value.region)
+    if region is None:
+        yield f"region {array(value.region)}"
+    else:
+        wins = int(np.count_nonzero(region))
+        yield f"the system wins from {wins:,} of {count(region.size, 'state')}"
+        yield f"the environment from {region.size - wins:,}"
+    initial = readable(value.game.initial)
+    if region is not None and initial is not None and initial.shape == region.shape:
+        yield "realizable" if (region | (initial <= 0)).all() else "not realizable"
+    memories = value.action.shape[len(value.region.shape):]
+    if memories:
+        yield f"strategies with {memories[0]} and {value.counter_action.shape[-1]} memories"
+    yield head(value.objective, _INNER)
+    yield head(value.game, _INNER)
+
+
+def permissive(value: Any) -> Iterator[str]:
+    """Of a permissive strategy."""
+    region = readable(value.region)
+    if region is None:
+        yield f"region {array(value.region)}"
+    else:
+        yield f"wins from {np.count_nonzero(region):,} of {count(region.size, 'state')}"
+    yield f"allowed {told(value.allowed)}"
+    yield value.reason
+    yield head(value.game, _INNER)

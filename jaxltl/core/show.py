@@ -1,0 +1,389 @@
+"""How objects show themselves: some facts of each in a few lines, never pages of arrays.
+
+``brief`` gives a class its ``repr``. What an array holds is read where the host has it and it is
+small; of an abstract one, inside ``jit`` or of ``eval_shape``, and of one that lies elsewhere, the
+type and the shape are told. JAX is not imported here: only where somebody else has loaded it can
+an array be one of its.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import functools
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+WIDTH, LINES = 100, 10  # characters of a line, and lines, that a repr has at most
+READ = 2**20  # entries of an array up to which its values are read
+_LIST = 6  # entries that are shown one by one
+_HEAD = 60  # characters of an object inside of another
+_DRAWN = 300_000  # characters of a picture in a notebook
+
+Facts = Callable[[Any], Iterable[str]]
+Class = TypeVar("Class", bound=type)
+
+
+@overload
+def brief(cls: Class, /) -> Class: ...
+
+
+@overload
+def brief(
+    *, facts: Facts | None = None, drawn: bool = False, codes: Mapping[str, Any] = ...,
+) -> Callable[[Class], Class]: ...
+
+
+def brief(
+    cls: Any = None, /, *, facts: Facts | None = None, drawn: bool = False,
+    codes: Mapping[str, Any] | None = None,
+) -> Any:
+    """A class whose ``repr`` is short, whatever its fields hold.
+
+    Args:
+      cls: a dataclass or a named tuple.
+      facts: what is told of an object, text by text, the most telling first; default its fields.
+      drawn: whether notebooks show the picture that :func:`picture` has of it, over the text.
+      codes: by the name of a field the ``enum`` whose numbers it holds.
+
+    Example:
+      >>> @brief
+      ... @dataclasses.dataclass
+      ... class Pair:
+      ...     left: object
+      ...     right: object
+      >>> Pair(np.linspace(0, 1, 1000), 2)
+      Pair(left=float64[1000] from 0 to 1, right=2)
+    """
+    if cls is None:
+        return functools.partial(_given, facts=facts, drawn=drawn, codes=codes or {})
+    return _given(cls, facts=facts, drawn=drawn, codes=codes or {})
+
+
+def _given(cls: Any, *, facts: Facts | None, drawn: bool, codes: Mapping[str, Any]) -> Any:
+    plain = functools.partial(fields, codes=codes)
+    cls._brief_facts = staticmethod(functools.partial(_safe, facts or plain, plain))
+    cls.__repr__ = _repr
+    if drawn:
+        cls._repr_svg_, cls._repr_html_ = _svg, _html
+    return cls
+
+
+def _repr(self: Any) -> str:
+    return laid_out(type(self).__name__, self._brief_facts(self))
+
+
+def _safe(facts: Facts, plain: Facts, value: Any) -> list[str]:
+    """Trees hold all kinds of things for a while, such as axes and shardings."""
+    for told in (facts, plain):
+        try:
+            return [text for text in told(value) if text]
+        except Exception:
+            continue
+    return ["..."]
+
+
+# --- lines ----------------------------------------------------------------------------------------
+
+
+def laid_out(name: str, facts: Sequence[str]) -> str:
+    """Facts in brackets after a name, in one line or several, cut off where they are too many."""
+    line = f"{name}({', '.join(facts)})"
+    if len(line) <= WIDTH and "\n" not in line:
+        return line
+    lines = [f"{name}("]
+    for i, fact in enumerate(facts):
+        text = cut(fact, WIDTH - 4) + ("," if i + 1 < len(facts) else ")")
+        if len(lines) > 1 and len(lines[-1]) + 1 + len(text) <= WIDTH:
+            lines[-1] += " " + text
+        else:
+            lines.append("    " + text)
+    if len(lines) > LINES:
+        lines = [*lines[: LINES - 1], "    ...)"]
+    return "\n".join(lines)
+
+
+def head(value: Any, width: int = _HEAD) -> str:
+    """An object inside of another: its name and as many facts as there is room for."""
+    facts = getattr(type(value), "_brief_facts", None)
+    if facts is None:
+        return cut(repr(value), width)
+    texts, name = facts(value), type(value).__name__
+    kept = list(texts)
+    while kept and len(f"{name}({', '.join(kept)}, ...)") > width:
+        kept.pop()
+    if len(kept) < len(texts):
+        kept.append("...")
+    return f"{name}({', '.join(kept)})"
+
+
+def cut(text: str, width: int = _HEAD) -> str:
+    """A text in one line, of at most so many characters."""
+    text = " ".join(text.split())
+    return text if len(text) <= width else f"{text[: width - 3]}..."
+
+
+def count(number: Any, noun: str, nouns: str = "") -> str:
+    """How many there are of something, in words.
+
+    >>> count(1, "state"), count(1_000_000, "state"), count(2, "entry", "entries")
+    ('1 state', '1,000,000 states', '2 entries')
+    """
+    return f"{int(number):,} {noun if number == 1 else nouns or noun + 's'}"
+
+
+def names(words: Iterable[Any], width: int = _HEAD) -> str:
+    """Names one after the other; of many, the first and how many there are in all."""
+    listed = [str(word) for word in words]
+    kept = list(listed)
+    while len(kept) > 1 and len(", ".join(kept)) > width:
+        kept.pop()
+    text = cut(", ".join(kept), width)
+    return text if len(kept) == len(listed) else f"{text}, ... ({len(listed)} in all)"
+
+
+def over(propositions: Sequence[str]) -> str:
+    """What labels speak of."""
+    return f"over {names(propositions) or 'no propositions'}"
+
+
+def lanes(shape: Sequence[int]) -> str:
+    """How many there are side by side; nothing where there is one."""
+    return count(shape[0], "lane") if len(shape) == 1 else (
+        f"{' x '.join(f'{n:,}' for n in shape)} lanes" if shape else "")
+
+
+# --- arrays ---------------------------------------------------------------------------------------
+
+
+def is_array(value: Any) -> bool:
+    """Whether something has a shape and a type, also without numbers."""
+    return hasattr(value, "shape") and hasattr(value, "dtype")
+
+
+def readable(value: Any, most: int = READ) -> NDArray[Any] | None:
+    """The numbers of an array that the host can read at once; else None."""
+    if isinstance(value, bool | int | float):
+        return np.asarray(value)
+    if not is_array(value) or not isinstance(value.dtype, np.dtype) or value.size > most:
+        return None
+    if not isinstance(value, np.ndarray | np.generic):
+        jax = sys.modules.get("jax")
+        if jax is None or not isinstance(value, jax.Array) or isinstance(value, jax.core.Tracer):
+            return None
+        if value.is_deleted() or not value.is_fully_addressable:
+            return None
+    try:
+        found = np.asarray(value)
+    except Exception:  # such as a transfer that is forbidden
+        return None
+    return None if found.dtype.kind in "OSU" else found
+
+
+def array(value: Any) -> str:
+    """The type and the shape of an array, and where it is if that is not here.
+
+    >>> array(np.zeros((2, 3), np.float32))
+    'float32[2, 3]'
+    """
+    text = f"{value.dtype}[{', '.join(f'{n}' for n in value.shape)}]"
+    jax = sys.modules.get("jax")
+    if jax is None or not isinstance(value, jax.Array):
+        return text
+    if isinstance(value, jax.core.Tracer):
+        return f"traced {text}"
+    if value.is_deleted():
+        return f"deleted {text}"
+    devices = len(value.sharding.device_set)
+    return f"{text} on {devices} devices" if devices > 1 else text
+
+
+def number(value: Any) -> str:
+    """A number; of one that is not whole, six digits."""
+    whole = isinstance(value, bool | np.bool_ | int | np.integer)
+    return str(value) if whole else f"{value:.6g}"
+
+
+def span(value: Any) -> str:
+    """What an array holds: a few numbers one by one, of more the least and the greatest.
+
+    >>> span(np.array([0.25, np.nan])), span(np.arange(9)), span(np.zeros(9, bool))
+    ('[0.25, nan]', '0 to 8', '0 of 9 true')
+    """
+    read = readable(value)
+    if read is None or read.size == 0 or read.dtype.kind == "c":
+        return array(value) if is_array(value) else cut(repr(value))
+    if read.dtype.kind not in "biuf":  # narrow floats
+        read = read.astype(np.float32)
+    if read.ndim == 0:
+        return number(read[()])
+    if read.ndim == 1 and read.size <= _LIST:
+        return f"[{', '.join(number(x) for x in read)}]"
+    if read.dtype.kind == "b":
+        return f"{np.count_nonzero(read):,} of {read.size:,} true"
+    low, high = read.min(), read.max()
+    missing = 0
+    if low != low:
+        missing = int(np.count_nonzero(np.isnan(read)))
+        if missing == read.size:
+            return "all nan"
+        low, high = np.nanmin(read), np.nanmax(read)
+    text = f"all {number(low)}" if low == high else f"{number(low)} to {number(high)}"
+    return f"{text}, {missing:,} nan" if missing else text
+
+
+def apart(lower: Any, upper: Any) -> str:
+    """How far certified bounds are apart at most, and where there are none.
+
+    >>> apart(np.zeros(3), np.array([0, 1e-6, np.inf])), apart(-np.inf, np.inf)
+    ('bounds at most 1e-06 apart, none for 1 of 3', 'no bounds')
+    """
+    low, high = readable(lower), readable(upper)
+    if low is None or high is None or not low.size:
+        return ""
+    low, high = low.astype(np.float64), high.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        width = np.where(low == high, 0.0, high - low)
+    known = np.isfinite(width)
+    if not known.any():
+        return "no bounds"
+    most = width[known].max()
+    text = f"bounds at most {most:.2g} apart" if most > 0 else "bounds meet"
+    none = known.size - int(np.count_nonzero(known))
+    return f"{text}, none for {none:,} of {known.size:,}" if none else text
+
+
+def coded(value: Any, codes: Iterable[enum.IntEnum]) -> str:
+    """The names of codes; of several, how many of each there are, the first code first."""
+    read = readable(value)
+    if read is None or read.dtype.kind not in "iu":
+        return array(value) if is_array(value) else cut(str(value))
+    found, times = np.unique(read, return_counts=True)
+    known = {int(code): code.name for code in codes}
+    words = [known.get(int(n), str(n)) for n in found]
+    if read.ndim == 0:
+        return words[0]
+    return ", ".join(f"{n:,} {word}" for n, word in zip(times.tolist(), words, strict=True))
+
+
+# --- fields ---------------------------------------------------------------------------------------
+
+
+def fields(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]:
+    """All fields of an object, each with what is in it; of lanes of a learner how many they are."""
+    step = getattr(value, "step", None)
+    if step is not None and is_array(step):
+        yield lanes(step.shape)
+    keys = getattr(value, "_fields", None) or [x.name for x in dataclasses.fields(value) if x.repr]
+    for name in keys:
+        given = getattr(value, name)
+        if not (is_array(given) and str(given.dtype).startswith("key<")):  # of random numbers
+            yield field(name, given, (codes or {}).get(name))
+
+
+def field(name: str, value: Any, codes: Iterable[enum.IntEnum] | None = None) -> str:
+    """A name and what it stands for."""
+    if codes is not None and is_array(value):
+        return f"{name}={coded(value, codes)}"
+    return f"{name}={told(value)}"
+
+
+def told(value: Any) -> str:
+    """Any value in a few words."""
+    if is_array(value):
+        text = span(value)
+        if text.startswith("[") or np.ndim(value) == 0 or text == array(value):
+            return text
+        joined = "with " if value.dtype == bool else "from " if " to " in text else ""
+        return f"{array(value)} {joined}{text}"
+    if hasattr(type(value), "_brief_facts"):
+        return head(value)
+    if isinstance(value, enum.Enum):
+        return value.name
+    if value is None or isinstance(value, str | bytes | bool | int | float | complex):
+        return cut(repr(value))
+    if isinstance(value, tuple | list) and all(isinstance(x, str | int | float) for x in value):
+        return f"({names(value)}{',' if len(value) == 1 else ''})"
+    return _tree(value)
+
+
+def _tree(value: Any) -> str:
+    """What is no single array: the name of its type or function, and how many arrays are in it."""
+    leaves = [x for x in _leaves(value) if is_array(x)]
+    inner = getattr(value, "func", value)
+    name = getattr(inner, "__name__", type(value).__name__)
+    if not leaves and (callable(value) or not isinstance(value, dict | list | tuple)):
+        return cut(name)
+    size = sum(int(np.prod(x.shape)) for x in leaves)
+    what = f"{count(len(leaves), 'array')} of {count(size, 'number')}"
+    if isinstance(value, dict) and not leaves:
+        return f"{{{names(value)}}}"
+    plain = isinstance(value, dict | list | tuple) and not hasattr(value, "_fields")
+    return what if plain else f"{cut(name)}({what})"
+
+
+def _leaves(value: Any) -> list[Any]:
+    """Of any tree, if JAX is there to say what one is."""
+    jax = sys.modules.get("jax")
+    if jax is not None:
+        return list(jax.tree.leaves(value))
+    if isinstance(value, dict | list | tuple):
+        inner = value.values() if isinstance(value, dict) else value
+        return [leaf for x in inner for leaf in _leaves(x)]
+    return [value]
+
+
+def history(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]:
+    """Fields that are rows of figures: the last of them, and how all statuses are.
+
+    Of ``status [...]`` the axes say how many rows there are; before the last axis they are lanes.
+    """
+    shape = tuple(value.status.shape)
+    if not shape or readable(value.status) is None:
+        yield from fields(value, codes)
+        return
+    yield f"{' x '.join(str(n) for n in shape)} rows, the last{'s' * (len(shape) > 1)}:"
+    for one in dataclasses.fields(value):
+        given = getattr(value, one.name)
+        if one.name in (codes or {}) or not is_array(given) or given.ndim < len(shape):
+            yield field(one.name, given, (codes or {}).get(one.name))
+        elif (read := readable(given)) is not None:
+            yield f"{one.name}={span(np.take(read, -1, axis=len(shape) - 1))}"
+        else:
+            yield field(one.name, given)
+
+
+# --- pictures -------------------------------------------------------------------------------------
+
+
+@functools.singledispatch
+def picture(value: object) -> str | None:
+    """A value as SVG, by whoever draws its type; None where nobody does, or it would crowd."""
+    return None
+
+
+def _svg(self: Any) -> str | None:
+    """The picture that notebooks show; None, so that they show text, where there is none."""
+    try:
+        found = picture(self)
+    except Exception:  # nobody who looks at an object wants to hear of its picture
+        return None
+    return None if found is None or len(found) > _DRAWN else found
+
+
+def _html(self: Any) -> str | None:
+    """The picture over the text, whose colour is the page's own; None without a picture."""
+    found = _svg(self)
+    if found is None:
+        return None
+    text = repr(self).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return (
+        '<figure style="margin:0.4em 0"><div style="display:inline-block;max-width:100%;'
+        f'overflow-x:auto;background:#fff;border-radius:6px;padding:4px">{found}</div>'
+        f'<figcaption><pre style="margin:0.3em 0;white-space:pre-wrap">{text}</pre></figcaption>'
+        "</figure>"
+    )

@@ -1,0 +1,102 @@
+"""What results tell of themselves, beyond their fields."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from jaxltl.core.show import apart, array, coded, count, cut, head, number, span, told
+from jaxltl.core.types import Status
+
+_INNER = 92
+
+
+def evaluation(value: Any) -> Iterator[str]:
+    """Of an Evaluation, whose ``str`` is a table."""
+    yield value.status.name
+    yield count(value.num_episodes, "episode")
+    for name in ("success", "reward", "cost", "length"):
+        found = getattr(value, name)
+        if found is not None and (name != "cost" or found.mean):
+            yield f"{name} {number(found.mean)} in [{found.lower:.6g}, {found.upper:.6g}]"
+    yield f"confidence {value.confidence:g}"
+    if value.threshold is not None:
+        known = {True: "met", False: "not met", None: "open"}[value.decision]
+        yield f"threshold {value.threshold:g} {known}"
+
+
+def estimate(value: Any) -> Iterator[str]:
+    """Of an Estimate."""
+    yield f"{number(value.mean)} in [{value.lower:.6g}, {value.upper:.6g}]"
+    yield value.method
+
+
+def guarantee(value: Any) -> Iterator[str]:
+    """Of a DataGuarantee."""
+    yield f"at least {value.bound:.6g}" if value.bound <= value.optimistic else (
+        f"at most {value.bound:.6g}")
+    yield f"no policy beyond {value.optimistic:.6g}"
+    yield f"confidence {value.confidence:g}"
+    yield f"{int(value.sets.num_samples.sum()):,} samples"
+    yield head(value.model, _INNER)
+    yield head(value.satisfaction.automaton, _INNER)
+
+
+def gap(value: Any) -> Iterator[str]:
+    """Of an OptimalityGap."""
+    yield count(len(value.start), "beginning")
+    for name, ends in (("gap", value.mean), ("value", value.mean_value),
+                       ("optimum", value.mean_optimum)):
+        yield f"mean {name} in [{ends[0]:.6g}, {ends[1]:.6g}]"
+    yield f"gap at most {float(value.upper.max(initial=0.0)):.6g}"
+    yield f"evidence {value.evidence!r}"
+
+
+def optimal_actions(value: Any) -> Iterator[str]:
+    """Of OptimalActions."""
+    yield coded(value.status, Status)
+    yield f"allowed {told(value.allowed)}"
+    yield f"loses at most {span(value.loss)}"
+    yield f"best {told(value.best.value)}"
+
+
+def answer(value: Any) -> Iterator[str]:
+    """Of an Answer."""
+    yield value.status.name
+    yield count(len(value.states), "state")
+    yield f"value {span(value.value)}"
+    yield apart(value.lower, value.upper)
+    if value.holds is not None:
+        yield f"holds {cut(str(value.holds))}"
+    yield f"by {value.method}"
+
+
+def satisfaction(value: Any) -> Iterator[str]:
+    """Of the best policy with a memory for a task, beside what is reached of the product."""
+    yield head(value.solution, _INNER)
+    yield head(value.automaton, _INNER)
+    yield f"{count(len(value.product.base_state), 'state')} of the product"
+
+
+def objective(value: Any) -> Iterator[str]:
+    """Of an Objective: what was given."""
+    for name in ("formula", "target", "stay", "avoid", "reward", "threshold"):
+        given = getattr(value, name)
+        if given is not None:
+            yield f"{name}={told(given)}"
+    yield f"direction={value.direction!r}"
+
+
+def prepared(value: Any) -> Iterator[str]:
+    """Of a question that was put in order."""
+    yield value.question
+    yield value.objective
+    yield f"nature {value.nature}" if hasattr(value, "nature") else ""
+    yield count(value.num_states, "state")
+    yield count(value.num_rows, "choice")
+    yield count(value.entry_row.shape[-1], "transition")
+    if hasattr(value, "levels"):
+        yield "circles" if value.cyclic else "no circles"
+        yield count(value.levels, "level")
+    numbers = value.probability if hasattr(value, "probability") else value.lower
+    yield array(numbers)
