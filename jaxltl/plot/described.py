@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 from collections.abc import Collection
 from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
-from PIL import Image
 
 from jaxltl.plot.style import to_bytes
 
@@ -33,19 +31,11 @@ class Described(NamedTuple):
     def __repr__(self) -> str:
         return self.text
 
-    def png(self) -> bytes:
-        """The picture in at most 256 colours, a third of the bytes of one with all."""
-        buffer = io.BytesIO()
-        with Image.open(io.BytesIO(to_bytes(self.figure, "png", dpi=_DPI))) as image:
-            image.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(
-                buffer, format="png", optimize=True)
-        return buffer.getvalue()
-
     def _repr_mimebundle_(
         self, include: Collection[str] | None = None, exclude: Collection[str] | None = None
     ) -> tuple[dict[str, str], dict[str, Any]]:
-        data = {
-            "text/plain": self.text, "image/png": base64.b64encode(self.png()).decode("ascii")}
+        png = to_bytes(self.figure, "png", dpi=_DPI)
+        data = {"text/plain": self.text, "image/png": base64.b64encode(png).decode("ascii")}
         if self.page is not None:
             data["text/html"] = (
                 f'<iframe title="{html.escape(self.text)}" srcdoc="{html.escape(self.page)}" '
