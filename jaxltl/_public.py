@@ -7,7 +7,6 @@ from jaxltl.core.automata.automaton import (
     accepts_lasso,
     complement,
     make_automaton,
-    picture,
 )
 from jaxltl.core.automata.language import find_difference, is_equivalent, is_included
 from jaxltl.core.automata.sequences import Sequences, reach_avoid_sequences
@@ -110,6 +109,7 @@ from jaxltl.core.models.task_environment import (
 )
 from jaxltl.core.models.time_limit import with_time_limit
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, rollout
+from jaxltl.core.show import picture
 from jaxltl.core.types import Method, NotConverged, Solution, Status, check
 from jaxltl.core.values.answer import Answer, PropertyStrategy, solve_property
 from jaxltl.core.values.average_reward import average_reward
