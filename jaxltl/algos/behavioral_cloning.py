@@ -3,6 +3,29 @@
 A network that sees what is near and the memory of the task's automaton classifies which
 action was demonstrated there. There is no world model: nothing is planned, so what was
 learned holds where things look as they did in the demonstrations.
+
+Example: a policy of what is seen, here of which state it is, and of the task's memory.
+
+  >>> import jax, jax.numpy as jnp
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import behavioral_cloning as cloning
+  >>> world = jl.make_mdp(  # a start, from where one gets to a goal or into a trap
+  ...     [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
+  ...     [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
+  ...     available=[[True, True], [True, False], [True, False]], initial=[1, 0, 0],
+  ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["g", "r"])
+  >>> shown = jl.make_trajectories(world, [[(0, 1), (0, 0), (1, 0)], [(0, 0), (1, 0)]])
+  >>> model = jl.product(world, "!r U g")
+  >>> network = cloning.DensePolicy(num_actions=2, hidden=(4,))
+  >>> problem = cloning.make_problem(model, jnp.eye(3), shown, network=network, held_out=0.5)
+  >>> hparams = cloning.Hparams(batch=5)
+  >>> state, metrics = cloning.train(jax.random.key(0), problem, hparams, num_steps=2)
+  >>> metrics.loss.shape, cloning.policy(state, problem, hparams).shape  # [W, S, Q, A]
+  ((2,), (1, 3, 3, 2))
+
+Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
+many settings, by ``vmap`` over the numbers of ``Hparams``. Stop
+when patience has run out by ``train_until(..., until=learner.has_stopped)``.
 """
 
 from __future__ import annotations
@@ -41,6 +64,9 @@ class ConvolutionalPolicy(nn.Module):
       num_actions: how many scores to give.
       kernels: of each convolution, 2 x 2 with stride 1 and no padding.
       hidden: widths of the dense layers.
+
+    Called with ``float[..., O]``, O the product of that shape, and ``float[..., Q]`` it returns
+    scores ``float[..., A]``.
     """
 
     observation_shape: Sequence[int] = (3, 3, 5)
@@ -63,6 +89,8 @@ class DensePolicy(nn.Module):
     Attributes:
       num_actions: how many scores to give.
       hidden: widths of the hidden layers.
+
+    Called with ``float[..., O]`` and ``float[..., Q]`` it returns scores ``float[..., A]``.
     """
 
     num_actions: int = 4
@@ -96,7 +124,7 @@ class Problem:
 
     Attributes:
       observation: ``float[W, S, O]``, what is seen in each world state.
-      available: ``bool[W, S, A]``.
+      available: ``bool[W, S, A]``, others have no probability.
       counts: ``float[W, S, Q, A]``, how often each pair was demonstrated.
       held_out: counts of the demonstrations by which learning is stopped; may be zero.
       network: called as ``network(observation [..., O], memory [..., Q]) -> float[..., A]``,
@@ -116,10 +144,10 @@ class Hparams:
     """How to learn. Numbers are traced, so new values do not recompile.
 
     Attributes:
-      learning_rate: of Adam.
-      l2: precision of the Gaussian prior on the parameters, shared by all pairs.
-      patience: steps without a better held-out likelihood after which learning stops.
-      batch: pairs in a minibatch; static.
+      learning_rate: of Adam; default 3e-3.
+      l2: precision of the Gaussian prior on the parameters, shared by all pairs; default 0.0.
+      patience: steps without a better held-out likelihood after which learning stops; default 500.
+      batch: pairs in a minibatch; static; default 128.
     """
 
     learning_rate: jax.Array | float = 3e-3
@@ -134,11 +162,12 @@ class State:
     """Parameters on their way; once `stopped`, only the step counter goes on.
 
     Attributes:
-      key, step: the root key and the number of steps made.
-      parameters: of the network.
+      key, step: the root key and the number of steps made, ``int32[]``.
+      parameters: of the network, a pytree.
       optimizer: optax's state.
-      best: what was learned: ``state.best.parameters``.
-      stopped: whether patience has run out.
+      best: what was learned, :class:`~jaxltl.algos.early_stopping.Best`:
+        ``state.best.parameters``.
+      stopped: ``bool[]``, whether patience has run out.
     """
 
     key: jax.Array
@@ -152,10 +181,10 @@ class State:
 @brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
-    """Figures of the parameters before a step.
+    """Figures of the parameters before a step; scalars, of a run ``[T]``.
 
     Attributes:
-      loss: of the minibatch, per pair, with the prior.
+      loss: of the minibatch, in nats a pair, with the prior.
       held_out: negative log-likelihood of the average held-out pair; NaN without any.
       gradient_norm: Euclidean.
       status: NONFINITE if the loss or its gradient is no number, else CONVERGED.
@@ -185,6 +214,9 @@ def make_problem(
         stopped early; or such trajectories; None or 0: no early stopping.
       network: the policy; default :class:`ConvolutionalPolicy` with the models' number of
         actions.
+
+    Returns:
+      :class:`Problem`, its arrays stacked over W worlds.
 
     Raises:
       ValueError: worlds that differ, observations or scores of the wrong shape, or
@@ -238,6 +270,9 @@ def policy_in_world(
       parameters: what was learned, ``state.best.parameters``.
       model: the product of that world and the task; batches of worlds by ``vmap``.
       observation: ``float[S, O]``.
+
+    Returns:
+      ``float[S, Q, A]``, zero at actions that are not available; differentiable in the parameters.
     """
     memory = jnp.eye(model.num_memory, dtype=observation.dtype)[None]
     scores: Any = network.apply(parameters, observation[:, None], memory)
@@ -245,7 +280,15 @@ def policy_in_world(
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
-    """The best policy so far in the problem's worlds: ``float[W, S, Q, A]``."""
+    """The best policy so far in the problem's worlds: ``float[W, S, Q, A]``.
+
+    Args:
+      state: of one run; ``vmap`` over several.
+      problem, hparams: of the run.
+
+    Returns:
+      ``float[W, S, Q, A]``; :func:`policy_in_world` has it in others.
+    """
     del hparams
     scores = _scores(state.best.parameters, problem)
     return jax.nn.softmax(
@@ -268,6 +311,9 @@ def neg_log_likelihood(parameters: Any, problem: Problem, counts: jax.Array) -> 
       parameters: of the network.
       problem: the worlds.
       counts: ``float[W, S, Q, A]``.
+
+    Returns:
+      ``float[]``, in nats; differentiable in the parameters.
     """
     log_policy = _log_policy(_scores(parameters, problem), problem.available[:, :, None])
     return -jnp.sum(counts * log_policy) / jnp.sum(counts)
@@ -279,7 +325,16 @@ def _log_policy(scores: jax.Array, available: jax.Array) -> jax.Array:
 
 
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
-    """A state at the network's own random start; the key is kept."""
+    """A state at the network's own random start; the key is kept.
+
+    Args:
+      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
+      problem: of :func:`make_problem`.
+      hparams: :class:`Hparams`.
+
+    Returns:
+      :class:`State`, no step made.
+    """
     dtype = problem.observation.dtype
     drawn = problem.network.init(learner.init_key(key), *_inputs(problem))
     parameters = jax.tree.map(lambda x: jnp.asarray(x, dtype), drawn)
@@ -298,6 +353,13 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
 
     The loss is (3.10) with the network's outputs read as logits; softmax twice, as the
     formula has it where they are probabilities, does not train.
+
+    Args:
+      state: of :func:`init` or of an earlier step; unchanged.
+      problem, hparams: as of :func:`init`.
+
+    Returns:
+      The next :class:`State`, and :class:`Metrics`, figures of the parameters before the step.
     """
     pairs = _draw(learner.step_key(state), problem.counts, hparams.batch)
 

@@ -15,6 +15,27 @@ the elites; here it is given by its logarithm, or is any number, and the weights
 Only the share of feasible *samples* is controlled: the mean policy can be infeasible, and the best
 sample can owe its place to luck. :func:`result` evaluates both anew and names a solution
 only if it is feasible.
+
+Example: to be near (1, 1), with a first coordinate of at most 0.5.
+
+  >>> import jax, jax.numpy as jnp
+  >>> from jaxltl.algos import cce
+  >>> from jaxltl.algos.exponential_family import diagonal_gaussian
+  >>> def evaluate(x, key):
+  ...     return -jnp.sum((x - 1.0) ** 2), x[0]  # an objective, and a cost
+  >>> problem = cce.make_problem(evaluate, diagonal_gaussian(jnp.zeros(2), 1.0), limit=0.5)
+  >>> key, fresh = jax.random.split(jax.random.key(0))
+  >>> hparams = cce.Hparams(rate=0.5)
+  >>> state, metrics = cce.train(key, problem, hparams, num_steps=50)
+  >>> metrics.spread.shape, cce.policy(state, problem, hparams).shape
+  ((50,), (2,))
+  >>> found = cce.result(state, problem, hparams, fresh)
+  >>> found.solution.round(2).tolist(), bool(found.solution[0] <= 0.5)
+  ([0.5, 1.0], True)
+
+Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
+many settings, by ``vmap`` over the numbers of ``Hparams``. Policies
+of environments are searched with :func:`~jaxltl.core.values.episode_scores.episode_evaluator`.
 """
 
 
@@ -72,32 +93,34 @@ class Hparams:
     :func:`theorem_conditions`. The defaults are outside of it.
 
     Attributes:
-      rate: alpha_l, in (0, 1]; a schedule.
+      rate: alpha_l, in (0, 1]; a schedule; default 0.1.
       sample_share: lambda_l, the weight in [0, 1] of the samples' own mean instead of the last mean
-        parameter; a schedule, or None for 0.
+        parameter; a schedule, or None for 0; default None.
       num_samples: n_l, a schedule, rounded and kept between 1 / rho and `population`; later samples
-        are masked, but drawn and evaluated. None: always `population`.
-      temperature: of the weights, positive. At 1 the objective is the logarithm of G.
+        are masked, but drawn and evaluated. None: always `population`. Default None.
+      temperature: of the weights, positive. At 1 the objective is the logarithm of G. Default 1.0.
       margin: taken off the limits for the search, a number or ``float[C]``; :func:`result` is not
         concerned. Where costs are random, samples are feasible by luck: with normal noise of
         deviation s and a rho of .2 the search can rest .84 s above a limit without margin.
-      population: the largest n_l; static.
-      rho: the share of elites; static.
+        Default 0.0.
+      population: the largest n_l; static; default 100.
+      rho: the share of elites; static; default 0.2.
       weighting: static. ``"until_feasible"``: elites count equally until k of them are feasible,
         then by G, because G-weights while nothing is feasible narrow the search around policies
         that are merely good; ``"literal"``: always by G; ``"uniform"``: always equally.
+        Default ``"until_feasible"``.
 
-      Outside of the theorem:
-      elite_reuse: the last elites compete again with the values they had; static. Where values are
-        random, lucky ones stay.
-      antithetic: samples come in pairs mirrored about the mean; static.
-      variance_floor: the variance is at least this in every direction.
-      noise: a variance added after every step, a schedule (Szita and Lorincz 2006).
+      elite_reuse: outside of the theorem, as what comes next: the last elites compete again with
+        the values they had; static. Where values are random, lucky ones stay. Default False.
+      antithetic: samples come in pairs mirrored about the mean; static; default False.
+      variance_floor: the variance is at least this in every direction; default None.
+      noise: a variance added after every step, a schedule (Szita and Lorincz 2006); default None.
       restart_below: the search starts again from the first distribution when all standard
-        deviations are below this. What was found is kept.
+        deviations are below this. What was found is kept. Default None.
 
       sharding: a ``NamedSharding`` whose spec names the mesh axis over which the population's axis
-        is split, such as ``NamedSharding(mesh, PartitionSpec("population"))``; static.
+        is split, such as ``NamedSharding(mesh, PartitionSpec("population"))``; static;
+        default None.
     """
 
     rate: Schedule = 0.1
@@ -123,16 +146,18 @@ class State:
 
     Attributes:
       key: of the whole run.
-      step: steps made.
+      step: ``int32[]``, steps made.
       family: the distribution of policies.
-      best: the feasible sample of the highest objective; by its one evaluation.
+      best: the feasible sample of the highest objective, by its one evaluation: its parameters
+        ``float[D]``, objective ``float[]`` and cost ``float[C]``.
       least: the sample of the least violation, likewise.
       elites: the last ones; None without reuse.
-      num_evaluated, num_invalid: samples so far, and those that could not be used: an objective
-        that is NaN or plus infinity, or a cost that is NaN. At most 2^31 - 1 are counted.
-      num_restarts: so far.
-      status: NONFINITE if no sample of the last step could be used (the distribution then stays
-        as it was), else CONVERGED, which says nothing of the search: it has no end of its own.
+      num_evaluated, num_invalid: ``int32[]``, samples so far, and those that could not be used: an
+        objective that is NaN or plus infinity, or a cost that is NaN. At most 2^31 - 1 are counted.
+      num_restarts: ``int32[]``, so far.
+      status: ``int32[]``, NONFINITE if no sample of the last step could be used (the distribution
+        then stays as it was), else CONVERGED, which says nothing of the search: it has no end of
+        its own.
     """
 
     key: jax.Array
@@ -150,7 +175,7 @@ class State:
 @brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
-    """Figures of a step.
+    """Figures of a step; scalars unless a shape is given, of a run with ``[T]`` before it.
 
     Attributes:
       num_evaluated: samples so far.
@@ -202,6 +227,9 @@ def make_problem(
       scale: what violations are divided by before the largest counts, a number or ``float[C]``;
         default ``|limit|``, or 1 where that is zero or infinite. Of no effect with one cost.
 
+    Returns:
+      :class:`Problem`.
+
     Raises:
       ValueError: evaluate returns other shapes, or a limit or scale that does not fit or is no
         limit or scale.
@@ -210,11 +238,8 @@ def make_problem(
       >>> def evaluate(x, key):
       ...     return -jnp.sum((x - 1.0) ** 2), x[0]
       >>> problem = make_problem(evaluate, families.diagonal_gaussian(jnp.zeros(2), 1.0), limit=0.5)
-      >>> key, fresh = jax.random.split(jax.random.key(0))
-      >>> state, _ = train(key, problem, Hparams(rate=0.5), num_steps=50)
-      >>> found = result(state, problem, Hparams(), fresh)
-      >>> found.solution.round(2).tolist(), bool(found.solution[0] <= 0.5)
-      ([0.5, 1.0], True)
+      >>> problem.limit.tolist(), problem.scale.tolist()
+      ([0.5], [0.5])
     """
     if not isinstance(evaluate, jax.tree_util.Partial):
         evaluate = jax.tree_util.Partial(evaluate)
@@ -254,6 +279,14 @@ def make_problem(
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """The first distribution, before any sample.
 
+    Args:
+      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
+      problem: of :func:`make_problem`.
+      hparams: :class:`Hparams`.
+
+    Returns:
+      :class:`State`, no step made.
+
     Raises:
       ValueError: settings that leave no elite or that are out of range.
     """
@@ -283,7 +316,15 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
 
 
 def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """One population: drawn, evaluated, ranked, and the distribution moved."""
+    """One population: drawn, evaluated, ranked, and the distribution moved.
+
+    Args:
+      state: of :func:`init` or of an earlier step; unchanged.
+      problem, hparams: as of :func:`init`.
+
+    Returns:
+      The next :class:`State`, and :class:`Metrics`, figures of the step.
+    """
     _check(problem, hparams)
     draw_key, evaluate_key = jax.random.split(learner.step_key(state))
     draw = families.sample_antithetic if hparams.antithetic else families.sample
@@ -340,6 +381,13 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     """The mean policy of the last distribution: parameters ``float[D]`` of what is evaluated.
 
     It may be infeasible: see :func:`result`, which evaluates it anew.
+
+    Args:
+      state: of one run; ``vmap`` over several.
+      problem, hparams: of the run.
+
+    Returns:
+      ``float[D]``.
     """
     del problem, hparams
     return families.center(state.family)
@@ -398,13 +446,13 @@ class Assessment:
 
     Attributes:
       parameters: ``float[D]``.
-      objective: the mean over the evaluations.
+      objective: ``float[]``, the mean over the evaluations.
       cost: ``float[C]``, likewise; the estimate of H.
       lower, upper: ``float[C]``, a 95% confidence interval of each cost (Student's). A cost that
         never varied has an interval of length zero.
-      excess: ``max_c (cost_c - limit_c) / scale_c``.
-      feasible: whether every cost is at most its limit.
-      confident: whether every `upper` is.
+      excess: ``float[]``, ``max_c (cost_c - limit_c) / scale_c``.
+      feasible: ``bool[]``, whether every cost is at most its limit.
+      confident: ``bool[]``, whether every `upper` is.
     """
 
     parameters: jax.Array
@@ -445,7 +493,17 @@ class Result(NamedTuple):
 def assess(
     problem: Problem, parameters: jax.Array, key: chex.PRNGKey, *, num_evaluations: int = 1000
 ) -> Assessment:
-    """A policy evaluated with `num_evaluations` keys of its own. Under ``jit`` and ``vmap``."""
+    """A policy evaluated with `num_evaluations` keys of its own. Under ``jit`` and ``vmap``.
+
+    Args:
+      problem: of the search.
+      parameters: ``float[D]``.
+      key: fresh.
+      num_evaluations: calls of evaluate, at least 1; static.
+
+    Returns:
+      :class:`Assessment`.
+    """
     from scipy.special import stdtrit
 
     if num_evaluations < 2:
@@ -489,6 +547,9 @@ def result(
       problem, hparams: of the run.
       key: fresh.
       num_evaluations: calls of evaluate for each of the two.
+
+    Returns:
+      :class:`Result`.
 
     Raises:
       ValueError: no sample of the last step could be evaluated, or a batch of states.

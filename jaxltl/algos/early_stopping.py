@@ -18,9 +18,9 @@ class Best:
     """The parameters with the best held-out likelihood; without held-out data the newest.
 
     Attributes:
-      parameters: of the network.
-      neg_log_likelihood: held out, per pair; NaN without held-out data.
-      step: the number of steps after which they were reached.
+      parameters: of the network, a pytree.
+      neg_log_likelihood: ``float[]``, held out, in nats a pair; NaN without held-out data.
+      step: ``int32[]``, the number of steps after which they were reached.
     """
 
     parameters: Any
@@ -36,9 +36,12 @@ def stop_early(
     Args:
       state: before a step, with ``parameters``, ``step``, ``best`` and ``stopped``.
       after: the parameters after it.
-      held_out: negative log-likelihood of the parameters before it.
-      judged: whether there is held-out data.
+      held_out: ``float[]``, negative log-likelihood of the parameters before it.
+      judged: ``bool[]``, whether there is held-out data.
       patience: steps without anything better after which learning stops.
+
+    Returns:
+      :class:`Best`, and ``bool[]``.
     """
     better = judged & (held_out < state.best.neg_log_likelihood) & ~state.stopped
     best = choose(better, Best(state.parameters, held_out, state.step), state.best)

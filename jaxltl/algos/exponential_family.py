@@ -11,6 +11,17 @@ for by options only.
 ``project`` moves the mean parameter without ever forming it. As ``E x^2 - (E x)^2`` the variance
 of a Gaussian with mean 3 and standard deviation 1e-3 comes out negative in single precision;
 here every variance is a sum of squares.
+
+Example:
+  >>> import jax, jax.numpy as jnp
+  >>> from jaxltl.algos import exponential_family as families
+  >>> start = families.diagonal_gaussian(jnp.zeros(2), 1.0)
+  >>> samples = families.sample(start, jax.random.key(0), 8)
+  >>> moved = families.project(start, samples, jnp.ones(8), rate=0.5)
+  >>> samples.shape, families.log_density(moved, samples).shape
+  ((8, 2), (8,))
+  >>> bool(jnp.allclose(families.center(moved), samples.mean(0) / 2))
+  True
 """
 
 from __future__ import annotations
@@ -81,6 +92,13 @@ Family = DiagonalGaussian | FullGaussian | Gamma
 def diagonal_gaussian(mean: chex.Array, std: chex.Array | float) -> DiagonalGaussian:
     """A :class:`DiagonalGaussian` from ``float[D]`` and a standard deviation (or one for each).
 
+    Args:
+      mean: ``float[D]``.
+      std: positive, ``float[D]`` or one for all entries.
+
+    Returns:
+      :class:`DiagonalGaussian`.
+
     Raises:
       ValueError: `mean` is no vector, `std` does not fit it, or is not positive.
 
@@ -96,6 +114,13 @@ def diagonal_gaussian(mean: chex.Array, std: chex.Array | float) -> DiagonalGaus
 
 def full_gaussian(mean: chex.Array, covariance: chex.Array) -> FullGaussian:
     """A :class:`FullGaussian` from ``float[D]`` and a positive definite ``float[D, D]``.
+
+    Args:
+      mean: ``float[D]``.
+      covariance: ``float[D, D]``.
+
+    Returns:
+      :class:`FullGaussian`.
 
     Raises:
       ValueError: a wrong shape, or a covariance that is not symmetric and positive definite.
@@ -113,6 +138,13 @@ def full_gaussian(mean: chex.Array, covariance: chex.Array) -> FullGaussian:
 
 def gamma(shape: chex.Array, rate: chex.Array | float) -> Gamma:
     """A :class:`Gamma` from shapes ``float[D]`` and rates (or one for all).
+
+    Args:
+      shape: positive, ``float[D]``.
+      rate: positive, ``float[D]`` or one for all entries.
+
+    Returns:
+      :class:`Gamma`.
 
     Raises:
       ValueError: a wrong shape, or a number that is not positive.
@@ -168,7 +200,14 @@ def sufficient_statistics(family: Any, samples: jax.Array) -> tuple[jax.Array, j
 
 @singledispatch
 def mean_parameter(family: Any) -> tuple[jax.Array, jax.Array]:
-    """``m(v) = E_v[Gamma(x)]``, the mean of :func:`sufficient_statistics`."""
+    """``m(v) = E_v[Gamma(x)]``, the mean of :func:`sufficient_statistics`.
+
+    Args:
+      family: any member.
+
+    Returns:
+      Two arrays, as :func:`sufficient_statistics` has them for one sample; differentiable.
+    """
     raise TypeError(_unknown(family))
 
 
@@ -182,6 +221,9 @@ def from_mean_parameter(family: Any, eta: tuple[jax.Array, jax.Array]) -> Any:
       family: says which; its values are not used.
       eta: as :func:`mean_parameter` returns.
 
+    Returns:
+      A member of the same family.
+
     Example:
       >>> start = diagonal_gaussian([1.0, 2.0], 0.5)
       >>> from_mean_parameter(start, mean_parameter(start)).variance.tolist()
@@ -192,19 +234,44 @@ def from_mean_parameter(family: Any, eta: tuple[jax.Array, jax.Array]) -> Any:
 
 @singledispatch
 def log_density(family: Any, samples: jax.Array) -> jax.Array:
-    """``log f_v(x)``: ``float[...]`` from ``float[..., D]``. Differentiable in both."""
+    """``log f_v(x)``: ``float[...]`` from ``float[..., D]``. Differentiable in both.
+
+    Args:
+      family: any member.
+      samples: ``float[..., D]``.
+
+    Returns:
+      ``float[...]``, in nats.
+    """
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def sample(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.Array:
-    """Independent draws, ``float[num_samples, D]``; `num_samples` is static."""
+    """Independent draws, ``float[num_samples, D]``; `num_samples` is static.
+
+    Args:
+      family: any member.
+      key: a PRNG key.
+      num_samples: n; static.
+
+    Returns:
+      ``float[n, D]``.
+    """
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def sample_antithetic(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.Array:
     """Draws of which samples 2 i and 2 i + 1 mirror each other about the mean, ``[n, D]``.
+
+    Args:
+      family: any symmetric member.
+      key: a PRNG key.
+      num_samples: n; static.
+
+    Returns:
+      ``float[n, D]``.
 
     Raises:
       ValueError: the family is not symmetric.
@@ -243,25 +310,55 @@ def project(
 
 @singledispatch
 def center(family: Any) -> jax.Array:
-    """``E_v[x]``, ``float[D]``."""
+    """``E_v[x]``, ``float[D]``.
+
+    Args:
+      family: any member.
+
+    Returns:
+      ``float[D]``.
+    """
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def standard_deviation(family: Any) -> jax.Array:
-    """Of each entry, ``float[D]``."""
+    """Of each entry, ``float[D]``.
+
+    Args:
+      family: any member.
+
+    Returns:
+      ``float[D]``.
+    """
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def widen(family: Any, variance: jax.Array | float) -> Any:
-    """The same mean, and `variance` (a number or ``float[D]``) added to that of each entry."""
+    """The same mean, and `variance` (a number or ``float[D]``) added to that of each entry.
+
+    Args:
+      family: any member.
+      variance: ``float[D]`` or one for all entries, at least 0.
+
+    Returns:
+      A member of the same family.
+    """
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def at_least(family: Any, variance: jax.Array | float) -> Any:
-    """The same mean, and a variance of at least a number, in every direction."""
+    """The same mean, and a variance of at least a number, in every direction.
+
+    Args:
+      family: any member.
+      variance: a number of at least 0.
+
+    Returns:
+      A member of the same family.
+    """
     raise TypeError(_unknown(family))
 
 

@@ -10,6 +10,30 @@ the same everywhere. A run ends when it is past the threshold.
 What floats say there is no proof: :func:`feasible` has each point that is claimed certified by the
 host engine, on the model at that point, with bounds of both sides. Gradients find local optima;
 that nothing was found says nothing.
+
+Example: a head, then a tail of one coin, of which the bias is sought.
+
+  >>> import jax, jax.numpy as jnp, numpy as np
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import feasible as search
+  >>> chain = jl.make_sparse(None, [0, 2, 4, 5, 6], [1, 3, 2, 3, 2, 3], [0.5] * 4 + [1, 1],
+  ...                        initial=[1, 0, 0, 0], label={"both": [2]})
+  >>> def numbers(x):  # of each transition
+  ...     p, q = x
+  ...     return jnp.array([p, 1 - p, 1 - q, q, 1, 1])
+  >>> model = jl.make_parametric(chain, numbers, [0.1, 0.2], [0.9, 0.8], parameters=["p", "q"])
+  >>> problem = search.make_problem(model, "both", bound=">=")
+  >>> hparams = search.Hparams()
+  >>> state, metrics = search.train(jax.random.key(0), problem, hparams, num_steps=2)
+  >>> metrics.value.shape, bool(metrics.best_value[1] > metrics.best_value[0])
+  ((2,), True)
+  >>> point = search.policy(state, problem, hparams)  # float[D], the best so far
+  >>> low, high = search.certify(problem, point)
+  >>> low <= float(state.best.value) + 1e-6 <= high + 2e-6
+  True
+
+:func:`feasible` searches from many starts, side by side, and proves what it finds; so does
+``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``, without proof.
 """
 
 from __future__ import annotations
@@ -52,7 +76,7 @@ class Problem:
     Attributes:
       model: the model; its box may be made smaller by :func:`within`.
       prepared: the question, put in order.
-      weight: ``float[S]``, the initial distribution.
+      weight: ``float[S]``, the initial distribution, over which values are averaged.
       low, high, inside: ``float[D]``, the box and a point of it, in the precision of the search.
       target, stay: ``bool[S]``, where to get, and what may be passed or None.
       reward: the name of the reward, or None for a probability; static.
@@ -84,9 +108,9 @@ class Hparams:
     """How to search. Numbers are traced, so new values do not recompile.
 
     Attributes:
-      learning_rate: in shares of the box; a schedule.
+      learning_rate: in shares of the box; a schedule; default 0.1.
       optimizer: ``"adam"``, ``"rmsprop"``, ``"sgd"``, or ``"sign"``, which takes the signs of the
-        gradient alone; static.
+        gradient alone; static; default ``"adam"``.
       tolerance: of the solves of decision processes, see
         :func:`~jaxltl.core.values.prepared.solve_prepared`; None is its default.
     """
@@ -99,7 +123,12 @@ class Hparams:
 @brief
 @struct.dataclass
 class Best:
-    """A point, ``float[D]``, and its value; NaN before there is one."""
+    """The best point so far; NaN before there is one.
+
+    Attributes:
+      parameters: ``float[D]``.
+      value: ``float[]``, a probability, or in units of the reward.
+    """
 
     parameters: jax.Array
     value: jax.Array
@@ -111,10 +140,10 @@ class State:
     """A search on its way.
 
     Attributes:
-      key, step: the root key, and the steps made.
+      key, step: the root key, and the steps made, ``int32[]``.
       parameters: ``float[D]``, where the next step looks.
       inside: ``float[D]``, the newest point at which the functions were a model.
-      best: of all points seen.
+      best: of all points seen, :class:`Best`.
       optimizer: optax's state.
     """
 
@@ -129,7 +158,7 @@ class State:
 @brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
-    """Figures of the point before a step.
+    """Figures of the point before a step; scalars, of a run ``[T]``.
 
     Attributes:
       value: there.
@@ -169,6 +198,9 @@ def make_problem(
       stay: ``bool[S]``, the states that may be passed before, of probabilities.
       objective: ``"max"`` or ``"min"`` over the policies of a decision process: with ``"max"``,
         ``">="`` asks for some policy and ``"<="`` for all of them. Of no effect on a chain.
+
+    Returns:
+      :class:`Problem`.
 
     Raises:
       ValueError: an unknown bound, objective, reward or label, or a shape that does not fit; or
@@ -214,6 +246,9 @@ def within(problem: Problem, low: Ends, high: Ends) -> Problem:
       problem: the question.
       low, high: as of :func:`~jaxltl.core.models.parametric.make_parametric`.
 
+    Returns:
+      :class:`Problem`.
+
     Raises:
       ValueError: the box is none, or reaches out of the problem's.
     """
@@ -258,10 +293,10 @@ def evaluate(parameters: jax.Array, problem: Problem, hparams: Hparams) -> Any:
       problem, hparams: what and how.
 
     Returns:
-      The value and a status, ``INVALID`` where the functions are no model; of decision processes
-      the solves have bounds of their own, of chains they have none (``UNCERTIFIED``).
-      Differentiable in the parameters; for an optimum over policies with the optimal policy held
-      fixed.
+      The value ``float[]`` and a status ``int32[]``, ``INVALID`` where the functions are no model;
+      of decision processes the solves have bounds of their own, of chains they have none
+      (``UNCERTIFIED``). Differentiable in the parameters; for an optimum over policies with the
+      optimal policy held fixed.
     """
     probability, rewards = problem.model.numbers(parameters)
     prepared = problem.prepared
@@ -288,13 +323,30 @@ def _takes_turns(prepared: Prepared) -> bool:
 
 
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
-    """A point drawn uniformly from the box."""
+    """A point drawn uniformly from the box.
+
+    Args:
+      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
+      problem: of :func:`make_problem`.
+      hparams: :class:`Hparams`.
+
+    Returns:
+      :class:`State`, no step made.
+    """
     share = jax.random.uniform(learner.init_key(key), problem.low.shape, problem.low.dtype)
     return start_at(problem.low + share * (problem.high - problem.low), key, problem, hparams)
 
 
 def start_at(parameters: jax.Array, key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
-    """A search that starts at a point, ``float[D]``, or at the nearest of the box."""
+    """A search that starts at a point, ``float[D]``, or at the nearest of the box.
+
+    Args:
+      parameters: ``float[D]``.
+      key, problem, hparams: as of :func:`init`.
+
+    Returns:
+      :class:`State`, no step made.
+    """
     point = jnp.clip(jnp.asarray(parameters, problem.low.dtype), problem.low, problem.high)
     best = Best(jnp.full_like(point, jnp.nan), jnp.full((), jnp.nan, point.dtype))
     optimizer = learner.strong(_optimizer(hparams, 0).init(point))
@@ -316,6 +368,13 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     """One step along the gradient, projected to the box; back half the way from where no model is.
 
     Points where a solve failed count as such too.
+
+    Args:
+      state: of :func:`init` or of an earlier step; unchanged.
+      problem, hparams: as of :func:`init`.
+
+    Returns:
+      The next :class:`State`, and :class:`Metrics`, figures of the point before the step.
     """
     x = state.parameters
     size = problem.high - problem.low
@@ -363,7 +422,15 @@ run, train, run_until, train_until = learner.bind(init, step)
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
-    """What was found: the parameters ``float[D]`` of the best value; NaN before there is one."""
+    """What was found: the parameters ``float[D]`` of the best value; NaN before there is one.
+
+    Args:
+      state: of one run; ``vmap`` over several.
+      problem, hparams: of the run.
+
+    Returns:
+      ``float[D]``, in the order of ``problem.model.parameters``.
+    """
     del problem, hparams
     return state.best.parameters
 

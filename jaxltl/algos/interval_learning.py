@@ -13,6 +13,31 @@ equations, and sweeps may go on from the last values however the intervals have 
 
 The world is touched through ``sample_successor`` only. Values have shape ``[S, Q]``: S states of
 the world, Q of the task's automaton, which reads the label of the state that is left.
+
+Example: to come to the goal ``g`` and never to ``r``, where nobody knows the probabilities.
+
+  >>> import jax, jax.numpy as jnp
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import interval_learning
+  >>> world = jl.make_mdp(  # a start, from where one gets to a goal or into a trap
+  ...     [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
+  ...     [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
+  ...     available=[[True, True], [True, False], [True, False]], initial=[1, 0, 0],
+  ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["g", "r"])
+  >>> problem = interval_learning.make_problem(world, "!r U g")
+  >>> hparams = interval_learning.Hparams(num_runs=2, length=5)
+  >>> state, metrics = interval_learning.train(jax.random.key(0), problem, hparams, num_steps=2)
+  >>> metrics.samples.tolist(), bool((metrics.lower <= metrics.upper).all())
+  ([10, 20], True)
+  >>> interval_learning.policy(state, problem, hparams).shape  # [S, Q, A]
+  (3, 3, 2)
+  >>> sure = interval_learning.guarantee(state, problem, 0.9)
+  >>> 0 <= sure.bound <= sure.optimistic <= 1
+  True
+
+Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
+many settings, by ``vmap`` over the numbers of ``Hparams``. End when
+enough is known by ``train_until(..., until=known_within(0.01))``.
 """
 
 from __future__ import annotations
@@ -63,8 +88,8 @@ class Problem:
         all may be made for ever, and it is done almost surely.
       component: ``int32[S * Q]``, the end component of each undecided state, or its own number.
       staying: ``bool[S, Q, A]``, the moves of undecided states that stay in it.
-      start_table: where runs start, for drawing.
-      num_claims: how many probabilities have to be known at once.
+      start_table: ``uint32[S]``, where runs start, for drawing.
+      num_claims: ``int[]``, how many probabilities have to be known at once.
     """
 
     model: Product
@@ -86,20 +111,23 @@ class Hparams:
       intervals: ``"linear"``: linearly updating intervals, which come together soon and forget a
         wrong prior; ``"confidence"``: intervals that hold all true probabilities at all times with
         a chance of `confidence`, by which the pessimistic value never exceeds the truth, and the
-        optimistic one is never below; static.
-      confidence: in (0, 1); for ``"confidence"``.
-      least: the smallest probability that a transition of the graph is taken to have, positive.
+        optimistic one is never below; static; default ``"linear"``.
+      confidence: in (0, 1); for ``"confidence"``; default 0.9.
+      least: the smallest probability that a transition of the graph is taken to have, positive;
+        default 1e-4.
       strength, most_strength: as how many samples the first linear intervals count, at least where
-        data contradict them, and where they do not; positive, the second not below the first.
-      exploration: the probability of making any allowed move, in (0, 1].
+        data contradict them, and where they do not; positive, the second not below the first;
+        default 5.0 and 10.0.
+      exploration: the probability of making any allowed move, in (0, 1]; default 0.1.
       restart: the probability with which a run starts anew before a move where the task is won;
-        where it is lost, it always does.
+        where it is lost, it always does; default 0.05.
       discount: in (0, 1); among moves of one optimistic value those are made that lead soonest to
-        where the task is won.
-      sweeps: of each value in a step; as many as it takes moves to where the task is won, or more.
-      tolerance: the change by the last sweep up to which values count as settled.
-      num_runs: that a step samples; static.
-      length: moves of each; static.
+        where the task is won; default 0.99.
+      sweeps: of each value in a step; as many as it takes moves to where the task is won, or more;
+        default 40.
+      tolerance: the change by the last sweep up to which values count as settled; default 1e-4.
+      num_runs: that a step samples; static; default 4.
+      length: moves of each; static; default 64.
     """
 
     intervals: str = struct.field(pytree_node=False, default="linear")
@@ -123,14 +151,14 @@ class State:
 
     Attributes:
       key: of the whole run.
-      step: steps made.
-      samples: transitions seen; near 2^31 a run is over, and steps see no more.
+      step: ``int32[]``, steps made.
+      samples: ``int32[]``, transitions seen; near 2^31 a run is over, and steps see no more.
       counts: ``int32[S, A, K]``, how often each was.
       lower, upper: ``float[S, A, K]``, the intervals; 0 at what is no transition.
       pessimistic, optimistic: ``float[S, Q]``, the largest probability of the task with nature
         against it and for it, as far as sweeps have come.
       best: ``bool[S, Q, A]``, the moves that are preferred.
-      residual: the largest change by the last sweep.
+      residual: ``float[]``, the largest change by the last sweep.
     """
 
     key: jax.Array
@@ -148,7 +176,7 @@ class State:
 @brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
-    """Figures after a step.
+    """Figures after a step; scalars, of a run ``[T]``.
 
     Attributes:
       samples: so far.
@@ -175,6 +203,9 @@ def make_problem(world: Any, task: Task) -> Problem:
       world: an MDP or a sparse model; its labels, start and graph are known to the learner.
       task: any formula, its text, or an automaton over the letters that occur. For a probability
         to be made small, negate the formula.
+
+    Returns:
+      :class:`Problem`.
 
     Raises:
       ValueError: the world is a game or no model, or the formula has unknown labels.
@@ -232,6 +263,14 @@ def _allowed(model: Product, won: jax.Array, region: jax.Array, inside: jax.Arra
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """Nothing seen: every transition of a choice may have nearly all of its probability.
 
+    Args:
+      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
+      problem: of :func:`make_problem`.
+      hparams: :class:`Hparams`.
+
+    Returns:
+      :class:`State`, no step made.
+
     Raises:
       ValueError: unknown `intervals`, or runs without moves.
     """
@@ -259,7 +298,15 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
 
 
 def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """Some runs from the start, the intervals after them, and sweeps from the last values."""
+    """Some runs from the start, the intervals after them, and sweeps from the last values.
+
+    Args:
+      state: of :func:`init` or of an earlier step; unchanged.
+      problem, hparams: as of :func:`init`.
+
+    Returns:
+      The next :class:`State`, and :class:`Metrics`, figures after the step.
+    """
     _check(hparams)
     size = hparams.num_runs * hparams.length
     more = state.samples <= learner.MOST - size
@@ -285,7 +332,14 @@ run, train, run_until, train_until = learner.bind(init, step)
 
 
 def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
-    """The :class:`Metrics` of a state."""
+    """The :class:`Metrics` of a state.
+
+    Args:
+      state, problem, hparams: of a run.
+
+    Returns:
+      :class:`Metrics`, scalars.
+    """
     model = problem.model
     more = state.samples <= learner.MOST - hparams.num_runs * hparams.length
     settled = (state.residual <= hparams.tolerance) & more
@@ -299,7 +353,14 @@ def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
 
 
 def known_within(width: chex.Numeric) -> learner.Until:
-    """A condition for :func:`run_until`: the values have settled, so close to each other."""
+    """A condition for :func:`run_until`: the values have settled, so close to each other.
+
+    Args:
+      width: of optimistic minus pessimistic value at the start, in [0, 1]; traced.
+
+    Returns:
+      A condition, for ``until``.
+    """
     return Partial(_known_within, width)
 
 
@@ -309,7 +370,15 @@ def _known_within(width: Any, before: State, after: State, metrics: Metrics) -> 
 
 @jax.jit
 def behavior(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
-    """What is sampled, ``float[S, Q, A]``: preferred moves, and now and then any allowed one."""
+    """What is sampled, ``float[S, Q, A]``: preferred moves, and now and then any allowed one.
+
+    Args:
+      state: of one run; ``vmap`` over several.
+      problem, hparams: of the run.
+
+    Returns:
+      ``float[S, Q, A]``, positive at every allowed action.
+    """
     dtype = problem.model.dtype
     return pac.hat_strategy(state.best, problem.allowed, hparams.exploration).astype(dtype)
 
@@ -320,6 +389,13 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
 
     Where the task is won almost surely it makes all allowed moves alike, and so wins almost surely.
     In an end component between it makes the best moves out, and those that stay.
+
+    Args:
+      state: of one run; ``vmap`` over several.
+      problem, hparams: of the run.
+
+    Returns:
+      ``float[S, Q, A]``.
     """
     nature = jnp.full(1, -1, state.lower.dtype)
     ends = state.lower[None], state.upper[None]
@@ -369,6 +445,9 @@ def wins_almost_surely(problem: Problem, play: jax.Array) -> bool:
     Args:
       problem: the problem.
       play: ``float[S, Q, A]``; only what is positive counts.
+
+    Returns:
+      A truth value; on the host.
     """
     return bool(_wins(problem, play))
 

@@ -8,6 +8,35 @@ A learner is a module with ``init(key, problem, hparams) -> State`` and
 What was learned is ``policy(state, problem, hparams)``. The root key stays in the state: what step
 n draws comes from ``step_key(state)``, the key with n folded in, and what ``init`` draws from
 ``init_key(key)``, a number that no step reaches.
+
+Example: a learner of one's own, of a number that is asked for.
+
+  >>> import jax, jax.numpy as jnp
+  >>> from flax import struct
+  >>> from jaxltl.algos import learner
+  >>> @struct.dataclass
+  ... class State:
+  ...     key: jax.Array
+  ...     step: jax.Array
+  ...     guess: jax.Array
+  >>> @struct.dataclass
+  ... class Metrics:
+  ...     error: jax.Array
+  ...     status: jax.Array
+  >>> def init(key, problem, hparams):
+  ...     return State(key, jnp.int32(0), jax.random.normal(learner.init_key(key)))
+  >>> def step(state, problem, hparams):
+  ...     guess = state.guess + hparams * (problem - state.guess)
+  ...     return (State(state.key, state.step + 1, guess),
+  ...             Metrics(jnp.abs(guess - problem), jnp.int32(0)))
+  >>> run, train, run_until, train_until = learner.bind(init, step)
+  >>> state, metrics = train(jax.random.key(0), 5.0, 0.5, num_steps=4)
+  >>> state.step.item(), metrics.error.shape, bool(metrics.error[3] < metrics.error[0])
+  (4, (4,), True)
+  >>> learned = train_until(jax.random.key(0), 5.0, 0.5, num_steps=100,
+  ...                       until=lambda before, after, metrics: metrics.error < 1e-3)
+  >>> learned.status.item(), learned.num_steps.item() < 20
+  (0, True)
 """
 
 from __future__ import annotations
@@ -44,17 +73,39 @@ MOST = np.iinfo(np.int32).max  # counters stay here; see `count`
 
 
 def init_key(key: chex.PRNGKey) -> chex.PRNGKey:
-    """The key of what ``init`` draws; no step folds in as large a number."""
+    """The key of what ``init`` draws; no step folds in as large a number.
+
+    Args:
+      key: the root key.
+
+    Returns:
+      A PRNG key.
+    """
     return jax.random.fold_in(key, 0xFFFFFFFF)
 
 
 def step_key(state: Any) -> chex.PRNGKey:
-    """The key of what the next step draws: the root key with the number of steps folded in."""
+    """The key of what the next step draws: the root key with the number of steps folded in.
+
+    Args:
+      state: of any learner, with ``key`` and ``step``.
+
+    Returns:
+      A PRNG key.
+    """
     return jax.random.fold_in(state.key, state.step)
 
 
 def count(total: jax.Array, more: jax.Array | int) -> jax.Array:
-    """``total + more`` of counters ``int32``, which stay at ``2 ** 31 - 1`` once they are there."""
+    """``total + more`` of counters ``int32``, which stay at ``2 ** 31 - 1`` once they are there.
+
+    Args:
+      total: ``int32``.
+      more: at least 0.
+
+    Returns:
+      ``int32``.
+    """
     more = jnp.asarray(more, jnp.int32)
     return jnp.where(total > MOST - more, MOST, total + more).astype(jnp.int32)
 
@@ -62,7 +113,18 @@ def count(total: jax.Array, more: jax.Array | int) -> jax.Array:
 def run(
     step: Step, state: Any, problem: Any, hparams: Any, *, num_steps: int, max_rows: int = 1000
 ) -> tuple[Any, Any]:
-    """`num_steps` steps of a learner's `step`; the rest is as for the ``run`` of :func:`bind`."""
+    """`num_steps` steps of a learner's `step`; the rest is as for the ``run`` of :func:`bind`.
+
+    Args:
+      step: the learner's.
+      state, problem, hparams, num_steps, max_rows: as there.
+
+    Returns:
+      The state, and metrics with a first axis of rows.
+
+    Raises:
+      ValueError: num_steps or max_rows is not positive.
+    """
     num_steps, max_rows = (
         x if isinstance(x, int) else whole(name, x, least=1)
         for name, x in (("num_steps", num_steps), ("max_rows", max_rows)))
@@ -110,9 +172,9 @@ class Learned:
     Attributes:
       state: where it ended.
       metrics: of the last step.
-      num_steps: steps made by this run.
-      status: CONVERGED if the condition was met, MAX_STEPS if it was not; or worse, as the last
-        step's metrics say.
+      num_steps: ``int32[]``, steps made by this run.
+      status: ``int32[]``, CONVERGED if the condition was met, MAX_STEPS if it was not; or worse, as
+        the last step's metrics say.
     """
 
     state: Any
@@ -145,6 +207,9 @@ def run_until(
       step: the learner's step.
       idle: whether the step takes another argument, ``bool[]``, and by itself leaves alone a
         state for which that is False; else its arrays are chosen one by one; static.
+
+    Returns:
+      :class:`Learned`.
     """
     if keep not in ("after", "before"):
         raise ValueError(f'keep={keep!r}; choose "after" or "before".')
@@ -201,12 +266,26 @@ def _run_until(step, state, problem, hparams, until, most, check_every, keep, id
 
 
 def has_stopped(before: Any, after: Any, metrics: Any) -> jax.Array:
-    """A condition for :func:`run_until`: the learner has stopped early, as its state says."""
+    """A condition for :func:`run_until`: the learner has stopped early, as its state says.
+
+    Args:
+      before, after, metrics: as ``until`` is given them.
+
+    Returns:
+      ``bool[]``.
+    """
     return after.stopped
 
 
 def gradient_vanishes(tolerance: chex.Numeric) -> Until:
-    """A condition for :func:`run_until`: the gradient's norm is at most a tolerance."""
+    """A condition for :func:`run_until`: the gradient's norm is at most a tolerance.
+
+    Args:
+      tolerance: at least 0; traced.
+
+    Returns:
+      A condition, for ``until``.
+    """
     return Partial(_gradient_vanishes, tolerance)
 
 
@@ -227,6 +306,9 @@ def while_active(
       active: whether a lane goes on, ``bool[]``.
       body: changes nothing in a lane that does not.
       carry, given: what changes and what does not.
+
+    Returns:
+      The carry, once no lane is active.
     """
     carry, given = jax.tree.map(jnp.asarray, (carry, given))
 
@@ -254,7 +336,13 @@ def while_active(
 
 @brief
 class Bound(NamedTuple):
-    """What follows from a learner's ``init`` and ``step``; each has its own help."""
+    """What follows from a learner's ``init`` and ``step``; each has its own help.
+
+    Attributes:
+      run: steps from a state.
+      train: the same from a key.
+      run_until, train_until: the same until a condition is met.
+    """
 
     run: Callable[..., tuple[Any, Any]]
     train: Callable[..., tuple[Any, Any]]
@@ -273,6 +361,9 @@ def bind(init: Init, step: Step, *, step_if: Step | None = None, keep: str = "af
       step_if: a step that takes another argument, ``bool[]``, and by itself leaves alone a state
         for which that is False; for runs that end early. Default: arrays are chosen one by one.
       keep: the default of that argument.
+
+    Returns:
+      :class:`Bound`.
     """
     both = (*_whole(init, step), *_early(init, step if step_if is None else step_if, keep,
                                          step_if is not None))
@@ -497,7 +588,12 @@ def _metrics_of(
 
 
 def trace_lanes(step: Step, state: Any, problem: Any, hparams: Any) -> None:
-    """Does of :func:`run_in_chunks` with lanes what takes only the shapes of the first states."""
+    """Does of :func:`run_in_chunks` with lanes what takes only the shapes of the first states.
+
+    Args:
+      step, problem, hparams: as for :func:`run_in_chunks`.
+      state: of N runs side by side, or its shapes.
+    """
     _metrics_of(step, state, problem, _spread(hparams, state), len(state.step))
 
 
@@ -549,7 +645,14 @@ def _spread(hparams: Any, state: Any) -> Any:
 
 
 def strong(tree: Any) -> Any:
-    """Arrays whose type is not weak, so that the first chunk's program serves the others too."""
+    """Arrays whose type is not weak, so that the first chunk's program serves the others too.
+
+    Args:
+      tree: any tree of arrays.
+
+    Returns:
+      The same tree.
+    """
 
     def one(x: jax.Array) -> jax.Array:
         is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
@@ -568,6 +671,9 @@ def optimizer(name: str, learning_rate: Any) -> optax.GradientTransformationExtr
       name: which one.
       learning_rate: of all but ``"lbfgs"``, which searches along its lines.
 
+    Returns:
+      The gradient transformation.
+
     Raises:
       ValueError: an unknown name.
     """
@@ -584,12 +690,28 @@ def optimizer(name: str, learning_rate: Any) -> optax.GradientTransformationExtr
 
 
 def either(condition: jax.Array, one: Any, other: Any) -> Any:
-    """As :func:`choose`, as one branch, which compiles sooner than a choice of each array."""
+    """As :func:`choose`, as one branch, which compiles sooner than a choice of each array.
+
+    Args:
+      condition: ``bool[]``.
+      one, other: trees of the same structure.
+
+    Returns:
+      The first where the condition holds, else the second.
+    """
     return lax.cond(condition, lambda: one, lambda: other)
 
 
 def choose(condition: jax.Array, one: Any, other: Any) -> Any:
-    """``jnp.where`` on trees; keys, which steps do not change, are those of `one`."""
+    """``jnp.where`` on trees; keys, which steps do not change, are those of `one`.
+
+    Args:
+      condition: ``bool[]``.
+      one, other: trees of the same structure.
+
+    Returns:
+      The first where the condition holds, else the second.
+    """
     def leaf(x: jax.Array, y: jax.Array) -> jax.Array:
         is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
         return x if is_key else jnp.where(condition, x, y)

@@ -20,6 +20,24 @@ a value for each system move and answer, where turns strictly alternate::
 
 Both converge to the minimax value if every allowed move is made infinitely often and
 either the game is deterministic and ``alpha = 1``, or ``alpha`` decays as is usual.
+
+Example: in one state the system may stay or go to the other, which pays.
+
+  >>> import jax
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import maximin_q
+  >>> game = jl.make_game(jl.from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]]), [True, True])
+  >>> problem = maximin_q.make_problem(game, [[0.0, 0.0], [1.0, 1.0]])
+  >>> hparams = maximin_q.Hparams(discount=0.5, restart=0.5, num_chains=4, moves_per_step=8)
+  >>> state, metrics = maximin_q.train(jax.random.key(0), problem, hparams, num_steps=10)
+  >>> [round(v, 3) for v in state.value.tolist()], metrics.violations[-1].item()
+  ([1.0, 2.0], 0)
+  >>> maximin_q.policy(state, problem, hparams).tolist()
+  [1, 0]
+
+Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
+many settings, by ``vmap`` over the numbers of ``Hparams``. End when
+the value rests by ``train_until(..., until=value_rests(1e-6), check_every=...)``.
 """
 
 
@@ -93,19 +111,24 @@ class Hparams:
     Attributes:
       discount: in [0, 1).
       step_size: alpha; None is 1 for games without chance, where the new value replaces
-        the old one, which is fastest.
+        the old one, which is fastest; default None.
       step_power: with omega in (1/2, 1], the n-th visit of a pair has the step size
         ``alpha / n ** omega``; None: always alpha. Near 1 the old is forgotten very slowly
-        (Even-Dar and Mansour 2003).
-      epsilon: the system plays greedily with probability ``1 - epsilon``; None: never.
-      environment_epsilon: the same for the environment, which is then adversarial.
-      epsilon_decay: both epsilons are multiplied by ``epsilon_decay ** step``.
-      epsilon_min: and are at least this.
-      restart: the probability with which a chain starts anew at the beginning of a step.
+        (Even-Dar and Mansour 2003). Default None.
+      epsilon: the system plays greedily with probability ``1 - epsilon``; None: never;
+        default None.
+      environment_epsilon: the same for the environment, which is then adversarial; default None.
+      epsilon_decay: both epsilons are multiplied by ``epsilon_decay ** step``; default 1.0.
+      epsilon_min: and are at least this; default 0.0.
+      restart: the probability with which a chain starts anew at the beginning of a step;
+        default 0.0.
       initial_value: of every entry of the table. The environment's untried moves count.
-      per: ``"system_move"`` or ``"move"``: which moves pay the discount; static.
-      num_chains: static.
+        Default 0.0.
+      per: ``"system_move"`` or ``"move"``: which moves pay the discount; static;
+        default ``"system_move"``.
+      num_chains: static; default 1024.
       moves_per_step: of each chain; static. A step reports once, so few moves cost more each.
+        Default 64.
     """
 
     discount: jax.Array | float
@@ -129,14 +152,14 @@ class State:
 
     Attributes:
       key: of the whole run.
-      step: steps made.
+      step: ``int32[]``, steps made.
       q: ``float[S, A]``, or ``float[S, A, A]`` of a system state, its move and the answer;
         minus infinity at system moves that are not allowed, plus infinity at the
         environment's, so that maxima and minima pass over them.
       visits: ``int32`` like `q`, how often each entry was updated, counted up to 2^30.
       value: ``float[S]``, of `q`.
-      residual: the largest change of `value` in the last step.
-      violations: moves made that were not allowed, of all chains. It stays zero.
+      residual: ``float[]``, the largest change of `value` in the last step.
+      violations: ``int32[]``, moves made that were not allowed, of all chains. It stays zero.
       position: ``int32[num_chains]``, where the chains are.
       pending: ``int32[num_chains]``, the system's move ``s * A + a`` that waits for its
         answer, or -1; None unless the method is maximin.
@@ -158,7 +181,7 @@ class State:
 @brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
-    """Figures after a step.
+    """Figures after a step; scalars, of a run ``[T]``.
 
     Attributes:
       residual: the largest change of the value in the step.
@@ -209,6 +232,9 @@ def make_problem(
         wherever a move is allowed (with maximin: at the system's states).
       method: ``"generalized"`` or ``"maximin"``.
 
+    Returns:
+      :class:`Problem`.
+
     Raises:
       ValueError: a wrong shape, a reward that is not finite, a mask that allows a move
         that does not exist or none in a state that can be reached, rows or a start that
@@ -217,11 +243,9 @@ def make_problem(
     Example:
       >>> from jaxltl.core.models.mdp import from_dense
       >>> mdp = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]])
-      >>> problem = make_problem(mdp, [[0.0, 0.0], [1.0, 1.0]])
-      >>> hparams = Hparams(discount=0.5, restart=0.5, num_chains=4, moves_per_step=8)
-      >>> state, metrics = train(jax.random.key(0), problem, hparams, num_steps=10)
-      >>> [round(v, 3) for v in state.value.tolist()], policy(state, problem, hparams).tolist()
-      ([1.0, 2.0], [1, 0])
+      >>> problem = make_problem(mdp, [[0.0, 0.0], [1.0, 1.0]], allowed=[[False, True]] * 2)
+      >>> problem.allowed.tolist(), problem.method
+      ([[False, True], [False, True]], 'generalized')
     """
     if method not in ("generalized", "maximin"):
         raise ValueError(f'method={method!r}; choose "generalized" or "maximin".')
@@ -261,6 +285,12 @@ def recurrent_states(problem: Problem) -> jax.Array:
     """States that chains without restarts visit infinitely often, if nobody plays greedily.
 
     They are the bottom components of the reachable part, ``bool[S]``; on the host.
+
+    Args:
+      problem: of :func:`make_problem`.
+
+    Returns:
+      ``bool[S]``, for ``make_problem(..., measured=...)``.
     """
     part = restrict(problem.game, problem.start, allowed=problem.behavior > 0)
     inside = bottom_components(part.model, part.model.available).inside.any(-1)
@@ -326,6 +356,14 @@ _MOST_VISITS = 2**30  # counted; a step adds at most as many again
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """A table of ``hparams.initial_value``, and chains at states drawn from the start.
 
+    Args:
+      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
+      problem: of :func:`make_problem`.
+      hparams: :class:`Hparams`.
+
+    Returns:
+      :class:`State`, no step made.
+
     Raises:
       ValueError: unknown `per`, no chain or move, or no step size for a game with chance.
     """
@@ -359,6 +397,13 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
         Q <- (1 - a)^m Q + (1 - (1 - a)^m) mean.
 
     Cost: a few nanoseconds for each move and allowed action, without arrays of their number.
+
+    Args:
+      state: of :func:`init` or of an earlier step; unchanged.
+      problem, hparams: as of :func:`init`.
+
+    Returns:
+      The next :class:`State`, and :class:`Metrics`, figures after the step.
     """
     _check(problem, hparams)
     start_key, action_key, successor_key = (
@@ -389,7 +434,14 @@ run, train, run_until, train_until = learner.bind(init, step)
 
 
 def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
-    """The :class:`Metrics` of a state."""
+    """The :class:`Metrics` of a state.
+
+    Args:
+      state, problem, hparams: of a run.
+
+    Returns:
+      :class:`Metrics`, scalars.
+    """
     dtype = problem.game.dtype
     error, finite = jnp.asarray(jnp.nan, dtype), jnp.all(jnp.isfinite(state.value))
     if problem.exact is not None:
@@ -411,6 +463,12 @@ def value_rests(tolerance: chex.Numeric) -> learner.Until:
     A move that was made for the first time counts as a change. That the value rests is evidence
     of convergence and no proof of it: the longer the window, ``check_every``, the better the
     evidence.
+
+    Args:
+      tolerance: in units of the value, at least 0; traced.
+
+    Returns:
+      A condition, for ``until``.
     """
     return Partial(_value_rests, tolerance)
 
@@ -427,6 +485,13 @@ def value(q: jax.Array, problem: Problem) -> jax.Array:
 
     Zero where no move is allowed, and at the environment's states with maximin, whose
     table holds none for them.
+
+    Args:
+      q: ``float[S, A]``, or ``float[S, A, A]`` with maximin; ``state.q``.
+      problem: of it.
+
+    Returns:
+      ``float[S]``, in units of the reward.
     """
     if problem.method == "maximin":
         return finite(reduce_last(jnp.maximum, reduce_last(jnp.minimum, q)))
@@ -439,6 +504,13 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
 
     With maximin the environment's moves are its first ones: its best answer depends on the
     system's move, and is the minimum of ``state.q[s, a]``.
+
+    Args:
+      state: of one run; ``vmap`` over several.
+      problem, hparams: of the run.
+
+    Returns:
+      ``int32[S]``; 0 where no move is allowed.
     """
     del hparams
     if problem.method == "maximin":

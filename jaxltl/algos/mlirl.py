@@ -3,6 +3,31 @@
 From demonstrations, learn a reward whose softmax policy makes them likely (2.4), in the
 world or in its product with a task, and trade the likelihood against the probability
 that the policy does the task (2.6).
+
+Example: learning from two runs, of which one tries again, to reach the goal ``g`` and never ``r``.
+
+  >>> import jax, jax.numpy as jnp
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import mlirl
+  >>> world = jl.make_mdp(  # a start, from where one gets to a goal or into a trap
+  ...     [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
+  ...     [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
+  ...     available=[[True, True], [True, False], [True, False]], initial=[1, 0, 0],
+  ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["g", "r"])
+  >>> shown = jl.make_trajectories(world, [[(0, 1), (0, 0), (1, 0)], [(0, 0), (1, 0)]])
+  >>> model = jl.product(world, "!r U g")
+  >>> features = jnp.zeros((*model.state_shape, 2, 2)).at[..., 0, 0].set(1).at[..., 1, 1].set(1)
+  >>> problem = mlirl.make_problem(model, features, shown)
+  >>> hparams = mlirl.Hparams(discount=0.5, mu=0.1)
+  >>> state, metrics = mlirl.train(jax.random.key(0), problem, hparams, num_steps=2)
+  >>> metrics.loss.shape, bool(metrics.loss[1] < metrics.loss[0])  # a row for each step
+  ((2,), True)
+  >>> mlirl.policy(state, problem, hparams).shape == (*model.state_shape, model.num_actions)
+  True
+
+Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
+many settings, by ``vmap`` over the numbers of ``Hparams``. Resume by
+``run(state, problem, hparams, num_steps=...)``; end early by ``train_until``.
 """
 
 from __future__ import annotations
@@ -42,7 +67,19 @@ Reward = Callable[[Any, jax.Array], jax.Array]
 
 
 def linear_reward(weights: jax.Array, features: jax.Array) -> jax.Array:
-    """``R = F theta``: ``float[S, A]`` from ``float[F]`` and ``float[S, A, F]``."""
+    """``R(s, a) = sum_f theta_f F_f(s, a)``, the class of rewards of section 2.2.
+
+    Args:
+      weights: ``float[F]``, theta.
+      features: ``float[S, A, F]`` (``[S, Q, A, F]``).
+
+    Returns:
+      ``float[S, A]`` (``[S, Q, A]``); differentiable in both.
+
+    Example:
+      >>> linear_reward(jnp.array([1.0, 2.0]), jnp.array([[[3.0, 4.0]]])).tolist()
+      [[11.0]]
+    """
     return features @ weights
 
 
@@ -54,8 +91,8 @@ class Problem:
     Attributes:
       model: the world, or its product with the task.
       features: ``float[S, A, F]`` (``[S, Q, A, F]``).
-      counts: ``float[S, A]``, how often each pair was demonstrated.
-      start: parameters around which learning starts, any pytree.
+      counts: ``float[S, A]`` (``[S, Q, A]``), how often each pair was demonstrated.
+      start: parameters around which learning starts, any pytree; ``float[F]`` if linear.
       satisfaction_weight: ``float[S]``, of the states over which g sums the satisfaction.
       reward: ``(parameters, features) -> float[S, A]``; static.
     """
@@ -75,13 +112,14 @@ class Hparams:
 
     Attributes:
       discount: in [0, 1).
-      mu: weight of the satisfaction term (2.6); None leaves it out (cases 1 and 2).
-      l2: precision of the Gaussian prior on the parameters.
-      learning_rate: for ``adam`` and ``sgd``.
-      start_scale: standard deviation of the noise added to ``Problem.start``.
-      policy: ``"boltzmann"`` (2.3) or ``"soft"``; static.
-      adjoint: ``"exact"``, or ``"approximate"`` for (2.7); static.
-      optimizer: ``"lbfgs"``, ``"adam"``, ``"rmsprop"`` or ``"sgd"``, all optax's; static.
+      mu: weight of the satisfaction term (2.6); None leaves it out (cases 1 and 2); default None.
+      l2: precision of the Gaussian prior on the parameters; default 1e-3.
+      learning_rate: for ``adam`` and ``sgd``; default 0.1.
+      start_scale: standard deviation of the noise added to ``Problem.start``; default 1.0.
+      policy: ``"boltzmann"`` (2.3) or ``"soft"``; static; default ``"boltzmann"``.
+      adjoint: ``"exact"``, or ``"approximate"`` for (2.7); static; default ``"exact"``.
+      optimizer: ``"lbfgs"``, ``"adam"``, ``"rmsprop"`` or ``"sgd"``, all optax's; static;
+        default ``"lbfgs"``.
     """
 
     discount: jax.Array | float
@@ -100,9 +138,9 @@ class State:
     """Parameters on their way, with the value that the next solve starts from.
 
     Attributes:
-      key, step: the root key and the number of steps made.
-      parameters: of the reward.
-      value: ``float[S]``, of the reward at parameters that are near.
+      key, step: the root key and the number of steps made, ``int32[]``.
+      parameters: of the reward, as ``Problem.start``; ``float[F]`` if linear.
+      value: ``float[S]`` (``[S, Q]``), of the reward at parameters that are near.
       optimizer: optax's state, or that of the line search.
     """
 
@@ -116,12 +154,12 @@ class State:
 @brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
-    """Figures of the parameters before a step.
+    """Figures of the parameters before a step; scalars, of a run ``[T]``.
 
     Attributes:
       loss: the objective, with prior and satisfaction term.
-      neg_log_likelihood: (2.4), over all demonstrated pairs.
-      satisfaction: weighted mean of the satisfaction probability; NaN without the term.
+      neg_log_likelihood: (2.4), in nats, over all demonstrated pairs.
+      satisfaction: weighted mean of the satisfaction probability, in [0, 1]; NaN without the term.
       gradient_norm: Euclidean.
       status: of the solvers of value and satisfaction; see :class:`~jaxltl.core.types.Status`.
     """
@@ -135,7 +173,14 @@ class Metrics:
 
 @brief(codes={"status": Status})
 class Objective(NamedTuple):
-    """The loss at some parameters, and what it was made of."""
+    """What the loss at some parameters was made of.
+
+    Attributes:
+      neg_log_likelihood: ``float[]``, (2.4), in nats, over all demonstrated pairs.
+      satisfaction: ``float[]``, g of (2.6); NaN without the term.
+      value: ``float[S]`` (``[S, Q]``), from which the next solve may start.
+      status: ``int32[]``, of the solvers.
+    """
 
     neg_log_likelihood: jax.Array
     satisfaction: jax.Array
@@ -168,6 +213,9 @@ def make_problem(
         that lose nothing of the task (:func:`~jaxltl.core.values.optimal_actions.optimal_actions`);
         default all. Demonstrated steps that take others are left out:
         :func:`~jaxltl.core.models.product.allowed_steps` tells which.
+
+    Returns:
+      :class:`Problem`.
 
     Raises:
       ValueError: features, weights or mask of the wrong shape, features that are not finite,
@@ -214,10 +262,11 @@ def solve(
     Args:
       parameters: as ``Problem.start``.
       problem, hparams: what and how.
-      initial: a value to start the Boltzmann iteration from.
+      initial: ``float[S]`` (``[S, Q]``), a value to start the Boltzmann iteration from.
 
     Returns:
-      :class:`Solution`, differentiable in the parameters.
+      :class:`Solution`, `policy` ``float[S, A]`` (``[S, Q, A]``); both differentiable in the
+      parameters.
 
     Raises:
       ValueError: unknown kind of policy or adjoint.
@@ -248,8 +297,8 @@ def objective(
       parameters, problem, hparams, initial: as in :func:`solve`.
 
     Returns:
-      The loss, and :class:`Objective`. Differentiable in the parameters: exactly, or as in
-      (2.7) with the policy held constant in the Bellman equation.
+      The loss ``float[]``, and :class:`Objective`. Differentiable in the parameters: exactly, or as
+      in (2.7) with the policy held constant in the Bellman equation.
     """
     # Once, so that the derivative goes back through it once.
     reward = problem.reward(parameters, problem.features)
@@ -276,7 +325,16 @@ def objective(
 
 
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
-    """Parameters at ``problem.start`` plus noise of ``hparams.start_scale``; the key is kept."""
+    """Parameters at ``problem.start`` plus noise of ``hparams.start_scale``; the key is kept.
+
+    Args:
+      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
+      problem: of :func:`make_problem`.
+      hparams: :class:`Hparams`.
+
+    Returns:
+      :class:`State`, no step made.
+    """
     flat, unravel = ravel_pytree(problem.start)
     noise = jax.random.normal(learner.init_key(key), flat.shape, flat.dtype)
     parameters = unravel(flat + hparams.start_scale * noise)
@@ -306,6 +364,13 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
 
     Under ``vmap`` runs make their steps in turn: each takes as many evaluations as it needs.
     A step is not differentiated through: :func:`objective` is what has derivatives.
+
+    Args:
+      state: of :func:`init` or of an earlier step; unchanged.
+      problem, hparams: as of :func:`init`.
+
+    Returns:
+      The next :class:`State`, and :class:`Metrics`, figures of the parameters before the step.
     """
     return in_turn(_step, state, problem, hparams)
 
@@ -349,5 +414,12 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     """The softmax policy of the reward: ``float[S, A]``, in a product ``[S, Q, A]``.
 
     :func:`solve` tells with it how well its value is known.
+
+    Args:
+      state: of one run; ``vmap`` over several.
+      problem, hparams: of the run.
+
+    Returns:
+      ``float[S, A]``, in a product ``[S, Q, A]``; zero at actions that are not available.
     """
     return solve(state.parameters, problem, hparams, state.value).policy

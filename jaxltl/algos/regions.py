@@ -36,6 +36,12 @@ class Regions:
       lower, upper: ``float64[N]``, what encloses the value in each of them.
       verdict: ``int8[N]``: 1 where it is past the threshold at every point, -1 where it is at none,
         0 where nothing was decided.
+
+    Example:
+      >>> halves = Regions(np.array([[0.0], [0.5]]), np.array([[0.5], [1.0]]), np.array([0.0, 0.5]),
+      ...                  np.array([0.5, 1.0]), np.array([-1, 1], np.int8))
+      >>> halves.share(1)
+      0.5
     """
 
     low: np.ndarray
@@ -65,6 +71,8 @@ def enclose(problem: Problem, low: Any = None, high: Any = None) -> tuple[float,
     Raises:
       ValueError: the box is none, or reaches out of the problem's or below 0; the model is of
         functions whose ranges are not known.
+
+    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> import pathlib, tempfile
@@ -128,7 +136,16 @@ def _value(
 
 
 def verdict_of(problem: Problem, threshold: float, lower: float, upper: float) -> int:
-    """Whether all values between bounds are past a threshold (1), or none (-1), or neither (0)."""
+    """Whether all values between bounds are past a threshold (1), or none (-1), or neither (0).
+
+    Args:
+      problem: which side of the threshold is asked for.
+      threshold: the number.
+      lower, upper: bounds on all values.
+
+    Returns:
+      1, -1 or 0.
+    """
     if problem.bound == ">=":
         return ACCEPTED if lower >= threshold else REJECTED if upper < threshold else OPEN
     return ACCEPTED if upper <= threshold else REJECTED if lower > threshold else OPEN
@@ -152,6 +169,21 @@ def prove_regions(
 
     Raises:
       ValueError: as :func:`enclose`; the threshold is NaN, or `max_boxes` below 1.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> from jaxltl.algos.feasible import make_problem
+      >>> from jaxltl.io.parametric import read_parametric
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
+      >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n3\\n@model\\n"
+      ...     "state 0 init\\n\\taction 0\\n\\t\\t1 : p\\n\\t\\t2 : 1-p\\n"
+      ...     "state 1 goal\\n\\taction 0\\n\\t\\t1 : 1\\nstate 2\\n\\taction 0\\n\\t\\t2 : 1\\n")
+      >>> coin = make_problem(read_parametric(path).over(0.01, 0.99), "goal", bound=">=")
+      >>> found = prove_regions(coin, 0.5, max_boxes=31)
+      >>> found.share(1) > 0.45, found.share(-1) > 0.45, found.share(0) < 0.1
+      (True, True, True)
     """
     threshold, max_boxes = _limit(threshold), count("max_boxes", max_boxes, least=1)
     low, high = _box(problem, low, high)
@@ -207,6 +239,21 @@ def prove_around(
 
     Raises:
       ValueError: as :func:`prove_regions`; the point is not in the box.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> from jaxltl.algos.feasible import make_problem
+      >>> from jaxltl.io.parametric import read_parametric
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
+      >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n3\\n@model\\n"
+      ...     "state 0 init\\n\\taction 0\\n\\t\\t1 : p\\n\\t\\t2 : 1-p\\n"
+      ...     "state 1 goal\\n\\taction 0\\n\\t\\t1 : 1\\nstate 2\\n\\taction 0\\n\\t\\t2 : 1\\n")
+      >>> coin = make_problem(read_parametric(path).over(0.01, 0.99), "goal", bound=">=")
+      >>> low, high = prove_around(coin, 0.5, [0.75])
+      >>> low.shape, 0.5 <= low.item() < 0.55 and 0.95 < high.item() <= 0.99
+      ((1,), True)
     """
     _require_problem(problem)
     threshold, num_halvings = _limit(threshold), count("num_halvings", num_halvings, most=1000)

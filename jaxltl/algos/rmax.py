@@ -10,6 +10,26 @@ model is solved anew, from the last values.
 The true game is touched through ``sample_successor`` and the rewards of the transitions made
 only. Shapes are written for the S states of ``problem.game``; states outside the region stay
 where they are and are never entered.
+
+Example: to come home again and again, and to be paid for staying away.
+
+  >>> import jax
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import rmax
+  >>> world = jl.from_dense([[[1.0, 0], [0, 1.0]], [[1.0, 0], [1.0, 0]]],
+  ...                       label=[[0], [1]], propositions=["home"], initial=[1, 0])
+  >>> problem = rmax.make_problem(world, "G F home", [[1.0, 0.0], [0.0, 0.0]])
+  >>> hparams = rmax.Hparams(discount=0.5, reward_bound=1.0, epsilon=0.1)
+  >>> learned = rmax.train_until(jax.random.key(0), problem, hparams, num_steps=10_000,
+  ...                            until=rmax.strategy_rests(1000))
+  >>> learned.metrics.num_known.item(), rmax.policy(learned.state, problem, hparams).shape
+  (4, (2, 2))
+  >>> sure = rmax.evidence(learned.state, problem, hparams)
+  >>> bool(sure.almost_sure), sure.epsilon_optimal.all().tolist()
+  (True, True)
+
+Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; a run
+of a fixed number of steps is ``train``, and goes on by ``run``.
 """
 
 from __future__ import annotations
@@ -96,15 +116,16 @@ class Hparams:
       discount: in (0, 1), paid by every move.
       reward_bound: R_max; rewards lie in [0, R_max].
       epsilon: how far from optimal the strategy may end.
-      failure: delta_c, the probability with which it may end further.
+      failure: delta_c, the probability with which it may end further; default 0.1.
       known_after: visits after which a pair of several successors is known. None: the K of
         the theorem, which is out of reach for all but toys; with a number the theorem's
-        guarantee is void, and what remains is the evidence of :func:`evidence`.
-      restart: the probability with which a run starts anew before a move.
+        guarantee is void, and what remains is the evidence of :func:`evidence`. Default None.
+      restart: the probability with which a run starts anew before a move; default 0.0.
       update: ``"every"`` observed reward enters the model; ``"printed"``: as algorithm 5 has it
         in line 16, only that of a pair's last successor before it is known, which is wrong
-        where a move has several successors; static.
-      moves_per_step: a step ends when something new is known, or after this many moves; static.
+        where a move has several successors; static; default ``"every"``.
+      moves_per_step: a step ends when something new is known, or after this many moves; static;
+        default 128.
     """
 
     discount: jax.Array | float
@@ -124,24 +145,25 @@ class State:
 
     Attributes:
       key: of the whole run.
-      step: steps made.
-      moves: moves made; with 2^31 - 1 of them a run is over, and steps make no more.
+      step: ``int32[]``, steps made.
+      moves: ``int32[]``, moves made; with 2^31 - 1 of them a run is over, and steps make no more.
       position: ``int32[]``, the state of the game.
       counts: ``int32[S, A, K]``, how often each transition was seen; in a game without chance,
         whether it was.
       reward: ``float[S, A, K]``, the rewards seen; ``R_max / (1 - discount)`` at others.
       known_at: ``int32[S, A]``, the number of moves after which a pair was known; -1 before.
-      num_known: the pairs that are.
+      num_known: ``int32[]``, the pairs that are.
       probability, gain: ``float[S, A, K]`` and ``[S, A]``, transitions and expected rewards of
         the optimistic model.
       value: ``float[S]``, its value.
       best: ``bool[S, A]``, the moves that the strategy prefers.
-      error: how far `value` may be from the model's, up to a constant.
-      last_update: the number of moves after which the strategy was last computed.
-      num_updates: how often it was.
-      always_almost_sure: whether every strategy so far made each move of the region with positive
-        probability, so that it wins almost surely (lemma 6).
-      fault: the first pair ``s * A + a`` with a reward outside [0, R_max]; -1 if there is none.
+      error: ``float[]``, how far `value` may be from the model's, up to a constant.
+      last_update: ``int32[]``, the number of moves after which the strategy was last computed.
+      num_updates: ``int32[]``, how often it was.
+      always_almost_sure: ``bool[]``, whether every strategy so far made each move of the region
+        with positive probability, so that it wins almost surely (lemma 6).
+      fault: ``int32[]``, the first pair ``s * A + a`` with a reward outside [0, R_max]; -1 if there
+        is none.
     """
 
     key: jax.Array
@@ -166,7 +188,7 @@ class State:
 @brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
-    """Figures after a step.
+    """Figures after a step; scalars, of a run ``[T]``.
 
     Attributes:
       moves, num_known, last_update, num_updates: so far.
@@ -195,7 +217,8 @@ class Evidence:
 
     Attributes:
       strategy: ``float[S, A]``, of the system.
-      almost_sure: whether it wins almost surely from every state of the region, by the graph.
+      almost_sure: ``bool[]``, whether it wins almost surely from every state of the region, by the
+        graph.
       optimal: the best that any strategy in the region secures.
       worst: what this one secures against every environment.
       met: its value against the environment that was played.
@@ -258,12 +281,6 @@ def make_problem(
       >>> problem = make_problem(world, "G F home", [[1.0, 0.0], [0.0, 0.0]])
       >>> problem.region.tolist()
       [True, True]
-      >>> hparams = Hparams(discount=0.5, reward_bound=1.0, epsilon=0.1)
-      >>> learned = train_until(jax.random.key(0), problem, hparams, num_steps=10_000,
-      ...                       until=strategy_rests(1000))
-      >>> sure = evidence(learned.state, problem, hparams)
-      >>> bool(sure.almost_sure), sure.epsilon_optimal.all().tolist()
-      (True, True)
     """
     game = as_padded_game(game)
     reward = shaped_reward(game, reward)
@@ -302,6 +319,14 @@ def _allowed(game: Game, region: jax.Array) -> jax.Array:
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """Nothing known: every unknown move is taken to pay ``R_max / (1 - discount)`` for ever.
 
+    Args:
+      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
+      problem: of :func:`make_problem`.
+      hparams: :class:`Hparams`.
+
+    Returns:
+      :class:`State`, no step made.
+
     Raises:
       ValueError: an unknown `update`, or steps without moves.
     """
@@ -328,6 +353,13 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     """Moves until something new is known, at most ``moves_per_step``, and then the new strategy.
 
     Under ``vmap`` every lane goes on to its next update, and then one solve serves all.
+
+    Args:
+      state: of :func:`init` or of an earlier step; unchanged.
+      problem, hparams: as of :func:`init`.
+
+    Returns:
+      The next :class:`State`, and :class:`Metrics`, figures after the step.
     """
     return _step_if(state, problem, hparams, jnp.bool_(True))
 
@@ -348,7 +380,14 @@ run, train, run_until, train_until = learner.bind(init, step, step_if=_step_if)
 
 
 def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
-    """The :class:`Metrics` of a state."""
+    """The :class:`Metrics` of a state.
+
+    Args:
+      state, problem, hparams: of a run.
+
+    Returns:
+      :class:`Metrics`, scalars.
+    """
     solved = state.error <= _solver_tolerance(problem, hparams)
     status = status_code(solved & (state.moves < learner.MOST), jnp.isfinite(state.error))
     return Metrics(
@@ -362,7 +401,14 @@ def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
 
 
 def strategy_rests(moves: chex.Numeric) -> learner.Until:
-    """A condition for :func:`run_until`: no update of the strategy for so many moves."""
+    """A condition for :func:`run_until`: no update of the strategy for so many moves.
+
+    Args:
+      moves: at least 1; traced.
+
+    Returns:
+      A condition, for ``until``.
+    """
     return Partial(_strategy_rests, moves)
 
 
@@ -371,7 +417,15 @@ def _strategy_rests(moves: Any, before: State, after: State, metrics: Metrics) -
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
-    """The system's strategy, ``float[S, A]``: Remark 4 of section 6.5.2; zero elsewhere."""
+    """The system's strategy, ``float[S, A]``: Remark 4 of section 6.5.2; zero elsewhere.
+
+    Args:
+      state: of one run; ``vmap`` over several.
+      problem, hparams: of the run.
+
+    Returns:
+      ``float[S, A]``, rows that sum to one where the system moves inside the region.
+    """
     allowed = problem.allowed & problem.game.system[:, None]
     return pac.hat_strategy(state.best, allowed, _exploration(problem, hparams))
 
@@ -389,6 +443,14 @@ def observe(
     Whoever moves at ``state.position`` has made it; the system's moves are drawn from
     ``policy(state, problem, hparams)[state.position]``. Where a run starts anew, give the
     place first: ``state.replace(position=jnp.int32(s))``.
+
+    Args:
+      state, problem, hparams: of a learner.
+      action, successor: what was done, and the state of ``problem.game`` that came.
+      reward: what it paid.
+
+    Returns:
+      The next :class:`State`.
 
     Raises:
       ValueError: the move is not allowed there, the successor is not in the graph, or the
@@ -427,6 +489,13 @@ def evidence(
 
     One state at a time: of vmapped seeds, ``jax.tree.map(itemgetter(i), states)``. With a
     `confidence` in (0, 1) also what the counts alone guarantee, however few they are.
+
+    Args:
+      state, problem, hparams: of one run.
+      confidence: of ``Evidence.data``; None leaves it out.
+
+    Returns:
+      :class:`Evidence`, with certified bounds.
 
     Raises:
       ValueError: a reward outside [0, R_max] was observed, which voids every guarantee.

@@ -1,4 +1,13 @@
-"""Numbers that change from step to step, and the theorem's conditions on them (chapter 4)."""
+"""Numbers that change from step to step, and the theorem's conditions on them (chapter 4).
+
+Example:
+  >>> from jaxltl.algos import cce, schedules
+  >>> hparams = cce.Hparams(  # those of theorem 1
+  ...     rate=schedules.Polynomial(0.5, -0.7), num_samples=schedules.Polynomial(10, 0.5),
+  ...     weighting="literal")
+  >>> schedules.theorem_conditions(hparams, num_steps=90).holds
+  True
+"""
 
 from __future__ import annotations
 
@@ -22,6 +31,10 @@ class Polynomial:
 
     A negative power decays. Numbers are traced.
 
+    Attributes:
+      scale, power: the numbers.
+      offset: added to the step; default 0.
+
     Example:
       >>> [round(float(at(Polynomial(0.5, -1.0), step)), 3) for step in range(3)]
       [0.5, 0.25, 0.167]
@@ -38,6 +51,10 @@ class Linear:
     """From `first` in the first step in a straight line to `last` after `num_steps` steps.
 
     Then it stays there. Numbers are traced.
+
+    Attributes:
+      first, last: the ends.
+      num_steps: steps of the way between them.
 
     Example:
       >>> [float(at(Linear(1.0, 0.0, 4), step)) for step in range(6)]
@@ -63,6 +80,12 @@ Schedule = Any  # a number, a Polynomial, or a pytree that is called with l = 1,
 def is_schedule(given: Any) -> bool:
     """Whether it is a schedule of the step, and no number: a tree of arrays, so that it is traced.
 
+    Args:
+      given: anything.
+
+    Returns:
+      A truth value.
+
     Example:
       >>> import math
       >>> [is_schedule(x) for x in (Linear(1.0, 0.0, 4), Polynomial(1.0, -1.0), 0.5, math.exp)]
@@ -73,7 +96,15 @@ def is_schedule(given: Any) -> bool:
 
 
 def at(schedule: Schedule, step: jax.Array | int) -> Any:
-    """A schedule's number in the step after `step` steps, l = step + 1."""
+    """A schedule's number in the step after `step` steps, l = step + 1.
+
+    Args:
+      schedule: a number, :class:`Polynomial`, :class:`Linear`, or a function of l in a pytree.
+      step: at least 0; may be traced.
+
+    Returns:
+      A number, as the schedule gives it; None of None.
+    """
     l = jnp.asarray(step) + 1  # noqa: E741
     if isinstance(schedule, Polynomial):
         return schedule.scale * (l + jnp.asarray(schedule.offset)) ** jnp.asarray(schedule.power)
@@ -82,7 +113,13 @@ def at(schedule: Schedule, step: jax.Array | int) -> Any:
 
 @brief
 class Condition(NamedTuple):
-    """One of theorem 1's conditions, whether it holds (None: cannot be told), and why."""
+    """One of theorem 1's conditions.
+
+    Attributes:
+      name: in a few words.
+      holds: whether it does; None if that cannot be told.
+      reason: why.
+    """
 
     name: str
     holds: bool | None
@@ -127,6 +164,9 @@ def theorem_conditions(hparams: Any, *, num_steps: int | None = None) -> Conditi
       hparams: concrete numbers.
       num_steps: the length of the run. `population` bounds n_l, so that the samples can grow
         only for so long; None asks for ever.
+
+    Returns:
+      :class:`Conditions`.
 
     Example:
       >>> from jaxltl.algos.cce import Hparams

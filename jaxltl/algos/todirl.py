@@ -4,6 +4,34 @@ From demonstrations, learn a reward network that sees what is near, the memory o
 task's automaton and the action, such that the soft (maximum-entropy) policy of the product
 makes the demonstrations likely (3.3). What was learned is local, so it plans in worlds that
 were never seen: :func:`plan`.
+
+Example: a reward of what is seen, here of which state it is, that plans in another world.
+
+  >>> import jax, jax.numpy as jnp
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import todirl
+  >>> world = jl.make_mdp(  # a start, from where one gets to a goal or into a trap
+  ...     [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
+  ...     [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
+  ...     available=[[True, True], [True, False], [True, False]], initial=[1, 0, 0],
+  ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["g", "r"])
+  >>> shown = jl.make_trajectories(world, [[(0, 1), (0, 0), (1, 0)], [(0, 0), (1, 0)]])
+  >>> model = jl.product(world, "!r U g", label_on="exit")
+  >>> problem = todirl.make_problem(  # the second demonstration tells when to stop
+  ...     model, jnp.eye(3), shown, network=todirl.RewardNetwork((3,)), held_out=0.5)
+  >>> hparams = todirl.Hparams(discount=0.9, patience=3, optimizer="sgd")
+  >>> state, metrics = todirl.train(jax.random.key(0), problem, hparams, num_steps=2)
+  >>> metrics.held_out.shape, todirl.policy(state, problem, hparams).shape  # [W, S, Q, A]
+  ((2,), (1, 3, 3, 2))
+  >>> parameters = state.best.parameters
+  >>> shape = jax.eval_shape(  # in any world that is seen the same way
+  ...     lambda other: todirl.plan(problem.network, parameters, other, jnp.eye(3), hparams), model)
+  >>> shape.policy.shape
+  (3, 3, 2)
+
+Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
+many settings, by ``vmap`` over the numbers of ``Hparams``. Stop
+when patience has run out by ``train_until(..., until=learner.has_stopped)``.
 """
 
 from __future__ import annotations
@@ -46,6 +74,9 @@ class RewardNetwork(nn.Module):
 
     Attributes:
       hidden: widths of the hidden layers; section 3.5 has two of 80. Empty: a linear reward.
+
+    Called with ``float[..., O]``, ``float[..., Q]`` and ``float[..., A]``, which broadcast, it
+    returns ``float[...]``.
     """
 
     hidden: Sequence[int] = (80, 80)
@@ -71,7 +102,7 @@ class Concatenated(nn.Module):
     """A network that reads one vector, ``[..., O + Q + A] -> [...]`` or ``[..., 1]``, as a reward.
 
     Attributes:
-      network: the flax module.
+      network: the flax module, of vectors ``float[N, O + Q + A]``, or of any leading axes.
     """
 
     network: nn.Module
@@ -127,15 +158,20 @@ class Hparams:
 
     Attributes:
       discount: in [0, 1); with a horizon 1 is allowed.
-      l2: precision of the Gaussian prior on the parameters.
-      learning_rate: for every optimiser but ``lbfgs``.
+      l2: precision of the Gaussian prior on the parameters; default 1e-3.
+      learning_rate: for every optimiser but ``lbfgs``; default 3e-3.
       patience: steps without a better held-out likelihood after which learning stops; with `mu`,
-        without a better sum of it and of the weighed probability of an average pair.
-      mu: weight of the probability of the task (2.6) from the worlds' starts; None leaves it out.
-      tolerance: certified error asked of the soft values; None: what the dtype allows.
-      optimizer: ``"adam"``, ``"sgd"``, ``"rmsprop"`` or ``"lbfgs"``, all optax's; static.
-      method: of the soft solver, see :func:`~jaxltl.core.values.soft.soft_value`; static.
-      horizon: None, or the number of steps of a run, for a policy of the time left; static.
+        without a better sum of it and of the weighed probability of an average pair; default 50.
+      mu: weight of the probability of the task (2.6) from the worlds' starts; None leaves it out;
+        default None.
+      tolerance: certified error asked of the soft values; None: what the dtype allows;
+        default None.
+      optimizer: ``"adam"``, ``"sgd"``, ``"rmsprop"`` or ``"lbfgs"``, all optax's; static;
+        default ``"adam"``.
+      method: of the soft solver, see :func:`~jaxltl.core.values.soft.soft_value`; static;
+        default ``"value_iteration"``.
+      horizon: None, or the number of steps of a run, for a policy of the time left; static;
+        default None.
     """
 
     discount: jax.Array | float
@@ -155,12 +191,13 @@ class State:
     """Parameters on their way; once `stopped`, only the step counter goes on.
 
     Attributes:
-      key, step: the root key and the number of steps made.
-      parameters: of the network.
+      key, step: the root key and the number of steps made, ``int32[]``.
+      parameters: of the network, a pytree.
       value: ``float[W, S, Q]``, the soft value that the next solve starts from.
       optimizer: optax's state.
-      best: what was learned: ``state.best.parameters``.
-      stopped: whether patience has run out.
+      best: what was learned, :class:`~jaxltl.algos.early_stopping.Best`:
+        ``state.best.parameters``.
+      stopped: ``bool[]``, whether patience has run out.
     """
 
     key: jax.Array
@@ -175,16 +212,16 @@ class State:
 @brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
-    """Figures of the parameters before a step.
+    """Figures of the parameters before a step; scalars, of a run ``[T]``.
 
     Attributes:
       loss: the negative log-likelihood and minus the logarithm of the prior.
-      neg_log_likelihood: minus (3.3), over all pairs, weighted by world.
+      neg_log_likelihood: minus (3.3), in nats, over all pairs, weighted by world.
       per_pair: the same for the average pair.
       held_out: negative log-likelihood of the average held-out pair; NaN without any.
       satisfaction: mean probability of the task over the worlds and their starts; NaN without mu.
       gradient_norm: Euclidean.
-      error: certified error of the soft values, the largest over the worlds.
+      error: certified error of the soft values, in units of the reward, largest over the worlds.
       status: of the soft solver, the worst over the worlds.
     """
 
@@ -225,6 +262,9 @@ def make_problem(
         as those that lose nothing of the task
         (:func:`~jaxltl.core.values.optimal_actions.optimal_actions`); default all. Demonstrated
         steps that take others are left out.
+
+    Returns:
+      :class:`Problem`, its arrays stacked over W worlds.
 
     Raises:
       ValueError: worlds of different shapes or propositions, observations, weights or
@@ -274,7 +314,16 @@ def _inputs(model: Product, observation: jax.Array) -> tuple[jax.Array, jax.Arra
 
 
 def reward(network: nn.Module, parameters: Any, model: Product, observation: jax.Array):
-    """The network's reward in a product: ``float[S, Q, A]``."""
+    """The network's reward in a product.
+
+    Args:
+      network, parameters: what was learned.
+      model: the product, of S states, Q memories and A actions.
+      observation: ``float[S, O]``.
+
+    Returns:
+      ``float[S, Q, A]``; differentiable in the parameters and the observation.
+    """
     return network.apply(parameters, *_inputs(model, observation))
 
 
@@ -356,6 +405,10 @@ def solve(
       parameters: of the network.
       problem, hparams: what and how.
       initial: ``float[W, S, Q]``, values to start from.
+
+    Returns:
+      :class:`~jaxltl.core.types.Solution`, `value` ``float[W, S, Q]`` and `policy`
+      ``float[W, S, Q, A]``, with a horizon ``[W, T, ...]``; differentiable in the parameters.
     """
     def world(model, observation, initial):
         return plan(problem.network, parameters, model, observation, hparams, initial=initial)
@@ -383,7 +436,13 @@ def _initial(problem: Problem, initial: jax.Array | None) -> jax.Array:
 @brief(codes={"status": Status})
 @struct.dataclass
 class Objective:
-    """What the loss was made of, and the soft values with their evidence."""
+    """What the loss was made of, and the soft values with their evidence.
+
+    Attributes:
+      neg_log_likelihood, per_pair, held_out, satisfaction, error, status: as of :class:`Metrics`.
+      score: ``float[]``, by which learning is stopped early, the less the better.
+      value: ``float[W, S, Q]``, from which the next solve may start.
+    """
 
     neg_log_likelihood: jax.Array
     per_pair: jax.Array
@@ -408,7 +467,7 @@ def objective(
       parameters, problem, hparams, initial: as in :func:`solve`.
 
     Returns:
-      The loss, and :class:`Objective`.
+      The loss ``float[]``, in nats, and :class:`Objective`; differentiable in the parameters.
 
     Raises:
       ValueError: the problem does not count pairs by time up to ``hparams.horizon``, or there is
@@ -498,7 +557,16 @@ def _flat(*counts: jax.Array) -> list[jax.Array]:
 
 
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
-    """A state at the network's own random start; the key is kept."""
+    """A state at the network's own random start; the key is kept.
+
+    Args:
+      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
+      problem: of :func:`make_problem`.
+      hparams: :class:`Hparams`.
+
+    Returns:
+      :class:`State`, no step made.
+    """
     dtype = problem.model.dtype
     inputs = _inputs(problem.model, problem.observation[0])
     drawn = _draw(problem.network, learner.init_key(key), inputs)
@@ -520,7 +588,15 @@ def _draw(network: nn.Module, key: chex.PRNGKey, inputs: tuple[jax.Array, ...]) 
 
 
 def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """One full-batch step of the optimiser on :func:`objective`; deterministic given the state."""
+    """One full-batch step of the optimiser on :func:`objective`; deterministic given the state.
+
+    Args:
+      state: of :func:`init` or of an earlier step; unchanged.
+      problem, hparams: as of :func:`init`.
+
+    Returns:
+      The next :class:`State`, and :class:`Metrics`, figures of the parameters before it.
+    """
 
     def loss_of(parameters: Any) -> jax.Array:
         return objective(parameters, problem, hparams, state.value)[0]
@@ -558,5 +634,12 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     """The soft policy of the best reward so far: ``float[W, S, Q, A]``.
 
     With a horizon ``[W, T, S, Q, A]``; :func:`plan` finds it in other worlds.
+
+    Args:
+      state: of one run; ``vmap`` over several.
+      problem, hparams: of the run.
+
+    Returns:
+      ``float[W, S, Q, A]``, or with a horizon ``[W, T, S, Q, A]``.
     """
     return solve(state.best.parameters, problem, hparams).policy

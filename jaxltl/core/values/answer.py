@@ -63,6 +63,13 @@ class PropertyStrategy(NamedTuple):
       memory: the automaton and the product that a memory is from, or None.
       nature: of an interval model nature's distributions, ``float64[T]``; with a memory of the
         product's entries. Else None.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> safe_or_not = make_sparse([0, 2, 3, 4], [0, 1, 3, 4, 5], [1, 1, 2, 1, 2],
+      ...                           [1, 0.5, 0.5, 1, 1], initial=[1, 0, 0], label={"a": [1]})
+      >>> solve_property(safe_or_not, 'Pmin=? [ F "a" ]').strategy.row.tolist()  # in each state
+      [1, 2, 3]
     """
 
     row: np.ndarray
@@ -82,6 +89,14 @@ class Answer(NamedTuple):
       status: CONVERGED where all bounds are narrow, or decide the threshold.
       method: how it was found and proven, in a few words.
       strategy: what attains the value; None where nothing is chosen.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                    initial=[1, 0, 0], label={"a": [1]})
+      >>> found = solve_property(coin, 'P>=0.4 [ F "a" ]')
+      >>> found.states.tolist(), found.value.tolist(), found.holds, found.status.name
+      ([0], [0.5], [True], 'CONVERGED')
     """
 
     states: np.ndarray
@@ -138,6 +153,8 @@ def solve_property(
     Raises:
       ValueError: an unknown label or reward; no direction though the model has choices, or
         intervals; a question that the solvers do not take, with the reason.
+
+    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse

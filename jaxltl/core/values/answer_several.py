@@ -46,8 +46,15 @@ def answer_several(
       prop: a property or its text.
       tolerance: as for :func:`~jaxltl.core.values.multi_objective.multi_objective`.
 
+    Returns:
+      :class:`~jaxltl.core.values.multi_objective.Achievable` where all have thresholds,
+      :class:`~jaxltl.core.values.multi_objective.ConstrainedOptimum` where one has none, and
+      :class:`~jaxltl.core.values.multi_objective.Pareto` where none has.
+
     Raises:
       ValueError: an objective that is not solved for beside others, with the reason.
+
+    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse

@@ -39,7 +39,9 @@ def average_reward(
       enclosure.
 
     Raises:
-      ValueError: the reward or the objective.
+      ValueError: the reward, the objective, or probabilities that are intervals.
+
+    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse

@@ -39,6 +39,9 @@ def boltzmann_expansion(num_actions: Any) -> Any:
     Args:
       num_actions: n, a number or traced.
 
+    Returns:
+      A float of at least 1, or an array of `num_actions`' shape; not differentiable.
+
     Example:
       >>> [round(boltzmann_expansion(n), 2) for n in (1, 2, 3, 4)]
       [1.0, 1.2, 1.33, 1.42]
@@ -223,7 +226,23 @@ def boltzmann_fixed_points(
         tenth of it times ``1 - discount``.
 
     Returns:
-      Converged solutions, ordered by the sum of their values. Works on the host.
+      Converged solutions (``CONVERGED`` or ``UNCERTIFIED``), ordered by the sum of their values; a
+      list as long as there were fixed points.
+
+    Raises:
+      ValueError: the reward has the wrong shape.
+
+    The list is made on the host; each solution alone is differentiable as of
+    :func:`boltzmann_value`.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import make_mdp
+      >>> loop_or_end = make_mdp([[[0], [1]], [[1], [1]]], [[[1.0], [1.0]], [[1.0], [0.0]]])
+      >>> reward = jnp.array([[0.2, 0.0], [0.0, 0.0]])  # for going round
+      >>> found = boltzmann_fixed_points(
+      ...     loop_or_end, reward, 0.99, jax.random.key(0), tolerance=1e-2)
+      >>> [round(one.value[0].item(), 1) for one in found]
+      [0.3, 2.5, 20.0]
     """
     best = optimal_value(model, reward, discount).value
     worst = -optimal_value(model, -jnp.asarray(reward), discount).value

@@ -36,6 +36,8 @@ def next_probability(model: Any, target: Any, *, objective: str = "max") -> Solu
     Raises:
       ValueError: the shape of the target or the objective.
 
+    Concrete arrays only, on the host; not differentiable.
+
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
       >>> model = make_sparse([0, 2, 3], [0, 2, 3, 4], [0, 1, 0, 1], [0.75, 0.25, 1, 1])
@@ -84,6 +86,8 @@ def bounded_reachability(
     Raises:
       ValueError: a shape, the objective, or a negative number of steps.
 
+    Concrete arrays only, on the host; not differentiable.
+
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
       >>> model = make_sparse(None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0])
@@ -114,6 +118,8 @@ def cumulative_reward(
 
     Raises:
       ValueError: the reward, the objective, or a negative number of steps.
+
+    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
@@ -147,6 +153,14 @@ def instantaneous_reward(
 
     Raises:
       ValueError: the reward has no part on states, or as for :func:`cumulative_reward`.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> model = make_sparse(None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0])
+      >>> instantaneous_reward(model, [1.0, 0.0], 3).value.tolist()
+      [0.125, 0.0]
     """
     model, operation = _problem(model, objective, num_step)
     start = state_reward(model, reward)
@@ -182,6 +196,8 @@ def reward_bounded_reachability(
     Raises:
       ValueError: a shape, the objective, a reward that is negative, or has no unit in common with
         the others of which the bound has at most 10^7.
+
+    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse

@@ -28,16 +28,27 @@ class DataGuarantee:
     """What data guarantee of a task.
 
     Attributes:
-      bound: of the initial distribution; with the confidence that was asked for, the task has at
-        least this probability under the policy (at most, where it was to be made small).
-      confidence: the chance that data are drawn of which all this is true.
-      optimistic: what no policy exceeds, with the same confidence, of the same data: how much more
-        data can gain at most.
+      bound: a probability, of the initial distribution; with the confidence that was asked for, the
+        task has at least this probability under the policy (at most, where it was to be made
+        small).
+      confidence: the chance, in (0, 1), that data are drawn of which all this is true.
+      optimistic: a probability that no policy exceeds, with the same confidence, of the same data:
+        how much more data can gain at most.
       satisfaction: the policy, the automaton that is its memory, and nature's worst case.
       model: the model with its intervals.
       sets: the sets from which these come.
       gain: ``float64[R]``, where more samples help: by how much the bound would rise, to first
         order, if a choice were known to be what its frequencies say.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [.5, .5, 1, 1], initial=[1, 0, 0],
+      ...                    label=[[0], [1], [0]], propositions=["a"])
+      >>> found = learn_guarantee(coin, np.array([900, 100, 0, 0]), "F a", confidence=0.95)
+      >>> 0.85 < found.bound < 0.9 < found.optimistic < 0.95, found.confidence
+      (True, 0.95)
+      >>> found.gain.argmax().item(), found.gain.shape  # sample choice 0
+      (0, (3,))
     """
 
     bound: float
@@ -79,6 +90,8 @@ def learn_guarantee(
 
     Raises:
       ValueError: the counts do not fit the model, the confidence, a label or a direction.
+
+    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
@@ -179,6 +192,16 @@ def guarantee_curve(
 
     Raises:
       ValueError: a size is negative or larger than the data; and as there.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [.5, .5, 1, 1], initial=[1, 0, 0],
+      ...                    label=[[0], [1], [0]], propositions=["a"])
+      >>> curve = guarantee_curve(coin, np.array([900, 100, 0, 0]), "F a", 0.95, [10, 100, 1000])
+      >>> curve.shape, bool((np.diff(curve) > 0).all())
+      ((3,), True)
     """
     sparse = to_sparse(model)
     every = counts_on(sparse, counts) if isinstance(counts, TransitionCounts) else counts

@@ -55,6 +55,18 @@ class EpisodeTotals(NamedTuple):
       verdict: ``int32``, the task's :class:`~jaxltl.Verdict` at the end; None without a task.
       visits: ``int32``, accepting readings, that of the first label included; None without.
       discounted_visits: the k-th reading, from 0, counts ``discount ** k``.
+
+    Example:
+      >>> from jaxltl.core.models.environment import agent_of
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl.core.models.simulated_model import environment_of
+      >>> clock = environment_of(from_dense([[[0.0, 1.0]], [[1.0, 0.0]]]))
+      >>> agent = agent_of(lambda observation, key: jnp.int32(0))
+      >>> keys = jax.random.split(jax.random.key(0), 4)
+      >>> shapes = jax.eval_shape(jax.vmap(
+      ...     lambda key: episode_totals(key, clock, agent, num_steps=3)), keys)
+      >>> shapes.reward.shape, shapes.verdict
+      ((4,), None)
     """
 
     reward: jax.Array

@@ -33,6 +33,8 @@ def hitting_time(model: Any, policy: Any, target: Any) -> NDArray[np.float64]:
     Raises:
       ValueError: something is traced.
 
+    Concrete arrays only, on the host; not differentiable.
+
     Example:
       >>> from jaxltl.core.models.mdp import from_dense
       >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])

@@ -46,13 +46,14 @@ def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> S
 
     Returns:
       :class:`Solution`; `policy` is ``int32[S]``, optimal for both players; rows in a game on a
-      sparse model. `lower` and `upper`
-      are `value`, or its neighbours among the floats where the mean is not a float. Where
-      max_steps did not suffice they are infinite.
+      sparse model. `lower` and `upper` are `value`, or its neighbours among the floats where the
+      mean is not a float. Where max_steps did not suffice they are infinite.
 
     Raises:
       ValueError: a move has several successors, the reward has a wrong shape or is not finite,
         or the values are traced.
+
+    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models.game import make_game

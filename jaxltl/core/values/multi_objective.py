@@ -42,6 +42,16 @@ class Front(NamedTuple):
         (an objective to be made small has a negative normal).
       policies: for each point ``float64[R']``, the weights of the product's rows.
       product: the model beside what the objectives remember; rows are the model's `base_row`.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
+      ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
+      >>> front = pareto(model, [Objective(target="a"), Objective(target="b")]).front
+      >>> front.points.tolist(), len(front.policies)
+      ([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0]], 3)
+      >>> bool((front.normals @ front.points.T <= front.bounds[:, None]).all())
+      True
     """
 
     points: np.ndarray
@@ -61,6 +71,15 @@ class NearestMixture(NamedTuple):
       share: the probabilities with which the front's policies are drawn at the start.
       lower, upper: ``float64[n]``, certified bounds on what that attains.
       gap: ``float64[n]``, how far it may miss each threshold at most.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
+      ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
+      >>> both = [Objective(target="a"), Objective(target="b")]
+      >>> open_yet = achievable(model, both, [0.5, 0.6], max_points=2)  # two sums do not tell
+      >>> open_yet.holds, open_yet.nearest.lower.round(6).tolist()
+      (None, [0.45, 0.55])
     """
 
     share: np.ndarray
@@ -80,6 +99,18 @@ class Achievable(NamedTuple):
       front: the evidence.
       status: CONVERGED if it is known.
       nearest: of None, the mixture of policies that comes nearest to the thresholds.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
+      ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
+      >>> both = [Objective(target="a"), Objective(target="b")]
+      >>> found = achievable(model, both, [0.5, 0.5])
+      >>> found.holds, found.share.round(6).tolist()  # of the front's two policies
+      (True, [0.5, 0.5])
+      >>> refused = achievable(model, both, [0.5, 0.6])
+      >>> refused.holds, refused.front.normals[refused.normal].tolist()  # a + b is 1 at most
+      (False, [0.5, 0.5])
     """
 
     holds: bool | None
@@ -104,6 +135,15 @@ class ConstrainedOptimum(NamedTuple):
       status: CONVERGED if the bounds are narrow, or the thresholds are known not to be met.
       nearest: where it is not known whether thresholds can be met, the best mixture of policies
         among those that come nearest to them.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
+      ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
+      >>> both = [Objective(target="a"), Objective(target="b", threshold=0.25)]
+      >>> best = multi_objective(model, both)
+      >>> round(best.lower, 6), round(best.upper, 6), best.status.name
+      (0.75, 0.75, 'CONVERGED')
     """
 
     value: float
@@ -126,6 +166,14 @@ class Pareto(NamedTuple):
       gap: how far beyond the mixtures a value can be at most, in each objective, as a share of
         its largest size (absolute for probabilities).
       status: CONVERGED if the gap is as small as asked.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
+      ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
+      >>> curve = pareto(model, [Objective(target="a"), Objective(target="b")])
+      >>> curve.points.tolist(), curve.gap < 1e-4
+      ([[0.0, 1.0], [1.0, 0.0]], True)
     """
 
     points: np.ndarray
@@ -253,6 +301,19 @@ def multi_objective(
     Raises:
       ValueError: some but not all of several objectives without a threshold; or as for
         :func:`achievable`.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
+      ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
+      >>> one, other = Objective(target="a"), Objective(target="b", threshold=0.4)
+      >>> best = multi_objective(model, [one, other])  # as often a as b has at least 0.4
+      >>> round(best.value, 6), best.holds
+      (0.6, True)
+      >>> multi_objective(model, [one, Objective(target="b")]).points.tolist()
+      [[0.0, 1.0], [1.0, 0.0]]
     """
     _require(model, objectives)
     free = [i for i, o in enumerate(objectives) if o.threshold is None]

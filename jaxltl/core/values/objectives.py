@@ -37,6 +37,19 @@ class Objective:
       reward: as for :func:`~jaxltl.core.models.sparse.row_reward`, not negative.
       direction: ``"max"`` or ``"min"``.
       threshold: at least that, or at most that for ``"min"``; None to optimise.
+
+    Raises:
+      ValueError: on use, in :func:`~jaxltl.core.values.multi_objective.achievable` and the like:
+        none or several of the four are given, or a direction, a label or a shape is wrong.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl.core.values.multi_objective import multi_objective
+      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
+      ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
+      >>> wanted = [Objective(formula="F G a"), Objective(target="b", threshold=0.25)]
+      >>> round(multi_objective(model, wanted).value, 6)
+      0.75
     """
 
     formula: Any = None

@@ -135,10 +135,20 @@ def feature_expectation(occupancy: jax.Array, features: jax.Array) -> jax.Array:
     """Expected discounted features, ``sum_{s, a} x(s, a) f(s, a)``: ``float[F]``.
 
     Args:
-      occupancy: ``float[S, A]``, the value of :func:`occupancy_measure`.
-      features: ``float[S, A, F]``.
+      occupancy: ``float[S, A]``, the value of :func:`occupancy_measure`; of a product
+        ``float[S, Q, A]``, of a sparse model ``float[R]``.
+      features: one axis more, ``float[S, A, F]``.
 
     Returns:
       ``float[F]``; linear in both, and differentiable in them.
+
+    Raises:
+      TypeError: shapes that do not fit.
+
+    Example:
+      >>> visits = jnp.array([[1.0, 0.5], [0.0, 2.5]])
+      >>> kind = jnp.array([[[1.0, 0], [1, 0]], [[0, 1], [0, 1]]])  # which state
+      >>> feature_expectation(visits, kind).tolist()
+      [1.5, 2.5]
     """
     return jnp.tensordot(occupancy, features, axes=occupancy.ndim)

@@ -53,6 +53,15 @@ class OptimalActions:
       attained: the probability that `policy` attains.
       loss: ``float[]``, a certified bound on what `policy` loses in any state.
       status: CONVERGED if the loss is within the tolerance, else PRECISION.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl.core.models.product import product
+      >>> world = from_dense([[[0, 1.0, 0], [0, 0.5, 0.5]], [[0, 1.0, 0]] * 2, [[0, 0, 1.0]] * 2],
+      ...                    label=[[0], [1], [0]], propositions=["goal"])
+      >>> found = optimal_actions(product(world, "F goal"))
+      >>> found.policy[0, 0].tolist(), found.best.value[0, 0].item(), found.loss.item() < 1e-3
+      ([1.0, 0.0], 1.0, True)
     """
 
     allowed: jax.Array
@@ -101,6 +110,8 @@ def optimal_actions(
 
     Raises:
       ValueError: the model is traced, or the objective is unknown.
+
+    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models.mdp import from_dense

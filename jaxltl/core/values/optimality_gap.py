@@ -47,6 +47,20 @@ class OptimalityGap(NamedTuple):
       mean_value, mean_optimum: bounds on theirs.
       evidence: why the table is the environment, on which all bounds rest; see
         :class:`~jaxltl.core.models.tabulate.Table`.
+
+    Example:
+      >>> from jaxltl.core.models.environment import Timestep, make_environment
+      >>> from jaxltl.core.models.tabulate import tabulate
+      >>> corridor = make_environment(
+      ...     lambda key: jnp.int32(2),
+      ...     lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),
+      ...     lambda place: place[None], actions=2,
+      ...     labels=lambda place: jnp.array([place == 4]), propositions=["goal"])
+      >>> found = optimality_gap(tabulate(corridor), "F goal", np.full((5, 2, 2), 0.5), num_steps=4)
+      >>> found.start.tolist(), found.weight.tolist(), found.mean_optimum  # listed from the start
+      ([0], [1.0], (1.0, 1.0))
+      >>> bool(found.lower[0] <= 0.625 <= found.upper[0])
+      True
     """
 
     start: np.ndarray
@@ -76,6 +90,25 @@ def tabulate_policy(
 
     Returns:
       ``int32[S, Q]`` or ``float[S, Q, A]``, for :func:`optimality_gap`.
+
+    Raises:
+      ValueError: the table is none of :func:`~jaxltl.core.models.tabulate.tabulate`, the number of
+        memories is none, or the policy is no function.
+
+    Not differentiable: the answer is a NumPy array.
+
+    Example:
+      >>> from jaxltl.core.models.environment import Timestep, make_environment
+      >>> from jaxltl.core.models.tabulate import tabulate
+      >>> corridor = make_environment(
+      ...     lambda key: jnp.int32(2),
+      ...     lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),
+      ...     lambda place: place[None], actions=2,
+      ...     labels=lambda place: jnp.array([place == 4]), propositions=["goal"])
+      >>> def to_the_right(observation, memory):
+      ...     return jnp.where(memory == 0, 1, 0)
+      >>> tabulate_policy(to_the_right, corridor, tabulate(corridor), 2).tolist()
+      [[1, 0], [1, 0], [1, 0], [1, 0], [1, 0]]
     """
     inner, _ = without_time_limit(environment)
     given.instance("table", table, Table, "one of tabulate")
@@ -135,6 +168,8 @@ def optimality_gap(
     Raises:
       ValueError: a policy of another shape, or that is no distribution over the actions that are
         allowed where a run may come to; or worlds that are cut off without a limit.
+
+    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models.environment import Timestep, make_environment

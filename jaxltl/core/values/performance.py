@@ -58,6 +58,15 @@ class Performance:
       worst_state: ``int32[]``, the start where it is attained.
       value: ``float[S]``, the probability from each world state, started there.
       status: whether the bounds at all starts are as narrow as asked.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl.core.models.product import product
+      >>> world = from_dense([[[0, 0.5, 0.5]], [[0, 1.0, 0]], [[0, 0, 1.0]]], initial=[0.5, 0.5, 0],
+      ...                    label=[[0], [1], [0]], propositions=["a"])
+      >>> found = task_performance(product(world, "F a", label_on="exit"), jnp.ones((3, 2, 1)))
+      >>> round(found.mean.item(), 6), round(found.worst.item(), 6), found.worst_state.item()
+      (0.75, 0.5, 0)
     """
 
     mean: jax.Array
@@ -98,6 +107,9 @@ def task_performance(
       ValueError: the policy has the wrong shape or a row that is no distribution over available
         actions (under ``jit`` the status is then INVALID), blocks are asked for another kind of
         task, or an unknown method.
+
+    Differentiable as :func:`~jaxltl.core.values.satisfaction.satisfaction_probability` is, in the
+    policy and in the world's probabilities, with the support held fixed.
 
     Example:
       >>> from jaxltl.core.models.mdp import from_dense
@@ -268,6 +280,19 @@ def task_performances(
 
     Raises:
       ValueError: the models are not stacked or the policies have the wrong shape.
+
+    Not differentiable; under ``vmap`` and ``grad`` take :func:`task_performance`.
+
+    Example:
+      >>> from jaxltl.core.models.batch import stack_products
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> def world(p):
+      ...     return from_dense([[[0, p, 1 - p]], [[0, 1.0, 0]], [[0, 0, 1.0]]], initial=[1, 0, 0],
+      ...                       label=[[0], [1], [0]], propositions=["a"])
+      >>> both = stack_products([world(0.25), world(0.75)], "F a", label_on="exit")
+      >>> found = task_performances(both, jnp.ones((3, 2, 1)))  # one policy in both worlds
+      >>> found.mean.round(6).tolist(), found.value.shape
+      ([0.25, 0.75], (2, 3))
     """
     if not is_stacked(models):
         raise ValueError("models is a single product; use task_performance, or as_stacked(model).")
@@ -423,6 +448,9 @@ def infeasible_starts(model: Product) -> jax.Array:
     Args:
       model: one product; on the host if it is concrete, else under ``jit`` and ``vmap``.
 
+    Returns:
+      ``bool[S]``; not differentiable.
+
     Example:
       >>> from jaxltl.core.models.mdp import from_dense
       >>> from jaxltl.core.models.product import product
@@ -486,6 +514,9 @@ def summarize(
       performance: of :func:`task_performances`.
       names: W names of the worlds; default ``"world 0"`` and so on.
       leave_out: names of worlds that do not count. Nothing is left out otherwise.
+
+    Returns:
+      :class:`Summary`, numbers of Python.
 
     Raises:
       ValueError: names are missing, double or unknown, or no world is left.

@@ -52,6 +52,13 @@ class Prepared:
       objective: ``"max"``, ``"min"`` or ``"policy"``, static.
       cyclic: whether some nodes are on circles, static.
       levels, choices, terms, groups: see the plan, static.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> prepared = prepare(coin, [False, True, False])
+      >>> prepared.question, prepared.objective, prepared.num_states, prepared.num_rows
+      ('probability', 'max', 3, 3)
     """
 
     segments: tuple[Blocks, Blocks, Blocks]
@@ -115,6 +122,8 @@ def prepare(
     Raises:
       ValueError: a shape or the objective is wrong, a reward is negative or not finite, there is
         `stay` with a reward, or something is traced.
+
+    Not differentiable: it reads the graph, on the host; :func:`solve_prepared` has the derivatives.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
@@ -225,6 +234,16 @@ def solve_prepared(
 
     Differentiable, forward and reverse, in the probabilities, in the rewards and in the weights of
     a policy, along distributions; of an optimum with its policy held fixed.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> prepared = prepare(coin, [False, True, False])
+      >>> def value(p):
+      ...     probability = jnp.array([p, 1 - p, 1, 1])
+      ...     return solve_prepared(prepared, probability=probability).value[0]
+      >>> value(0.25).item(), round(jax.grad(value)(0.25).item(), 6)
+      (0.25, 1.0)
     """
     probability, reward = given_numbers(prepared, probability, reward)
     policy = None if policy is None else jnp.asarray(policy)

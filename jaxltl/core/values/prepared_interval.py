@@ -65,6 +65,13 @@ class PreparedInterval:
       objective, nature: ``"max"`` or ``"min"``, static.
       num_rows: R, static.
       circling: whether who gets out may stay for ever, static.
+
+    Example:
+      >>> from jaxltl.core.models.interval import interval_rows
+      >>> coin = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1])
+      >>> prepared = prepare_interval(coin, [False, True, False])
+      >>> prepared.objective, prepared.nature, prepared.size, prepared.node.tolist()
+      ('max', 'min', 1, [0, 2, 1])
     """
 
     table: Any
@@ -121,6 +128,9 @@ def prepare_interval(
     Raises:
       ValueError: a shape or a direction is wrong, the model has a radius, a reward is negative, not
         finite or depends on nature, there is `stay` with a reward, or something is traced.
+
+    Not differentiable: it reads the graph, on the host; :func:`solve_prepared_interval` has the
+    derivatives.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
@@ -247,6 +257,14 @@ def solve_prepared_interval(
 
     Differentiable, forward and reverse, in the ends and in the rewards, with the policy and the
     order of each row's successors held fixed: where neither is tied, that is the derivative.
+
+    Example:
+      >>> from jaxltl.core.models.interval import interval_rows
+      >>> coin = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1])
+      >>> prepared = prepare_interval(coin, [False, True, False])
+      >>> value = jax.jit(lambda low: solve_prepared_interval(prepared, lower=low).value[0])
+      >>> round(value(jnp.array([0.5, 0.3, 1, 1])).item(), 3)
+      0.5
     """
     if not isinstance(prepared, PreparedInterval):
         raise ValueError(f"prepared is {shown(prepared)}; give what prepare_interval returns.")

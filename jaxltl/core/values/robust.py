@@ -89,6 +89,10 @@ def robust_reachability(
     Raises:
       ValueError: shapes, or a direction.
 
+    Concrete arrays only, on the host;
+    :func:`~jaxltl.core.values.robust_sensitivity.robust_sensitivity` has the derivatives in the
+    ends.
+
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
       >>> from jaxltl.core.models.interval import make_interval
@@ -132,6 +136,17 @@ def robust_total_reward(
 
     Raises:
       ValueError: shapes, a direction, or a reward that is negative or depends on nature.
+
+    Concrete arrays only, on the host;
+    :func:`~jaxltl.core.values.robust_sensitivity.robust_sensitivity` has the derivatives in the
+    ends.
+
+    Example:
+      >>> from jaxltl.core.models.interval import interval_rows
+      >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
+      >>> found = robust_total_reward(coin, [1.0, 0.0], [False, True], objective="min")
+      >>> found.value.round(6).tolist(), found.nature.tolist()  # tosses, if nature is against it
+      ([2.0, 0.0], [0.5, 0.5, 1.0])
     """
     asked = width_asked(tolerance)
     sides = sides_of(model, policy, objective, nature)
@@ -166,6 +181,15 @@ def robust_discounted_value(
 
     Raises:
       ValueError: shapes, a direction, the discount, or a reward that is not finite.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl.core.models.interval import interval_rows
+      >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
+      >>> found = robust_discounted_value(coin, [1.0, 0.0], 0.5)
+      >>> found.value.round(6).tolist(), found.nature.tolist()
+      ([1.142857, 0.0], [0.25, 0.75, 1.0])
     """
     try:
         rate = float(discount)
@@ -198,6 +222,12 @@ def robust_expectation(
 
     Returns:
       ``float64[R]``, and nature's distributions, ``float64[T]``.
+
+    Raises:
+      ValueError: a direction, the shape of the value, a model without intervals, or a successor's
+        value that is not finite.
+
+    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models.interval import interval_rows

@@ -36,6 +36,8 @@ def robust_next_probability(
     Raises:
       ValueError: the target, or a direction.
 
+    Concrete arrays only, on the host; not differentiable.
+
     Example:
       >>> from jaxltl.core.models.interval import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
@@ -70,6 +72,8 @@ def robust_bounded_reachability(
 
     Raises:
       ValueError: a shape, a direction, or a negative number of steps.
+
+    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models.interval import interval_rows
@@ -106,6 +110,8 @@ def robust_cumulative_reward(
     Raises:
       ValueError: the reward, a direction, or a negative number of steps.
 
+    Concrete arrays only, on the host; not differentiable.
+
     Example:
       >>> from jaxltl.core.models.interval import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
@@ -135,6 +141,14 @@ def robust_instantaneous_reward(
 
     Raises:
       ValueError: the reward has no part on states, or as for :func:`robust_cumulative_reward`.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl.core.models.interval import interval_rows
+      >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
+      >>> robust_instantaneous_reward(coin, [1.0, 0.0], 2, nature="max").value.tolist()
+      [0.25, 0.0]
     """
     start = state_reward(require_interval(model).nominal, reward)
     zero = np.zeros(model.num_transitions)

@@ -40,6 +40,14 @@ class RobustSatisfaction(NamedTuple):
       letter: ``int[S]``, the letter that each state shows.
       product: what is reached of the model beside the automaton, N states.
       value: ``float64[N]``, in each of them.
+
+    Example:
+      >>> from jaxltl.core.models.interval import interval_rows
+      >>> model = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1],
+      ...                       initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["a"])
+      >>> found = robust_satisfaction(model, "F a")
+      >>> found.solution.value.round(6).tolist(), found.product.base_state.tolist()
+      ([0.4], [0, 1, 1, 2])
     """
 
     solution: Solution
@@ -73,6 +81,8 @@ def robust_satisfaction(
 
     Raises:
       ValueError: an unknown label, state or direction, or a product beyond 2^31 states.
+
+    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models.interval import interval_rows

@@ -20,7 +20,17 @@ from jaxltl.core.values.robust import require_direction
 
 @brief
 class Sensitivity(NamedTuple):
-    """Derivatives of a value in the ends, ``float64[T]`` each."""
+    """Derivatives of a value in the ends of intervals, see :func:`robust_sensitivity`.
+
+    Attributes:
+      lower, upper: ``float64[T]``, in units of the value for one of probability.
+
+    Example:
+      >>> change = Sensitivity(lower=np.zeros(2), upper=np.array([0.0, -1.0]))
+      >>> narrower = np.array([0.0, -0.1])  # by how much the upper ends come down
+      >>> (change.upper @ narrower).item()  # what the value gains by it, to first order
+      0.1
+    """
 
     lower: Floats
     upper: Floats
@@ -53,6 +63,8 @@ def robust_sensitivity(
     Raises:
       ValueError: shapes, a direction, a policy of weights, a model with a radius, or an infinite
         value from the initial states.
+
+    It is a derivative, and not differentiable itself: concrete arrays only, on the host.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse

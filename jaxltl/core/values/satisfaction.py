@@ -60,8 +60,25 @@ def satisfaction_probability(
       :class:`Solution`; `value` is ``float[S, Q]``. The probability from the start is
       ``jnp.sum(model.initial * solution.value)``.
 
+    Raises:
+      ValueError: the model is no product, the policy has the wrong shape or a row that is no
+        distribution over available actions (under ``jit`` the status is then INVALID), nature is
+        named where probabilities are no intervals, or an unknown method.
+
     Differentiable in the policy and in the world's transition probabilities, with the
     support held fixed.
+
+    Not so of products of sparse and of interval models, which are solved on the host.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl.core.models.product import product
+      >>> world = from_dense([[[0, 1.0, 0], [0, 0.5, 0.5]], [[0, 1.0, 0]] * 2, [[0, 0, 1.0]] * 2],
+      ...                    label=[[0], [1], [0]], propositions=["goal"], initial=[1, 0, 0])
+      >>> model = product(world, "F goal")
+      >>> found = satisfaction_probability(model, np.full((3, 2, 2), 0.5))
+      >>> round(float(np.sum(model.initial * found.value)), 6)
+      0.75
     """
     _require_product(model)
     if isinstance(model.mdp, IntervalMDP):
@@ -134,7 +151,22 @@ def optimal_satisfaction(
       best policies, of the world's rows.
 
     Raises:
-      ValueError: the objective is unknown.
+      ValueError: the model is no product, the objective is unknown, nature is named where
+        probabilities are no intervals, or the world is sparse and its actions are restricted.
+
+    Differentiable in the world's transition probabilities, with the support and the best policy
+    held fixed; not so of products of sparse and of interval models, which are solved on the host.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl.core.models.product import product
+      >>> world = from_dense([[[0, 0.5, 0.5], [0, 0.75, 0.25]], [[0, 1, 0]] * 2, [[0, 0, 1]] * 2],
+      ...                    label=[[0], [1], [0]], propositions=["goal"], initial=[1, 0, 0])
+      >>> best = optimal_satisfaction(product(world, "F goal"))
+      >>> best.value[0, 0].item(), best.policy[0, 0].item()
+      (0.75, 1)
+      >>> optimal_satisfaction(product(world, "G F goal"), objective="min").value[0, 0].item()
+      0.5
     """
     _require_product(model)
     if isinstance(model.mdp, IntervalMDP):

@@ -35,6 +35,14 @@ class Satisfaction(NamedTuple):
       letter: ``int[S]``, the letter that each state shows.
       product: what is reached of the model beside the automaton, N states.
       row: ``int32[N]``, the row of the model that the policy takes in each of them.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> two_ways = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
+      ...                        initial=[1, 0, 0], label={"a": [1]})
+      >>> found = sparse_satisfaction(two_ways, "F a")
+      >>> found.solution.value.tolist(), found.row[found.product.start].tolist()
+      ([1.0], [0])
     """
 
     solution: Solution
@@ -77,6 +85,8 @@ def sparse_satisfaction(
     Raises:
       ValueError: an unknown label, state, objective or reading, or a product beyond 2^31
         states.
+
+    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models.sparse import make_sparse
