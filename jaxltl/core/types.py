@@ -26,6 +26,10 @@ class Status(enum.IntEnum):
     - ``MAX_STEPS``: it was stopped, or cannot get nearer.
     - ``NONFINITE``: NaN or infinity where a number should be.
     - ``INVALID``: a policy that is no distribution over available actions.
+
+    Example:
+      >>> [status.name for status in Status if status > Status.MAX_STEPS]
+      ['NONFINITE', 'INVALID']
     """
 
     CONVERGED = 0
@@ -46,7 +50,20 @@ _REMEDY = {
 
 
 class NotConverged(RuntimeError):
-    """A solver's answer was asked for and its status says that there is none."""
+    """A solver's answer was asked for and its status says that there is none; by :func:`check`.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> coin = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                       label={"heads": [1]})
+      >>> stopped = jl.reachability_probability(coin, coin.states_where("heads")).replace(
+      ...     status=np.int32(Status.MAX_STEPS))
+      >>> try:
+      ...     check(stopped)
+      ... except NotConverged as error:
+      ...     print(str(error).split(",")[0])
+      the solver ended with MAX_STEPS
+    """
 
 
 class Method:
@@ -104,6 +121,16 @@ class Solution:
       nature: of interval models, ``float[T]``: the distribution that nature picks for each choice,
         so that someone else can check. Where it is against the policy, no policy does better than
         the value if nature keeps to it; where it is for it, both attain the value together.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> coin = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                       label={"heads": [1]})
+      >>> found = jl.reachability_probability(coin, coin.states_where("heads"))
+      >>> found.value.tolist(), Status(int(found.status)).name
+      ([0.5, 1.0, 0.0], 'CONVERGED')
+      >>> bool((found.lower <= found.value).all() and (found.value <= found.upper).all())
+      True
     """
 
     value: jax.Array
@@ -131,6 +158,13 @@ def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:
       NotConverged: some lane did not converge. The message names the status, the
         first such lane, the residual and what to do.
       ValueError: a policy was none, with the state and its row; or called on traced values.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> coin = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                       label={"heads": [1]})
+      >>> check(jl.reachability_probability(coin, coin.states_where("heads"))).value.tolist()
+      [0.5, 1.0, 0.0]
     """
     if isinstance(solution.status, jax.core.Tracer):
         raise ValueError(

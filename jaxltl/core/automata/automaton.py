@@ -51,6 +51,11 @@ class Automaton:
         propositions: `[P]` names.
         acceptance: `"cosafe"`, `"safety"`, `"buchi"` or `"parity"`.
         state_names: `[Q]` readable names, one formula per state, or empty.
+
+    >>> import jaxltl as jl
+    >>> task = jl.to_automaton("F a")
+    >>> task.acceptance, task.delta.tolist(), task.letters.tolist(), task.final.tolist()
+    ('cosafe', [[0, 1], [1, 1]], [[False], [True]], [False, True])
     """
 
     delta: NDArray[np.int32]
@@ -295,6 +300,12 @@ def accepts_lasso(automaton: Automaton, prefix: Iterable[Letter], cycle: Iterabl
         automaton: The automaton.
         prefix: `[n]` letters, may be empty.
         cycle: `[m]` letters, at least one.
+
+    Returns:
+        Whether the word is accepted.
+
+    Raises:
+        ValueError: If the cycle is empty, or a letter is not among the automaton's.
 
     >>> from jaxltl.core.automata.translate import to_automaton
     >>> accepts_lasso(to_automaton("F a"), prefix=[set()], cycle=[set(), {"a"}])

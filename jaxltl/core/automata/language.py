@@ -90,6 +90,9 @@ def is_equivalent(a: Task, b: Task) -> bool:
     Returns:
       Whether they do; :func:`find_difference` gives a word that tells them apart.
 
+    Raises:
+        ValueError: If there is no joint letter, or too many.
+
     >>> from jaxltl.core.automata.translate import to_automaton
     >>> is_equivalent(to_automaton("F a"), to_automaton("a | X F a"))
     True
@@ -124,6 +127,16 @@ def find_not_included(a: Task, b: Task) -> Lasso | None:
 
 def is_included(a: Task, b: Task) -> bool:
     """Whether the second automaton accepts whatever the first accepts, over joint letters.
+
+    Args:
+        a: The automaton whose words are questioned; or a formula, or its text.
+        b: The one that should accept them, likewise; both are aligned first, see `align`.
+
+    Returns:
+        Whether it does; :func:`find_not_included` gives a word that `a` accepts and `b` does not.
+
+    Raises:
+        ValueError: If there is no joint letter, or too many.
 
     >>> from jaxltl.core.automata.translate import to_automaton
     >>> is_included(to_automaton("a U b"), to_automaton("F b"))

@@ -36,6 +36,12 @@ class Sequences:
         avoid: bool `[Q, M, D, E]`, those that set back the task before it.
         length: int32 `[Q, M]`, how many steps there are in all, also beyond D; for an infinite
             task, up to and with the first accepting round. 0: there is no such sequence.
+
+    >>> import jaxltl as jl
+    >>> task = jl.to_automaton("F b", letters=[{}, {"b"}])
+    >>> found = jl.reach_avoid_sequences(task, [[0], [1]], ("b",), depth=1, most=1)
+    >>> found.reach[0, 0].tolist(), found.length.tolist()
+    ([[False, True]], [[1], [0]])
     """
 
     reach: NDArray[np.bool_]

@@ -35,6 +35,14 @@ class Parity:
       won: ``bool[S]``: whoever enters has achieved the objective, whatever follows.
       lost: ``bool[S]``: whoever enters has failed it.
       num_priorities: priorities are below it; static.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
+      ...                       label={"a": [0], "b": [1, 2]})
+      >>> never = safety(path, "b")
+      >>> never.lost.tolist(), never.num_priorities
+      ([True, False, False], 1)
     """
 
     priority: jax.Array | np.ndarray
@@ -55,6 +63,14 @@ class GR1:
       assumptions: ``bool[M, S]``, at least one.
       guarantees: ``bool[J, S]``, at least one.
       lost: ``bool[S]``.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
+      ...                       label={"a": [0], "b": [1, 2]})
+      >>> fair = gr1(path, ["a"], ["b"])
+      >>> fair.assumptions.tolist(), fair.guarantees.tolist()
+      ([[True, False, False]], [[False, True, True]])
     """
 
     assumptions: jax.Array | np.ndarray
@@ -116,6 +132,15 @@ def safety(game: Any, safe: States) -> Parity:
     Raises:
       ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
         proposition.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
+      ...                       label={"a": [0], "b": [1, 2]})
+      >>> jl.winning_region(path, safety(path, "!a")).region.tolist()
+      [False, False, False]
+      >>> jl.winning_region(path, safety(path, "a | b")).region.tolist()
+      [True, True, True]
     """
     return _parity(game, 0, 1, safe)
 
@@ -134,6 +159,16 @@ def reach(game: Any, goal: States, *, safe: States = "true") -> Parity:
     Raises:
       ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
         proposition.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
+      ...                       label={"a": [0], "b": [1, 2]})
+      >>> jl.winning_region(path, reach(path, "a", safe="b")).region.tolist()
+      [True, True, True]
+      >>> middle = np.array([False, True, False])
+      >>> jl.winning_region(path, reach(path, middle, safe="b")).region.tolist()
+      [False, True, False]
     """
     return _parity(game, 1, 2, safe, won=states_where(game, goal, "goal"))
 
@@ -152,6 +187,15 @@ def buchi(game: Any, accepting: States, *, safe: States = "true") -> Parity:
     Raises:
       ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
         proposition.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
+      ...                       label={"a": [0], "b": [1, 2]})
+      >>> buchi(path, "a").priority.tolist()
+      [0, 1, 1]
+      >>> jl.winning_region(path, buchi(path, "a")).region.tolist()
+      [True, True, True]
     """
     xp, accepting = namespace(states_where(game, accepting, "accepting"))
     return _parity(game, xp.where(accepting, 0, 1), 2, safe)
@@ -171,6 +215,15 @@ def cobuchi(game: Any, persistent: States, *, safe: States = "true") -> Parity:
     Raises:
       ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
         proposition.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
+      ...                       label={"a": [0], "b": [1, 2]})
+      >>> cobuchi(path, "b").priority.tolist()
+      [1, 2, 2]
+      >>> jl.winning_region(path, cobuchi(path, "b")).region.tolist()
+      [False, False, False]
     """
     xp, persistent = namespace(states_where(game, persistent, "persistent"))
     return _parity(game, xp.where(persistent, 2, 1), 3, safe)
@@ -193,6 +246,14 @@ def parity(
 
     Raises:
       ValueError: negative or non-integer priorities, or a wrong shape.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
+      ...                       label={"a": [0], "b": [1, 2]})
+      >>> spec = parity(path, np.array([3, 2, 3]))
+      >>> spec.num_priorities, jl.winning_region(path, spec).region.tolist()
+      (4, [True, True, True])
     """
     if num_priorities is None:
         values = np.asarray(priority)
@@ -236,6 +297,13 @@ def generalized_buchi(game: Any, sets: Sequence[States], *, safe: States = "true
     Raises:
       ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
         proposition.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
+      ...                       label={"a": [0], "b": [1, 2]})
+      >>> jl.winning_region(path, generalized_buchi(path, ["a", "b"])).region.tolist()
+      [True, True, True]
     """
     return gr1(game, (), sets, safe=safe)
 
@@ -260,6 +328,13 @@ def gr1(
 
     Raises:
       ValueError: an entry is not Boolean or mentions an unknown proposition.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
+      ...                       label={"a": [0], "b": [1, 2]})
+      >>> jl.winning_region(path, gr1(path, ["a"], ["b", "!b"])).region.tolist()
+      [True, True, True]
     """
     def rows(sets: Sequence[States], name: str) -> jax.Array:
         if isinstance(sets, str | Formula):

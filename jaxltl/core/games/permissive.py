@@ -49,6 +49,16 @@ class Permissive:
         automaton that each of the game's world states stands for.
       maximal: whether it includes every winning strategy; static.
       reason: what it includes, in words; static.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> fork = jl.from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]], initial=[1, 0],
+      ...                      label={"crash": [1]})
+      >>> found = jl.permissive_strategy(fork, "G !crash")
+      >>> found.region[0].tolist(), found.allowed[0].any(0).tolist()
+      ([True, False], [True, False])
+      >>> found.maximal
+      True
     """
 
     game: Game
@@ -156,6 +166,17 @@ def apply_strategy(strategy: Permissive) -> Restriction:
     Returns:
       A :class:`~jaxltl.core.models.restrict.Restriction`; ``base_state`` and ``memory`` number the
       states of ``strategy.game``.
+
+    Raises:
+      ValueError: as of :func:`~jaxltl.core.models.restrict.restrict`.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> fork = jl.from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]], initial=[1, 0],
+      ...                      label={"crash": [1]})
+      >>> inside = apply_strategy(permissive_strategy(fork, "G !crash")).model
+      >>> inside.available.tolist(), inside.mdp.label.tolist()
+      ([[True, False]], [[False]])
     """
     region, initial = np.asarray(strategy.region), np.asarray(strategy.game.initial)
     initial = np.where(region, initial, 0)

@@ -43,6 +43,11 @@ class ShieldedWorld(NamedTuple):
       world: the inner one.
       state: ``int32[]``, the state that the strategy is in, -1 where it has lost its way: the run
         began outside of the region where it wins, or did what it does not allow.
+
+    Example:
+      >>> lost = ShieldedWorld(world=3, state=-1)
+      >>> lost.world, lost.state < 0
+      (3, True)
     """
 
     world: Any

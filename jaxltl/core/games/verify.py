@@ -32,6 +32,14 @@ class Verification(NamedTuple):
       system: the system's strategy wins almost surely in the region.
       environment: the environment's strategy prevents that outside of the region.
       reason: for each claim that fails what goes wrong, and in which state; else empty.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> fork = jl.from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]], initial=[1, 0],
+      ...                      label={"crash": [1]})
+      >>> found = jl.verify(jl.winning_region(fork, "G !crash"))
+      >>> bool(found), found.system, found.environment, found.reason
+      (True, True, True, '')
     """
 
     system: bool

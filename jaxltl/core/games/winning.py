@@ -48,6 +48,14 @@ class Winning:
         own states in the region.
       counter_action: ``int32[S]``, for GR(1) ``int32[S, M]``: the environment's, at its own
         states outside of the region.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> fork = jl.from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]], initial=[1, 0],
+      ...                      label={"crash": [1]})
+      >>> found = jl.winning_region(fork, jl.safety(fork, "!crash"))
+      >>> found.region.tolist(), int(found.action[0]), bool(found.realizable)
+      ([True, False], 0, True)
     """
 
     game: Game

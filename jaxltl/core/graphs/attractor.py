@@ -30,6 +30,15 @@ class Attractor(NamedTuple):
         lead nearer); elsewhere the first available one.
       rank: ``int32[S]``: the round in which the state joined, 0 in the goal; meaningless
         outside of the region.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> fork = jl.from_dense([[[0, 0.5, 0.5], [1, 0, 0]], [[0, 1, 0], [0, 0, 0]],
+      ...                       [[0, 0, 1], [0, 0, 0]]])
+      >>> goal = np.array([False, True, False])
+      >>> found = jl.attractor(fork, goal)
+      >>> found.region.tolist(), found.action[0].tolist(), found.rank[:2].tolist()
+      ([True, True, False], 0, [1, 0])
     """
 
     region: jax.Array
@@ -114,6 +123,14 @@ def avoidable(model: Any, goal: jax.Array, allowed: jax.Array | None = None) -> 
 
     Returns:
       ``bool[S]``.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> fork = jl.from_dense([[[0, 0.5, 0.5], [1, 0, 0]], [[0, 1, 0], [0, 0, 0]],
+      ...                       [[0, 0, 1], [0, 0, 0]]])
+      >>> goal = np.array([False, True, False])
+      >>> avoidable(fork, goal).tolist()
+      [True, False, True]
     """
     graph = graph_of(model, goal, allowed)
     return to_jax(avoid(graph, *take(graph, (goal, allowed))))
@@ -144,6 +161,16 @@ def almost_surely_reaching(
 
     Returns:
       :class:`Attractor`: the region and, outside the goal, the actions of such a policy.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> fork = jl.from_dense([[[0, 0.5, 0.5], [1, 0, 0]], [[0, 1, 0], [0, 0, 0]],
+      ...                       [[0, 0, 1], [0, 0, 0]]])
+      >>> goal = np.array([False, True, False])
+      >>> almost_surely_reaching(fork, goal).region.tolist()
+      [False, True, False]
+      >>> almost_surely_reaching(fork, np.array([False, True, True])).region.tolist()
+      [True, True, True]
     """
     graph = graph_of(model, goal, allowed, reaching)
     goal, allowed, reaching = take(graph, (goal, allowed, reaching))

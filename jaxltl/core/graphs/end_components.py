@@ -20,6 +20,15 @@ class EndComponents(NamedTuple):
       component: ``int32[S]``: the smallest (flat) state number of the state's component;
         outside of all components, the state's own number.
       inside: ``bool[S, A]``: actions that surely stay in the state's component.
+
+    Example:
+      >>> import numpy as np
+      >>> import jaxltl as jl
+      >>> fork = jl.from_dense([[[0, 0.5, 0.5], [1, 0, 0]], [[0, 1, 0], [0, 0, 0]],
+      ...                       [[0, 1, 0], [0, 0, 0]]])
+      >>> found = jl.end_components(fork, np.array([True, False, True]))
+      >>> found.component.tolist(), found.inside.tolist()
+      ([0, 1, 2], [[False, True], [False, False], [False, False]])
     """
 
     component: jax.Array
@@ -43,6 +52,14 @@ def end_components(
 
     Returns:
       :class:`EndComponents`.
+
+    Example:
+      >>> import numpy as np
+      >>> import jaxltl as jl
+      >>> fork = jl.from_dense([[[0, 0.5, 0.5], [1, 0, 0]], [[0, 1, 0], [0, 0, 0]],
+      ...                       [[0, 1, 0], [0, 0, 0]]])
+      >>> end_components(fork, np.ones(3, bool)).inside.tolist()
+      [[False, True], [True, False], [False, False]]
     """
     graph = graph_of(model, region, allowed)
     return to_jax(components_within(graph, *take(graph, (region, allowed))))

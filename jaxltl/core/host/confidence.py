@@ -61,6 +61,12 @@ class ConfidenceSets:
       num_samples: of a row each, ``int64``.
       num_claims: M, how many claims share the chance ``1 - confidence`` to be wrong.
       confidence, method: as asked for.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> found = jl.intervals_from_counts([[90, 10]], confidence=0.95)
+      >>> found.num_samples.tolist(), bool((found.lower[0] < [0.9, 0.1]).all())
+      ([100], True)
     """
 
     lower: Floats

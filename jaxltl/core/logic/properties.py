@@ -94,6 +94,10 @@ class Property:
             an :class:`Earned`, for `"LRA"` a state formula.
         parts: Of `"multi"`, its objectives.
         name: The name before the colon, or None.
+
+    >>> asked = parse_property('Pmax>=0.9 [ F "goal" ]')
+    >>> asked.operator, asked.objective, asked.relation, str(asked.threshold), str(asked.path)
+    ('P', 'max', '>=', '9/10', 'F goal')
     """
 
     text: str
@@ -135,6 +139,12 @@ def parse_properties(text: str) -> tuple[Property, ...]:
     `G F "a" & "b"` is `G F ("a" & "b")`. A property may have a name, `"p1": ...`, and `//`
     begins a comment.
 
+    Args:
+        text: One property or several.
+
+    Returns:
+        The properties, in their order.
+
     Raises:
         ValueError: With the place of the first error and what was expected there.
 
@@ -157,8 +167,17 @@ def parse_properties(text: str) -> tuple[Property, ...]:
 def parse_property(text: str) -> Property:
     """The one property that a text writes; see :func:`parse_properties`.
 
+    Args:
+        text: One property.
+
+    Returns:
+        The property.
+
     Raises:
         ValueError: There is an error, or not exactly one property.
+
+    >>> print(parse_property('R{"steps"}min=? [ F "goal" ]').reward)
+    steps
     """
     found = parse_properties(text)
     if len(found) != 1:

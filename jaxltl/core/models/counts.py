@@ -36,6 +36,11 @@ class TransitionCounts:
       state, action, successor: ``int32[N]``, numbers of names.
       count: ``int64[N]``, from 0; with 0, a transition that is possible and never came.
       states, actions: the names.
+
+    Example:
+      >>> counts = make_counts([0, 0, 1], [0, 0, 0], [1, 0, 1], states=["dock", "bay"])
+      >>> counts.num_samples, counts.states, counts.count.tolist()
+      (3, ('dock', 'bay'), [1, 1, 1])
     """
 
     state: Integers

@@ -43,7 +43,15 @@ from jaxltl.core.types import require_shape
 @brief
 @struct.dataclass
 class Finite:
-    """The actions ``0 .. num - 1``; `num` is static."""
+    """The actions ``0 .. num - 1``.
+
+    Attributes:
+      num: how many there are; static.
+
+    Example:
+      >>> Finite(4).num
+      4
+    """
 
     num: int = struct.field(pytree_node=False)
 
@@ -57,6 +65,11 @@ class Box:
       low, high: arrays that broadcast to the shape; infinite where there is no bound.
       shape: static.
       dtype: by name; static.
+
+    Example:
+      >>> space = make_box([-1.0, 0.0], 1.0)
+      >>> space.shape, space.low.tolist()
+      ((2,), [-1.0, 0.0])
     """
 
     low: chex.Array
@@ -68,12 +81,16 @@ class Box:
 def make_box(
     low: ArrayLike, high: ArrayLike, shape: Sequence[int] | None = None, dtype: Any = None
 ) -> Box:
-    """A :class:`Box`.
+    """Arrays between two bounds, checked: a :class:`Box`.
+
 
     Args:
       low, high: bounds, numbers or arrays; infinite for none.
       shape: of what is in it; default that of the bounds together.
       dtype: default that of the bounds together, at least a float of the default precision.
+
+    Returns:
+      :class:`Box`, whose bounds are NumPy's.
 
     Raises:
       ValueError: bounds that cross, are no numbers, or do not fit the shape.
@@ -136,6 +153,11 @@ class Timestep(NamedTuple):
       truncated: whether it is merely cut off. Both may hold; then it is over.
       cost: of the step, for learners that keep to a limit.
       discount: of all that comes after the step, times the learner's own.
+
+    Example:
+      >>> made = Timestep(world=3, reward=1.0, terminated=True)
+      >>> made.world, made.truncated, made.discount
+      (3, False, 1.0)
     """
 
     world: Any
@@ -163,6 +185,15 @@ class Environment:
       horizon: after how many steps every episode has ended; None: not known; static.
       starts, outcomes: what may be drawn, or None: not told; the worlds and the fields of the
         Timestep have a first axis. Of a step that draws nothing they may be left out.
+
+    Example:
+      >>> coin = make_environment(
+      ...     lambda key: jnp.int32(0), lambda world, action, key: Timestep(action, 0.0, False),
+      ...     lambda world: world[None], actions=2)
+      >>> coin.actions.num, coin.propositions, coin.horizon
+      (2, (), None)
+      >>> coin.step(0, 1, jax.random.key(0)).world
+      1
     """
 
     reset: Callable[..., Any]
@@ -204,6 +235,9 @@ def make_environment(
       observations: a tree of :class:`Box`; default: without bounds.
       horizon: after how many steps every episode has ended, if that is known.
       starts, outcomes: see the module's text; for :func:`~jaxltl.core.models.tabulate.tabulate`.
+
+    Returns:
+      :class:`Environment`.
 
     Raises:
       ValueError: a function that returns something of another shape, that is not pure (it keeps
@@ -326,6 +360,11 @@ class Agent:
       act: ``(memory, observation, allowed, key) -> (action, memory)``; `allowed` is ``bool[A]``, or
         None where the environment allows everything.
       memory: before anything is seen; a tree of arrays, ``()`` for none.
+
+    Example:
+      >>> first = Agent(lambda memory, observation, allowed, key: (allowed.argmax(), memory))
+      >>> int(first.act((), None, np.array([False, True]), None)[0])
+      1
     """
 
     act: Callable[..., tuple[Any, Any]]
@@ -333,7 +372,19 @@ class Agent:
 
 
 def agent_of(function: Callable[..., Any]) -> Agent:
-    """An :class:`Agent` without memory that ignores masks, of ``(observation, key) -> action``."""
+    """An :class:`Agent` without memory that ignores masks, of a function.
+
+    Args:
+      function: ``(observation, key) -> action``, of one trajectory.
+
+    Returns:
+      :class:`Agent`.
+
+    Example:
+      >>> still = agent_of(lambda observation, key: 0)
+      >>> still.act((), np.zeros(3), None, None)
+      (0, ())
+    """
     return Agent(Partial(_without_memory, as_partial(function)))
 
 
@@ -359,6 +410,17 @@ class Episode(NamedTuple):
       valid: ``bool[T]``, whether the step was made.
       terminated, truncated: ``bool[]``, how it ended; neither if T steps were not enough.
       discount: ``float[T]``, that of each step; one after the end.
+
+    Example:
+      >>> coin = make_environment(
+      ...     lambda key: jnp.int32(0),
+      ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
+      ...     lambda world: world[None], actions=2)
+      >>> seen = jax.eval_shape(
+      ...     lambda key: run_episode(key, coin, agent_of(lambda seen, key: 1), num_steps=5),
+      ...     jax.random.key(0))
+      >>> seen.world.shape, seen.reward.shape, seen.terminated.shape
+      ((6,), (5,), ())
     """
 
     world: Any
@@ -390,6 +452,16 @@ def run_episode(
 
     Raises:
       ValueError: a number below 1.
+
+    Example:
+      >>> coin = make_environment(
+      ...     lambda key: jnp.int32(0),
+      ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
+      ...     lambda world: world[None], actions=2)
+      >>> found = run_episode(
+      ...     jax.random.key(0), coin, agent_of(lambda seen, key: 1), num_steps=5)
+      >>> found.reward.tolist(), bool(found.terminated)
+      ([1.0, 0.0, 0.0, 0.0, 0.0], True)
     """
     num_steps = given.whole("num_steps", num_steps, least=1, most=2**31 - 1)
     environment, agent = require_environment(environment), require_agent(agent)
@@ -484,9 +556,24 @@ def step_or_reset(
 ) -> tuple[Any, Timestep]:
     """A step, and a fresh start where an episode ends with it; for episodes one after the other.
 
+    Args:
+      environment: the world.
+      world: before the step.
+      action: that is taken.
+      key: of the step and of the fresh start.
+
     Returns:
       The world to go on from, and the :class:`Timestep`, whose world is the one that the step led
       to, also where the episode ended there.
+
+    Example:
+      >>> coin = make_environment(
+      ...     lambda key: jnp.int32(0),
+      ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
+      ...     lambda world: world[None], actions=2)
+      >>> onward, made = step_or_reset(coin, np.int32(0), np.int32(1), jax.random.key(0))
+      >>> int(onward), int(made.world)
+      (0, 1)
     """
     step_key, reset_key = jax.random.split(key)
     found = Timestep(*environment.step(world, action, step_key))

@@ -37,6 +37,11 @@ class FiniteTask:
         number hold; bit i is that of the i-th of `columns`.
       columns: where the formula's n propositions are in a row of labels; static.
       num_columns: P, the length of a row; static.
+
+    Example:
+      >>> task = make_finite_task("!wet U dry", ["wet", "dry"])
+      >>> task.num_columns, task.letter.tolist()
+      (2, [0, 1, 2, 3])
     """
 
     monitor: Monitor
@@ -47,7 +52,16 @@ class FiniteTask:
 
 @brief
 class Shares(NamedTuple):
-    """What part of some trajectories satisfies, violates or leaves undecided; the sum is 1."""
+    """What part of some trajectories satisfies, violates or leaves undecided; the sum is 1.
+
+    Attributes:
+      satisfied, violated, undecided: ``float[...]``.
+
+    Example:
+      >>> shares = Shares(satisfied=0.5, violated=0.25, undecided=0.25)
+      >>> shares.satisfied + shares.undecided  # at most that many satisfy it in the end
+      0.75
+    """
 
     satisfied: jax.Array
     violated: jax.Array
@@ -62,6 +76,9 @@ def make_finite_task(
     Args:
       formula: a formula, its text, or an automaton that reads every subset of its propositions.
       propositions: the names of the P columns, in order; the formula need not use all.
+
+    Returns:
+      :class:`FiniteTask`.
 
     Raises:
       ValueError: a proposition without a column, a name twice, an automaton that cannot read

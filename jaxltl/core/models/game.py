@@ -33,6 +33,12 @@ class Game:
         chooses.
       system: ``bool[S]`` (``[S, Q]`` in a product): True where the system moves, who
         maximises; False where the environment does.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> game = jl.make_game(jl.from_dense([[[0, 1.0]], [[1.0, 0]]]), [True, False])
+      >>> game.num_states, game.system.tolist(), game.available.tolist()
+      (2, [True, False], [[True], [True]])
     """
 
     mdp: Any
@@ -40,14 +46,17 @@ class Game:
 
     @property
     def num_states(self) -> int:
+        """S, or S times Q in a product."""
         return self.mdp.num_states
 
     @property
     def num_actions(self) -> int:
+        """A; of a sparse model there is none."""
         return self.mdp.num_actions
 
     @property
     def num_successors(self) -> int:
+        """K, as of the model."""
         return self.mdp.num_successors
 
     @property
@@ -67,18 +76,22 @@ class Game:
 
     @property
     def initial(self) -> jax.Array:
+        """``float[S]``, the initial distribution."""
         return self.mdp.initial
 
     @property
     def label(self) -> jax.Array:
+        """``bool[S, P]``, which propositions hold in a state."""
         return self.mdp.label
 
     @property
     def propositions(self) -> tuple[str, ...]:
+        """The P names."""
         return self.mdp.propositions
 
     @property
     def dtype(self) -> jnp.dtype:
+        """Of the probabilities."""
         return self.mdp.dtype
 
 

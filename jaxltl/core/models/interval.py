@@ -52,6 +52,17 @@ class IntervalMDP:
       center: ``float64[T]``, a distribution between them in each row; None without a radius.
       radius: ``float64[R]``, how far from it a row may be in the L1 norm; None: as far as the ends
         allow.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> coin = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                       label={"heads": [1]})
+      >>> rough = jl.make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
+      >>> rough.num_transitions, rough.lower.tolist(), rough.is_chain
+      (4, [0.4, 0.3, 1.0, 1.0], True)
+      >>> round(float(jl.reachability_probability(rough, rough.states_where("heads"), nature="min")
+      ...             .value[0]), 6)
+      0.4
     """
 
     nominal: SparseMDP
@@ -62,14 +73,17 @@ class IntervalMDP:
 
     @property
     def num_states(self) -> int:
+        """S."""
         return self.nominal.num_states
 
     @property
     def num_rows(self) -> int:
+        """R, the choices of all states."""
         return self.nominal.num_rows
 
     @property
     def num_transitions(self) -> int:
+        """T, the entries of all choices."""
         return self.nominal.num_transitions
 
     @property
@@ -84,22 +98,27 @@ class IntervalMDP:
 
     @property
     def dtype(self) -> Any:
+        """Of the nominal probabilities."""
         return self.nominal.dtype
 
     @property
     def initial(self) -> Array:
+        """``float[S]``, the initial distribution."""
         return self.nominal.initial
 
     @property
     def label(self) -> Array:
+        """``bool[S, P]``, which propositions hold in a state."""
         return self.nominal.label
 
     @property
     def propositions(self) -> tuple[str, ...]:
+        """The P names."""
         return self.nominal.propositions
 
     @property
     def rewards(self) -> dict[str, Rewards]:
+        """Named :class:`~jaxltl.core.models.sparse.Rewards`."""
         return self.nominal.rewards
 
     @cached_property
@@ -257,8 +276,18 @@ def interval_rows(
       rest: `initial`, `label`, `propositions`, `action`, `action_names` and `valuation` of
         :func:`~jaxltl.core.models.sparse.make_sparse`.
 
+    Returns:
+      :class:`IntervalMDP`.
+
     Raises:
       ValueError: as of :func:`make_interval` and :func:`~jaxltl.core.models.sparse.make_sparse`.
+
+    Example:
+      >>> rough = interval_rows(
+      ...     None, [0, 2, 3, 4], [1, 2, 1, 2], [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1],
+      ...     label={"heads": [1]})
+      >>> rough.num_states, rough.upper.tolist()
+      (3, [0.7, 0.6, 1.0, 1.0])
     """
     entry_start, successor = np.asarray(entry_start), np.asarray(successor)
     lower, upper = numbers("lower", lower), numbers("upper", upper)

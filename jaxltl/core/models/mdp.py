@@ -33,6 +33,15 @@ class MDP:
       initial: ``float[S]``, the initial distribution.
       label: ``bool[S, P]``, which propositions hold in a state.
       propositions: the P names, static.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> chain = jl.make_mdp([[[0, 1]], [[1, 0]]], [[[0.5, 0.5]], [[1.0, 0.0]]],
+      ...                     label={"goal": [1]})
+      >>> chain.num_states, chain.num_actions, chain.label.tolist()
+      (2, 1, [[False], [True]])
+      >>> chain.replace(initial=np.array([1.0, 0.0])).initial.tolist()  # a changed copy
+      [1.0, 0.0]
     """
 
     successor: jax.Array
@@ -44,10 +53,12 @@ class MDP:
 
     @property
     def num_states(self) -> int:
+        """S."""
         return self.available.shape[-2]
 
     @property
     def num_actions(self) -> int:
+        """A."""
         return self.available.shape[-1]
 
     @property
@@ -57,6 +68,7 @@ class MDP:
 
     @property
     def num_successors(self) -> int:
+        """K, the longest list of successors."""
         return self.probability.shape[-1]
 
     @property
@@ -66,6 +78,7 @@ class MDP:
 
     @property
     def dtype(self) -> jnp.dtype:
+        """Of the probabilities."""
         return self.probability.dtype
 
 
@@ -77,6 +90,12 @@ class DenseMDP:
     Attributes:
       transition: ``float[S, A, S]``; rows of unavailable actions are zero.
       available, initial, label, propositions: as in :class:`MDP`.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> chain = jl.to_dense(jl.from_dense([[[0.5, 0.5]], [[0, 1.0]]]))
+      >>> chain.transition.shape
+      (2, 1, 2)
     """
 
     transition: jax.Array
@@ -87,14 +106,17 @@ class DenseMDP:
 
     @property
     def num_states(self) -> int:
+        """S."""
         return self.available.shape[-2]
 
     @property
     def num_actions(self) -> int:
+        """A."""
         return self.available.shape[-1]
 
     @property
     def num_successors(self) -> int:
+        """S: every state counts as a successor."""
         return self.num_states
 
     @property
@@ -109,6 +131,7 @@ class DenseMDP:
 
     @property
     def dtype(self) -> jnp.dtype:
+        """Of the probabilities."""
         return self.transition.dtype
 
 
@@ -250,6 +273,9 @@ def to_dense(mdp: MDP) -> DenseMDP:
 
     Returns:
       :class:`DenseMDP`.
+
+    Raises:
+      ValueError: the model is sparse or of intervals, or none.
 
     Example:
       >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])

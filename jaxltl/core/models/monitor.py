@@ -27,7 +27,17 @@ from jaxltl.core.show import brief
 
 
 class Verdict(enum.IntEnum):
-    """What a finite word says of its infinite continuations."""
+    """What a finite word says of its infinite continuations.
+
+    - ``UNDECIDED``: some are accepted, and some are not.
+    - ``SATISFIED``: every one is accepted.
+    - ``VIOLATED``: none is.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> jl.verdict(jl.to_automaton("G a"), [{"a"}, set()]).name
+      'VIOLATED'
+    """
 
     UNDECIDED = 0
     SATISFIED = 1  # every continuation is accepted
@@ -44,6 +54,12 @@ class Monitor:
         automaton's, such as ``Product.letter`` holds for each state of a world.
       initial: ``int32``, the state before anything is read.
       verdict: ``int32[Q]``, the :class:`Verdict` in each state.
+
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> monitor = make_monitor(to_automaton("F a"))
+      >>> monitor.delta.tolist(), monitor.verdict.tolist()
+      ([[0, 1], [1, 1]], [0, 1])
     """
 
     delta: jax.Array
@@ -150,7 +166,14 @@ def monitor_step(monitor: Monitor, state: chex.Array, letter: chex.Array) -> jax
 
 
 def monitor_verdict(monitor: Monitor, state: chex.Array) -> jax.Array:
-    """``int32[...]``: the verdict in each of the given states.
+    """The verdict in each of the given states of a monitor, for ``jit``, ``vmap`` and ``scan``.
+
+    Args:
+      monitor: from :func:`make_monitor`.
+      state: ``int32[...]``, of :func:`monitor_step`.
+
+    Returns:
+      ``int32[...]``, of :class:`Verdict`.
 
     Example:
       >>> from jaxltl.core.automata.translate import to_automaton

@@ -78,6 +78,12 @@ def exists_successor(model: Any, region: jax.Array) -> jax.Array:
 
     Raises:
       TypeError: the model is none.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> fork = jl.make_sparse([0, 2, 3, 4], [0, 2, 3, 4, 5], [1, 2, 0, 1, 2], [0.5, 0.5, 1, 1, 1])
+      >>> exists_successor(fork, np.array([False, True, False])).tolist()  # one for each choice
+      [True, False, True, False]
     """
     raise TypeError(_unknown(model))
 
@@ -97,6 +103,12 @@ def forall_successor(model: Any, region: jax.Array) -> jax.Array:
 
     Raises:
       TypeError: the model is none.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> fork = jl.make_sparse([0, 2, 3, 4], [0, 2, 3, 4, 5], [1, 2, 0, 1, 2], [0.5, 0.5, 1, 1, 1])
+      >>> forall_successor(fork, np.array([False, True, True])).tolist()  # one for each choice
+      [True, False, True, True]
     """
     raise TypeError(_unknown(model))
 
@@ -128,6 +140,12 @@ def sample_successor(
 
     Raises:
       TypeError: the model is none.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> cycle = jl.make_mdp([[[1]], [[0]]], [[[1.0]], [[1.0]]])
+      >>> int(sample_successor(cycle, jax.random.key(0), jnp.int32(0), jnp.int32(0)))
+      1
     """
     raise TypeError(_unknown(model))
 

@@ -36,6 +36,12 @@ def to_padded(model: SparseMDP) -> MDP:
     Raises:
       ValueError: padding would take more than 8 GB, with the size; or two choices of a state have
         one number.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> model = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> to_padded(model).successor.tolist()
+      [[[1, 2]], [[1, 0]], [[2, 0]]]
     """
     column, host = action_of(model), model.host
     width = int(np.diff(host.entry_start).max())

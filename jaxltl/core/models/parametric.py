@@ -42,6 +42,13 @@ class ParametricMDP:
       exact: ``float64[D] -> SparseMDP`` with the same transitions, each number of which is rounded
         `roundings` times at most; None where `numbers` are all that is known. Static.
       roundings: static.
+
+    Example:
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> biased = make_parametric(coin, lambda x: jnp.array([x[0], 1 - x[0], 1, 1]),
+      ...                          {"heads": 0.1}, {"heads": 0.9})
+      >>> biased.parameters, biased.low.tolist(), biased.high.tolist()
+      (('heads',), [0.1], [0.9])
     """
 
     model: Any
@@ -139,6 +146,9 @@ def make_parametric(
       low, high: ``float[D]``, one number for all, or a number for each name: keep the box away
         from where a probability becomes zero.
       parameters: the names; default those of `low`, else p0, p1 and so on.
+
+    Returns:
+      :class:`ParametricMDP`.
 
     Raises:
       ValueError: the box is none, names are missing, or the function returns other shapes, or in

@@ -37,6 +37,13 @@ class Rewards:
       state: ``float[S]``, earned by each step from a state.
       choice: ``float[R]``, earned by a choice.
       transition: ``float[T]``, earned by an entry.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> steps = Rewards(state=[1, 1, 0])
+      >>> model = make_sparse(None, [0, 1, 2, 3], [1, 2, 2], [1, 1, 1], rewards={"steps": steps})
+      >>> jl.total_reward(model, "steps", np.array([False, False, True])).value.tolist()
+      [2.0, 1.0, 0.0]
     """
 
     state: Array | None = None
@@ -68,6 +75,14 @@ class SparseMDP:
       valuation: the values of named variables in each state, ``[S]`` each.
       propositions: the P names, static.
       action_names: the names of actions by their number, static; empty if they have none.
+
+    Example:
+      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 3, 4, 5], [1, 1, 2, 1, 2], [1, 0.5, 0.5, 1, 1],
+      ...                     label={"goal": [1]}, rewards={"steps": Rewards(state=[1, 0, 0])})
+      >>> model.num_states, model.num_rows, model.num_transitions, model.is_chain
+      (3, 4, 5, False)
+      >>> model.states_where("goal").tolist()
+      [False, True, False]
     """
 
     row_start: Array
@@ -84,14 +99,17 @@ class SparseMDP:
 
     @property
     def num_states(self) -> int:
+        """S."""
         return self.row_start.shape[-1] - 1
 
     @property
     def num_rows(self) -> int:
+        """R, the choices of all states."""
         return self.entry_start.shape[-1] - 1
 
     @property
     def num_transitions(self) -> int:
+        """T, the entries of all choices."""
         return self.successor.shape[-1]
 
     @property
@@ -120,6 +138,7 @@ class SparseMDP:
 
     @property
     def dtype(self) -> Any:
+        """Of the probabilities."""
         return self.probability.dtype
 
     @cached_property
@@ -156,6 +175,11 @@ def row_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = Non
 
     Raises:
       ValueError: there is no such reward, or its shape fits nothing.
+
+    Example:
+      >>> model = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> row_reward(model, Rewards(state=[1, 0, 0], transition=[4, 0, 0, 0])).tolist()
+      [3.0, 0.0, 0.0]
     """
     reward = reward_parts(model, reward)
     if is_traced((model, reward)):
