@@ -87,6 +87,14 @@ class Product:
       label_on: which label a step reads; static.
       allowed: ``bool[S, Q, A]``, the actions to which the world's are narrowed, or None; see
         :func:`~jaxltl.core.models.restrict.with_allowed`.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], initial=[1, 0, 0],
+      ...                    label={"a": [1]})
+      >>> prod = jl.product(path, "F a")
+      >>> prod.state_shape, prod.next_memory.tolist(), prod.final[1].tolist()
+      ((3, 2), [[0, 1], [1, 1], [0, 1]], [False, True])
     """
 
     mdp: MDP | DenseMDP
@@ -102,10 +110,12 @@ class Product:
 
     @property
     def num_memory(self) -> int:
+        """Q, the states of the automaton."""
         return self.automaton.delta.shape[-2]
 
     @property
     def num_actions(self) -> int:
+        """A, as of the world."""
         return self.mdp.num_actions
 
     @property
@@ -115,6 +125,7 @@ class Product:
 
     @property
     def num_successors(self) -> int:
+        """K, as of the world."""
         return self.mdp.num_successors
 
     @property
@@ -124,6 +135,7 @@ class Product:
 
     @property
     def dtype(self) -> jnp.dtype:
+        """Of the probabilities."""
         return self.mdp.dtype
 
     @property
@@ -459,6 +471,15 @@ def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectorie
 
     Raises:
       ValueError: they are not the world's.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], initial=[1, 0, 0],
+      ...                    label={"a": [1]})
+      >>> prod = jl.product(path, "F a")
+      >>> shown = jl.make_trajectories(path, [[(0, 0), (1, 0), (2, 0)]])
+      >>> lift_trajectories(prod, shown).state.tolist()  # s * Q + q
+      [[0, 3, 5]]
     """
     require_states(trajectories, model.mdp)
     if is_traced((model, trajectories)):
@@ -499,6 +520,15 @@ def project_trajectories(model: Product, trajectories: Trajectories) -> Trajecto
 
     Raises:
       ValueError: they are not the product's.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], initial=[1, 0, 0],
+      ...                    label={"a": [1]})
+      >>> prod = jl.product(path, "F a")
+      >>> shown = jl.make_trajectories(path, [[(0, 0), (1, 0), (2, 0)]])
+      >>> project_trajectories(prod, lift_trajectories(prod, shown)).state.tolist()
+      [[0, 1, 2]]
     """
     require_states(trajectories, model)
     return replace(
@@ -553,7 +583,15 @@ def lift_policy(model: Product, policy: jax.Array) -> jax.Array:
       policy: ``[S, ...]``, of the world.
 
     Returns:
-      ``[S, Q, ...]``: the policy does not see the memory.
+      ``[S, Q, ...]``: the policy does not see the memory. Differentiable in the policy.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], initial=[1, 0, 0],
+      ...                    label={"a": [1]})
+      >>> prod = jl.product(path, "F a")
+      >>> lift_policy(prod, jnp.array([0, 0, 0])).shape
+      (3, 2)
     """
     return jnp.repeat(policy[:, None], model.num_memory, axis=1)
 
@@ -568,6 +606,15 @@ class FiniteMemoryPolicy:
       initial_memory: ``int32[S]``, the memory at the start of a run in s.
       next_memory: ``int32[S, Q]``, the memory after reading the label of s.
       label_on: static, as in :class:`Product`.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], initial=[1, 0, 0],
+      ...                    label={"a": [1]})
+      >>> prod = jl.product(path, "F a")
+      >>> runs = jl.project_policy(prod, jnp.zeros((3, 2), jnp.int32))
+      >>> runs.initial_memory.tolist(), runs.next_memory[1].tolist()  # state 1 shows a
+      ([0, 1, 0], [1, 1])
     """
 
     action: jax.Array
@@ -592,6 +639,14 @@ def project_policy(model: Product, policy: jax.Array) -> FiniteMemoryPolicy:
 
     Raises:
       ValueError: the policy does not have the product's shape.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], initial=[1, 0, 0],
+      ...                    label={"a": [1]})
+      >>> prod = jl.product(path, "F a")
+      >>> project_policy(prod, jnp.zeros((3, 2), jnp.int32)).action.shape
+      (3, 2)
     """
     operators.policy_distribution(model, policy)
     return FiniteMemoryPolicy(policy, model.initial_memory, model.next_memory, model.label_on)

@@ -80,8 +80,17 @@ def _named(state: list[int]) -> str:
 class Restriction(NamedTuple):
     """The reachable part of a model as an ordinary one.
 
-    State i of `model` is the state ``base_state[i]`` of the world, in a product with the
-    memory ``memory[i]`` (zero otherwise).
+    Attributes:
+      model: S' states, with labels and propositions of the world.
+      base_state: ``int32[S']``, the state of the world that each is.
+      memory: ``int32[S']``, in a product its memory, zero otherwise.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 1, 0], [1, 1, 1], initial=[1, 0, 0])
+      >>> part = jl.restrict(path)
+      >>> part.model.num_states, part.base_state.tolist()
+      (2, [0, 1])
     """
 
     model: Any
@@ -106,6 +115,12 @@ def restrict(
 
     Raises:
       ValueError: the world has no successor lists, or a reachable state keeps no action.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 1, 0], [1, 1, 1])
+      >>> restrict(path, np.array([0, 1, 0])).base_state.tolist()
+      [1]
     """
     if isinstance(model, IntervalMDP):
         found = restrict(model.nominal, initial, allowed=allowed)

@@ -51,6 +51,13 @@ class SequenceSampler:
       reach: ``float[N]``, how often a step asks for one of 1 to N sets of events.
       avoid: ``float[N]``, how often 0 to N - 1 sets are to be avoided.
       sets: ``bool[G, E]``, the sets of events that are drawn.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> events = jl.events_of(["a", "b"])
+      >>> sampler = jl.sequence_sampler([1, 1], [1], [1, 1], jl.proposition_sets(events))
+      >>> sampler.sets.shape, sampler.length.tolist()
+      ((2, 3), [1.0, 1.0])
     """
 
     length: chex.Array
@@ -85,7 +92,17 @@ class SequenceObservation(NamedTuple):
 
 
 def events_of(propositions: Ordered[str], at_most: int = 1) -> np.ndarray:
-    """``bool[E, P]``: the labels in which at most so many propositions hold, first that of none.
+    """The labels in which at most so many propositions hold, first that of none.
+
+    Args:
+      propositions: the P names.
+      at_most: how many may hold at once.
+
+    Returns:
+      ``bool[E, P]``, NumPy's.
+
+    Raises:
+      ValueError: a name twice, or a number below 0.
 
     Example:
       >>> events_of(["a", "b"]).astype(int).tolist()
@@ -111,7 +128,13 @@ def event_index(events: chex.Array, label: chex.Array) -> jax.Array:
 
 
 def proposition_sets(events: ArrayLike) -> np.ndarray:
-    """``bool[P, E]``: for each proposition the events in which it holds, to be drawn as sets.
+    """For each proposition the events in which it holds, to be drawn as sets.
+
+    Args:
+      events: ``bool[E, P]``, as of :func:`events_of`.
+
+    Returns:
+      ``bool[P, E]``, NumPy's.
 
     Example:
       >>> proposition_sets(events_of(["a", "b"], at_most=2)).astype(int).tolist()
@@ -130,13 +153,16 @@ def sequence_sampler(
       sets: ``bool[G, E]``, as of :func:`proposition_sets`; or ``bool[E]``, the events that are
         drawn one by one.
 
+    Returns:
+      :class:`SequenceSampler`.
+
     Raises:
       ValueError: weights that are negative or all zero, an empty set, or more sets a step than
         there are.
 
     Example:
       >>> sampler = sequence_sampler([1, 1], [1], [1, 1], [False, True, True, True])
-      >>> drawn = draw_sequence(jax.random.key(0), sampler)
+      >>> drawn = jax.jit(draw_sequence)(jax.random.key(0), sampler)
       >>> drawn.reach.shape, bool((drawn.reach & drawn.avoid).any())
       ((2, 4), False)
     """
@@ -220,6 +246,18 @@ def sequence_environment(
 
     Raises:
       ValueError: events or a sampler that do not fit.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> coin = jl.make_environment(
+      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.Timestep(action, 0.0, False),
+      ...     lambda world: world[None], actions=2,
+      ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
+      >>> events = events_of(["a"])
+      >>> drawn = sequence_environment(
+      ...     coin, events, sequence_sampler([1], [1], [1], proposition_sets(events)))
+      >>> jax.eval_shape(drawn.reset, jax.random.key(0)).sequence.reach.shape  # steps, events
+      (1, 2)
     """
     rows, inner = _booleans(events), require_environment(environment)
     given.instance("sampler", sampler, SequenceSampler, "one of sequence_sampler")

@@ -46,6 +46,11 @@ class ModelPart:
       rewards: expected rewards of rows by name, ``float[r]``.
       row: ``int[r]``, the numbers of the rows among all rows of the model, so that quantities on
         them can be put onto the mesh; default: none are.
+
+    Example:
+      >>> part = ModelPart(np.arange(3), np.array([1, 0]), np.ones(2))  # of two states in a circle
+      >>> part.successor.tolist(), part.row_start is None
+      ([1, 0], True)
     """
 
     entry_start: np.ndarray
@@ -169,6 +174,13 @@ def to_mesh(model: ShardedMDP, quantity: Any, fill: Any = 0) -> jax.Array:
 
     Raises:
       ValueError: the shape is wrong.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2], [1, 1], [1, 1])
+      >>> model = shard(path, jax.make_mesh((1,), ("states",)))
+      >>> to_mesh(model, np.array([1.0, 2.0])).shape
+      (2,)
     """
     quantity = np.asarray(quantity)
     if quantity.dtype == np.float64:
@@ -203,6 +215,20 @@ def from_mesh(model: ShardedMDP, quantity: jax.Array) -> np.ndarray:
     """A quantity ``[N, ...]`` as one of the given model, ``[S, ...]``, on the host.
 
     In several processes all of them call it, and each gets all of it.
+
+    Args:
+      model: the model on the mesh.
+      quantity: ``[N, ...]``, such as a solution's value.
+
+    Returns:
+      ``[S, ...]``, NumPy's.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2], [1, 1], [1, 1])
+      >>> model = shard(path, jax.make_mesh((1,), ("states",)))
+      >>> from_mesh(model, to_mesh(model, np.array([1.0, 2.0]))).tolist()
+      [1.0, 2.0]
     """
     number, found = on_host((model.number, quantity))
     result = np.zeros((model.num_given, *found.shape[1:]), found.dtype)

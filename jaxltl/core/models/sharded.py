@@ -64,6 +64,13 @@ class ShardedMDP:
       num_given: S, the states of the given model; static.
       mesh, axis: the devices, and over which of the mesh's axes the states lie; static.
       rounds: for each round the pairs (from, to) of devices; None: all values go to all; static.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2], [1, 1], [1, 1])
+      >>> model = jl.shard(path, jax.make_mesh((1,), ("states",)))
+      >>> model.num_given, model.num_devices, model.num_exchanged
+      (2, 1, 0)
     """
 
     tables: tuple[RowTable, ...]
@@ -89,6 +96,7 @@ class ShardedMDP:
 
     @property
     def num_actions(self) -> int:
+        """A, the most choices of a state."""
         return self.available.shape[1]
 
     @property
@@ -103,6 +111,7 @@ class ShardedMDP:
 
     @property
     def dtype(self) -> Any:
+        """Of the probabilities."""
         return self.tables[0].probability.dtype
 
     @property

@@ -53,6 +53,15 @@ class Table:
         with what was drawn; ``"keys"``: all keys that were tried led to the same; ``"distinct"``:
         the caller says so, as the program does not rule out that something depends on what
         `distinct` leaves out. Where several hold, the last of them in this order.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> coin = jl.make_environment(
+      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.Timestep(action, 0.0, False),
+      ...     lambda world: world[None], actions=2)
+      >>> table = jl.tabulate(coin)
+      >>> table.model.num_states, table.world.tolist(), table.start.tolist()
+      (2, [0, 1], [0])
     """
 
     model: SparseMDP

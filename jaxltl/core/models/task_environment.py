@@ -58,6 +58,16 @@ class TaskWorld(NamedTuple):
         or safety task, whether the state that it led to is final.
       visits: ``int32[]``, how many readings were accepting so far, that of the first label
         included.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> coin = jl.make_environment(
+      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.Timestep(action, 0.0, False),
+      ...     lambda world: world[None], actions=2,
+      ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
+      >>> begun = jax.eval_shape(jl.task_environment(coin, "F a").reset, jax.random.key(0))
+      >>> begun.world.dtype.name, begun.memory.shape, begun.visits.dtype.name
+      ('int32', (), 'int32')
     """
 
     world: Any
@@ -74,6 +84,16 @@ class TaskObservation(NamedTuple):
     Attributes:
       world: the observation of the inner world.
       memory: ``float[Q]``, one-hot, the automaton's state; or its row of an embedding.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> coin = jl.make_environment(
+      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.Timestep(action, 0.0, False),
+      ...     lambda world: world[None], actions=2,
+      ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
+      >>> task = jl.task_environment(coin, "F a")
+      >>> task.observations.world.shape, task.observations.memory.shape  # of two states
+      ((1,), (2,))
     """
 
     world: Any
@@ -100,6 +120,11 @@ class TaskTables:
       learner_discount: ``float[]``, with which shaping reckons.
       embedding: ``float[Q, ...]``, how a state is shown, or None: one-hot.
       text: what is left of the formula in each state; static.
+
+    Example:
+      >>> tables = make_task_tables("F goal", ["wall", "goal"])
+      >>> tables.delta.tolist(), tables.verdict.tolist(), tables.decided.tolist()
+      ([[0, 1], [1, 1]], [0, 1], [0.0, 1.0, 0.0])
     """
 
     weight: Any
@@ -374,6 +399,9 @@ def what_is_left(task: Environment | TaskTables | Automaton, memory: Any) -> str
       task: an environment of :func:`task_environment`, its tables, or an automaton. Of a stack,
         ask the single environments.
       memory: the state, such as ``world.memory`` of a :class:`TaskWorld`.
+
+    Returns:
+      The formula's text.
 
     Raises:
       ValueError: there is no such state.

@@ -22,8 +22,23 @@ def with_time_limit(environment: Environment, num_steps: int) -> Environment:
     Its worlds are pairs ``(world, time)``. What is observed is as before: where the best thing to
     do depends on the time that is left, tell it in `observe`.
 
+    Args:
+      environment: the world.
+      num_steps: after how many of them an episode is cut off, if it has not ended.
+
+    Returns:
+      The environment; `num_steps` is its horizon, or what was before if that is less.
+
     Raises:
       ValueError: a number below 1.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> coin = jl.make_environment(
+      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.Timestep(action, 0.0, False),
+      ...     lambda world: world[None], actions=2)
+      >>> with_time_limit(coin, 10).horizon
+      10
     """
     num_steps = given.whole("num_steps", num_steps, least=1, most=2**31 - 1)
     inner = require_environment(environment)

@@ -30,6 +30,13 @@ class Trajectories:
       length: ``int32[N]``, the number of pairs that count.
       state_shape: of the model whose states they number, ``(S,)`` or in a product ``(S, Q)``;
         None: not known. Static.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_mdp([[[1]], [[1]]], [[[1.0]], [[1.0]]])
+      >>> shown = jl.make_trajectories(path, [[(0, 0), (1, 0)], [(1, 0)]])
+      >>> shown.state.tolist(), shown.mask.tolist()
+      ([[0, 1], [1, 0]], [[True, True], [True, False]])
     """
 
     state: jax.Array
@@ -155,6 +162,17 @@ def rollout(
 
     Returns:
       :class:`Trajectories` with N rows. Jit-compiled callers pass the counts statically.
+
+    Raises:
+      ValueError: a policy that is no distribution over available actions, or of another shape.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_mdp([[[1]], [[0]]], [[[1.0]], [[1.0]]], initial=[1, 0])
+      >>> runs = rollout(path, jnp.zeros(2, jnp.int32), jax.random.key(0),
+      ...                num_trajectories=2, num_steps=3)
+      >>> runs.state.tolist()
+      [[0, 1, 0], [0, 1, 0]]
     """
     distribution = policy_distribution(model, policy).reshape(-1, model.num_actions)
     nowhere = np.zeros(model.state_shape, bool)
