@@ -8,7 +8,7 @@ Example: a policy of what is seen, here of which state it is, and of the task's 
 
   >>> import jax, jax.numpy as jnp
   >>> import jaxltl as jl
-  >>> from jaxltl.algos import behavioral_cloning as cloning
+  >>> from jaxltl.algos import behavioral_cloning as cloning, learner
   >>> world = jl.make_mdp(  # a start, from where one gets to a goal or into a trap
   ...     [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
   ...     [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
@@ -22,6 +22,23 @@ Example: a policy of what is seen, here of which state it is, and of the task's 
   >>> state, metrics = cloning.train(jax.random.key(0), problem, hparams, num_steps=2)
   >>> metrics.loss.shape, cloning.policy(state, problem, hparams).shape  # [W, S, Q, A]
   ((2,), (1, 3, 3, 2))
+
+A run is made of steps, goes on from a state, and may end early:
+
+  >>> state = cloning.init(jax.random.key(0), problem, hparams)
+  >>> state, metrics = cloning.run(state, problem, hparams, num_steps=2)
+  >>> state.step.item()
+  2
+  >>> after, figures = jax.eval_shape(cloning.step, state, problem, hparams)
+  >>> until = learner.has_stopped  # for train_until too
+  >>> ended = jax.eval_shape(lambda state: cloning.run_until(
+  ...     state, problem, hparams, until=until, num_steps=9), state)
+  >>> figures.loss.shape, ended.num_steps.shape
+  ((), ())
+  >>> cloning.policy_in_world(network, state.best.parameters, model, jnp.eye(3)).shape
+  (3, 3, 2)
+  >>> jax.eval_shape(cloning.neg_log_likelihood, state.parameters, problem, problem.counts).shape
+  ()
 
 Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
 many settings, by ``vmap`` over the numbers of ``Hparams``. Stop

@@ -33,6 +33,23 @@ Example: to be near (1, 1), with a first coordinate of at most 0.5.
   >>> found.solution.round(2).tolist(), bool(found.solution[0] <= 0.5)
   ([0.5, 1.0], True)
 
+A run is made of steps, goes on from a state, and may end early:
+
+  >>> state = cce.init(jax.random.key(0), problem, hparams)
+  >>> state, metrics = cce.run(state, problem, hparams, num_steps=50)
+  >>> state.step.item()
+  50
+  >>> after, figures = jax.eval_shape(cce.step, state, problem, hparams)
+  >>> until = lambda before, after, metrics: metrics.spread < 1e-3  # for train_until too
+  >>> ended = jax.eval_shape(lambda state: cce.run_until(
+  ...     state, problem, hparams, until=until, num_steps=9), state)
+  >>> figures.spread.shape, ended.num_steps.shape
+  ((), ())
+  >>> anew = jax.eval_shape(  # as result does it
+  ...     lambda x, key: cce.assess(problem, x, key, num_evaluations=10), problem.family.mean, key)
+  >>> anew.upper.shape
+  (1,)
+
 Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
 many settings, by ``vmap`` over the numbers of ``Hparams``. Policies
 of environments are searched with :func:`~jaxltl.core.values.episode_scores.episode_evaluator`.

@@ -32,8 +32,22 @@ Example: a head, then a tail of one coin, of which the bias is sought.
   >>> low <= float(state.best.value) + 1e-6 <= high + 2e-6
   True
 
-:func:`feasible` searches from many starts, side by side, and proves what it finds; so does
-``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``, without proof.
+A run is made of steps, begins where one likes, goes on from a state, and may end early:
+
+  >>> state = search.start_at(jnp.array([0.5, 0.5]), jax.random.key(0), problem, hparams)
+  >>> value, status = search.evaluate(state.parameters, problem, hparams)
+  >>> value.item(), search.within(problem, 0.4, 0.6).low.round(3).tolist()
+  (0.25, [0.4, 0.4])
+  >>> state, metrics = search.run(state, problem, hparams, num_steps=2)  # after init, or start_at
+  >>> after, figures = jax.eval_shape(search.step, state, problem, hparams)
+  >>> early = jax.eval_shape(  # train_until begins with a key
+  ...     lambda state: search.run_until(state, problem, hparams, num_steps=9, until=(
+  ...         lambda before, after, metrics: metrics.best_value > 0.3)), state)
+  >>> figures.value.shape, early.num_steps.shape
+  ((), ())
+
+Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``;
+:func:`feasible` does it, and proves what it finds.
 """
 
 from __future__ import annotations
@@ -257,7 +271,20 @@ def within(problem: Problem, low: Ends, high: Ends) -> Problem:
 
 
 def require_problem(problem: Any) -> None:
-    """Raises ValueError unless a problem is one."""
+    """Raises ValueError unless a problem is one.
+
+    Args:
+      problem: anything.
+
+    Raises:
+      ValueError: it is none of :func:`make_problem`.
+
+    Example:
+      >>> require_problem(0.5)
+      Traceback (most recent call last):
+        ...
+      ValueError: problem is 0.5; give what make_problem returns.
+    """
     if not isinstance(problem, Problem):
         raise ValueError(f"problem is {shown(problem)}; give what make_problem returns.")
 

@@ -35,6 +35,24 @@ Example: to come to the goal ``g`` and never to ``r``, where nobody knows the pr
   >>> 0 <= sure.bound <= sure.optimistic <= 1
   True
 
+A run is made of steps, goes on from a state, and may end early:
+
+  >>> state = interval_learning.init(jax.random.key(0), problem, hparams)
+  >>> state, metrics = interval_learning.run(state, problem, hparams, num_steps=2)
+  >>> state.step.item()
+  2
+  >>> after, figures = jax.eval_shape(interval_learning.step, state, problem, hparams)
+  >>> until = interval_learning.known_within(0.01)  # for train_until too
+  >>> ended = jax.eval_shape(lambda state: interval_learning.run_until(
+  ...     state, problem, hparams, until=until, num_steps=9), state)
+  >>> figures.samples.shape, ended.num_steps.shape
+  ((), ())
+  >>> play = interval_learning.behavior(state, problem, hparams)
+  >>> interval_learning.wins_almost_surely(problem, play)  # always
+  True
+  >>> interval_learning.measure(state, problem, hparams).samples.item()
+  20
+
 Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
 many settings, by ``vmap`` over the numbers of ``Hparams``. End when
 enough is known by ``train_until(..., until=known_within(0.01))``.

@@ -34,6 +34,23 @@ Example: in one state the system may stay or go to the other, which pays.
   ([1.0, 2.0], 0)
   >>> maximin_q.policy(state, problem, hparams).tolist()
   [1, 0]
+  >>> maximin_q.recurrent_states(problem).tolist()  # nobody leaves the second
+  [False, True]
+
+A run is made of steps, goes on from a state, and may end early:
+
+  >>> state = maximin_q.init(jax.random.key(0), problem, hparams)
+  >>> state, metrics = maximin_q.run(state, problem, hparams, num_steps=10)
+  >>> state.step.item()
+  10
+  >>> after, figures = jax.eval_shape(maximin_q.step, state, problem, hparams)
+  >>> until = maximin_q.value_rests(1e-6)  # for train_until too
+  >>> ended = jax.eval_shape(lambda state: maximin_q.run_until(
+  ...     state, problem, hparams, until=until, num_steps=9), state)
+  >>> figures.residual.shape, ended.num_steps.shape
+  ((), ())
+  >>> maximin_q.measure(state, problem, hparams).moves.item()  # of 4 chains, 8 a step
+  320.0
 
 Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
 many settings, by ``vmap`` over the numbers of ``Hparams``. End when

@@ -8,7 +8,7 @@ Example: learning from two runs, of which one tries again, to reach the goal ``g
 
   >>> import jax, jax.numpy as jnp
   >>> import jaxltl as jl
-  >>> from jaxltl.algos import mlirl
+  >>> from jaxltl.algos import learner, mlirl
   >>> world = jl.make_mdp(  # a start, from where one gets to a goal or into a trap
   ...     [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
   ...     [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
@@ -23,6 +23,23 @@ Example: learning from two runs, of which one tries again, to reach the goal ``g
   >>> metrics.loss.shape, bool(metrics.loss[1] < metrics.loss[0])  # a row for each step
   ((2,), True)
   >>> mlirl.policy(state, problem, hparams).shape == (*model.state_shape, model.num_actions)
+  True
+
+A run is made of steps, goes on from a state, and may end early:
+
+  >>> state = mlirl.init(jax.random.key(0), problem, hparams)
+  >>> state, metrics = mlirl.run(state, problem, hparams, num_steps=2)
+  >>> state.step.item()
+  2
+  >>> after, figures = jax.eval_shape(mlirl.step, state, problem, hparams)
+  >>> until = learner.gradient_vanishes(1e-6)  # for train_until too
+  >>> ended = jax.eval_shape(lambda state: mlirl.run_until(
+  ...     state, problem, hparams, until=until, num_steps=9), state)
+  >>> figures.loss.shape, ended.num_steps.shape
+  ((), ())
+  >>> loss, parts = jax.eval_shape(mlirl.objective, state.parameters, problem, hparams)
+  >>> solution = jax.eval_shape(mlirl.solve, state.parameters, problem, hparams)
+  >>> solution.value.shape == parts.value.shape
   True
 
 Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are

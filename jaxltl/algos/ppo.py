@@ -9,6 +9,45 @@ entropy is that over those allowed: a network learns inside what a shield leaves
 
 What published implementations list (Huang et al. 2022, Andrychowicz et al. 2021) is here by name
 in :class:`Hparams`.
+
+Example: a corridor of which one leaves at its beginning; to go to the end and back earns most.
+
+  >>> import jax, jax.numpy as jnp, numpy as np
+  >>> from jax.tree_util import Partial
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import ppo
+  >>> def reset(width, key):
+  ...     return jnp.int32(0)
+  >>> def step(width, place, action, key):  # ahead, back, or stay
+  ...     place = place + jnp.array([1, -1, 0], jnp.int32)[action]
+  ...     return jl.Timestep(place, reward=place / width, terminated=place < 0,
+  ...                        truncated=jax.random.bernoulli(key, 0.1))
+  >>> def observe(width, place):
+  ...     return {"place": place / width, "end": place == 3}
+  >>> def allowed(width, place):
+  ...     return jnp.array([place < 3, True, True])
+  >>> width = np.array(3.0)  # an argument, so that another one compiles nothing anew
+  >>> corridor = jl.make_environment(*(Partial(f, width) for f in (reset, step, observe)),
+  ...                                actions=3, allowed=Partial(allowed, width))
+  >>> problem = ppo.make_problem(corridor, network=ppo.ActorCritic(3, hidden=()))
+  >>> hparams = ppo.Hparams(
+  ...     discount=0.9, learning_rate=0.01, num_envs=4, num_steps=6, num_epochs=1,
+  ...     num_minibatches=2, normalize_observation=True, normalize_reward=True)
+  >>> state, metrics = ppo.train(jax.random.key(0), problem, hparams, num_steps=2)
+  >>> metrics.transitions.tolist(), metrics.status.tolist()
+  ([24, 48], [0, 0])
+  >>> agent = ppo.greedy(state, problem, hparams)  # or ppo.policy, which draws
+  >>> episode = jax.eval_shape(
+  ...     lambda key: jl.run_episode(key, corridor, agent, num_steps=5), jax.random.key(1))
+  >>> episode.reward.shape
+  (5,)
+  >>> state, metrics = ppo.run(state, problem, hparams, num_steps=2)  # and two steps more
+  >>> state.step.item()
+  4
+
+A run is ``init`` and then ``step`` after ``step``; ``train_until`` and ``run_until`` end early.
+Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
+many settings, by ``vmap`` over the numbers of ``Hparams``.
 """
 
 from __future__ import annotations
@@ -64,7 +103,7 @@ class Problem:
 
     Attributes:
       environment: where to act.
-      memory: of the network before it has seen anything; ``()`` for one without.
+      memory: of the network before it has seen anything, a tree of arrays; ``()`` for one without.
       network: a ``flax.linen`` module; static.
     """
 
@@ -84,37 +123,42 @@ class Hparams:
 
     Attributes:
       discount: of rewards, in [0, 1]; times what the environment says of each step.
-      gae_lambda: of the generalised advantages: 1 has no bias, 0 least variance.
-      learning_rate: of Adam; a schedule.
-      clip: how far the ratio of probabilities may move before it is worth nothing; a schedule.
-      value_clip: the same of values, in their units; a schedule; None: they are not clipped.
-      value_weight: of the value's squared error, halved.
-      entropy_weight: of the entropy of the actions.
-      max_gradient_norm: gradients are shortened to it; None: they are not.
+      gae_lambda: of the generalised advantages: 1 has no bias, 0 least variance; default 0.95.
+      learning_rate: of Adam; a schedule; default 2.5e-4.
+      clip: how far the ratio of probabilities may move before it is worth nothing; a schedule;
+        default 0.2.
+      value_clip: the same of values, in their units; a schedule; None: they are not clipped;
+        default None.
+      value_weight: of the value's squared error, halved; default 0.5.
+      entropy_weight: of the entropy of the actions; default 0.01.
+      max_gradient_norm: gradients are shortened to it; None: they are not; default 0.5.
       target_kl: no further updates in a step once a minibatch's estimated divergence from the
-        policy that acted exceeds it; None: all are made.
-      adam_epsilon: of Adam.
-      num_envs: N, environments side by side; static.
-      num_steps: T, of each of them in a step of the learner; static.
-      num_epochs: passes over what was collected; static.
-      num_minibatches: of each pass; with a recurrent network, each has whole environments; static.
-      normalize_advantage: whether advantages are centred and scaled in each minibatch; static.
+        policy that acted exceeds it; None: all are made; default None.
+      adam_epsilon: of Adam; default 1e-5.
+      num_envs: N, environments side by side; static; default 8.
+      num_steps: T, of each of them in a step of the learner; static; default 128.
+      num_epochs: passes over what was collected; static; default 4.
+      num_minibatches: of each pass; with a recurrent network, each has whole environments; static;
+        default 4.
+      normalize_advantage: whether advantages are centred and scaled in each minibatch; static;
+        default True.
       normalize_observation: whether the network reads observations (their floats) centred and
-        scaled by their moments up to the step before, clipped to ten deviations; static.
+        scaled by their moments up to the step before, clipped to ten deviations; static;
+        default False.
       normalize_reward: whether rewards are divided by the standard deviation of discounted sums of
-        rewards so far, and clipped to ten; static.
+        rewards so far, and clipped to ten; static; default False.
       squash: how a Gaussian action gets into its box: ``"clip"``, or ``"tanh"`` along axes that
         have both bounds; static. Either way the network speaks in units in which such axes are
-        [-1, 1].
+        [-1, 1]. Default ``"clip"``.
       num_resets: how many worlds in which episodes begin are drawn before the T steps of a step;
         static. None: T N, one for whatever might end, which is fast and takes memory. 0: N of them
         in each of the T steps, which is the same to the learner. Some other number: that many,
         handed out in turn, and from the first again if they do not suffice; where a reset is
-        costly and episodes are long, this is fastest.
+        costly and episodes are long, this is fastest. Default None.
       sharding: a ``NamedSharding`` whose spec names the mesh axis over which the environments, and
         each minibatch, are split, such as ``NamedSharding(mesh, PartitionSpec("environments"))``;
         static. The run is the same up to the order of sums. What a step collected is sent to
-        all devices once, for a minibatch is drawn from all of it.
+        all devices once, for a minibatch is drawn from all of it. Default None.
     """
 
     discount: jax.Array | float
@@ -146,13 +190,13 @@ class State:
 
     Attributes:
       key: of the whole run.
-      step: steps of the learner made.
-      parameters: of the network.
+      step: ``int32[]``, steps of the learner made.
+      parameters: of the network, a pytree.
       optimizer: optax's state.
       walkers: the N environments.
       moments: of the observation, a tree as it is, of its float leaves; None: not asked for.
       return_moments: of discounted sums of rewards; None: not asked for.
-      transitions: steps of environments made; at most 2^31 - 1 are counted.
+      transitions: ``int32[]``, steps of environments made; at most 2^31 - 1 are counted.
     """
 
     key: jax.Array
@@ -168,7 +212,7 @@ class State:
 @brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
-    """Figures of a step. Those of episodes are of the policy before it.
+    """Figures of a step; scalars, of a run ``[T]``. Those of episodes are of the policy before it.
 
     Attributes:
       transitions: steps of environments made so far, this step's included.
@@ -221,6 +265,9 @@ def make_problem(
         scalar. Default :class:`ActorCritic`.
       memory: of a recurrent network before it has seen anything; default what its method
         ``initial_memory()`` returns, if it has one.
+
+    Returns:
+      :class:`Problem`.
 
     Raises:
       ValueError: a network that returns something else, or keeps more than parameters; a memory
@@ -314,12 +361,33 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
     """What was learned, an :class:`~jaxltl.core.models.environment.Agent` that draws its actions.
 
     Never one that is not allowed. For :func:`~jaxltl.core.models.environment.run_episode`.
+
+    Args:
+      state: of one run, as of ``train``.
+      problem, hparams: of the run.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Agent`, a pytree.
+
+    Raises:
+      ValueError: the state or the problem is none of PPO's.
     """
     return _agent(state, problem, hparams, True)
 
 
 def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
-    """The same, taking the most likely action each time; of a box the Gaussian's mean."""
+    """The same, taking the most likely action each time; of a box the Gaussian's mean.
+
+    Args:
+      state: of one run, as of ``train``.
+      problem, hparams: of the run.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Agent`, a pytree.
+
+    Raises:
+      ValueError: the state or the problem is none of PPO's.
+    """
     return _agent(state, problem, hparams, False)
 
 
@@ -349,7 +417,16 @@ def _act(
 
 
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
-    """The network at its own random start, and N environments at theirs."""
+    """The network at its own random start, and N environments at theirs.
+
+    Args:
+      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
+      problem: of :func:`make_problem`.
+      hparams: :class:`Hparams`.
+
+    Returns:
+      :class:`State`, no step made.
+    """
     _check(problem, hparams)
     return _begun(require_key(key), problem, hparams)
 
@@ -380,7 +457,15 @@ def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
 
 
 def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """T steps of N environments, and some epochs of minibatches of what they tell."""
+    """T steps of N environments, and some epochs of minibatches of what they tell.
+
+    Args:
+      state: of :func:`init` or of an earlier step; unchanged.
+      problem, hparams: as of :func:`init`.
+
+    Returns:
+      The next :class:`State`, and :class:`Metrics`, figures of the step.
+    """
     _check(problem, hparams)
     given.instance("state", state, State, "one of ppo.init or ppo.train")
     collect_key, update_key = jax.random.split(learner.step_key(state))

@@ -27,9 +27,21 @@ Example: to come home again and again, and to be paid for staying away.
   >>> sure = rmax.evidence(learned.state, problem, hparams)
   >>> bool(sure.almost_sure), sure.epsilon_optimal.all().tolist()
   (True, True)
+  >>> rmax.wins_almost_surely(problem, sure.strategy).item()
+  True
 
-Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; a run
-of a fixed number of steps is ``train``, and goes on by ``run``.
+A run is made of steps, goes on from a state, and may take its moves from elsewhere:
+
+  >>> state = rmax.init(jax.random.key(0), problem, hparams)  # then step, or run, or run_until
+  >>> seen = rmax.observe(state, problem, hparams, action=1, successor=1, reward=0.0)
+  >>> seen.position.item(), rmax.measure(seen, problem, hparams).moves.item()
+  (1, 1)
+  >>> after, metrics = jax.eval_shape(  # train does it with init
+  ...     lambda state: rmax.run(state, problem, hparams, num_steps=2), seen)
+  >>> metrics.value.shape
+  (2,)
+
+Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ Example: a reward of what is seen, here of which state it is, that plans in anot
 
   >>> import jax, jax.numpy as jnp
   >>> import jaxltl as jl
-  >>> from jaxltl.algos import todirl
+  >>> from jaxltl.algos import learner, todirl
   >>> world = jl.make_mdp(  # a start, from where one gets to a goal or into a trap
   ...     [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
   ...     [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
@@ -28,6 +28,22 @@ Example: a reward of what is seen, here of which state it is, that plans in anot
   ...     lambda other: todirl.plan(problem.network, parameters, other, jnp.eye(3), hparams), model)
   >>> shape.policy.shape
   (3, 3, 2)
+
+A run is made of steps, goes on from a state, and may end early:
+
+  >>> state = todirl.init(jax.random.key(0), problem, hparams)
+  >>> state, metrics = todirl.run(state, problem, hparams, num_steps=2)
+  >>> state.step.item()
+  2
+  >>> after, figures = jax.eval_shape(todirl.step, state, problem, hparams)
+  >>> until = learner.has_stopped  # for train_until too
+  >>> ended = jax.eval_shape(lambda state: todirl.run_until(
+  ...     state, problem, hparams, until=until, num_steps=9), state)
+  >>> figures.loss.shape, ended.num_steps.shape
+  ((), ())
+  >>> loss, parts = jax.eval_shape(todirl.objective, state.parameters, problem, hparams)
+  >>> jax.eval_shape(todirl.solve, state.parameters, problem, hparams).value.shape
+  (1, 3, 3)
 
 Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
 many settings, by ``vmap`` over the numbers of ``Hparams``. Stop

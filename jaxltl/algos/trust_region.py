@@ -18,6 +18,40 @@ a termination nothing comes, and what would come after the horizon does not coun
 of a sum of rewards. Where the environment truncates an episode something would come, and what it
 would be worth is added, as the value network expects it of the last observation. Costs are limited
 as they are drawn: what would come after a trajectory never counts in them.
+
+Example: a point that is pushed about; the reward is for being near, the cost is the push.
+
+  >>> import jax, jax.numpy as jnp
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import trust_region
+  >>> def reset(key):
+  ...     return jax.random.uniform(key, (2,), minval=-1)
+  >>> def step(world, action, key):
+  ...     place = world + 0.3 * action
+  ...     return jl.Timestep(
+  ...         place, -jnp.sum(place**2), jnp.abs(place).max() > 4, cost=jnp.sum(action**2))
+  >>> world = jl.make_environment(
+  ...     reset, step, lambda world: world, actions=jl.make_box(-jnp.inf, jnp.inf, (2,)))
+  >>> problem = trust_region.make_problem(world, horizon=4, limit=6.0)
+  >>> hparams = trust_region.Hparams(
+  ...     discount=0.9, method="cpo", num_trajectories=6, hidden=(3,), value_hidden=(), cg_steps=3,
+  ...     value_epochs=1, value_batches=2)
+  >>> state = trust_region.init(jax.random.key(0), problem, hparams)
+  >>> state, metrics = trust_region.run(state, problem, hparams, num_steps=2)
+  >>> metrics.trajectories.tolist(), metrics.cost.shape  # as many were drawn for the moments first
+  ([12, 18], (2,))
+  >>> agent = trust_region.greedy(state, problem, hparams)  # or trust_region.policy, which draws
+  >>> mean, deviation = trust_region.act(state, hparams, jnp.zeros(2))
+  >>> mean.shape, deviation.shape
+  ((2,), (2,))
+  >>> shapes = jax.eval_shape(lambda key: trust_region.rollout(
+  ...     key, state, problem, hparams, num_trajectories=5), jax.random.key(1))
+  >>> shapes.reward.shape
+  (4, 5)
+
+``train`` is ``init`` and ``run``, which is ``step`` after ``step``; ``train_until`` and
+``run_until`` end early. Many seeds are
+``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``.
 """
 
 
@@ -75,8 +109,8 @@ class Problem:
 
     Attributes:
       environment: whose actions are a box. Those that are drawn outside of it are clipped.
-      limit: on the expected cost of a trajectory; None: there is none.
-      horizon: T; static.
+      limit: ``float[]``, on the expected cost of a trajectory; None: there is none.
+      horizon: T, steps of a trajectory at most; static.
     """
 
     environment: Environment
@@ -91,25 +125,28 @@ class Hparams:
 
     Attributes:
       discount: of rewards, in [0, 1], times that of each step of the environment.
-      cost_discount: of costs; 1 limits the expected sum of a trajectory's costs.
-      gae_lambda: of the generalised advantage of rewards: 1 has no bias, 0 least variance.
-      cost_gae_lambda: the same of costs. Costs that come late need a value near 1.
-      delta: the mean divergence that a step may cause.
-      damping: added to the Fisher matrix, times the identity.
-      penalty: TRPO only: learn from ``reward - penalty * cost``; None: from the reward.
-      initial_deviation: the standard deviation of the first policy's actions.
-      backtrack: how much shorter each try of the line search is than the one before.
-      value_rate: learning rate of the value networks (Adam).
-      method: ``"trpo"`` or ``"cpo"``; static.
-      num_trajectories: N, drawn in each step; static.
+      cost_discount: of costs; 1 limits the expected sum of a trajectory's costs; default 1.0.
+      gae_lambda: of the generalised advantage of rewards: 1 has no bias, 0 least variance;
+        default 0.97.
+      cost_gae_lambda: the same of costs. Costs that come late need a value near 1. Default 0.97.
+      delta: the mean divergence that a step may cause; default 0.01.
+      damping: added to the Fisher matrix, times the identity; default 1e-3.
+      penalty: TRPO only: learn from ``reward - penalty * cost``; None: from the reward;
+        default None.
+      initial_deviation: the standard deviation of the first policy's actions; default 1.0.
+      backtrack: how much shorter each try of the line search is than the one before; default 0.8.
+      value_rate: learning rate of the value networks (Adam); default 3e-3.
+      method: ``"trpo"`` or ``"cpo"``; static; default ``"cpo"``.
+      num_trajectories: N, drawn in each step; static; default 200.
       hidden, value_hidden: widths of the tanh layers of the policy and of the value networks;
-        ``()`` is linear; static.
+        ``()`` is linear; static; default ``(32, 32)``.
       normalize: whether networks read observations centred and scaled by their moments so far;
-        the policy as a function is not changed by new moments; static.
-      cg_steps: of the conjugate gradient; static.
-      search_steps: tries of the line search; static.
-      fisher_stride: the Fisher matrix is estimated from every so many-th sample; static.
-      value_epochs, value_batches: passes over the samples, each in so many batches; static.
+        the policy as a function is not changed by new moments; static; default True.
+      cg_steps: of the conjugate gradient; static; default 10.
+      search_steps: tries of the line search; static; default 15.
+      fisher_stride: the Fisher matrix is estimated from every so many-th sample; static; default 1.
+      value_epochs, value_batches: passes over the samples, each in so many batches; static;
+        default 5 and 8.
     """
 
     discount: jax.Array | float
@@ -141,14 +178,14 @@ class State:
 
     Attributes:
       key: of the whole run.
-      step: steps made.
+      step: ``int32[]``, steps made.
       parameters: of the policy: ``{"mean": network, "log_deviation": float[A]}``.
       values: parameters of the value networks with a leading axis [V]: of rewards, and with
         CPO of costs. They also read the time, for sums over a finite horizon depend on it.
       value_moments: ``float[2, V]``, mean and deviation by which their output is scaled.
       optimizer: of `values`.
       moments: of the observations.
-      trajectories: drawn so far; at most 2^31 - 1 are counted.
+      trajectories: ``int32[]``, drawn so far; at most 2^31 - 1 are counted.
     """
 
     key: jax.Array
@@ -164,7 +201,8 @@ class State:
 @brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
-    """Figures of a step. Means are of the policy before it, over its finite trajectories.
+    """Figures of a step; scalars unless a shape is given, of a run ``[T]``. Means are of the policy
+    before it, over its finite trajectories.
 
     Attributes:
       trajectories: drawn so far, this step's included.
@@ -244,6 +282,9 @@ def make_problem(
       horizon: T, at least 1; default the environment's.
       limit: on the expected cost of a trajectory; may be negative. CPO needs it.
 
+    Returns:
+      :class:`Problem`.
+
     Raises:
       ValueError: finitely many actions, episodes that never end, a horizon below 1, or a limit
         that is no number.
@@ -320,12 +361,27 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
     """What was learned, an :class:`~jaxltl.core.models.environment.Agent` that draws its actions.
 
     :func:`act` tells the distribution that they are drawn from.
+
+    Args:
+      state: of one run.
+      problem, hparams: of the run.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Agent`, a pytree.
     """
     return Agent(Partial(_drawn, state, problem, hparams))
 
 
 def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
-    """The same, taking the mean of the actions each time."""
+    """The same, taking the mean of the actions each time.
+
+    Args:
+      state: of one run.
+      problem, hparams: of the run.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Agent`, a pytree.
+    """
     return Agent(Partial(_mean, state, problem, hparams))
 
 
@@ -353,6 +409,9 @@ def act(state: State, hparams: Hparams, observation: jax.Array) -> tuple[jax.Arr
     Args:
       state, hparams: of the learner.
       observation: ``float[..., O]``.
+
+    Returns:
+      Two arrays, in units of the action before it is clipped; differentiable in the parameters.
     """
     return gaussian(state.parameters, hparams, normalized(state.moments, hparams, observation))
 
@@ -429,6 +488,14 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """Random networks. If observations are normalised, a first batch of trajectories is drawn
     for their moments, and counted.
 
+    Args:
+      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
+      problem: of :func:`make_problem`.
+      hparams: :class:`Hparams`.
+
+    Returns:
+      :class:`State`, no step made.
+
     Raises:
       ValueError: a method that does not fit the problem, or a number below 1.
     """
@@ -466,7 +533,15 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
 
 
 def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """N trajectories, one step of the policy, and the value networks fitted to the same ones."""
+    """N trajectories, one step of the policy, and the value networks fitted to the same ones.
+
+    Args:
+      state: of :func:`init` or of an earlier step; unchanged.
+      problem, hparams: as of :func:`init`.
+
+    Returns:
+      The next :class:`State`, and :class:`Metrics`, figures of the step.
+    """
     _check(problem, hparams)
     draw_key, fit_key = jax.random.split(learner.step_key(state))
     batch = rollout(
