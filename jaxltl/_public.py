@@ -199,7 +199,7 @@ def _drawn(value: object) -> str | None:
 
 
 for _kind in (
-    Automaton, DenseMDP, FiniteMemoryPolicy, Game, MDP, Permissive, Product, Solution, SparseMDP,
+    Automaton, DenseMDP, Game, MDP, Permissive, Product, Solution, SparseMDP,
     Winning,
 ):
     picture.register(_kind, _drawn)

@@ -1,16 +1,18 @@
-"""Pictures, one call each: automata, grid maps, games of two robots, learning curves.
+"""Pictures, one call each: automata, models, grid maps, games of two robots, learning curves.
 
 Each function returns a new matplotlib ``Figure`` and touches no global state, so it works
 without a display and in any thread. ``figure.savefig("name.svg")`` writes it. Those named live
 return the text of an SVG for pages that move.
 """
 
+from jaxltl.plot import notebook as notebook
 from jaxltl.plot.automata import automaton
 from jaxltl.plot.curves import bands, curves, guarantees, lines, paths, sweep
 from jaxltl.plot.described import described
 from jaxltl.plot.games import compare, game_moves, game_region, game_values
 from jaxltl.plot.live import live_automaton, live_curve, live_map
 from jaxltl.plot.maps import grid, strategies
+from jaxltl.plot.models import model, solution
 from jaxltl.plot.style import to_bytes
 from jaxltl.plot.worlds import temporal_gridworld
 
@@ -29,7 +31,9 @@ __all__ = [
     "live_automaton",
     "live_curve",
     "live_map",
+    "model",
     "paths",
+    "solution",
     "strategies",
     "sweep",
     "temporal_gridworld",

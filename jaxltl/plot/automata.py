@@ -68,15 +68,15 @@ def automaton(
     axes.set(xlim=((width - full) / 2, (width + full) / 2), ylim=(0, height), aspect="equal")
     axes.axis("off")
     for edge in graph.edges:
-        _edge(axes, edge.curve, _edge_color(table, edge.key, doomed))
+        draw_edge(axes, edge.curve, _edge_color(table, edge.key, doomed))
     for label in graph.labels:
-        _label(axes, label, MUTED if doomed[label.key[1]] else INK)
+        draw_label(axes, label, MUTED if doomed[label.key[1]] else INK)
     start = graph.position[int(table.initial)]
     tail = start - [drawing.RADIUS + 0.42, 0]
-    _edge(axes, np.array([tail, (tail + start) / 2, start - [drawing.RADIUS, 0]]), INK)
+    draw_edge(axes, np.array([tail, (tail + start) / 2, start - [drawing.RADIUS, 0]]), INK)
     final = table.final if table.acceptance in ("cosafe", "safety") else doomed & False
     for q, center in enumerate(graph.position):
-        _state(axes, center, str(q), bool(final[q]), bool(doomed[q]))
+        draw_state(axes, center, str(q), bool(final[q]), bool(doomed[q]))
     for i, line in enumerate(lines):
         figure.text(
             0.25 / full, (below - 0.19 * (i + 0.5)) / (height + below), line, fontsize=8,
@@ -183,7 +183,7 @@ def _edge_color(table: Automaton, key: drawing.Key, doomed: NDArray[np.bool_]) -
     return ACCENT if table.acceptance == "buchi" and curve == 0 else INK
 
 
-def _label(axes: Axes, label: drawing.Label, color: str) -> None:
+def draw_label(axes: Axes, label: drawing.Label, color: str) -> None:
     """The lines of a label in the middle; if some have marks, to the left, after the marks."""
     rows, (x, y) = label.rows, label.center
     style: dict[str, Any] = {
@@ -214,7 +214,8 @@ def _mark(axes: Axes, center: tuple[float, float], mark: str) -> None:
                   color=PAPER if filled else INK, zorder=5)
 
 
-def _edge(axes: Axes, curve: NDArray[np.float64], color: str) -> None:
+def draw_edge(axes: Axes, curve: NDArray[np.float64], color: str) -> None:
+    """An arrow along a Bezier curve."""
     codes = [Path.MOVETO] + [Path.CURVE3 if len(curve) == 3 else Path.CURVE4] * (len(curve) - 1)
     axes.add_patch(
         FancyArrowPatch(
@@ -224,7 +225,10 @@ def _edge(axes: Axes, curve: NDArray[np.float64], color: str) -> None:
     )
 
 
-def _state(axes: Axes, center: NDArray[np.float64], text: str, final: bool, doomed: bool) -> None:
+def draw_state(
+    axes: Axes, center: NDArray[np.float64], text: str, final: bool, doomed: bool
+) -> None:
+    """A circle with a text, double where it is final, grey where it is doomed."""
     line, fill = (MUTED, "#f2f3f5") if doomed else (INK, GOOD if final else PAPER)
     axes.add_patch(
         Circle(tuple(center), drawing.RADIUS, facecolor=fill, edgecolor=line, lw=1.3, zorder=5)

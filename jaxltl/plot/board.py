@@ -30,8 +30,10 @@ class Board(NamedTuple):
     wall: str
 
 
-def board_of(board: int | str, wall: str) -> Board:
-    """The board of a map, or of a number of cells a side."""
+def board_of(board: int | str | Board, wall: str) -> Board:
+    """The board of a map, or of a number of cells a side; or the board that it is."""
+    if isinstance(board, Board):
+        return board
     if isinstance(board, str):
         cells = parse_map(board)
         return Board(cells, np.argwhere(cells != wall), wall)
@@ -46,9 +48,18 @@ def fill_cells(axes: Axes, world: Board, colors: Sequence[str], lines: str = PAP
         axes.add_patch(Rectangle((column, row), 1, 1, facecolor=color, lw=0))
         kind = world.cells[row, column]
         if kind not in (".", world.wall) and max(world.cells.shape) <= 16:
-            axes.text(column + 0.07, row + 0.07, kind, ha="left", va="top", fontsize=6.5,
-                      color=MUTED, weight="bold", parse_math=False, zorder=5)
+            axes.text(column + 0.07, row + 0.07, short_name(kind), ha="left", va="top",
+                      fontsize=6.5, color=MUTED, weight="bold", parse_math=False, zorder=5)
     frame_cells(axes, world, lines)
+
+
+def short_name(kind: str) -> str:
+    """The name of a cell, as much of it as there is room for.
+
+    >>> short_name("goal"), short_name("upper_left")
+    ('goal', 'uppe…')
+    """
+    return kind if len(kind) <= 5 else f"{kind[:4]}…"
 
 
 def frame_cells(axes: Axes, world: Board, color: str = PAPER) -> None:

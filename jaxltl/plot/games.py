@@ -102,7 +102,7 @@ def game_values(
 
 def game_region(
     region: ArrayLike,
-    board: int | str,
+    board: int | str | Board,
     *,
     environment: Sequence[int] | None = None,
     wall: str = "#",
@@ -111,7 +111,7 @@ def game_region(
 
     Args:
       region: ``bool[2 * C * C]``, see :func:`game_values`.
-      board, environment, wall: as there.
+      board, environment, wall: as there; or a board as :mod:`jaxltl.plot.board` has it.
 
     Returns:
       The figure.

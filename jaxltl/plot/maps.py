@@ -25,6 +25,7 @@ from jaxltl.plot.board import (
     require_directions,
     rows_of_maps,
     rule_cells,
+    short_name,
 )
 from jaxltl.plot.style import FAINT, INK, KINDS, PAPER, SCALE, head, note, scale_bar, value_limits
 
@@ -90,6 +91,11 @@ def grid(
         keep_out_of_layout(axes)
     if panels is not None:
         scale_bar(figure, image, all_axes.tolist(), label)
+    engine = figure.get_layout_engine()
+    if engine is not None and any(titles):
+        # Titles find their height above the numbers only when these have found theirs: once more
+        # than drawing does it.
+        engine.execute(figure)
     return figure
 
 
@@ -144,11 +150,11 @@ def _cells(
             if blank:
                 axes.add_patch(Rectangle((c, r), 1, 1, facecolor=color, lw=0))
             if not tiny and blank:
-                axes.text(c + 0.5, r + 0.5, kind, ha="center", va="center", fontsize=9, color=INK,
-                          parse_math=False)
+                axes.text(c + 0.5, r + 0.5, short_name(kind), ha="center", va="center",
+                          fontsize=9, color=INK, parse_math=False)
             elif not tiny:
-                axes.text(c + 0.06, r + 0.06, kind, ha="left", va="top", fontsize=6.5, color=INK,
-                          weight="bold", parse_math=False, zorder=5,
+                axes.text(c + 0.06, r + 0.06, short_name(kind), ha="left", va="top",
+                          fontsize=6.5, color=INK, weight="bold", parse_math=False, zorder=5,
                           bbox={"facecolor": color, "edgecolor": "none", "pad": 0.9})
         if numbers and not blank and not tiny:
             dark = shown[r, c] < low + 0.5 * (high - low)

@@ -1,0 +1,345 @@
+"""Models and solutions as pictures: maps where moves lie on a grid, else graphs of few states."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.types import Solution
+from jaxltl.envs.gridworld import ACTIONS
+from jaxltl.plot import layout as drawing
+from jaxltl.plot.automata import draw_edge, draw_label, draw_state
+from jaxltl.plot.board import Board
+from jaxltl.plot.maps import grid
+from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER, plain_axes
+
+MOST_CELLS, MOST_STATES, MOST_ARROWS = 900, 16, 40  # up to which something is drawn
+_MOST_PANELS = 9
+_WALL = "#"
+
+
+def model(model: Any) -> Figure:
+    """A model: the map on which its moves lie, or the graph of its few states.
+
+    That moves lie on a map is read off them: there are four actions, most of what each does goes
+    one cell up, down, left or right, or stays, and states are numbered in rows from the top left,
+    as :func:`~jaxltl.gridworld` has it. What nobody enters or leaves is a wall. In a game of two
+    robots, see :func:`~jaxltl.grid_game`, the map is that of both.
+
+    Args:
+      model: an MDP, a DenseMDP, a SparseMDP, or a Game or a Product of one of them, of which the
+        world is shown.
+
+    Returns:
+      The figure. In a graph an arrow has the choice and its probability, unless that is 1; states
+      of a game in which the environment moves are square.
+
+    Raises:
+      ValueError: there is no map, and there are too many states for a graph.
+    """
+    world = model.mdp if isinstance(model, Product) else model
+    inner = world.mdp if isinstance(world, Game) else world
+    if isinstance(world, Game) and (board := board_of_robots(world)) is not None:
+        return grid(board.cells, wall=board.wall)
+    if isinstance(inner, Product):
+        raise ValueError("model: a game on a product is not drawn; give the game of its world.")
+    if (cells := map_of(inner)) is not None:
+        return grid(cells, wall=_WALL)
+    return _graph(inner, np.asarray(world.system) if isinstance(world, Game) else None, None, None)
+
+
+def solution(solution: Solution, model: Any = None, *, memories: Any = None) -> Figure:
+    """What a solver found: values and policy on the map or graph of a model, or values alone.
+
+    Args:
+      solution: of one lane; without a model also of several.
+      model: what was solved. Without it the values are drawn from the least to the greatest, with
+        their certified bounds.
+      memories: of a product, which memory states to show; default those in which the values are
+        not all the same, at most nine of them.
+
+    Returns:
+      The figure, with a panel for each memory state of a product.
+
+    Raises:
+      ValueError: the model has no map and is too large for a graph, or the solution is another
+        one's.
+    """
+    if model is None:
+        return _strip(solution)
+    world = model.mdp if isinstance(model, Product) else model
+    values, given = np.asarray(solution.value), np.asarray(solution.policy)
+    if values.shape != tuple(model.state_shape):
+        raise ValueError(
+            f"solution: its value has shape {values.shape}, the model's states "
+            f"{tuple(model.state_shape)}; give the model that was solved, and one lane.")
+    cells = map_of(world)
+    if cells is None:
+        if isinstance(model, Product):
+            raise ValueError("solution: the product's world has no map; read the values.")
+        return _graph(world, None, values, given if given.dtype.kind in "iu" else None)
+    is_known = given.dtype.kind in "iu" or given.shape[values.ndim :] == (len(ACTIONS),)
+    policy = given if is_known else None
+    inside = (cells != _WALL).ravel()
+    if not isinstance(model, Product):
+        return grid(cells, np.where(inside, values, np.nan), _arrows(policy, inside),
+                    limits=_limits(values), wall=_WALL)
+    chosen = _open_memories(values, inside) if memories is None else [int(q) for q in memories]
+    if not chosen or not all(0 <= q < values.shape[1] for q in chosen):
+        raise ValueError(f"memories={memories}; give some of 0 to {values.shape[1] - 1}.")
+    names = model.automaton.state_names or ("",) * values.shape[1]
+    titles = [textwrap.shorten(f"memory {q}: {names[q]}".rstrip(": "), 34, placeholder=" …")
+              for q in chosen]
+    arrows = None if policy is None else np.stack(
+        [_arrows(policy[:, q], inside) for q in chosen])  # type: ignore[misc]
+    return grid(cells, np.stack([np.where(inside, values[:, q], np.nan) for q in chosen]), arrows,
+                titles=titles, limits=_limits(values), wall=_WALL)
+
+
+def _limits(values: NDArray[Any]) -> tuple[float, float] | None:
+    """The scale of probabilities, or that of the data."""
+    return (0.0, 1.0) if values.size and values.min() >= 0 and values.max() <= 1 else None
+
+
+def _arrows(policy: NDArray[Any] | None, inside: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+    if policy is None:
+        return None
+    chance = np.eye(4)[policy] if policy.dtype.kind in "iu" else policy.astype(float)
+    return np.where(inside[:, None], chance, np.nan)
+
+
+def _open_memories(values: NDArray[Any], inside: NDArray[np.bool_]) -> list[int]:
+    spread = [q for q in range(values.shape[1]) if np.ptp(values[inside, q]) > 0]
+    return (spread or [0])[:_MOST_PANELS]
+
+
+def _strip(found: Solution) -> Figure:
+    """Values of all states from the least to the greatest; a line for each lane."""
+    value, low, high = (np.asarray(x, float) for x in (found.value, found.lower, found.upper))
+    lanes = int(np.prod(np.shape(found.status)))
+    figure = Figure(figsize=(4.6, 1.7), layout="constrained", facecolor=PAPER)
+    axes = figure.subplots()
+    plain_axes(axes)
+    for mine, least, most in zip(*(x.reshape(lanes, -1)[:8] for x in (value, low, high)),
+                                 strict=True):
+        order = np.argsort(mine, kind="stable")
+        kept = order[np.linspace(0, order.size - 1, min(order.size, 1000)).astype(int)]
+        edges = np.linspace(0, order.size, len(kept) + 1)
+        below, above, middle = (
+            np.where(np.isfinite(x[kept]), x[kept], np.nan) for x in (least, most, mine))
+        axes.stairs(above, edges, baseline=below, fill=True, color=ACCENT, alpha=0.25)
+        axes.stairs(middle, edges, baseline=None, color=ACCENT, lw=1.4)
+    axes.set_xlabel("states, from the least value to the greatest", fontsize=8, color=MUTED)
+    axes.set_ylabel("value", fontsize=8, color=MUTED)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.margins(x=0.01)
+    return figure
+
+
+# --- maps -----------------------------------------------------------------------------------------
+
+
+def map_of(world: Any) -> NDArray[np.str_] | None:
+    """The cells of a map on which a model's moves lie, ``str[rows, columns]``, or None.
+
+    Example:
+      >>> from jaxltl.envs.gridworld import gridworld
+      >>> map_of(gridworld("b.#y")).tolist()
+      [['b', '.', '#', 'y']]
+    """
+    if not isinstance(world, MDP | DenseMDP) or world.available.ndim != 2 or (
+            world.num_actions != len(ACTIONS) or not 1 < world.num_states <= MOST_CELLS):
+        return None
+    state = np.arange(world.num_states)
+    target = _likeliest(world)
+    step = np.where(np.asarray(world.available), target - state[:, None], 0)
+    up, down, left, right = step.T
+    heights = {*np.abs(np.stack([up, down])).ravel().tolist()} - {0}
+    columns = heights.pop() if heights else len(state)
+    fits = (
+        not heights and len(state) % columns == 0 and step.any()
+        and (up <= 0).all() and (down >= 0).all()
+        and np.isin(left, (-1, 0)).all() and np.isin(right, (0, 1)).all()
+        and not (left[state % columns == 0]).any()
+        and not (right[state % columns == columns - 1]).any()
+    )
+    if not fits:
+        return None
+    stuck = ~step.any(axis=1)
+    entered = np.zeros(len(state), bool)
+    entered[(state[:, None] + step)[step != 0]] = True
+    wall = stuck & ~entered & ~(np.asarray(world.initial) > 0)
+    label = np.asarray(world.label)
+    names = np.array([
+        _WALL if here else ",".join(np.array(world.propositions)[row]) or "."
+        for here, row in zip(wall, label, strict=True)
+    ])
+    return None if _WALL in world.propositions else names.reshape(-1, columns)
+
+
+def _likeliest(world: MDP | DenseMDP) -> NDArray[np.int64]:
+    """``int[S, A]``, the most likely successor."""
+    if isinstance(world, DenseMDP):
+        return np.argmax(np.asarray(world.transition), axis=-1)
+    first = np.argmax(np.asarray(world.probability), axis=-1)[..., None]
+    found = np.take_along_axis(np.asarray(world.successor), first, axis=-1)[..., 0]
+    return np.asarray(found, np.int64)
+
+
+def board_of_robots(game: Game) -> Board | None:
+    """The board of a game of two robots in turns, read off the system's moves, or None."""
+    world, count = game.mdp, round((game.num_states / 2) ** 0.5)
+    known = isinstance(world, MDP) and world.num_actions == 5 and (
+        world.propositions[:3] == ("collision", "diagonal", "system_turn"))
+    if not known or 2 * count**2 != world.num_states or count > MOST_CELLS:
+        return None
+    own = 2 * np.arange(count) + 1  # the environment in its first place, the system to move
+    target = np.where(np.asarray(world.available)[own], _likeliest(world)[own] // 2, -1)
+    steps = ((-1, 0), (1, 0), (0, -1), (0, 1))
+    place: dict[int, tuple[int, int]] = {0: (0, 0)}
+    queue = [0]
+    while queue:
+        here = queue.pop()
+        for (down, right), there in zip(steps, target[here, :4].tolist(), strict=True):
+            spot = (place[here][0] + down, place[here][1] + right)
+            if there < 0 or there == here:
+                continue
+            if there not in place:
+                place[there] = spot
+                queue.append(there)
+            elif place[there] != spot:
+                return None
+    if len(place) != count or len({*place.values()}) != count:
+        return None
+    places = np.array([place[i] for i in range(count)])
+    places -= places.min(axis=0)
+    cells = np.full(places.max(axis=0) + 1, _WALL, dtype="<U64")
+    marks = [(i, p.removeprefix("system_")) for i, p in enumerate(world.propositions[3:], 3)
+             if p.startswith("system_")]
+    label = np.asarray(world.label)[own]
+    for i, spot in enumerate(places):
+        cells[tuple(spot)] = ",".join(name for k, name in marks if label[i, k]) or "."
+    return Board(cells, places, _WALL)
+
+
+# --- graphs ---------------------------------------------------------------------------------------
+
+
+class _Arrow(NamedTuple):
+    source: int
+    target: int
+    number: int  # of the choice, as policies name it
+    choice: str
+    probability: float
+
+
+def _arrows_of(world: Any) -> Iterator[_Arrow]:
+    """What is possible in a model, choice by choice."""
+    if isinstance(world, SparseMDP):
+        rows, entries = np.asarray(world.row_start), np.asarray(world.entry_start)
+        for s in range(world.num_states):
+            for k, r in enumerate(range(rows[s], rows[s + 1])):
+                name = str(k) if rows[s + 1] - rows[s] > 1 else ""
+                if world.action is not None and world.action_names:
+                    name = world.action_names[int(world.action[r])]
+                for e in range(entries[r], entries[r + 1]):
+                    yield _Arrow(s, int(world.successor[e]), r, name, float(world.probability[e]))
+        return
+    dense = isinstance(world, DenseMDP)
+    weight = np.asarray(world.transition if dense else world.probability)
+    used = (weight > 0) & np.asarray(world.available)[..., None]
+    for s, a, k in np.argwhere(used).tolist():
+        target = k if dense else int(np.asarray(world.successor)[s, a, k])
+        name = str(a) if used[s].any(axis=-1).sum() > 1 else ""
+        yield _Arrow(s, target, a, name, float(weight[s, a, k]))
+
+
+def _graph(
+    world: Any, system: NDArray[np.bool_] | None, values: NDArray[Any] | None,
+    policy: NDArray[np.int64] | None, region: NDArray[np.bool_] | None = None,
+) -> Figure:
+    count = world.num_states
+    if count > MOST_STATES:
+        raise ValueError(
+            f"model: it has {count} states and its moves lie on no map; graphs have up to "
+            f"{MOST_STATES} states.")
+    arrows = list(_arrows_of(world))
+    rows: dict[drawing.Key, drawing.Rows] = {}
+    for x in arrows:
+        chance = "" if x.probability == 1 else f"{x.probability:.3g}".removeprefix("0")
+        text = ": ".join(part for part in (x.choice, chance) if part)
+        text = text or ("⊤" if x.source == x.target else "1")  # such a loop is left out
+        key = (x.source, x.target, 0)
+        rows[key] = (*rows.get(key, ()), ("", text))
+    if len(rows) > MOST_ARROWS:
+        raise ValueError(
+            f"model: it has {len(rows)} arrows; graphs have up to {MOST_ARROWS}.")
+    delta = np.repeat(np.arange(count)[:, None], max(1, len(arrows)), axis=1)
+    for i, x in enumerate(arrows):
+        delta[x.source, i] = x.target
+    starts = np.flatnonzero(np.asarray(world.initial) > 0)
+    first = int(starts[0]) if starts.size else 0
+    graph = drawing.arrange(delta, first, np.zeros(count, bool), rows)
+    lines = _notes(world, values)
+    width, height = graph.size
+    full = max([width, *(0.5 + 0.602 * 8 / 72 * len(line) for line in lines)])
+    below = 0.19 * len(lines) + (0.25 if lines else 0.0)
+    figure = Figure(figsize=(full, height + below), facecolor=PAPER)
+    axes = figure.add_axes((0, below / (height + below), 1, height / (height + below)))
+    axes.set(xlim=((width - full) / 2, (width + full) / 2), ylim=(0, height), aspect="equal")
+    axes.axis("off")
+    taken = {(x.source, x.target) for x in arrows if policy is not None
+             and policy[x.source] == x.number}
+    for edge in graph.edges:
+        draw_edge(axes, edge.curve, ACCENT if edge.key[:2] in taken else INK)
+    for label in graph.labels:
+        draw_label(axes, label, INK)
+    if len(starts) == 1:
+        start = graph.position[first]
+        tail = start - [drawing.RADIUS + 0.42, 0]
+        draw_edge(axes, np.array([tail, (tail + start) / 2, start - [drawing.RADIUS, 0]]), INK)
+    for s, center in enumerate(graph.position):
+        if system is not None and not system[s]:
+            _square(axes, center, str(s), region is not None and bool(region[s]))
+        else:
+            draw_state(axes, center, str(s), region is not None and bool(region[s]), False)
+    for i, line in enumerate(lines):
+        figure.text(
+            0.25 / full, (below - 0.19 * (i + 0.5)) / (height + below), line, fontsize=8,
+            color=MUTED, va="center", family="monospace", parse_math=False,
+        )
+    return figure
+
+
+def _square(axes: Axes, center: NDArray[np.float64], text: str, good: bool) -> None:
+    half = drawing.RADIUS * 0.9
+    axes.add_patch(Rectangle(
+        tuple(center - half), 2 * half, 2 * half, facecolor=GOOD if good else FAINT, edgecolor=INK,
+        lw=1.3, zorder=5))
+    axes.text(center[0], center[1], text, ha="center", va="center_baseline", fontsize=11,
+              color=INK, zorder=6)
+
+
+def _notes(world: Any, values: NDArray[Any] | None) -> list[str]:
+    """What holds, and what is worth what, state by state."""
+    label = np.asarray(world.label)
+    lines = []
+    for s in range(world.num_states):
+        held = ", ".join(np.array(world.propositions)[label[s]]) if label.size else ""
+        value = "" if values is None else f"{values[s]:.6g}"
+        if held or value:
+            lines.append(textwrap.shorten(
+                f"{s}: {'; '.join(x for x in (value, held) if x)}", 60, placeholder=" …"))
+    return lines
