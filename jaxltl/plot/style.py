@@ -12,6 +12,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 INK, MUTED, FAINT = "#1f2a37", "#6b7785", "#d5dae0"
@@ -88,7 +89,9 @@ def scale_bar(
     aspect: float = 24,
 ) -> None:
     """What the colours of values mean, beside the maps."""
-    bar = figure.colorbar(image, ax=list(axes), shrink=shrink, pad=0.015, aspect=aspect)
+    # As many ticks at any height, so that the layout, which comes first, finds labels as they are.
+    bar = figure.colorbar(image, ax=list(axes), shrink=shrink, pad=0.015, aspect=aspect,
+                          ticks=MaxNLocator(5))
     bar.set_label(label, fontsize=9, color=INK)
     bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=8, color=MUTED, labelcolor=INK, length=2)
