@@ -2,10 +2,9 @@
 
 Each function returns a new matplotlib ``Figure`` and touches no global state, so it works
 without a display and in any thread. ``figure.savefig("name.svg")`` writes it. Those named live
-return the text of an SVG for pages that move.
+return the text of an SVG for pages that move, and ``playback`` that of one that moves by itself.
 """
 
-from jaxltl.plot import notebook as notebook
 from jaxltl.plot.automata import automaton
 from jaxltl.plot.curves import bands, curves, guarantees, lines, paths, sweep
 from jaxltl.plot.described import described
@@ -13,6 +12,7 @@ from jaxltl.plot.games import compare, game_moves, game_region, game_values
 from jaxltl.plot.live import live_automaton, live_curve, live_map
 from jaxltl.plot.maps import grid, strategies
 from jaxltl.plot.models import model, solution
+from jaxltl.plot.playback import playback
 from jaxltl.plot.style import to_bytes
 from jaxltl.plot.worlds import temporal_gridworld
 
@@ -33,6 +33,7 @@ __all__ = [
     "live_map",
     "model",
     "paths",
+    "playback",
     "solution",
     "strategies",
     "sweep",

@@ -142,7 +142,7 @@ def _cells(
     )
     tiny = max(rows, columns) > 16
     for (r, c), kind in np.ndenumerate(kinds):
-        blank = np.isnan(shown[r, c])
+        blank = np.isnan(shown[r, c]) or kind == wall
         if kind == wall:
             axes.add_patch(Rectangle((c, r), 1, 1, facecolor=WALL, lw=0))
         elif kind in special:
