@@ -1,10 +1,14 @@
-"""Models and solutions as pictures: maps where moves lie on a grid, else graphs of few states."""
+"""Models and solutions as pictures: maps where moves lie on a grid, else graphs of few states.
+
+Kinds of models are told by their fields: to import their types would load JAX, for which who draws
+in a process apart need not wait.
+"""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,17 +17,14 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from jaxltl.core.models.game import Game
-from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.models.product import Product
-from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.types import Solution
-from jaxltl.envs.gridworld import ACTIONS
 from jaxltl.plot import layout as drawing
 from jaxltl.plot.automata import draw_edge, draw_label, draw_state
-from jaxltl.plot.board import Board
+from jaxltl.plot.board import STEPS, Board
 from jaxltl.plot.maps import grid
 from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER, plain_axes
+
+if TYPE_CHECKING:
+    from jaxltl.core.types import Solution
 
 MOST_CELLS, MOST_STATES, MOST_ARROWS = 900, 16, 40  # up to which something is drawn
 _MOST_PANELS = 9
@@ -49,15 +50,16 @@ def model(model: Any) -> Figure:
     Raises:
       ValueError: there is no map, and there are too many states for a graph.
     """
-    world = model.mdp if isinstance(model, Product) else model
-    inner = world.mdp if isinstance(world, Game) else world
-    if isinstance(world, Game) and (board := board_of_robots(world)) is not None:
+    world = model.mdp if hasattr(model, "automaton") else model
+    system = getattr(world, "system", None)
+    if system is not None and (board := board_of_robots(world)) is not None:
         return grid(board.cells, wall=board.wall)
-    if isinstance(inner, Product):
+    inner = world if system is None else world.mdp
+    if hasattr(inner, "automaton"):
         raise ValueError("model: a game on a product is not drawn; give the game of its world.")
     if (cells := map_of(inner)) is not None:
         return grid(cells, wall=_WALL)
-    return _graph(inner, np.asarray(world.system) if isinstance(world, Game) else None, None, None)
+    return _graph(inner, None if system is None else np.asarray(system), None, None)
 
 
 def solution(solution: Solution, model: Any = None, *, memories: Any = None) -> Figure:
@@ -79,7 +81,8 @@ def solution(solution: Solution, model: Any = None, *, memories: Any = None) -> 
     """
     if model is None:
         return _strip(solution)
-    world = model.mdp if isinstance(model, Product) else model
+    is_product = hasattr(model, "automaton")
+    world = model.mdp if is_product else model
     values, given = np.asarray(solution.value), np.asarray(solution.policy)
     if values.shape != tuple(model.state_shape):
         raise ValueError(
@@ -87,13 +90,13 @@ def solution(solution: Solution, model: Any = None, *, memories: Any = None) -> 
             f"{tuple(model.state_shape)}; give the model that was solved, and one lane.")
     cells = map_of(world)
     if cells is None:
-        if isinstance(model, Product):
+        if is_product:
             raise ValueError("solution: the product's world has no map; read the values.")
         return _graph(world, None, values, given if given.dtype.kind in "iu" else None)
-    is_known = given.dtype.kind in "iu" or given.shape[values.ndim :] == (len(ACTIONS),)
+    is_known = given.dtype.kind in "iu" or given.shape[values.ndim :] == (len(STEPS),)
     policy = given if is_known else None
     inside = (cells != _WALL).ravel()
-    if not isinstance(model, Product):
+    if not is_product:
         return grid(cells, np.where(inside, values, np.nan), _arrows(policy, inside),
                     limits=_limits(values), wall=_WALL)
     chosen = _open_memories(values, inside) if memories is None else [int(q) for q in memories]
@@ -159,8 +162,10 @@ def map_of(world: Any) -> NDArray[np.str_] | None:
       >>> map_of(gridworld("b.#y")).tolist()
       [['b', '.', '#', 'y']]
     """
-    if not isinstance(world, MDP | DenseMDP) or world.available.ndim != 2 or (
-            world.num_actions != len(ACTIONS) or not 1 < world.num_states <= MOST_CELLS):
+    if hasattr(world, "row_start") or not (hasattr(world, "successor") or _is_dense(world)):
+        return None
+    if world.available.ndim != 2 or not (
+            world.num_actions == len(STEPS) and 1 < world.num_states <= MOST_CELLS):
         return None
     state = np.arange(world.num_states)
     target = _likeliest(world)
@@ -189,25 +194,29 @@ def map_of(world: Any) -> NDArray[np.str_] | None:
     return None if _WALL in world.propositions else names.reshape(-1, columns)
 
 
-def _likeliest(world: MDP | DenseMDP) -> NDArray[np.int64]:
+def _is_dense(world: Any) -> bool:
+    return hasattr(world, "transition")
+
+
+def _likeliest(world: Any) -> NDArray[np.int64]:
     """``int[S, A]``, the most likely successor."""
-    if isinstance(world, DenseMDP):
+    if _is_dense(world):
         return np.argmax(np.asarray(world.transition), axis=-1)
     first = np.argmax(np.asarray(world.probability), axis=-1)[..., None]
     found = np.take_along_axis(np.asarray(world.successor), first, axis=-1)[..., 0]
     return np.asarray(found, np.int64)
 
 
-def board_of_robots(game: Game) -> Board | None:
+def board_of_robots(game: Any) -> Board | None:
     """The board of a game of two robots in turns, read off the system's moves, or None."""
     world, count = game.mdp, round((game.num_states / 2) ** 0.5)
-    known = isinstance(world, MDP) and world.num_actions == 5 and (
+    known = hasattr(world, "probability") and world.available.shape[1:] == (5,) and (
         world.propositions[:3] == ("collision", "diagonal", "system_turn"))
     if not known or 2 * count**2 != world.num_states or count > MOST_CELLS:
         return None
     own = 2 * np.arange(count) + 1  # the environment in its first place, the system to move
     target = np.where(np.asarray(world.available)[own], _likeliest(world)[own] // 2, -1)
-    steps = ((-1, 0), (1, 0), (0, -1), (0, 1))
+    steps = [(down, right) for right, down in STEPS.values()]
     place: dict[int, tuple[int, int]] = {0: (0, 0)}
     queue = [0]
     while queue:
@@ -247,7 +256,7 @@ class _Arrow(NamedTuple):
 
 def _arrows_of(world: Any) -> Iterator[_Arrow]:
     """What is possible in a model, choice by choice."""
-    if isinstance(world, SparseMDP):
+    if hasattr(world, "row_start"):
         rows, entries = np.asarray(world.row_start), np.asarray(world.entry_start)
         for s in range(world.num_states):
             for k, r in enumerate(range(rows[s], rows[s + 1])):
@@ -257,7 +266,7 @@ def _arrows_of(world: Any) -> Iterator[_Arrow]:
                 for e in range(entries[r], entries[r + 1]):
                     yield _Arrow(s, int(world.successor[e]), r, name, float(world.probability[e]))
         return
-    dense = isinstance(world, DenseMDP)
+    dense = _is_dense(world)
     weight = np.asarray(world.transition if dense else world.probability)
     used = (weight > 0) & np.asarray(world.available)[..., None]
     for s, a, k in np.argwhere(used).tolist():

@@ -181,6 +181,8 @@ def test_graphviz_may_place_the_states(monkeypatch, tmp_path):
 
 
 def test_notebooks_show_a_picture_unless_it_would_crowd(monkeypatch):
+    import jaxltl.plot.notebook  # noqa: F401  as the package's first public name has it
+
     monkeypatch.setattr("shutil.which", lambda name: None)
     picture = to_automaton("G F a")._repr_svg_()
     assert picture is not None
