@@ -421,6 +421,7 @@ except SystemExit:
         assert flags(["reproduce", "mlirl"]) == "None"
     assert flags(["learn", "a.toml"], XLA_FLAGS="--xla_dump_to=x") == "--xla_dump_to=x"
     assert known_flags({"xla_no_compiler_has_this": "1"}) == ""
+    assert known_flags({"xla_backend_optimization": "1"}) == "", "a part of a flag is none"
 
 
 def test_short_work_solves_its_systems_in_one_thread(tmp_path):

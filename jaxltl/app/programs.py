@@ -97,5 +97,6 @@ def known_flags(flags: Mapping[str, str]) -> str:
     for library in home.glob("*.so"):
         with library.open("rb") as file:
             text = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-            found |= {name for name in flags if text.find(name.encode()) >= 0}
+            # A whole text: names of flags that are gone stand among others for good.
+            found |= {name for name in flags if text.find(b"\0%b\0" % name.encode()) >= 0}
     return " ".join(f"--{name}={value}" for name, value in flags.items() if name in found)
