@@ -1,209 +1,217 @@
-"""What the README, the pages with examples and the notebooks show runs as it stands."""
+"""Every snippet of the README and of the pages runs, and prints what stands beside it.
 
-import importlib.util
-import os
+The blocks of a page run in order, in one namespace and an empty folder beside ``examples``. What is
+printed is compared: with the block without a language that follows, with the comment behind a
+``print``, and in ``pycon`` and ``console`` blocks with what stands there. Comments before a block
+say what is not so, see CONTRIBUTING.md:
+
+- ``<!-- not run: why -->``: it needs a cluster, another program, a file that is not there.
+- ``<!-- minutes: why -->``: it runs with ``-m notebook`` only, with all of its page.
+- ``<!-- needs: package -->``: it runs where that is installed.
+- ``<!-- alone -->``: a namespace and a test of its own, as have those that come after it.
+- ``<!-- single precision -->``: JAX's own setting, for all of the page; the tests' is double.
+- ``<!-- before: code -->``, ``<!-- after: code -->``: Python that is not shown.
+- ``<!-- within 0.1 -->``: numbers may differ by so much, by themselves or relatively.
+"""
+
+import contextlib
+import doctest
+import io
 import re
 import shlex
 import warnings
 from pathlib import Path
+from typing import Any
 
 import jax
-import nbformat
 import pytest
 from click.testing import CliRunner
-from nbclient import NotebookClient
 
 from jaxltl.cli import main
+from notebooks.execute import _difference
+from tests.pages import MARKS, PAGES, ROOT, Block, blocks, name_of
 
-ROOT = Path(__file__).parent.parent
-ADAPTED = ("brax", "craftax", "gymnax", "jumanji", "navix", "pgx", "xminigrid")
-
-
-def test_the_readme_example_runs(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert len(blocks) == 6
-    names: dict = {}
-    for code in blocks:
-        exec(compile(code, "README.md", "exec"), names)
-    assert names["allowed"].maximal and not names["state"].violations
-    assert names["model"].num_transitions == names["coin"].num_transitions == 6
-    assert names["metrics"].loss.shape == (4, 20)
-    assert (names["metrics"].loss[:, -1] < names["metrics"].loss[:, 0]).all()
-    assert names["found"].decision is True
-    printed = capsys.readouterr().out
-    for told in ("P >= 0.938 with confidence 0.95\n", "no policy has more than 0.986", "\n0.8333"):
-        assert told in printed
+RUN = ("python", "sh", "pycon", "console")
+# Of a page that says nothing of how it is tested: what is slow in it, by a text.
+SLOW = {"README.md": ("ppo.train(", "jaxltl learn", "mlirl.train(")}
+ALL_SLOW = ("docs/gallery.md", "docs/guides/")
+INSTALLED = re.compile(r"(pip install|pytest|python -m build|git clone|cd )\b")
+PROMISE = re.compile(r"[-\[({'\"\d]|(True|False|None)\b|[!FGX] ?\(")
 
 
-def test_the_page_on_evaluation_runs(capsys):
-    page = (ROOT / "docs" / "evaluation.md").read_text()
-    names: dict = {}
-    first, second = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    exec(compile(first, "evaluation.md", "exec"), names)
-    jl, jnp = names["jl"], names["jnp"]
-    product = jl.product(names["world"], "!trap U goal")
-    policy = jnp.broadcast_to(jnp.array([0, 0.5, 0, 0.5]), (9, product.num_memory, 4))
-    exact = float(jl.satisfaction_probability(product, policy).value[0, product.automaton.initial])
-    found = names["found"]
-    assert f"it is {exact:.4f}" in page and found.success.lower <= exact <= found.success.upper
-    printed = capsys.readouterr().out.splitlines()
-    shown = page.split("```\n2,000")[1].split("```")[0].splitlines()
-    assert [row.split()[:1] for row in printed[1:]] == [row.split()[:1] for row in shown[1:]]
-    exec(compile(second, "evaluation.md", "exec"), names)
-    assert names["again"].decision is True
+def chapters() -> list[Any]:
+    """The tests: for each page, or part of one that stands alone, its blocks."""
+    found = []
+    for page in PAGES:
+        parts: list[list[Block]] = [[]]
+        for block in blocks(page.read_text()):
+            if "alone" in block.marks:
+                parts.append([])
+            parts[-1].append(block)
+        name = name_of(page)
+        for part in (p for p in parts if any(runs(b) for b in p)):
+            place = f"{name}:{part[0].line}" if len(parts) > 1 else name
+            slow = [b for b in part if runs(b) and is_slow(name, b)]
+            quick = part[: part.index(slow[0])] if slow else part
+            if any(runs(b) for b in quick):
+                found.append(pytest.param(name, quick, id=place))
+            if slow:
+                found.append(
+                    pytest.param(name, part, id=f"{place}-whole", marks=pytest.mark.notebook)
+                )
+    return found
 
 
-def test_the_page_on_worlds_runs(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "worlds-of-the-literature.md").read_text()
-    names: dict = {}
-    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
-        exec(compile(code, "worlds-of-the-literature.md", "exec"), names)
-    assert (tmp_path / "flat.png").read_bytes()[:4] == b"\x89PNG"
-    assert "9800 keyless 75\n" in capsys.readouterr().out
-    gap = names["gap"]
-    assert gap.mean_optimum == (1.0, 1.0) and 0.2 < gap.mean_value[0] < 0.6
-    assert 0 <= gap.mean[1] - gap.mean[0] < 1e-9
+def runs(block: Block) -> bool:
+    """Whether a block is run at all."""
+    return block.language in RUN and "not run" not in block.marks
 
 
-def devices_page(blocks):
-    page = (ROOT / "docs" / "devices.md").read_text()
-    names: dict = {}
-    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL)[:blocks]:
-        exec(compile(code, "devices.md", "exec"), names)
-    return names
+def is_slow(name: str, block: Block) -> bool:
+    """Whether a block takes too long for the default tests."""
+    return (
+        name.startswith(ALL_SLOW)
+        or "minutes" in block.marks
+        or any(x in block.text for x in SLOW.get(name, ()))
+    )
 
 
-def test_the_page_on_devices_runs(capsys):
-    states = devices_page(1)["states"]
-    assert capsys.readouterr().out == f"{[40] * 8} 0\n".replace(",", "")
-    assert len(states.q.sharding.device_set) == 4
-
-
-@pytest.mark.exhaustive
-def test_one_seed_over_several_devices_runs(capsys):
-    devices_page(2)
-    assert capsys.readouterr().out.splitlines()[1].split() == ["[0.5", "1.", "]"]
-
-
-def test_models_over_a_mesh_run(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "devices.md").read_text().split("## Models over a mesh")[1]
-    names: dict = {}
-    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL)[:2]:
-        exec(compile(code, "devices.md", "exec"), names)
-        promised = re.findall(r"print\(.*\)\s+# (\([^)]*\)|[0-9.]+)", code)
-        assert capsys.readouterr().out.splitlines() == promised
-    model, again = names["model"], names["again"]
-    assert again.num_given == model.num_given and again.rounds == model.rounds
-
-
-NEEDS = {"08_from_a_simulator_to_an_interval": ["gymnax"]}  # by a notebook, beside the tests' own
-
-
-@pytest.mark.notebook
-@pytest.mark.parametrize("path", sorted(ROOT.glob("notebooks/*.ipynb")), ids=lambda p: p.stem)
-def test_a_notebook_runs(path, tmp_path):
-    for package in NEEDS.get(path.stem, ()):
-        pytest.importorskip(package)
-    notebook = nbformat.read(path, as_version=4)
-    code = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "code")
-    for name in re.findall(rf"^\s*(?:import|from) ({'|'.join(ADAPTED)})\b", code, re.MULTILINE):
-        if importlib.util.find_spec(name) is None:
-            pytest.skip(f"{path.stem} needs the package {name}")
-    client = NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(tmp_path)}})
-    client.execute(env={**os.environ, "XLA_FLAGS": ""})  # long enough to be compiled for speed
-    outputs = [o for cell in notebook.cells for o in cell.get("outputs", ())]
-    assert not [o for o in outputs if o.output_type == "error"]
-    assert sum("image/png" in o.get("data", {}) for o in outputs) >= 3
-
-
-def test_the_page_on_intervals_runs(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "intervals.md").read_text()
-    (shell,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
-    text, command = shell.removeprefix("cat > rover.drn <<'END'\n").split("END\n")
-    (tmp_path / "rover.drn").write_text(text)
-    done = CliRunner().invoke(main, shlex.split(command.replace("\\\n", ""))[1:])
-    assert done.exit_code == 0, done.output
-    shown = re.search(r"\n```\n(imdp.*?)```", page, re.DOTALL)[1].split("\n\n")
-    found = re.sub(r", read in [^\n]*|[0-9.]+ s, ", "", done.stdout).strip().split("\n\n")
-    assert len(shown) == len(found)
-    for promised, printed in zip(shown, found, strict=True):
-        number = re.compile(r"\d\.\d+")
-        # Digits beyond the tolerance depend on the machine.
-        assert number.sub("", promised).split() == number.sub("", printed).split()
-        for a, b in zip(number.findall(promised), number.findall(printed), strict=True):
-            assert abs(float(a) - float(b)) <= 1e-6
-    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    exec(compile(code, "intervals.md", "exec"), {})
-    assert capsys.readouterr().out == "0.4 [0.4 0.6 1.  1. ]\n[0.7]\n0.3\n"
-
-
-def test_the_page_on_tasks_in_environments_runs(capsys):
-    page = (ROOT / "docs" / "tasks-in-environments.md").read_text()
-    names: dict = {}
-    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
-        exec(compile(code, "tasks-in-environments.md", "exec"), names)
-    promised = re.findall(r"print\(.*\)\s+# ([^:\n]*)", page)
-    assert len(promised) == 4 and capsys.readouterr().out.splitlines() == promised
-
-
-def test_the_page_on_ppo_runs(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "ppo.md").read_text()
-    names: dict = {}
-    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
-        exec(compile(code, "ppo.md", "exec"), names)
-    best, found = float(names["best"]), names["found"].success
-    (promised,) = re.findall(r"print\(.*\)  # (.*)", page)
-    assert promised.endswith(f"at best {best:.3f}") and capsys.readouterr().out.endswith(
-        f"at best {best:.3f}\n")
-    assert found.lower <= best and found.mean > best - 0.1
-    assert names["metrics"].episode_return.shape == (3, 4, 60)
-    assert b"<svg" in (tmp_path / "rates.svg").read_bytes()
-
-
-def test_the_page_on_many_formulas_runs(capsys):
-    page = (ROOT / "docs" / "many-formulas.md").read_text()
-    names: dict = {}
-    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
-        exec(compile(code, "many-formulas.md", "exec"), names)
-    printed = capsys.readouterr().out.splitlines()
-    (sequences,) = re.findall(r"```\n(3 steps.*?)```", page, re.DOTALL)
-    assert printed[3:-1] == sequences.splitlines()
-    assert names["found"].success.lower > 0.8 and len(names["formulas"]) == 3
-    assert names["gap"].mean_optimum == (1.0, 1.0) and names["gap"].mean[1] < 0.2
-
-
-@pytest.mark.parametrize("name", ADAPTED)
+@pytest.mark.parametrize(("page", "part"), chapters())
 @pytest.mark.filterwarnings("ignore:Brax System:UserWarning")
-def test_the_page_on_environments_runs(name, capsys):
-    page = (ROOT / "docs" / "environments.md").read_text()
-    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    (code,) = (x for x in blocks if re.search(rf"^(import|from) {name}\b", x, re.MULTILINE))
-    assert len(blocks) == 7
-    with jax.enable_x64(False), warnings.catch_warnings():  # as the packages are imported
-        warnings.simplefilter("ignore", DeprecationWarning)
-        pytest.importorskip(name)
-        capsys.readouterr()
-        exec(compile(code, "environments.md", "exec"), {})
-    (promised,) = re.findall(r"print\(.*\)\s+# (.*)", code)
-    assert capsys.readouterr().out.splitlines() == [promised]
-
-
-def test_the_page_on_data_shows_what_the_command_prints(tmp_path, monkeypatch):
-    """And the log of the example is what the script on the page writes."""
+def test_the_snippets_run(page, part, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "data.md").read_text()
-    (script,) = (x for x in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "WORLD" in x)
-    exec(compile(script, "data.md", "exec"), {})
-    log = (ROOT / "examples" / "log_patrol.csv").read_text()
-    assert (tmp_path / "log_patrol.csv").read_text() == log
-    monkeypatch.chdir(ROOT)
-    (shell,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
-    done = CliRunner().invoke(main, shlex.split(shell.replace("\\\n", ""))[1:])
-    assert done.exit_code == 0, done.output
-    shown = re.search(r"\n```\n(P >= .*?)```", page, re.DOTALL)[1]
-    assert re.sub(r"\n  [0-9.]+ s\n", "\n", done.stdout) == shown
+    monkeypatch.setattr("shutil.which", lambda name: None)  # pictures by our own hand
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    names: dict[str, Any] = {"__name__": "page"}
+    needs = [x for b in part for x in b.marks.get("needs", "").split()]
+    # Other packages are imported, and written, in single precision.
+    single = needs or any("single precision" in b.marks for b in part)
+    precision = jax.enable_x64(False) if single else contextlib.nullcontext()
+    with precision, warnings.catch_warnings():
+        for package in needs:
+            warnings.simplefilter("ignore", DeprecationWarning)
+            pytest.importorskip(package)
+        printed = None
+        for block in part:
+            where = f"{page}, line {block.line}"
+            if runs(block):
+                printed = run(block, names, tmp_path, where)
+            elif block.language == "" and printed is not None:
+                compare(block.text, printed, block, where)
+                printed = None
+
+
+def run(block: Block, names: dict[str, Any], folder: Path, where: str) -> str:
+    """Runs a block; what it prints."""
+    hide(block.marks.get("before", ""), names, where)
+    if block.language == "pycon":
+        test = doctest.DocTestParser().get_doctest(block.text, names, where, where, block.line)
+        test.globs = names
+        told = io.StringIO()
+        with contextlib.redirect_stdout(io.StringIO()):
+            failed = doctest.DocTestRunner().run(test, out=told.write, clear_globs=False).failed
+        assert not failed, told.getvalue()
+        printed = ""
+    elif block.language == "console":
+        printed = ""
+        for command in re.split(r"^\$ ", block.text, flags=re.MULTILINE)[1:]:
+            line, promised = command.split("\n", 1)
+            output = called(shlex.split(line)[1:], where, may_fail=True)
+            assert output.strip() == promised.strip(), f"{where}: {line}"
+    elif block.language == "sh":
+        printed = shell(block.text, folder, where)
+    else:
+        printed = execute(block.text, names, where)
+        kept_promises(block, printed, where)
+    hide(block.marks.get("after", ""), names, where)
+    return printed
+
+
+def hide(code: str, names: dict[str, Any], where: str) -> None:
+    """Runs what a page does not show."""
+    execute(code, names, f"{where}, before or after it")
+
+
+def execute(code: str, names: dict[str, Any], where: str) -> str:
+    """Runs Python; what it prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        exec(compile(code, where, "exec"), names)
+    return printed.getvalue()
+
+
+def shell(text: str, folder: Path, where: str) -> str:
+    """Does what lines for a shell say, those of ours, here and now; what they print."""
+    printed, lines = "", text.replace("\\\n", " ").split("\n")
+    while lines:
+        line = lines.pop(0).strip()
+        if here := re.match(r"cat > (\S+) <<'(\w+)'$", line):
+            end = lines.index(here[2])
+            (folder / here[1]).write_text("".join(f"{x}\n" for x in lines[:end]))
+            lines = lines[end + 1 :]
+            continue
+        for command in re.split(r" && ", line):
+            words = shlex.split(command, comments=True)
+            if not words or INSTALLED.match(command):
+                continue
+            assert words[0] == "jaxltl", f"{where}: {command!r} is not run here; mark the block"
+            target = words[words.index(">") + 1] if ">" in words else None
+            output = called(words[1 : words.index(">")] if target else words[1:], where)
+            if target:
+                (folder / target).write_text(output)
+            else:
+                printed += output
+    return printed
+
+
+def called(arguments: list[str], where: str, may_fail: bool = False) -> str:
+    """What the command line prints, both streams where it may fail."""
+    done = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert may_fail or done.exit_code == 0, f"{where}: {done.output}"
+    return done.output if may_fail else done.stdout
+
+
+def steady(text: str) -> str:
+    """A text without the seconds that something took."""
+    text = re.sub(r", read in [^\n]*|\b[0-9.]+ s, |^ *[0-9.]+ s\n", "", text, flags=re.MULTILINE)
+    return text.strip()
+
+
+def compare(promised: str, printed: str, block: Block, where: str) -> None:
+    """Words are as they stand; numbers with decimals may differ in their last place."""
+    within = float(block.marks.get("within") or 1e-6)
+    told = _difference(steady(promised), steady(printed), within)
+    assert not told, f"{where}: {told}"
+
+
+def kept_promises(block: Block, printed: str, where: str) -> None:
+    """Comments behind prints that begin with a value are lines of what was printed, in order."""
+    lines = printed.splitlines()
+    for comment in re.findall(r"^[^#\n]*\bprint\(.*\)\s+# (.*)$", block.text, re.MULTILINE):
+        if not PROMISE.match(comment):
+            continue
+        for i, line in enumerate(lines):
+            words = comment.strip("'").split()[: len(line.split())]
+            if words and words[-1] != line.split()[-1]:
+                words[-1] = words[-1].rstrip(":;,'")
+            within = float(block.marks.get("within") or 1e-6)
+            if words and not _difference(" ".join(words), " ".join(line.split()), within):
+                lines = lines[i + 1 :]
+                break
+        else:
+            raise AssertionError(f"{where}: nothing that was printed is {comment!r}:\n{printed}")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_block_is_run_or_says_why_not(page):
+    seen = ""
+    for block in blocks(page.read_text()):
+        where = f"{name_of(page)}, line {block.line}"
+        assert set(block.marks) <= {*MARKS, ""} or block.language not in RUN, where
+        if "not run" in block.marks or "minutes" in block.marks:
+            assert block.marks.get("not run", block.marks.get("minutes")), f"{where}: why?"
+        known = (*RUN, "", "text", "toml", "json", "{toctree}", "csv", "html", "bash")
+        assert block.language in known, f"{where}: {block.language!r}"
+        if block.language == "":
+            assert seen == block.section, f"{where}: the output of what? ```text is no output"
+        if block.language in ("python", "sh"):
+            seen = block.section

@@ -13,7 +13,7 @@ large on average, costs Z at most the task's limit:
 ====  =========================================  ==================================  =====
 task  J                                          Z                                   limit
 ====  =========================================  ==================================  =====
-1     1 for each state in the goal, and 2 |y|    -1 if the goal is reached, where    -0.5
+1     1 for each state in the goal, and 2 abs y   -1 if the goal is reached, where    -0.5
       for each in the strip -2 <= y <= -0.2      the robot then stays
 2     30 times the least signed distance         -1 if the goal is visited           -0.5
       from the obstacle
@@ -87,7 +87,12 @@ class Navigation:
 
 @brief
 class State(NamedTuple):
-    """Positions and headings, in arrays of one shape ``float[...]``; headings in [-pi, pi)."""
+    """Positions and headings, in arrays of one shape.
+
+    Attributes:
+      x, y: ``float[...]``, positions.
+      heading: ``float[...]``, radians in [-pi, pi).
+    """
 
     x: jax.Array
     y: jax.Array
@@ -139,6 +144,9 @@ def navigation(
       strip, weight: of the tasks, see :class:`Navigation`.
       horizon: N.
 
+    Returns:
+      :class:`Navigation`.
+
     Raises:
       ValueError: a box or range the wrong way round, or a size that is not positive.
 
@@ -177,7 +185,19 @@ def _box(name: str, corners: ArrayLike) -> np.ndarray:
 
 
 def policy_network(world: Navigation, hidden: Sequence[int] = (30, 30)) -> Network:
-    """The dissertation's: ReLU layers with biases, and tanh to a speed and a turn."""
+    """The dissertation's: ReLU layers with biases, and tanh to a speed and a turn.
+
+    Args:
+      world: from :func:`navigation`.
+      hidden: the widths of the hidden layers.
+
+    Returns:
+      :class:`~jaxltl.envs.networks.Network`.
+
+    Example:
+      >>> policy_network(navigation()).sizes
+      (62, 30, 30, 2)
+    """
     return make_network((world.num_observations, *hidden, 2), output="tanh")
 
 
@@ -187,7 +207,23 @@ def policy_network(world: Navigation, hidden: Sequence[int] = (30, 30)) -> Netwo
 def start_states(
     world: Navigation, key: chex.PRNGKey, shape: tuple[int, ...] = (), dtype: Any = None
 ) -> State:
-    """First states, uniform in the box of starts and in their heading."""
+    """First states, uniform in the box of starts and in their heading.
+
+    Args:
+      world: from :func:`navigation`.
+      key: a PRNG key, consumed.
+      shape: of the arrays.
+      dtype: of the numbers; default JAX's.
+
+    Returns:
+      :class:`State`, arrays of that shape.
+
+    Example:
+      >>> drawn = jax.eval_shape(
+      ...     lambda key: start_states(navigation(), key, (5,)), jax.random.key(0))
+      >>> drawn.x.shape
+      (5,)
+    """
     dtype = dtype or jnp.result_type(float)
     low, high = jnp.asarray(world.start, dtype)
     u = jax.random.uniform(key, (3, *shape), dtype)
@@ -199,7 +235,12 @@ def move(world: Navigation, state: State, action: jax.Array) -> State:
     """The next state: forward along the heading, then the turn.
 
     Args:
+      world: from :func:`navigation`.
+      state: arrays ``float[...]``.
       action: ``float[..., 2]``, speed and turn as shares of the largest; limited to [-1, 1].
+
+    Returns:
+      The next state, of the same shape.
 
     Example:
       >>> state = move(navigation(), State(*jnp.array([3.75, 0.0, 0.0])), jnp.array([1.0, -3.0]))
@@ -225,10 +266,18 @@ def _wrapped(angle: jax.Array) -> jax.Array:
 
 
 def observe(world: Navigation, state: State) -> jax.Array:
-    """What the robot reads: ``float[..., M + 2]``.
+    """What the robot reads.
+
 
     The labels of the M points, circle by circle, and then the direction of the goal's centre as
     ahead and to the left, a vector of length 1 (of zeros in the centre itself).
+
+    Args:
+      world: from :func:`navigation`.
+      state: arrays ``float[...]``.
+
+    Returns:
+      ``float[..., M + 2]``. Differentiable in the directions.
 
     Example:
       >>> seen = observe(navigation(), State(*jnp.array([1.0, 1.5, 0.0])))
@@ -266,7 +315,14 @@ def _as(world: Navigation, like: jax.Array) -> Navigation:
 
 
 def labels(world: Navigation, state: State) -> jax.Array:
-    """Which of :data:`PROPOSITIONS` hold: ``bool[..., 2]``; boxes contain their edges.
+    """Which of :data:`PROPOSITIONS` hold; boxes contain their edges.
+
+    Args:
+      world: from :func:`navigation`.
+      state: arrays ``float[...]``.
+
+    Returns:
+      ``bool[..., 2]``.
 
     Example:
       >>> labels(navigation(), State(*jnp.array([2.0, 1.5, 0.0]))).tolist()
@@ -278,7 +334,14 @@ def labels(world: Navigation, state: State) -> jax.Array:
 
 
 def obstacle_distance(world: Navigation, state: State) -> jax.Array:
-    """The signed distance ``float[...]`` from the obstacle, negative inside of it.
+    """The signed distance from the obstacle, negative inside of it.
+
+    Args:
+      world: from :func:`navigation`.
+      state: arrays ``float[...]``.
+
+    Returns:
+      ``float[...]``. Differentiable.
 
     Example:
       >>> x, y = jnp.array([4.0, -3.0, 0.5]), jnp.array([6.0, 1.0, 1.0])
@@ -296,7 +359,14 @@ def obstacle_distance(world: Navigation, state: State) -> jax.Array:
 
 
 def reward(world: Navigation, state: State) -> jax.Array:
-    """What one state adds to the J of tasks 1 and 4: ``float[...]``.
+    """What one state adds to the J of tasks 1 and 4.
+
+    Args:
+      world: from :func:`navigation`.
+      state: arrays ``float[...]``.
+
+    Returns:
+      ``float[...]``.
 
     Example:
       >>> x = jnp.array([2.0, 0.0, 0.0])
@@ -312,6 +382,7 @@ def scores(world: Navigation, state: State, task: int) -> tuple[jax.Array, jax.A
     """J and Z of trajectories in one of the four tasks.
 
     Args:
+      world: from :func:`navigation`.
       state: arrays ``float[..., N]``.
       task: static; what differs in task 1, that the goal is not left, is up to the states.
 
@@ -320,6 +391,12 @@ def scores(world: Navigation, state: State, task: int) -> tuple[jax.Array, jax.A
 
     Raises:
       ValueError: an unknown task.
+
+    Example:
+      >>> x = jnp.array([[2.0, 2.0]])
+      >>> both = jax.jit(scores, static_argnums=2)(navigation(), State(x, x - 0.5, x), 3)
+      >>> [v.tolist() for v in both]  # a distance of 1, and twice in the goal
+      [[30.0], [-2.0]]
     """
     if task not in TASKS:
         raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4, or give a function.")
@@ -349,6 +426,7 @@ def simulate(
     """Trajectories of a policy.
 
     Args:
+      world: from :func:`navigation`.
       network: from the observations to two shares, see :func:`policy_network`.
       parameters: ``float[D]``; they decide the precision.
       key: decides the first states, the only chance there is.
