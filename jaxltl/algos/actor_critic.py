@@ -1,4 +1,29 @@
-"""Networks that act and judge: what a policy of PPO is made of, and how any such one is called."""
+"""Networks that act and judge: what a policy of PPO is made of, and how any such one is called.
+
+Example: networks of finitely many actions, of a box, and with a memory.
+
+  >>> import jax, jax.numpy as jnp
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import actor_critic as networks
+  >>> seen = jax.ShapeDtypeStruct((3,), float)
+  >>> few = networks.default_network(jl.Finite(4))
+  >>> shapes = jax.eval_shape(lambda x: few.init_with_output(jax.random.key(0), x)[0], seen)
+  >>> shapes[0].shape, shapes[1].shape  # logits, and a value
+  ((4,), ())
+  >>> box = networks.ActorCritic(shape=(2,), hidden=(8,))
+  >>> (mean, log_deviation), value = jax.eval_shape(
+  ...     lambda x: box.init_with_output(jax.random.key(0), x)[0], seen)
+  >>> mean.shape, log_deviation.shape
+  ((2,), (2,))
+  >>> recurrent = networks.RecurrentActorCritic(num_actions=4, memory=5)
+  >>> memory = networks.initial_memory(recurrent)
+  >>> memory.shape
+  (5,)
+  >>> parameters = jax.eval_shape(
+  ...     lambda x: networks.fresh_parameters(jax.random.key(0), recurrent, memory, x), seen)
+  >>> "actor" in parameters and "critic" in parameters
+  True
+"""
 
 from __future__ import annotations
 
@@ -26,6 +51,10 @@ class Output(NamedTuple):
         finitely many; of a box a pair of arrays of an action's shape, mean and logarithm of the
         standard deviation.
       value: ``float[]``.
+
+    Example:
+      >>> Output((), jnp.zeros(4), jnp.array(0.5)).action.shape
+      (4,)
     """
 
     memory: Any
@@ -39,6 +68,17 @@ def orthogonal(scale: float) -> Any:
     By Gram and Schmidt, twice over, and not by LAPACK's factorisation as in ``flax``: on few
     processors several batched ones in one program, as seeds side by side ask for, may each hold the
     thread that another waits for (jaxlib 0.10.1).
+
+    Args:
+      scale: of the rows or columns.
+
+    Returns:
+      ``(key, shape, dtype) -> float[shape]``, as ``flax.linen`` takes it, of matrices.
+
+    Example:
+      >>> shape = jax.eval_shape(lambda key: orthogonal(1.0)(key, (3, 2)), jax.random.key(0))
+      >>> shape.shape
+      (3, 2)
     """
     def start(key: Any, shape: Any, dtype: Any = None) -> jax.Array:
         rows, columns = shape
@@ -58,7 +98,20 @@ def orthogonal(scale: float) -> Any:
 
 
 def dense(width: int, scale: float, name: str) -> nn.Dense:
-    """A layer of a network, orthogonal at the start, of the floats that are the default."""
+    """A layer of a network, orthogonal at the start, of the floats that are the default.
+
+    Args:
+      width: how many numbers it returns.
+      scale: of its matrix at the start, see :func:`orthogonal`.
+      name: among the layers of a module.
+
+    Returns:
+      The layer, ``float[..., N] -> float[..., width]``.
+
+    Example:
+      >>> dense(4, 1.0, "hidden").features
+      4
+    """
     return nn.Dense(
         width, kernel_init=orthogonal(scale), param_dtype=jnp.result_type(float), name=name)
 
@@ -149,7 +202,15 @@ class RecurrentActorCritic(nn.Module):
 
 
 def default_network(actions: Any) -> ActorCritic:
-    """An :class:`ActorCritic` for some actions."""
+    """An :class:`ActorCritic` for some actions.
+
+    Args:
+      actions: :class:`~jaxltl.core.models.environment.Finite`, or a
+        :class:`~jaxltl.core.models.environment.Box`.
+
+    Returns:
+      The module, its hidden layers as they are by default.
+    """
     if isinstance(actions, Finite):
         return ActorCritic(num_actions=actions.num)
     return ActorCritic(shape=actions.shape)
@@ -161,6 +222,9 @@ def initial_memory(network: nn.Module, memory: Any = None) -> Any:
     Args:
       network: whose method ``initial_memory()`` says so, if it has one.
       memory: in place of that; None: not given.
+
+    Returns:
+      A tree of arrays.
 
     Raises:
       ValueError: what is given are no numbers, or has not the shapes that the network's own has.
@@ -182,12 +246,43 @@ def initial_memory(network: nn.Module, memory: Any = None) -> Any:
 
 
 def has_memory(problem: Any) -> bool:
-    """Whether the problem's network is recurrent."""
+    """Whether the problem's network is recurrent.
+
+    Args:
+      problem: with a `memory`, such as PPO's.
+
+    Returns:
+      A truth value.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> has_memory(SimpleNamespace(memory=())), has_memory(SimpleNamespace(memory=np.zeros(2)))
+      (False, True)
+    """
     return bool(jax.tree.leaves(problem.memory))
 
 
 def evaluated(problem: Any, parameters: Any, memory: Any, observation: Any) -> Output:
-    """What the problem's network says of one observation."""
+    """What the problem's network says of one observation.
+
+    Args:
+      problem: with a `network` and its `memory`, such as PPO's.
+      parameters: of the network.
+      memory: before the observation; ``()`` for a network without.
+      observation: of one world.
+
+    Returns:
+      :class:`Output`; differentiable in the parameters.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> problem = SimpleNamespace(network=ActorCritic(num_actions=2, hidden=()), memory=())
+      >>> def first(key, seen):
+      ...     parameters = fresh_parameters(key, problem.network, (), seen)
+      ...     return evaluated(problem, parameters, (), seen)
+      >>> jax.eval_shape(first, jax.random.key(0), jnp.zeros(3)).action.shape
+      (2,)
+    """
     variables = {"params": parameters}
     if has_memory(problem):
         memory, (action, value) = problem.network.apply(variables, memory, observation)
@@ -197,7 +292,17 @@ def evaluated(problem: Any, parameters: Any, memory: Any, observation: Any) -> O
 
 
 def fresh_parameters(key: Any, network: nn.Module, memory: Any, observation: Any) -> Any:
-    """A network's parameters at its own random start."""
+    """A network's parameters at its own random start.
+
+    Args:
+      key: a PRNG key.
+      network: the module.
+      memory: before anything is seen; ``()`` for a network without.
+      observation: of one world; its numbers do not matter.
+
+    Returns:
+      The parameters, a dict of dicts of arrays.
+    """
     read = (memory, observation) if jax.tree.leaves(memory) else (observation,)
     return network.init(key, *read).get("params", {})
 
@@ -210,6 +315,13 @@ def require_network(network: Any, memory: Any, observation: Any, space: Any, fin
       memory, observation: shapes of what it reads.
       space: shape and type of one action; of finitely many, of the logits.
       finite: whether there are finitely many.
+
+    Raises:
+      ValueError: naming what it returns and what it should.
+
+    Example:
+      >>> seen, logits = jax.ShapeDtypeStruct((3,), float), jax.ShapeDtypeStruct((2,), float)
+      >>> require_network(ActorCritic(num_actions=2), (), seen, logits, True)  # nothing to say
     """
     recurrent = bool(jax.tree.leaves(memory))
     read = (memory, observation) if recurrent else (observation,)

@@ -84,6 +84,13 @@ class ConvolutionalPolicy(nn.Module):
 
     Called with ``float[..., O]``, O the product of that shape, and ``float[..., Q]`` it returns
     scores ``float[..., A]``.
+
+    Example:
+      >>> shape, _ = jax.eval_shape(
+      ...     ConvolutionalPolicy().init_with_output, jax.random.key(0), jnp.zeros((7, 45)),
+      ...     jnp.zeros((7, 2)))
+      >>> shape.shape
+      (7, 4)
     """
 
     observation_shape: Sequence[int] = (3, 3, 5)

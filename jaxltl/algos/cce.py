@@ -516,10 +516,13 @@ def assess(
       problem: of the search.
       parameters: ``float[D]``.
       key: fresh.
-      num_evaluations: calls of evaluate, at least 1; static.
+      num_evaluations: calls of evaluate, at least 2; static.
 
     Returns:
       :class:`Assessment`.
+
+    Raises:
+      ValueError: fewer than two evaluations.
     """
     from scipy.special import stdtrit
 

@@ -6,6 +6,24 @@ problem is refused, though its shapes be the same.
 
 Of arrays that lie on the devices of several processes each writes its part, and the file names
 them. It is read onto any other mesh, by any number of processes, or by one without.
+
+Example:
+  >>> import os, tempfile
+  >>> import numpy as np
+  >>> from jaxltl.algos import checkpoint
+  >>> path = os.path.join(tempfile.mkdtemp(), "state.npz")
+  >>> state, given = {"step": np.int32(3)}, checkpoint.fingerprint(problem=np.arange(2))
+  >>> checkpoint.save(path, state, given)
+  >>> checkpoint.load(path, {"step": np.int32(0)}, given)["step"].item()
+  3
+  >>> try:
+  ...     checkpoint.load(path, state, checkpoint.fingerprint(problem=np.ones(2)))
+  ... except ValueError as error:
+  ...     print("does not belong to this run" in str(error))
+  True
+  >>> checkpoint.remove(path)
+  >>> os.path.exists(path)
+  False
 """
 
 from __future__ import annotations
@@ -36,11 +54,27 @@ _PARTS = "parts"  # the name of what is in other files
 
 
 @contextlib.contextmanager
-def atomic_write(path: str | os.PathLike[str]):
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """A binary file that appears under its name only when complete.
+
+    Args:
+      path: where it is to be.
+
+    Yields:
+      The file, open for bytes.
 
     Raises:
       ValueError: the place cannot be written to.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "note"
+      >>> with atomic_write(path) as file:
+      ...     _ = file.write(b"all of it")
+      ...     path.exists()
+      False
+      >>> path.read_bytes()
+      b'all of it'
     """
     path = Path(path)
     try:
@@ -64,8 +98,22 @@ def atomic_write(path: str | os.PathLike[str]):
 def read_arrays(file: BinaryIO) -> dict[str, np.ndarray]:
     """The arrays of an ``.npz`` file, by name; nothing in it is executed.
 
+    Args:
+      file: open for bytes.
+
+    Returns:
+      NumPy arrays.
+
     Raises:
       ValueError: it is none, or damaged. The message tells what is wrong and lacks the file's name.
+
+    Example:
+      >>> import io
+      >>> file = io.BytesIO()
+      >>> np.savez(file, x=np.arange(3))
+      >>> _ = file.seek(0)
+      >>> read_arrays(file)["x"].tolist()
+      [0, 1, 2]
     """
     start = file.read(6)
     file.seek(0)
@@ -135,6 +183,9 @@ def remove(path: str | os.PathLike[str]) -> None:
     """Removes a state that :func:`save` wrote, with its parts and what was begun and not finished.
 
     No process may still be writing it.
+
+    Args:
+      path: the file; nothing is said of one that is not there.
     """
     path = Path(path)
     parts.remove([path, *parts.parts_of(path), *parts.unfinished(path)])
@@ -151,6 +202,9 @@ def load(
         length zero stands for one of any length. What lies on several devices there comes to lie
         on them, whatever devices the state was saved from; each process reads what it needs.
       given: as in :func:`save`, which has to be the same.
+
+    Returns:
+      A tree as `like`, with the arrays of the file.
 
     Raises:
       ValueError: the file is damaged, its arrays do not fit `like`, or it was saved for another
@@ -247,6 +301,12 @@ def fingerprint(**given: Any) -> dict[str, str]:
     """What is told apart of arguments, by place: types, static fields, and arrays by their bytes.
 
     Functions count by their code, not by where they lie, so that another process finds the same.
+
+    Args:
+      given: trees of arrays, by names of one's own.
+
+    Returns:
+      By the place of each part, a text that tells it from others.
 
     Example:
       >>> one, two = (fingerprint(x=(np.arange(2), {"b": y})) for y in (0.5, 0.25))

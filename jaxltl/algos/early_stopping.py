@@ -21,6 +21,10 @@ class Best:
       parameters: of the network, a pytree.
       neg_log_likelihood: ``float[]``, held out, in nats a pair; NaN without held-out data.
       step: ``int32[]``, the number of steps after which they were reached.
+
+    Example:
+      >>> Best(jnp.zeros(3), jnp.array(0.7), jnp.int32(4)).step.item()
+      4
     """
 
     parameters: Any
@@ -42,6 +46,15 @@ def stop_early(
 
     Returns:
       :class:`Best`, and ``bool[]``.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> best = Best(jnp.zeros(1), jnp.array(0.5), jnp.int32(2))
+      >>> state = SimpleNamespace(
+      ...     parameters=jnp.ones(1), step=jnp.int32(9), best=best, stopped=jnp.bool_(False))
+      >>> best, stopped = stop_early(state, jnp.full(1, 2.0), jnp.array(0.6), jnp.bool_(True), 5)
+      >>> best.parameters.tolist(), stopped.item()  # nothing better for seven steps
+      ([0.0], True)
     """
     better = judged & (held_out < state.best.neg_log_likelihood) & ~state.stopped
     best = choose(better, Best(state.parameters, held_out, state.step), state.best)

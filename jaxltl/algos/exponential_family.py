@@ -22,6 +22,16 @@ Example:
   ((8, 2), (8,))
   >>> bool(jnp.allclose(families.center(moved), samples.mean(0) / 2))
   True
+  >>> families.standard_deviation(families.widen(start, 3.0)).tolist()
+  [2.0, 2.0]
+  >>> families.at_least(start, 4.0).variance.tolist()
+  [4.0, 4.0]
+  >>> first, second = families.mean_parameter(start)  # E x and E x^2
+  >>> second.tolist(), families.sufficient_statistics(start, samples)[1].shape
+  ([1.0, 1.0], (8, 2))
+  >>> mirrored = families.sample_antithetic(start, jax.random.key(0), 8)
+  >>> bool(jnp.allclose(mirrored[0] + mirrored[1], 0.0))
+  True
 """
 
 from __future__ import annotations
@@ -66,6 +76,10 @@ class FullGaussian:
       mean: ``float[D]``.
       factor: ``float[D, D]``, lower triangular, the covariance being ``factor @ factor.T``.
         Kept instead of the covariance, which rounding could make indefinite.
+
+    Example:
+      >>> full_gaussian([0.0, 0.0], [[4.0, 0.0], [0.0, 1.0]]).factor.tolist()
+      [[2.0, 0.0], [0.0, 1.0]]
     """
 
     mean: jax.Array
@@ -80,6 +94,10 @@ class Gamma:
     Attributes:
       shape: ``float[D]``.
       rate: ``float[D]``; the mean is ``shape / rate``.
+
+    Example:
+      >>> center(gamma([2.0, 3.0], 2.0)).tolist()
+      [1.0, 1.5]
     """
 
     shape: jax.Array
@@ -124,6 +142,10 @@ def full_gaussian(mean: chex.Array, covariance: chex.Array) -> FullGaussian:
 
     Raises:
       ValueError: a wrong shape, or a covariance that is not symmetric and positive definite.
+
+    Example:
+      >>> full_gaussian([0.0, 0.0], [[4.0, 2.0], [2.0, 2.0]]).factor.tolist()
+      [[2.0, 0.0], [1.0, 1.0]]
     """
     mean = _vector("mean", mean)
     covariance = jnp.asarray(covariance, mean.dtype)
@@ -148,6 +170,10 @@ def gamma(shape: chex.Array, rate: chex.Array | float) -> Gamma:
 
     Raises:
       ValueError: a wrong shape, or a number that is not positive.
+
+    Example:
+      >>> center(gamma([2.0, 3.0], 2.0)).tolist()
+      [1.0, 1.5]
     """
     shape = _vector("shape", shape)
     rate = _like("rate", rate, shape)
@@ -194,6 +220,9 @@ def sufficient_statistics(family: Any, samples: jax.Array) -> tuple[jax.Array, j
 
     Returns:
       Two arrays, the second ``float[..., D, D]`` for a full Gaussian, else ``float[..., D]``.
+
+    Raises:
+      TypeError: there is no such family.
     """
     raise TypeError(_unknown(family))
 
@@ -207,6 +236,9 @@ def mean_parameter(family: Any) -> tuple[jax.Array, jax.Array]:
 
     Returns:
       Two arrays, as :func:`sufficient_statistics` has them for one sample; differentiable.
+
+    Raises:
+      TypeError: there is no such family.
     """
     raise TypeError(_unknown(family))
 
@@ -223,6 +255,9 @@ def from_mean_parameter(family: Any, eta: tuple[jax.Array, jax.Array]) -> Any:
 
     Returns:
       A member of the same family.
+
+    Raises:
+      TypeError: there is no such family.
 
     Example:
       >>> start = diagonal_gaussian([1.0, 2.0], 0.5)
@@ -242,6 +277,9 @@ def log_density(family: Any, samples: jax.Array) -> jax.Array:
 
     Returns:
       ``float[...]``, in nats.
+
+    Raises:
+      TypeError: there is no such family.
     """
     raise TypeError(_unknown(family))
 
@@ -257,6 +295,9 @@ def sample(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.Array:
 
     Returns:
       ``float[n, D]``.
+
+    Raises:
+      TypeError: there is no such family.
     """
     raise TypeError(_unknown(family))
 
@@ -299,6 +340,9 @@ def project(
     Returns:
       ``f_v'``.
 
+    Raises:
+      TypeError: there is no such family.
+
     Example:
       >>> start = diagonal_gaussian([0.0], 1.0)
       >>> moved = project(start, jnp.array([[1.0], [3.0]]), jnp.array([1.0, 1.0]), 0.5)
@@ -317,6 +361,9 @@ def center(family: Any) -> jax.Array:
 
     Returns:
       ``float[D]``.
+
+    Raises:
+      TypeError: there is no such family.
     """
     raise TypeError(_unknown(family))
 
@@ -330,6 +377,9 @@ def standard_deviation(family: Any) -> jax.Array:
 
     Returns:
       ``float[D]``.
+
+    Raises:
+      TypeError: there is no such family.
     """
     raise TypeError(_unknown(family))
 
@@ -344,6 +394,9 @@ def widen(family: Any, variance: jax.Array | float) -> Any:
 
     Returns:
       A member of the same family.
+
+    Raises:
+      TypeError: there is no such family.
     """
     raise TypeError(_unknown(family))
 
@@ -358,6 +411,9 @@ def at_least(family: Any, variance: jax.Array | float) -> Any:
 
     Returns:
       A member of the same family.
+
+    Raises:
+      TypeError: there is no such family.
     """
     raise TypeError(_unknown(family))
 

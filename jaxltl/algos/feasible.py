@@ -142,6 +142,10 @@ class Best:
     Attributes:
       parameters: ``float[D]``.
       value: ``float[]``, a probability, or in units of the reward.
+
+    Example:
+      >>> Best(jnp.full(2, jnp.nan), jnp.array(jnp.nan)).parameters.shape
+      (2,)
     """
 
     parameters: jax.Array

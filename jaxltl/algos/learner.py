@@ -37,6 +37,9 @@ Example: a learner of one's own, of a number that is asked for.
   ...                       until=lambda before, after, metrics: metrics.error < 1e-3)
   >>> learned.status.item(), learned.num_steps.item() < 20
   (0, True)
+  >>> chunks = learner.run_in_chunks(step, state, 5.0, 0.5, num_steps=8, chunk=4)
+  >>> chunks.state.step.item(), chunks.step.tolist()  # four had been made
+  (8, [5, 6, 7, 8])
 """
 
 from __future__ import annotations
@@ -92,6 +95,12 @@ def step_key(state: Any) -> chex.PRNGKey:
 
     Returns:
       A PRNG key.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> one, two = (SimpleNamespace(key=jax.random.key(0), step=step) for step in (0, 1))
+      >>> bool(step_key(one) == step_key(two))
+      False
     """
     return jax.random.fold_in(state.key, state.step)
 
@@ -105,6 +114,10 @@ def count(total: jax.Array, more: jax.Array | int) -> jax.Array:
 
     Returns:
       ``int32``.
+
+    Example:
+      >>> count(jnp.int32(5), 3).item()
+      8
     """
     more = jnp.asarray(more, jnp.int32)
     return jnp.where(total > MOST - more, MOST, total + more).astype(jnp.int32)
@@ -205,11 +218,15 @@ def run_until(
 
     Args:
       step: the learner's step.
+      state, problem, hparams, until, num_steps, check_every, keep: as there.
       idle: whether the step takes another argument, ``bool[]``, and by itself leaves alone a
         state for which that is False; else its arrays are chosen one by one; static.
 
     Returns:
       :class:`Learned`.
+
+    Raises:
+      ValueError: an unknown `keep`, or a number below 1.
     """
     if keep not in ("after", "before"):
         raise ValueError(f'keep={keep!r}; choose "after" or "before".')
@@ -273,6 +290,11 @@ def has_stopped(before: Any, after: Any, metrics: Any) -> jax.Array:
 
     Returns:
       ``bool[]``.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> has_stopped(None, SimpleNamespace(stopped=True), None)
+      True
     """
     return after.stopped
 
@@ -285,6 +307,11 @@ def gradient_vanishes(tolerance: chex.Numeric) -> Until:
 
     Returns:
       A condition, for ``until``.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> gradient_vanishes(1e-3)(None, None, SimpleNamespace(gradient_norm=1e-4))
+      True
     """
     return Partial(_gradient_vanishes, tolerance)
 
@@ -309,6 +336,13 @@ def while_active(
 
     Returns:
       The carry, once no lane is active.
+
+    Example:
+      >>> def half(x, most):  # leaves what is small alone
+      ...     return jnp.where(x > most, x / 2, x)
+      >>> run = jax.vmap(lambda x: while_active(lambda x, most: x > most, half, x, 1.0))
+      >>> run(jnp.array([0.5, 4.0])).tolist()
+      [0.5, 1.0]
     """
     carry, given = jax.tree.map(jnp.asarray, (carry, given))
 
@@ -593,6 +627,16 @@ def trace_lanes(step: Step, state: Any, problem: Any, hparams: Any) -> None:
     Args:
       step, problem, hparams: as for :func:`run_in_chunks`.
       state: of N runs side by side, or its shapes.
+
+    Example:
+      >>> from flax import struct
+      >>> @struct.dataclass
+      ... class State:
+      ...     step: jax.Array
+      ...     x: jax.Array
+      >>> def step(state, problem, hparams):
+      ...     return State(state.step + 1, state.x * hparams), {"x": state.x}
+      >>> trace_lanes(step, State(jnp.zeros(2, jnp.int32), jnp.ones(2)), (), 0.5)
     """
     _metrics_of(step, state, problem, _spread(hparams, state), len(state.step))
 
@@ -652,6 +696,11 @@ def strong(tree: Any) -> Any:
 
     Returns:
       The same tree.
+
+    Example:
+      >>> number = jnp.asarray(1.0)
+      >>> number.weak_type, strong({"x": number})["x"].weak_type
+      (True, False)
     """
 
     def one(x: jax.Array) -> jax.Array:
@@ -676,6 +725,10 @@ def optimizer(name: str, learning_rate: Any) -> optax.GradientTransformationExtr
 
     Raises:
       ValueError: an unknown name.
+
+    Example:
+      >>> optimizer("adam", 1e-3).init(jnp.zeros(2))[0].mu.shape
+      (2,)
     """
     if name == "lbfgs":
         return optax.lbfgs()
@@ -698,6 +751,10 @@ def either(condition: jax.Array, one: Any, other: Any) -> Any:
 
     Returns:
       The first where the condition holds, else the second.
+
+    Example:
+      >>> either(jnp.bool_(False), {"x": jnp.zeros(2)}, {"x": jnp.ones(2)})["x"].tolist()
+      [1.0, 1.0]
     """
     return lax.cond(condition, lambda: one, lambda: other)
 
@@ -711,6 +768,10 @@ def choose(condition: jax.Array, one: Any, other: Any) -> Any:
 
     Returns:
       The first where the condition holds, else the second.
+
+    Example:
+      >>> choose(jnp.bool_(False), {"x": jnp.zeros(2)}, {"x": jnp.ones(2)})["x"].tolist()
+      [1.0, 1.0]
     """
     def leaf(x: jax.Array, y: jax.Array) -> jax.Array:
         is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

@@ -6,6 +6,38 @@ it does any formula over the same labels: the automaton of the formula tells, fo
 states, the sequences that lead to acceptance, and the network's own value which of them to follow
 (Jackermeier and Abate 2025, "DeepLTL"). Automata are made on the host once a formula; their tables
 are arrays, so that episodes of different formulas are lanes of one ``vmap``.
+
+Example: what a network of the letter world would be trained on, and two formulas that it does then.
+(Of the network shapes alone: nothing is trained here.)
+
+  >>> import jax, numpy as np
+  >>> from functools import partial
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import many_tasks, ppo
+  >>> from jaxltl.envs.letter_world import events_seen
+  >>> world = jl.letter_world(size=4, letters=3, copies=1, horizon=30)
+  >>> events = jl.events_of(world.propositions)  # nothing, a, b, c
+  >>> network = many_tasks.SequenceNetwork(num_actions=4, events_seen=events_seen, hidden=(8,))
+  >>> def problem(longest):  # sequences of up to so many steps
+  ...     sampler = jl.sequence_sampler(
+  ...         np.arange(3) < longest, reach=[1.0], avoid=[0.5, 0.5], sets=events.any(1))
+  ...     return ppo.make_problem(jl.sequence_environment(world, events, sampler), network=network)
+  >>> stages, hparams = [problem(1), problem(3)], ppo.Hparams(discount=0.94, num_envs=2)
+  >>> curriculum = partial(many_tasks.train_in_stages, init=ppo.init, run=ppo.run, num_chunks=3)
+  >>> # state = curriculum(key, stages, hparams).state
+  >>> state = jax.eval_shape(lambda key: ppo.init(key, stages[0], hparams), jax.random.key(0))
+  >>> formulas = ["F(a & F b)", "!a U b"]
+  >>> plan, other = (
+  ...     many_tasks.make_plan(x, events, world.propositions, depth=3, most=2) for x in formulas)
+  >>> plan.length.tolist()  # of each state's sequences: first a and then b, then b, then nothing
+  [[2, 0], [1, 0], [0, 0]]
+  >>> many_tasks.stack_plans([plan, other]).reach.shape  # formulas, Q, M, D, E
+  (2, 3, 2, 3, 4)
+  >>> agent = many_tasks.sequence_agent(many_tasks.trained(network, state.parameters), plan)
+  >>> episode = jax.eval_shape(partial(jl.run_episode, num_steps=30), jax.random.key(1),
+  ...                          jl.task_environment(world, formulas[0]), agent)
+  >>> episode.action.shape
+  (30,)
 """
 
 from __future__ import annotations
@@ -47,7 +79,8 @@ class SequenceNetwork(nn.Module):
     sequence's rows.
 
     Attributes:
-      num_actions, shape, hidden, activation, initial_deviation: as of PPO's default network.
+      num_actions, shape, hidden, activation, initial_deviation: as of PPO's default network,
+        :class:`~jaxltl.algos.actor_critic.ActorCritic`; hidden layers read both parts.
       events_seen: ``observation -> float[..., E]``, or None; hashable, such as a function of a
         module.
       by_name: whether, where `events_seen` is given, the observation and the sequence's rows are
@@ -129,6 +162,9 @@ def make_plan(
       depth: D, as in training.
       most: M, sequences a state.
 
+    Returns:
+      :class:`Plan`, NumPy arrays; not differentiable.
+
     Raises:
       ValueError: as :func:`~jaxltl.core.automata.sequences.reach_avoid_sequences`.
     """
@@ -140,6 +176,12 @@ def make_plan(
 
 def stack_plans(plans: Sequence[Plan]) -> Plan:
     """Plans of several tasks, padded to one shape, with a leading axis; ``vmap`` over it.
+
+    Args:
+      plans: N of them.
+
+    Returns:
+      :class:`Plan`, ``[N, Q, ...]``.
 
     Raises:
       ValueError: no plan, or plans of different depths or events.
@@ -166,8 +208,17 @@ _FORGETS = 1 / 16  # share of what a choice has been worth that is forgotten in 
 
 @brief
 class Choice(NamedTuple):
-    """What an agent has taken up: a state of the automaton, which of its sequences, and what that
-    one has been worth of late."""
+    """What an agent has taken up.
+
+    Attributes:
+      state: ``int32[]``, of the automaton.
+      sequence: ``int32[]``, which of its sequences.
+      worth: ``float[]``, what that one has been worth of late.
+
+    Example:
+      >>> Choice(jnp.int32(0), jnp.int32(1), jnp.array(0.5)).sequence.item()
+      1
+    """
 
     state: jax.Array
     sequence: jax.Array
@@ -219,11 +270,26 @@ def sequence_agent(
 def sequence_policy(
     network: Callable[..., Any], plan: Plan, observation: Any, memory: chex.Numeric
 ) -> jax.Array:
-    """``float[A]``: how likely each of finitely many actions is to an agent that chooses anew at
-    every step, by the world's observation and the automaton's state alone.
+    """How likely each action is to an agent that chooses its sequence anew at every step.
 
+    By the world's observation and the automaton's state alone, so that
     ``Partial(sequence_policy, network, plan)`` is a policy for
     :func:`~jaxltl.core.values.optimality_gap.tabulate_policy`.
+
+    Args:
+      network, plan: as of :func:`sequence_agent`; of finitely many actions.
+      observation: of the world, without the task.
+      memory: ``int32[]``, the automaton's state.
+
+    Returns:
+      ``float[A]``, a distribution; differentiable in the network's parameters.
+
+    Example:
+      >>> plan = make_plan("F a", np.eye(2, 1, -1, bool), ["a"], depth=1, most=1)
+      >>> def network(observation):  # says what it is asked to reach
+      ...     return jnp.log(1.0 + observation.sequence.reach[0]), jnp.array(0.0)
+      >>> sequence_policy(network, plan, jnp.zeros(1), 0).round(3).tolist()
+      [0.333, 0.667]
     """
     actions, values = _judged(network, plan, observation, jnp.asarray(memory))
     return jax.nn.softmax(actions[jnp.argmax(values)])
@@ -253,6 +319,9 @@ def trained(network: nn.Module, parameters: Any, moments: Any = None) -> Partial
       network: a module without memory.
       parameters: of it, such as ``state.parameters`` of PPO.
       moments: by which observations were normalised in training, ``state.moments``; None: not.
+
+    Returns:
+      A function, and a pytree whose arrays are the parameters and moments.
     """
     given.instance("network", network, nn.Module, "a flax.linen.Module")
     return Partial(_applied, _Module(network), parameters, moments)

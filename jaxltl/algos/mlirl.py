@@ -316,6 +316,9 @@ def objective(
     Returns:
       The loss ``float[]``, and :class:`Objective`. Differentiable in the parameters: exactly, or as
       in (2.7) with the policy held constant in the Bellman equation.
+
+    Raises:
+      ValueError: unknown kind of policy or adjoint, or a satisfaction term without a task.
     """
     # Once, so that the derivative goes back through it once.
     reward = problem.reward(parameters, problem.features)

@@ -252,6 +252,10 @@ def approximation_gap(
 
     Returns:
       A float, or as the arguments broadcast.
+
+    Example:
+      >>> round(float(approximation_gap(1e-6, 10, 20, 0.5, 1.0)), 9)
+      0.0008
     """
     deviation, num_states, num_steps, discount, reward_bound = _floats(
         deviation, num_states, num_steps, discount, reward_bound
@@ -275,6 +279,13 @@ def epsilon_optimal_states(
 
     Returns:
       ``bool[S]``, in a product ``[S, Q]``.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> best, own = (
+      ...     SimpleNamespace(lower=x, upper=x) for x in (jnp.ones(2), jnp.array([0.5, 0.95])))
+      >>> epsilon_optimal_states(best, own, 0.1).tolist()
+      [False, True]
     """
     return value.lower >= optimal.upper - epsilon
 
@@ -419,6 +430,14 @@ def recover_hat_strategy(hat: Game, strategy: chex.Array) -> jax.Array:
 
     Raises:
       ValueError: the strategy has the wrong shape.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> game = Game(from_dense([[[1.0], [1.0]]]), jnp.array([True]))
+      >>> hat = hat_game(game, jnp.array([[False, True]]), 0.25)
+      >>> alike = hat.available / hat.available.sum(-1, keepdims=True)
+      >>> recover_hat_strategy(hat, alike).round(3).tolist()
+      [[0.125, 0.875]]
     """
     require_shape("strategy", strategy, hat.available.shape)
     num_states, last = hat.num_states // 3, hat.num_actions - 1

@@ -33,7 +33,8 @@ Example: a corridor of which one leaves at its beginning; to go to the end and b
   >>> hparams = ppo.Hparams(
   ...     discount=0.9, learning_rate=0.01, num_envs=4, num_steps=6, num_epochs=1,
   ...     num_minibatches=2, normalize_observation=True, normalize_reward=True)
-  >>> state, metrics = ppo.train(jax.random.key(0), problem, hparams, num_steps=2)
+  >>> state = ppo.init(jax.random.key(0), problem, hparams)
+  >>> state, metrics = ppo.run(state, problem, hparams, num_steps=2)  # both at once: ppo.train
   >>> metrics.transitions.tolist(), metrics.status.tolist()
   ([24, 48], [0, 0])
   >>> agent = ppo.greedy(state, problem, hparams)  # or ppo.policy, which draws
@@ -41,11 +42,10 @@ Example: a corridor of which one leaves at its beginning; to go to the end and b
   ...     lambda key: jl.run_episode(key, corridor, agent, num_steps=5), jax.random.key(1))
   >>> episode.reward.shape
   (5,)
-  >>> state, metrics = ppo.run(state, problem, hparams, num_steps=2)  # and two steps more
+  >>> state, _ = ppo.run(state, problem, hparams, num_steps=2)  # run_until, train_until end early
   >>> state.step.item()
   4
 
-A run is ``init`` and then ``step`` after ``step``; ``train_until`` and ``run_until`` end early.
 Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
 many settings, by ``vmap`` over the numbers of ``Hparams``.
 """

@@ -145,6 +145,12 @@ def verdict_of(problem: Problem, threshold: float, lower: float, upper: float) -
 
     Returns:
       1, -1 or 0.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> asked = SimpleNamespace(bound=">=")
+      >>> [verdict_of(asked, 0.5, *bounds) for bounds in ((0.6, 0.7), (0.1, 0.2), (0.4, 0.6))]
+      [1, -1, 0]
     """
     if problem.bound == ">=":
         return ACCEPTED if lower >= threshold else REJECTED if upper < threshold else OPEN

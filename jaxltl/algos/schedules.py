@@ -104,6 +104,10 @@ def at(schedule: Schedule, step: jax.Array | int) -> Any:
 
     Returns:
       A number, as the schedule gives it; None of None.
+
+    Example:
+      >>> at(Linear(1.0, 0.0, 2), 1).item(), at(0.5, 1)
+      (0.5, 0.5)
     """
     l = jnp.asarray(step) + 1  # noqa: E741
     if isinstance(schedule, Polynomial):
@@ -119,6 +123,10 @@ class Condition(NamedTuple):
       name: in a few words.
       holds: whether it does; None if that cannot be told.
       reason: why.
+
+    Example:
+      >>> Condition("samples grow", False, "their number stays").holds
+      False
     """
 
     name: str
@@ -135,6 +143,11 @@ class Conditions(NamedTuple):
       failing: the names of those that fail.
       conditions: all, with reasons.
       assumed: what the theorem assumes of the problem, which settings cannot show.
+
+    Example:
+      >>> from jaxltl.algos.cce import Hparams
+      >>> theorem_conditions(Hparams(weighting="literal")).conditions[0].name
+      'samples grow'
     """
 
     holds: bool | None

@@ -119,6 +119,14 @@ class Concatenated(nn.Module):
 
     Attributes:
       network: the flax module, of vectors ``float[N, O + Q + A]``, or of any leading axes.
+
+    Example:
+      >>> import jax
+      >>> network = Concatenated(nn.Dense(1))
+      >>> read = jnp.zeros((5, 3)), jnp.zeros((5, 2)), jnp.zeros((5, 4))
+      >>> shape, _ = jax.eval_shape(network.init_with_output, jax.random.key(0), *read)
+      >>> shape.shape
+      (5,)
     """
 
     network: nn.Module
@@ -329,7 +337,9 @@ def _inputs(model: Product, observation: jax.Array) -> tuple[jax.Array, jax.Arra
 # --- planning -------------------------------------------------------------------------------------
 
 
-def reward(network: nn.Module, parameters: Any, model: Product, observation: jax.Array):
+def reward(
+    network: nn.Module, parameters: Any, model: Product, observation: jax.Array
+) -> jax.Array:
     """The network's reward in a product.
 
     Args:
@@ -339,6 +349,17 @@ def reward(network: nn.Module, parameters: Any, model: Product, observation: jax
 
     Returns:
       ``float[S, Q, A]``; differentiable in the parameters and the observation.
+
+    Example:
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl.core.models.product import product
+      >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
+      >>> model = product(world, "F g")
+      >>> class Late(nn.Module):  # one for what is done with the task done
+      ...     def __call__(self, observation, memory, action):
+      ...         return 0 * observation[..., 0] + memory[..., 1] + 0 * action[..., 0]
+      >>> reward(Late(), {}, model, jnp.eye(2))[0, :, 0].tolist()
+      [0.0, 1.0]
     """
     return network.apply(parameters, *_inputs(model, observation))
 

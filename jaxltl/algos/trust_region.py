@@ -37,7 +37,8 @@ Example: a point that is pushed about; the reward is for being near, the cost is
   ...     discount=0.9, method="cpo", num_trajectories=6, hidden=(3,), value_hidden=(), cg_steps=3,
   ...     value_epochs=1, value_batches=2)
   >>> state = trust_region.init(jax.random.key(0), problem, hparams)
-  >>> state, metrics = trust_region.run(state, problem, hparams, num_steps=2)
+  >>> state, metrics = trust_region.run(  # both at once: train; till something holds: run_until
+  ...     state, problem, hparams, num_steps=2)  # or train_until
   >>> metrics.trajectories.tolist(), metrics.cost.shape  # as many were drawn for the moments first
   ([12, 18], (2,))
   >>> agent = trust_region.greedy(state, problem, hparams)  # or trust_region.policy, which draws

@@ -82,10 +82,12 @@ class Prepared:
 
     @property
     def num_states(self) -> int:
+        """S, of the model."""
         return self.place.shape[-1]
 
     @property
     def num_rows(self) -> int:
+        """R, of the model."""
         return self.row_state.shape[-1]
 
     @property

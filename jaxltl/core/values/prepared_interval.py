@@ -96,6 +96,7 @@ class PreparedInterval:
 
     @property
     def num_states(self) -> int:
+        """S, of the model."""
         return self.node.shape[-1]
 
     @property
