@@ -40,7 +40,12 @@ _MOVES = ((0, 1), (1, 0), (0, -1), (-1, 0), (_ROOT, _ROOT), (_ROOT, -_ROOT), (-_
 
 @brief
 class FlatState(NamedTuple):
-    """Where one is: `place` is ``float32[2]``."""
+    """Where one is: `place` is ``float32[2]``.
+
+    Example:
+      >>> FlatState(np.zeros(2)).place.tolist()
+      [0.0, 0.0]
+    """
 
     place: Any
 
@@ -137,7 +142,18 @@ def flat_world(
 
 
 def discs_of(environment: Environment) -> Discs:
-    """The discs of a flat world."""
+    """The discs of a flat world.
+
+    Args:
+      environment: of :func:`flat_world`.
+
+    Returns:
+      :class:`Discs`.
+
+    Example:
+      >>> discs_of(flat_world(discs=[("red", 0.5, 0.0, 0.25)], start=[0, 0])).center.tolist()
+      [[0.5, 0.0]]
+    """
     return without_time_limit(environment)[0].labels.args[0]  # type: ignore[attr-defined]
 
 

@@ -48,6 +48,11 @@ class LetterState(NamedTuple):
       letter: ``int8[C]``, the number of each cell's letter, or that of the letters for none; cells
         are counted row by row from the upper left.
       place: ``int32[]``, the agent's cell.
+
+    Example:
+      >>> here = LetterState(np.array([0, 1, 1, 1], np.int8), 3)
+      >>> int(here.letter[here.place])  # of one letter: none
+      1
     """
 
     letter: Any
@@ -181,8 +186,19 @@ def connected_cells(size: int, used: int, count: int, seed: int = 0) -> np.ndarr
     From any cell that is not in the set every cell of the torus is reached through such cells;
     those of the set are where ways may end.
 
+    Args:
+      size: cells a side.
+      used: how many cells are in a set.
+      count: how many sets.
+      seed: of the drawing.
+
     Raises:
       ValueError: such sets are so rare that they are not found.
+
+    Example:
+      >>> sets = connected_cells(4, 3, 2)
+      >>> sets.shape, sets.sum(1).tolist()
+      ((2, 16), [3, 3])
     """
     random, found, tries = np.random.default_rng(seed), [np.zeros((0, size * size), bool)], 0
     while (have := sum(map(len, found))) < count:
@@ -196,7 +212,15 @@ def connected_cells(size: int, used: int, count: int, seed: int = 0) -> np.ndarr
 
 
 def is_connected(used: np.ndarray) -> np.ndarray:
-    """``bool[N]`` of sets of cells ``bool[N, size, size]``, see :func:`connected_cells`."""
+    """``bool[N]`` of sets of cells ``bool[N, size, size]``, see :func:`connected_cells`.
+
+    Args:
+      used: the sets.
+
+    Example:
+      >>> is_connected(np.array([[[1, 0], [0, 0]], [[0, 1], [1, 0]]], bool)).tolist()
+      [True, False]
+    """
     def beside(x: np.ndarray) -> np.ndarray:
         return np.roll(x, 1, 1) | np.roll(x, -1, 1) | np.roll(x, 1, 2) | np.roll(x, -1, 2)
 

@@ -37,6 +37,10 @@ class LQR:
       start: ``float[n]``.
       scale: what J is divided by in the objective.
       horizon: N, the number of controls; static.
+
+    Example:
+      >>> lqr().dynamics.tolist(), lqr().control.shape
+      ([[1.0, 1.0], [0.0, 1.0]], (2, 1))
     """
 
     dynamics: chex.Array
@@ -106,6 +110,9 @@ def lqr(
       horizon: N.
       scale: what J is divided by in the objective; default J without any control, if that is
         positive, else 1.
+
+    Returns:
+      :class:`LQR`.
 
     Raises:
       ValueError: shapes that do not fit, costs that are not definite, or bounds the wrong way.
@@ -199,10 +206,15 @@ def simulate(world: LQR, network: Network | str, parameters: jax.Array) -> Run:
     """The run of a policy, or of many.
 
     Args:
+      world: from :func:`lqr`.
+      network: from the n states to the m controls; or its sizes, then with biases.
       parameters: ``float[D]``, or ``float[D, lanes]`` with any number of axes of lanes.
 
     Returns:
       :class:`Run`, with the lanes as last axes. Under ``jit`` and ``vmap``; differentiable.
+
+    Raises:
+      ValueError: a network with other inputs or outputs.
 
     Example:
       >>> run = simulate(lqr(), "2-2-1", jnp.zeros(9))
@@ -307,7 +319,18 @@ def _lanes_last(
 
 @brief
 class Plant(NamedTuple):
-    """A regulator on its way: its state, the largest violation so far, and steps made."""
+    """A regulator on its way.
+
+    Attributes:
+      state: ``float[n]``.
+      violation: the largest so far.
+      time: ``int32[]``, steps made.
+
+    Example:
+      >>> begun = as_environment(lqr()).reset(None)
+      >>> begun.state.tolist(), int(begun.time)
+      ([1.0, -1.0], 0)
+    """
 
     state: jax.Array
     violation: jax.Array
@@ -323,6 +346,9 @@ def as_environment(world: LQR, dtype: Any = None) -> Environment:
     Args:
       world: from :func:`lqr`, which travels as an argument.
       dtype: of all numbers; default JAX's.
+
+    Returns:
+      The environment.
 
     Example:
       >>> plant = as_environment(lqr())
@@ -367,6 +393,12 @@ def optimum(world: LQR) -> Optimum:
     With the states written in terms of the controls, J is a sum of squares ``|M u + c|^2`` under
     bounds: a strictly convex problem, solved by an active-set method (Stark and Parker 1995)
     that ends exactly up to rounding. On the host, in float64.
+
+    Args:
+      world: from :func:`lqr`.
+
+    Returns:
+      :class:`Optimum`.
 
     Raises:
       ValueError: the method did not finish.

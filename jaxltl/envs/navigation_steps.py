@@ -31,6 +31,11 @@ class Place(NamedTuple):
       nearest: the least distance from the obstacle before it.
       goal, obstacle: whether they were visited before it.
       time: steps made.
+
+    Example:
+      >>> task = as_environment(nav.navigation(), 1)
+      >>> jax.eval_shape(task.reset, jax.random.key(0)).time.dtype.name
+      'int32'
     """
 
     state: State
@@ -66,6 +71,9 @@ def as_environment(
       task: 1 to 4; another one does not recompile.
       absorbing: whether the robot stays for ever where it enters the goal; default only in task 1.
       dtype: of all numbers; default JAX's.
+
+    Returns:
+      The environment; its worlds are :class:`Place`.
 
     Raises:
       ValueError: an unknown task.

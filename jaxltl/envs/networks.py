@@ -74,6 +74,9 @@ def make_network(
       output: that of the last layer.
       biases: whether each layer adds a bias to each of its nodes.
 
+    Returns:
+      :class:`Network`.
+
     Raises:
       ValueError: fewer than two sizes, a size below 1, or an unknown activation.
 
@@ -99,6 +102,13 @@ def make_network(
 def num_parameters(sizes: Sequence[int], biases: bool = True) -> int:
     """``sum_l (n_l + [biases]) * n_(l+1)``, how many numbers a network of these sizes has.
 
+    Args:
+      sizes: of the layers, from the inputs on.
+      biases: whether the layers have them.
+
+    Returns:
+      D.
+
     Example:
       >>> num_parameters((62, 30, 30, 2))
       2882
@@ -116,7 +126,11 @@ def layers(network: Network, parameters: jax.Array) -> Layers:
     then the biases.
 
     Args:
+      network: from :func:`make_network`.
       parameters: ``float[D, lanes]``, with any number of axes of lanes.
+
+    Returns:
+      A pair for each layer; without biases the second is None.
 
     Raises:
       ValueError: another number of parameters than the network has.
@@ -171,7 +185,8 @@ def apply_layers(network: Network, parts: Layers, inputs: jax.Array) -> jax.Arra
     For loops: inside of one the parameters of many policies would be copied in every pass.
 
     Args:
-      parts: without lanes.
+      network: from :func:`make_network`.
+      parts: from :func:`layers`, without lanes.
       inputs: ``float[..., I]``.
 
     Returns:
@@ -179,6 +194,11 @@ def apply_layers(network: Network, parts: Layers, inputs: jax.Array) -> jax.Arra
 
     Raises:
       ValueError: inputs or parts that do not fit the network.
+
+    Example:
+      >>> double = make_network("1-1", biases=False)
+      >>> apply_layers(double, layers(double, jnp.array([2.0])), jnp.array([3.0])).tolist()
+      [6.0]
     """
     if inputs.shape[-1:] != network.sizes[:1] or parts[0][0].ndim != 2:
         raise ValueError(
@@ -201,6 +221,9 @@ def padded(parts: Layers, multiple: int = 16) -> Layers:
     Args:
       parts: from :func:`layers`, without lanes.
       multiple: of which the hidden layers' widths become multiples.
+
+    Returns:
+      A pair for each layer.
 
     Example:
       >>> parts = layers(make_network("3-5-1"), jnp.ones(26))
@@ -294,6 +317,10 @@ def network_agent(network: Network, environment: Environment) -> Partial:
     Args:
       network: from :func:`make_network`.
       environment: what it is to act in.
+
+    Returns:
+      A function of parameters, a pytree, that gives an
+      :class:`~jaxltl.core.models.environment.Agent`.
 
     Raises:
       ValueError: other inputs than the environment observes, or outputs than it has actions.

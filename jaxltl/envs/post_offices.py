@@ -85,6 +85,9 @@ def surveillance() -> Automaton:
     accepting, and goes on like ``q1``. It differs from the translation of the formula in that
     it takes the visits in either order.
 
+    Returns:
+      The automaton, of four states over p1 and p2.
+
     Example:
       >>> automaton = surveillance()
       >>> automaton.delta.tolist()  # reading neither, p1, p2, both
@@ -101,7 +104,8 @@ def surveillance() -> Automaton:
 
 
 def patrol_reward(game: Any) -> jax.Array:
-    """What the system is paid for patrolling the dangerous block: ``float[S, A]``.
+    """What the system is paid for patrolling the dangerous block.
+
 
     1 for a move into the block that the light marks as dangerous, and for a move inside it
     that goes round it counterclockwise where the light is on, clockwise where it is off; else
@@ -112,6 +116,9 @@ def patrol_reward(game: Any) -> jax.Array:
     Args:
       game: :func:`post_offices`, or a product of it, for which the reward has shape
         ``[S, Q, A]``. Of ``restrict(game)`` it is the reward of `game` at ``base_state``.
+
+    Returns:
+      ``float[S, A]``.
 
     Raises:
       ValueError: the game has other states.
@@ -174,6 +181,9 @@ def patrol() -> Patrol:
 
     The automaton reads the label of the state that is left, at both turns. The system can
     visit both post offices for ever from every state; the best patrol visits neither.
+
+    Returns:
+      :class:`Patrol`.
 
     Example:
       >>> model = patrol()

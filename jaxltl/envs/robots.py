@@ -164,11 +164,15 @@ def grid_game(
 
 
 def places(text: str, *, wall: str = "#") -> np.ndarray:
-    """Row and column of each place of a map, in the order of their numbers: ``int[C, 2]``.
+    """Row and column of each place of a map, in the order of their numbers.
+
 
     Args:
       text: the map, see :func:`~jaxltl.envs.text_map.parse_map`.
       wall: the kind of cell that is not a place.
+
+    Returns:
+      ``int[C, 2]``, NumPy's.
 
     Example:
       >>> places("a#\\n.b").tolist()
@@ -205,12 +209,16 @@ def arrival_reward(game: Any, condition: States) -> jax.Array:
 
 
 def diagonal_reward(game: Any) -> jax.Array:
-    """1 where the system's move arrives diagonally to the environment: ``float[S, A]``.
+    """1 where the system's move arrives diagonally to the environment, else 0.
+
 
     The instantaneous reward of the dissertation, section 5.5; see :func:`arrival_reward`.
 
     Args:
       game: a game of robots, whole or restricted.
+
+    Returns:
+      ``float[S, A]``.
 
     Example:
       >>> game = robots(3)

@@ -92,8 +92,17 @@ def colored_world(
       colors, objects, obstacles, margin: see :func:`categories`.
       slip: probability of moving sideways, see :func:`jaxltl.envs.gridworld.gridworld`.
 
+    Returns:
+      :class:`World`.
+
     Raises:
       ValueError: see :func:`categories`; or no cell is a distractor, so that no run can start.
+
+    Example:
+      >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
+      >>> again = colored_world(np.asarray(world.colors))
+      >>> again.shape, int(again.mdp.label.sum())
+      ((4, 4), 1)
     """
     kind = categories(colors, objects=objects, obstacles=obstacles, margin=margin)
     kinds = make_kinds(objects, obstacles)
@@ -143,6 +152,9 @@ def make_world(
       shape: rows and columns.
       objects, obstacles, margin, slip: see :func:`colored_world`.
 
+    Returns:
+      :class:`World`.
+
     Raises:
       ValueError: an unknown name, a cell outside the grid or used twice, patches that overlap
         with different colours, or obstacles between which another one would arise.
@@ -177,6 +189,14 @@ def make_world(
 
 def training_world(seed: int = 0, *, margin: int = 1, slip: float = 0.0) -> World:
     """The training world of the dissertation, Figure 5a; its free cells have random colours.
+
+    Args:
+      seed: of the colours of free cells.
+      margin: rings of coloured cells around the grid.
+      slip: probability of moving sideways.
+
+    Returns:
+      :class:`World`, of 10 by 10 cells.
 
     Example:
       >>> training_world().mdp.label.sum(0).tolist()
@@ -305,9 +325,17 @@ def random_worlds(
       obstacle_distance: of obstacles from objects, likewise.
       max_tries: placements to try for each world.
 
+    Returns:
+      A :class:`World` for each seed.
+
     Raises:
       ValueError: an unknown proposition, or no placement found in which the objects have room and
         the task can be done from everywhere.
+
+    Example:
+      >>> worlds = random_worlds([3, 4], shape=(6, 8), num_obstacles=2)
+      >>> [world.shape for world in worlds]
+      [(6, 8), (6, 8)]
     """
     kinds = make_kinds(objects, obstacles)
     check_margin(margin)
@@ -343,6 +371,17 @@ def random_worlds(
 
 def random_world(seed: int, task: Task = COMPLETE, **options: Any) -> World:
     """One world of :func:`random_worlds`, which takes the same options.
+
+    Args:
+      seed: of the world.
+      task: as for :func:`random_worlds`.
+      **options: as for :func:`random_worlds`.
+
+    Returns:
+      :class:`World`.
+
+    Raises:
+      ValueError: as :func:`random_worlds`.
 
     Example:
       >>> world = random_world(3, shape=(6, 8), num_obstacles=2)
@@ -480,13 +519,26 @@ def _patches(colors: jax.Array, rows: int, columns: int, margin: int, radius: in
 
 
 def observations(world: World, radius: int = 1) -> jax.Array:
-    """The colours around each cell, one-hot: ``float[S, O]``.
+    """The colours around each cell, one-hot.
+
 
     ``O = (2 * radius + 1)**2 * 5``: row by row, for each cell one number for each colour. Reshaped
     to ``[S, 2 * radius + 1, 2 * radius + 1, 5]`` it is an image.
 
+    Args:
+      world: the world.
+      radius: how far around, at most the world's margin; static.
+
+    Returns:
+      ``float[S, O]``.
+
     Raises:
       ValueError: see :func:`patches`.
+
+    Example:
+      >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
+      >>> observations(world, 0).shape, observations(world, 0).sum().item()
+      ((16, 5), 16.0)
     """
     hot = jax.nn.one_hot(patches(world, radius), len(COLORS), dtype=world.mdp.dtype)
     return hot.reshape(hot.shape[0], -1)
@@ -505,7 +557,20 @@ def _distance(automaton: Any) -> jax.Array:
 
 
 def is_over(model: Product) -> jax.Array:
-    """``bool[S, Q]``: the task is done or cannot be done any more, by the automaton alone."""
+    """Where the task is done or cannot be done any more, by the automaton alone.
+
+    Args:
+      model: the product of a world and a co-safe task.
+
+    Returns:
+      ``bool[S, Q]``.
+
+    Example:
+      >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
+      >>> model = product(world.mdp, "F o1", label_on="exit")
+      >>> jax.jit(is_over)(model)[0].tolist()
+      [False, True]
+    """
     distance = _distance(model.automaton)
     over = (distance == 0) | jnp.isinf(distance)
     return jnp.broadcast_to(over, model.state_shape)
@@ -520,7 +585,8 @@ def expert_reward(
     won: jax.Array | float = 3.0,
     lost: jax.Array | float = -3.0,
 ) -> jax.Array:
-    """The reward of one who knows the task: ``float[S, Q, A]``.
+    """The reward of one who knows the task.
+
 
     Each step has one of five rewards. While the task is open: `progress` if the automaton moves
     to a state from which fewer letters lead to a final one, `failure` if it moves to one from
@@ -531,8 +597,17 @@ def expert_reward(
         the label of the state that is entered.
       progress, failure, step, won, lost: scalars.
 
+    Returns:
+      ``float[S, Q, A]``. Differentiable in the five rewards.
+
     Raises:
       ValueError: the task has no final states.
+
+    Example:
+      >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
+      >>> model = product(world.mdp, "F o1", label_on="exit")
+      >>> jax.jit(expert_reward)(model)[:2, 0, 0].tolist()  # o1 is read where it is left
+      [-1.0, 10.0]
     """
     dtype = model.dtype
     distance = _distance(model.automaton)
@@ -555,7 +630,8 @@ def expert_policy(
     method: str = "value_iteration",
     tolerance: jax.Array | float | None = None,
 ) -> jax.Array:
-    """The soft-optimal policy (3.4), (3.5) for a reward: ``float[S, Q, A]``.
+    """The soft-optimal policy (3.4), (3.5) for a reward.
+
 
     Args:
       model: the product.
@@ -563,6 +639,16 @@ def expert_policy(
       reward: ``float[S, Q, A]``; default :func:`expert_reward`.
       method, tolerance: see :func:`jaxltl.core.values.soft.soft_value`. Sweeps suit the discount of
         the dissertation, and many worlds at once under ``vmap``; nearer to 1, use ``"newton"``.
+
+    Returns:
+      ``float[S, Q, A]``.
+
+    Example:
+      >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
+      >>> model = product(world.mdp, "F o1", label_on="exit")
+      >>> shape = jax.eval_shape(lambda: expert_policy(model)).shape
+      >>> shape == (*model.state_shape, model.num_actions)
+      True
     """
     reward = expert_reward(model) if reward is None else reward
     return soft_value(model, reward, discount, method=method, tolerance=tolerance).policy
@@ -584,6 +670,15 @@ def demonstrations(
     Returns:
       Trajectories of the world, states ``int32[num, horizon]``. The last pair of a run is the one
       that enters a final or failed state of the automaton.
+
+    Example:
+      >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
+      >>> model = product(world.mdp, "F o1", label_on="exit")
+      >>> policy = jnp.full((*model.state_shape, 4), 0.25)
+      >>> runs = jax.eval_shape(
+      ...     lambda key: demonstrations(key, model, policy, num=3, horizon=5), jax.random.key(0))
+      >>> runs.state.shape, runs.state_shape
+      ((3, 5), (16,))
     """
     runs = rollout(
         model, policy, key, num_trajectories=num, num_steps=horizon, stop=is_over(model)

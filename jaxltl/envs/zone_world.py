@@ -47,6 +47,11 @@ class ZoneState(NamedTuple):
       acceleration: ``float32[2]``, that of the last step.
       turning: ``float32[]``, radians a second, of the last step.
       zone: ``float32[P, N, 2]``, the places of each colour's zones.
+
+    Example:
+      >>> world = zone_world(num_maps=8, horizon=None)
+      >>> jax.eval_shape(world.reset, jax.random.key(0)).zone.shape
+      (4, 2, 2)
     """
 
     place: Any
@@ -142,8 +147,18 @@ def draw_places(count: int, extent: float, num_maps: int, seed: int = 0) -> np.n
     again where it is nearer to an earlier one than both keepouts; a map on which something finds no
     place is given up.
 
+    Args:
+      count: the zones of a map.
+      extent: half a side of the square.
+      num_maps: M.
+      seed: of the drawing.
+
     Raises:
       ValueError: hardly any map is completed.
+
+    Example:
+      >>> draw_places(2, 2.5, 3).shape
+      (3, 3, 2)
     """
     random, found, rounds = np.random.default_rng(seed), [np.zeros((0, count + 1, 2))], 0
     while (have := sum(map(len, found))) < num_maps:

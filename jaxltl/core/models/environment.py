@@ -458,8 +458,9 @@ def run_episode(
       ...     lambda key: jnp.int32(0),
       ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
       ...     lambda world: world[None], actions=2)
-      >>> found = run_episode(
-      ...     jax.random.key(0), coin, agent_of(lambda seen, key: 1), num_steps=5)
+      >>> run = jax.jit(
+      ...     lambda key: run_episode(key, coin, agent_of(lambda seen, key: 1), num_steps=5))
+      >>> found = run(jax.random.key(0))
       >>> found.reward.tolist(), bool(found.terminated)
       ([1.0, 0.0, 0.0, 0.0, 0.0], True)
     """

@@ -144,7 +144,7 @@ def sample_successor(
     Example:
       >>> import jaxltl as jl
       >>> cycle = jl.make_mdp([[[1]], [[0]]], [[[1.0]], [[1.0]]])
-      >>> int(sample_successor(cycle, jax.random.key(0), jnp.int32(0), jnp.int32(0)))
+      >>> int(jax.jit(sample_successor)(cycle, jax.random.key(0), 0, 0))
       1
     """
     raise TypeError(_unknown(model))

@@ -55,13 +55,11 @@ class Table:
         `distinct` leaves out. Where several hold, the last of them in this order.
 
     Example:
-      >>> import jaxltl as jl
-      >>> coin = jl.make_environment(
-      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.Timestep(action, 0.0, False),
-      ...     lambda world: world[None], actions=2)
-      >>> table = jl.tabulate(coin)
-      >>> table.model.num_states, table.world.tolist(), table.start.tolist()
-      (2, [0, 1], [0])
+      >>> over = Table(
+      ...     make_sparse(None, [0, 1], [0], [1.0]), world=np.array([7]), start=np.array([0]),
+      ...     terminated=np.array([True]), truncated=np.array([False]), evidence="told")
+      >>> over.model.num_states, over.world[over.start].tolist(), over.num_steps
+      (1, [7], None)
     """
 
     model: SparseMDP

@@ -48,6 +48,12 @@ def from_brax(
       ValueError: no environment of Brax, one that starts anew by itself, or a batch; labels that
         are not ``bool[P]``.
       ImportError: brax is not installed.
+
+    Example:
+      >>> import brax.envs
+      >>> world = from_brax(brax.envs.get_environment("inverted_pendulum"))
+      >>> world.actions.shape, world.observations.shape
+      ((1,), (4,))
     """
     envs, training = package("brax.envs"), package("brax.envs.wrappers.training")
     make = "give brax.envs.get_environment(name), and limit its episodes by with_time_limit"

@@ -49,6 +49,12 @@ def from_craftax(
       ValueError: no environment of Craftax, or one that starts anew by itself; labels that are not
         ``bool[P]``.
       ImportError: craftax is not installed.
+
+    Example:
+      >>> from craftax.craftax_env import make_craftax_env_from_name
+      >>> own = make_craftax_env_from_name("Craftax-Classic-Symbolic-v1", auto_reset=False)
+      >>> from_craftax(own).actions.num
+      17
     """
     bases = package("craftax.environment_base.environment_bases")
     make = "craftax_env.make_craftax_env_from_name(name, auto_reset=False)"

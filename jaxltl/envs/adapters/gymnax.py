@@ -56,6 +56,13 @@ def from_gymnax(
       ValueError: no environment of gymnax, or one in a wrapper; actions that are neither finite
         nor in a box; labels that are not ``bool[P]``.
       ImportError: gymnax is not installed.
+
+    Example:
+      >>> import gymnax
+      >>> world = from_gymnax(*gymnax.make("CartPole-v1"), propositions=["near"],
+      ...                     labels=lambda state: abs(state.x)[None] < 0.4)
+      >>> world.actions.num, world.horizon, world.propositions
+      (2, 500, ('near',))
     """
     module = package("gymnax.environments.environment")
     require_environment(

@@ -69,6 +69,12 @@ def from_jumanji(
         for each of several agents; actions that are neither finite nor in a box; labels that are
         not ``bool[P]``.
       ImportError: jumanji is not installed.
+
+    Example:
+      >>> import jumanji
+      >>> world = from_jumanji(jumanji.make("Snake-v1"))
+      >>> world.actions.num, world.allowed is None
+      (4, False)
     """
     jumanji, wrappers = package("jumanji"), package("jumanji.wrappers")
     require_environment("jumanji", env, jumanji.Environment, "jumanji.make(name)")

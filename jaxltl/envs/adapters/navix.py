@@ -48,6 +48,13 @@ def from_navix(
     Raises:
       ValueError: no environment of Navix; labels that are not ``bool[P]``.
       ImportError: navix is not installed.
+
+    Example:
+      >>> import navix
+      >>> world = from_navix(navix.make("Navix-Empty-5x5-v0"), propositions=["goal"],
+      ...                    labels=lambda state: state.events.goal_reached.happened[None])
+      >>> world.actions.num, world.propositions
+      (7, ('goal',))
     """
     navix = package("navix")
     require_environment("navix", env, navix.Environment, "navix.make(name)")

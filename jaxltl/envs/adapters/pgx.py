@@ -71,6 +71,13 @@ def from_pgx(
       ValueError: no environment of Pgx; no opponent, or no such player; labels that are not
         ``bool[P]``.
       ImportError: pgx is not installed.
+
+    Example:
+      >>> import pgx
+      >>> def anything(state, key):
+      ...     return jax.random.categorical(key, jnp.log(state.legal_action_mask))
+      >>> from_pgx(pgx.make("tic_tac_toe"), anything).actions.num
+      9
     """
     pgx = package("pgx")
     require_environment("pgx", env, pgx.Env, "pgx.make(name)")

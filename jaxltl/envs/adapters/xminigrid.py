@@ -49,6 +49,11 @@ def from_xminigrid(
       ValueError: no environment of xminigrid, or one that starts anew by itself; no limit of steps
         in `params`; labels that are not ``bool[P]``.
       ImportError: xminigrid is not installed.
+
+    Example:
+      >>> import xminigrid
+      >>> from_xminigrid(*xminigrid.make("MiniGrid-Empty-5x5")).actions.num
+      6
     """
     module = package("xminigrid.environment")
     wrappers = package("xminigrid.wrappers")
