@@ -20,7 +20,24 @@ LETTERS = "rywpb"  # of the colours, in text files
 
 
 def write_world(world: World) -> str:
-    """A world as text: its margin, slip and kinds of cells, then a letter for each colour."""
+    """A world as text: its margin, slip and kinds of cells, then a letter for each colour.
+
+    Args:
+      world: a :class:`~jaxltl.envs.temporal_gridworld.World`.
+
+    Returns:
+      The text, of which :func:`read_world` makes the same world.
+
+    Example:
+      >>> world = read_world('''
+      ... rbrp
+      ... brbp
+      ... rbry
+      ... ''')
+      >>> again = read_world(write_world(world))
+      >>> again.shape, bool((again.mdp.label == world.mdp.label).all())
+      ((1, 2), True)
+    """
     slip = 0.0
     if world.mdp.num_successors > 1:
         slip = 1 - float(world.mdp.probability[0, 0, 0])
@@ -39,6 +56,12 @@ def read_world(text: str) -> World:
     of a kind of cell, such as ``o1: 5 red, 4 black``; if there are none of the latter, kinds are
     those of the dissertation. All other lines are rows of the map with its margin, with a letter
     for each cell: r, y, w, p or b.
+
+    Args:
+      text: what is read.
+
+    Returns:
+      A :class:`~jaxltl.envs.temporal_gridworld.World`.
 
     Raises:
       ValueError: naming the line, or the row and column of the map, and what is wrong.
@@ -113,8 +136,24 @@ def _read_rows(rows: Sequence[str]) -> NDArray[np.int32]:
 def save_world(path: str | os.PathLike[str], world: World) -> None:
     """Writes a world as text to a file, which appears only when complete.
 
+    Args:
+      path: the file.
+      world: what is written.
+
     Raises:
       ValueError: the place cannot be written to.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> world = read_world('''
+      ... rbrp
+      ... brbp
+      ... rbry
+      ... ''')
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "world.txt"
+      >>> save_world(path, world)
+      >>> load_world(path).shape
+      (1, 2)
     """
     with atomic_write(path) as file:
         file.write(write_world(world).encode())
@@ -123,8 +162,21 @@ def save_world(path: str | os.PathLike[str], world: World) -> None:
 def load_world(path: str | os.PathLike[str]) -> World:
     """The world of a text file, see :func:`read_world`.
 
+    Args:
+      path: the file.
+
+    Returns:
+      A :class:`~jaxltl.envs.temporal_gridworld.World`.
+
     Raises:
       ValueError: the file cannot be read, or :func:`read_world` refuses it; naming the file.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "world.txt"
+      >>> _ = path.write_text("margin: 1\\nrbrp\\nbrbp\\nrbry\\n")
+      >>> load_world(path).shape
+      (1, 2)
     """
     try:
         return read_world(Path(path).read_text(encoding="utf-8"))

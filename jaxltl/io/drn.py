@@ -48,6 +48,10 @@ def read_drn(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
     Args:
       path: the file, plain or compressed with gzip or xz.
 
+    Returns:
+      A :class:`~jaxltl.core.models.sparse.SparseMDP`, or of intervals an
+      :class:`~jaxltl.core.models.interval.IntervalMDP`.
+
     Raises:
       ValueError: naming file and line, and what was expected; for models with parameters, with
         observations, or in continuous time.
@@ -152,6 +156,16 @@ def write_drn(path: str | os.PathLike[str], model: SparseMDP | IntervalMDP) -> N
     Raises:
       ValueError: the format cannot hold the model, naming what it cannot, such as rewards of
         transitions; or the place cannot be written to.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
+      ...                    label={"heads": [1]})
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
+      >>> write_drn(path, coin)
+      >>> read_drn(path).probability.tolist()
+      [0.5, 0.5, 1.0, 1.0]
     """
     lines = _written(model)
     with write_bytes(path) as file:

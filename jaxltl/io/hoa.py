@@ -46,25 +46,26 @@ def read_hoa(text: str, letters: Iterable[Letter] | None = None) -> Automaton:
     Where an edge is missing, a rejecting state is added. Propositions are sorted.
 
     Args:
-        text: The automaton, from `HOA:` to `--END--`.
-        letters: The letters that occur, each a collection of proposition names; names that are
-            not in the automaton are ignored. None stands for all 2^P subsets.
+      text: the automaton, from `HOA:` to `--END--`.
+      letters: the letters that occur, each a collection of proposition names; names that are
+        not in the automaton are ignored. None stands for all 2^P subsets.
 
     Returns:
-        An automaton with Buchi acceptance if its priorities are 0 and 1, else with parity
-        acceptance. What `write_hoa` wrote has the acceptance it was written from. Letters are in
-        the order of the binary numbers with proposition p as bit p.
+      An automaton with Buchi acceptance if its priorities are 0 and 1, else with parity
+      acceptance. What `write_hoa` wrote has the acceptance it was written from. Letters are in
+      the order of the binary numbers with proposition p as bit p.
 
     Raises:
-        ValueError: With the line, for text that breaks the format, and for an automaton that is
-            not deterministic; for a text that holds no automaton or several; for more than 12
-            propositions without `letters`.
+      ValueError: with the line, for text that breaks the format, and for an automaton that is
+        not deterministic; for a text that holds no automaton or several; for more than 12
+        propositions without `letters`.
 
-    >>> infinitely_often_a = read_hoa('''
-    ... HOA: v1 States: 1 Start: 0 AP: 1 "a" Acceptance: 1 Inf(0)
-    ... --BODY-- State: 0 [0] 0 {0} [!0] 0 --END--''')
-    >>> infinitely_often_a.acceptance, infinitely_often_a.priority.tolist()
-    ('buchi', [[1, 0]])
+    Example:
+      >>> infinitely_often_a = read_hoa('''
+      ... HOA: v1 States: 1 Start: 0 AP: 1 "a" Acceptance: 1 Inf(0)
+      ... --BODY-- State: 0 [0] 0 {0} [!0] 0 --END--''')
+      >>> infinitely_often_a.acceptance, infinitely_often_a.priority.tolist()
+      ('buchi', [[1, 0]])
     """
     found = split_texts(text)
     if len(found) != 1:
@@ -81,15 +82,19 @@ def read_hoa_stream(text: str, letters: Iterable[Letter] | None = None) -> list[
     An automaton that ends with `--ABORT--` is left out.
 
     Args:
-        text: The automata, each from `HOA:` to `--END--`.
-        letters: As in `read_hoa`, for all of them.
+      text: the automata, each from `HOA:` to `--END--`.
+      letters: as in `read_hoa`, for all of them.
+
+    Returns:
+      A list, empty where the text is.
 
     Raises:
-        ValueError: As `read_hoa`.
+      ValueError: as `read_hoa`.
 
-    >>> always = 'HOA: v1 Start: 0 Acceptance: 0 t --BODY-- State: 0 [t] 0 --END--'
-    >>> len(read_hoa_stream(always + always))
-    2
+    Example:
+      >>> always = 'HOA: v1 Start: 0 Acceptance: 0 t --BODY-- State: 0 [t] 0 --END--'
+      >>> len(read_hoa_stream(always + always))
+      2
     """
     known = None if letters is None else as_letters(letters, "read_hoa: letters")
     return [_read(tokens, known) for tokens in split_texts(text)]
@@ -104,34 +109,38 @@ def write_hoa(automaton: Automaton, name: str = "") -> str:
     said of the other subsets, and `letters` is needed to read the same automaton again.
 
     Args:
-        automaton: The automaton.
-        name: Of the automaton, such as its formula.
+      automaton: the automaton.
+      name: of the automaton, such as its formula.
 
     Returns:
-        A text from which `read_hoa` makes the same tables, provided that propositions and
-        letters are in the order that it gives them, as those of `to_automaton` are.
+      A text from which `read_hoa` makes the same tables, provided that propositions and
+      letters are in the order that it gives them, as those of `to_automaton` are.
 
     Raises:
-        ValueError: For priorities above 255, whose acceptance formula no reader would bear.
+      ValueError: for priorities above 255, whose acceptance formula no reader would bear.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> print(write_hoa(to_automaton("F a")))
-    HOA: v1
-    tool: "jaxltl"
-    States: 2
-    Start: 0
-    AP: 1 "a"
-    acc-name: Buchi
-    Acceptance: 1 Inf(0)
-    properties: trans-labels explicit-labels state-acc complete deterministic weak terminal
-    --BODY--
-    State: 0 "F a"
-    [!0] 0
-    [0] 1
-    State: 1 "true" {0}
-    [t] 1
-    --END--
-    <BLANKLINE>
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> text = write_hoa(to_automaton("F a"))
+      >>> print(text[: text.index("--BODY--")])
+      HOA: v1
+      tool: "jaxltl"
+      States: 2
+      Start: 0
+      AP: 1 "a"
+      acc-name: Buchi
+      Acceptance: 1 Inf(0)
+      properties: trans-labels explicit-labels state-acc complete deterministic weak terminal
+      <BLANKLINE>
+      >>> print(text[text.index("--BODY--"):])
+      --BODY--
+      State: 0 "F a"
+      [!0] 0
+      [0] 1
+      State: 1 "true" {0}
+      [t] 1
+      --END--
+      <BLANKLINE>
     """
     names = automaton.propositions
     lines = ["HOA: v1", 'tool: "jaxltl"']

@@ -53,6 +53,14 @@ class HoaGame(NamedTuple):
       objective: the parity objective.
       inputs: the propositions that the environment chooses.
       outputs: those that the system chooses.
+
+    Example:
+      >>> text = '''HOA: v1 States: 1 Start: 0 AP: 2 "request" "grant" controllable-AP: 1
+      ...   acc-name: parity max even 3 Acceptance: 3 Inf(2) | (Fin(1) & Inf(0))
+      ...   --BODY-- State: 0 [0 & 1] 0 {2} [0 & !1] 0 {1} [!0] 0 {0} --END--'''
+      >>> game, objective, inputs, outputs = read_hoa_game(text)
+      >>> inputs, outputs, objective.priority.shape == game.state_shape
+      (('request',), ('grant',), True)
     """
 
     game: Game
@@ -381,9 +389,23 @@ def write_hoa_game(
         those that occur.
       name: of the automaton.
 
+    Returns:
+      The text, from `HOA:` to `--END--`.
+
     Raises:
       ValueError: the game has a random move, several initial states or more than 256 priorities, or
         no objective is known.
+
+    Example:
+      >>> from jaxltl.core.games.objective import parity
+      >>> from jaxltl.core.models.game import make_game
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> world = from_dense([[[0, 1.0], [1, 0]], [[1.0, 0], [1, 0]]], initial=[1, 0])
+      >>> game = make_game(world, [True, False])
+      >>> text = write_hoa_game(game, parity(game, [0, 1]))
+      >>> again = read_hoa_game(text)
+      >>> "controllable-AP:" in text, again.outputs
+      (True, ('o0',))
     """
     row_start, successor = edges_of(game, "write_hoa_game")
     valuation = game.mdp.valuation if isinstance(game.mdp, SparseMDP) else {}

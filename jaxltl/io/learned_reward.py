@@ -28,7 +28,7 @@ class LearnedReward:
     """A reward over what is seen, the memory and the action, with all that planning needs.
 
     Attributes:
-      parameters: of ``RewardNetwork(hidden)``.
+      parameters: of ``RewardNetwork(hidden)``, ``{"params": ...}``.
       hidden: widths of the hidden layers.
       memory: the automaton whose state the network sees.
       label_on: which label a step of the product reads.
@@ -40,6 +40,17 @@ class LearnedReward:
       guarantee: ``"best"``: plans take the actions alone that lose nothing of the memory's task;
         a probability of it, for which as many of them are mixed in as it takes; or ``"none"``.
       over: of which initial states a probability is, their ``"mean"`` or the ``"worst"``.
+
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> linear = {"kernel": np.zeros((5, 1)), "bias": np.zeros(1)}  # of seen, memory and action
+      >>> learned = LearnedReward(
+      ...     parameters={"params": linear}, hidden=(),
+      ...     memory=to_automaton("F g"), label_on="exit", discount=0.9, horizon=None, radius=0,
+      ...     formula="F g", kinds=("plain", "goal"))
+      >>> learned.network.hidden, learned.hparams.discount
+      ((), 0.9)
     """
 
     parameters: Any
@@ -81,6 +92,21 @@ def plan_in(learned: LearnedReward, world: MDP, observation: Any) -> tuple[Produ
     Raises:
       ValueError: the world shows what the automaton does not know, the observation does not
         have the shape that the network reads, or no policy has the probability there.
+
+    Differentiable as :func:`~jaxltl.algos.todirl.plan` is, where nothing is guaranteed.
+
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> linear = {"kernel": np.zeros((5, 1)), "bias": np.zeros(1)}  # of seen, memory and action
+      >>> learned = LearnedReward(
+      ...     parameters={"params": linear}, hidden=(),
+      ...     memory=to_automaton("F g"), label_on="exit", discount=0.9, horizon=None, radius=0,
+      ...     formula="F g", kinds=("plain", "goal"))
+      >>> world = from_dense([[[0.5, 0.5]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
+      >>> model, solution = plan_in(learned, world, np.eye(2))
+      >>> solution.policy.shape
+      (2, 2, 1)
     """
     model = product(world, learned.memory, label_on=learned.label_on)
     seen = jnp.asarray(observation, model.dtype)
@@ -120,8 +146,26 @@ def save_reward(path: str | Path, learned: LearnedReward) -> None:
     Its arrays: the parameters by their names, such as ``params/kernel``, and ``about``, a text of
     JSON with all else.
 
+    Args:
+      path: the file.
+      learned: what is written.
+
     Raises:
       ValueError: the place cannot be written to.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> linear = {"kernel": np.zeros((5, 1)), "bias": np.zeros(1)}  # of seen, memory and action
+      >>> learned = LearnedReward(
+      ...     parameters={"params": linear}, hidden=(),
+      ...     memory=to_automaton("F g"), label_on="exit", discount=0.9, horizon=None, radius=0,
+      ...     formula="F g", kinds=("plain", "goal"))
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "reward.npz"
+      >>> save_reward(path, learned)
+      >>> load_reward(path).kinds
+      ('plain', 'goal')
     """
     about = {key: getattr(learned, key) for key in _ABOUT}
     text = json.dumps({**about, "memory": to_dict(learned.memory)})
@@ -133,8 +177,28 @@ def save_reward(path: str | Path, learned: LearnedReward) -> None:
 def load_reward(path: str | Path) -> LearnedReward:
     """The learned reward that :func:`save_reward` wrote.
 
+    Args:
+      path: the file.
+
+    Returns:
+      :class:`LearnedReward`.
+
     Raises:
       ValueError: the file cannot be read, or is no such file.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> linear = {"kernel": np.zeros((5, 1)), "bias": np.zeros(1)}  # of seen, memory and action
+      >>> learned = LearnedReward(
+      ...     parameters={"params": linear}, hidden=(),
+      ...     memory=to_automaton("F g"), label_on="exit", discount=0.9, horizon=None, radius=0,
+      ...     formula="F g", kinds=("plain", "goal"))
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "reward.npz"
+      >>> save_reward(path, learned)
+      >>> load_reward(path).parameters["params"]["kernel"].shape
+      (5, 1)
     """
     try:
         with open(path, "rb") as file:

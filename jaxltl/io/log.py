@@ -135,6 +135,13 @@ def read_labels(
 
     Raises:
       ValueError: naming the file and the line, as :func:`read_log`.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "labels.csv"
+      >>> _ = path.write_text("state,label\\nbay,goal\\nhall,goal\\nbay,warm\\n")
+      >>> read_labels(path)
+      {'goal': ('bay', 'hall'), 'warm': ('bay',)}
     """
     _check_columns(columns, 2)
     known = set() if states is None else set(map(str, given.listed("states", states)))

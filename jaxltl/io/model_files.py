@@ -79,6 +79,16 @@ def read_model(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
     Raises:
       ValueError: the format is not known, or the file is missing or malformed. The message names
         the file, the place in it and what was expected there.
+
+    Example:
+      >>> import tempfile
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
+      ...                    label={"heads": [1]})
+      >>> path = Path(tempfile.mkdtemp()) / "coin.drn.gz"
+      >>> write_model(path, coin)
+      >>> read_model(path).propositions
+      ('heads',)
     """
     return (_by_name(path) or _by_beginning(path)).read(path)
 

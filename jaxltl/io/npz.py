@@ -274,8 +274,25 @@ def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
     ``lower`` and ``upper`` in place of ``probability`` an interval model, and with ``center`` and
     ``radius`` besides one with a ball.
 
+    Args:
+      path: the file.
+
+    Returns:
+      A :class:`~jaxltl.core.models.sparse.SparseMDP`, a game over one, or an
+      :class:`~jaxltl.core.models.interval.IntervalMDP`.
+
     Raises:
       ValueError: naming the file and the array that is unknown, missing or wrong.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
+      ...                    label={"heads": [1]})
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.npz"
+      >>> write_npz(path, coin)
+      >>> read_npz(path).probability.tolist()
+      [0.5, 0.5, 1.0, 1.0]
     """
     name = str(path)
     try:
@@ -316,6 +333,16 @@ def write_npz(path: str | os.PathLike[str], model: Any) -> None:
 
     Raises:
       ValueError: a variable holds other things, or the place cannot be written to.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
+      ...                    label={"heads": [1]})
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.npz"
+      >>> write_npz(path, coin)
+      >>> read_npz(path).probability.tolist()
+      [0.5, 0.5, 1.0, 1.0]
     """
     arrays: dict[str, Any] = {}
     if isinstance(model, Game):

@@ -42,7 +42,21 @@ Term = tuple[Fraction, list[tuple[int, int]]]  # a coefficient, and parameters w
 @brief
 @dataclass(frozen=True)
 class RationalFunction:
-    """The quotient of two polynomials in the parameters of a model."""
+    """The quotient of two polynomials in the parameters of a model.
+
+    Attributes:
+      numerator, denominator: polynomials, each a table of exact coefficients by exponents.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
+      >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n2\\n@model\\n"
+      ...     "state 0 init\\n\\taction 0\\n\\t\\t0 : 1-p\\n\\t\\t1 : p\\n"
+      ...     "state 1\\n\\taction 0\\n\\t\\t1 : 1\\n")
+      >>> coin = read_parametric(path)
+      >>> [str(function.at((Fraction(1, 4),))) for function in coin.functions]
+      ['0', '3/4', '1/4', '1']
+    """
 
     numerator: Polynomial
     denominator: Polynomial
@@ -78,6 +92,16 @@ class ParametricModel:
       rewards: for each name the numbers of the functions on states, ``int32[S]``, and on choices,
         ``int32[R]``.
       names: labels, initial states and actions, as ``make_sparse`` takes them.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
+      >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n2\\n@model\\n"
+      ...     "state 0 init\\n\\taction 0\\n\\t\\t0 : 1-p\\n\\t\\t1 : p\\n"
+      ...     "state 1\\n\\taction 0\\n\\t\\t1 : 1\\n")
+      >>> coin = read_parametric(path)
+      >>> coin.parameters, coin.successor.tolist(), coin.at({"p": 0.25}).probability.tolist()
+      (('p',), [0, 1, 1], [0.75, 0.25, 1.0])
     """
 
     parameters: tuple[str, ...]
@@ -282,6 +306,10 @@ def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
 
     Args:
       path: the file, plain or compressed with gzip or xz.
+
+    Returns:
+      :class:`ParametricModel`; its :meth:`~ParametricModel.over` is differentiable in the
+      parameters.
 
     Raises:
       ValueError: naming file and line, and what was expected; as for

@@ -33,6 +33,14 @@ class ParityGame(NamedTuple):
     Attributes:
       game: a Game over a :class:`~jaxltl.core.models.sparse.SparseMDP`.
       objective: the parity objective, min-even, of the fewest priorities that say the same.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "game.pg"
+      >>> _ = path.write_text("parity 1; 0 0 0 1; 1 1 1 0;")
+      >>> found = read_pgsolver(path)
+      >>> found.game.system.tolist(), found.objective.priority.tolist()
+      ([True, False], [2, 1])
     """
 
     game: Game
@@ -46,6 +54,9 @@ def read_pgsolver(path: str | os.PathLike[str]) -> ParityGame:
     keeps what the file says of a state: ``"vertex"``, its number there, ``"priority"``, which is
     max-even, and ``"name"`` if any vertex has one. The start, if the file has one, is the initial
     state; without one all states are, uniformly.
+
+    Args:
+      path: the file; ``.gz`` and ``.xz`` are read too.
 
     Returns:
       :class:`ParityGame`.
@@ -275,6 +286,21 @@ def write_pgsolver(
 
     Raises:
       ValueError: the game has a random move, no objective is known, or a name has a quote in it.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> from jaxltl.core.games.objective import parity
+      >>> from jaxltl.core.models.game import make_game
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> world = from_dense([[[0, 1.0], [1, 0]], [[1.0, 0], [1, 0]]], initial=[1, 0])
+      >>> game = make_game(world, [True, False])
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "game.pg"
+      >>> write_pgsolver(path, game, parity(game, [0, 1]))
+      >>> print(path.read_text().strip())
+      parity 1;
+      start 0;
+      0 2 0 1,0;
+      1 1 1 0,0;
     """
     row_start, successor = edges_of(game, "write_pgsolver")
     valuation = game.mdp.valuation if isinstance(game.mdp, SparseMDP) else {}
@@ -308,8 +334,22 @@ def write_pgsolver(
 def objective_of(game: Game) -> Parity:
     """The objective that came with a game's file.
 
+    Args:
+      game: of :func:`read_pgsolver`, :func:`~jaxltl.io.hoa_game.read_hoa_game` or
+        :func:`~jaxltl.io.model_files.read_model`.
+
+    Returns:
+      Its parity objective, min-even.
+
     Raises:
       ValueError: the game is from no file that says one.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "game.pg"
+      >>> _ = path.write_text("parity 1; 0 0 0 1; 1 1 1 0;")
+      >>> objective_of(read_pgsolver(path).game).priority.tolist()
+      [2, 1]
     """
     valuation = game.mdp.valuation if isinstance(game.mdp, SparseMDP) else {}
     return parity_objective(min_even(max_even(valuation, None)[0]))

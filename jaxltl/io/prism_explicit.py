@@ -55,6 +55,10 @@ def read_prism(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
     Args:
       path: of the ``.tra`` or ``.pexp`` file.
 
+    Returns:
+      A :class:`~jaxltl.core.models.sparse.SparseMDP`, or of intervals an
+      :class:`~jaxltl.core.models.interval.IntervalMDP`.
+
     Raises:
       ValueError: naming file and line, and what was expected; for models with observations, or in
         continuous time.
@@ -101,6 +105,16 @@ def write_prism(
     Raises:
       ValueError: the format cannot hold the model, naming what it cannot; the place cannot be
         written to; or files of another model stand beside, which would be read with this one.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
+      ...                    label={"heads": [1]})
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.tra"
+      >>> write_prism(path, coin)
+      >>> read_prism(path).probability.tolist()
+      [0.5, 0.5, 1.0, 1.0]
     """
     path, found = Path(path), _NAME.fullmatch(Path(path).name)
     if found is None:

@@ -37,6 +37,16 @@ class RewardMachine(NamedTuple):
       automaton: with co-safe acceptance, whose final states are those in which the machine has
         ended. Its `state_names` are the numbers in the file.
       reward: ``float64[Q, L]``, of reading letter l in state q; zero once the machine has ended.
+
+    Example:
+      >>> machine = read_reward_machine('''
+      ... 0
+      ... [1]
+      ... (0, 1, 'goal', ConstantRewardFunction(1))
+      ... (0, 0, '!goal', ConstantRewardFunction(0))
+      ... ''')
+      >>> machine.automaton.acceptance, machine.reward.tolist()
+      ('cosafe', [[0.0, 1.0], [0.0, 0.0]])
     """
 
     automaton: Automaton
@@ -236,6 +246,19 @@ def machine_reward(product: Any, reward: ArrayLike | jax.Array) -> Any:
 
     Raises:
       ValueError: the reward has another shape, or the model is no product.
+
+    Example:
+      >>> machine = read_reward_machine('''
+      ... 0
+      ... [1]
+      ... (0, 1, 'goal', ConstantRewardFunction(1))
+      ... (0, 0, '!goal', ConstantRewardFunction(0))
+      ... ''')
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl.core.models.product import product
+      >>> world = from_dense([[[0.5, 0.5]], [[0, 1.0]]], label=[[0], [1]], propositions=["goal"])
+      >>> machine_reward(product(world, machine.automaton), machine.reward)[0, :, 0].tolist()
+      [0.5, 0.0]
     """
     model = product.mdp if isinstance(product, Game) else product
     if not isinstance(model, Product):

@@ -37,6 +37,13 @@ def from_stormpy(model: Any) -> SparseMDP | IntervalMDP | Game:
 
     Raises:
       ValueError: stormpy (version 2 or later) is not installed, or the model is none of these.
+
+    Example:
+      >>> from importlib.util import find_spec
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0])
+      >>> if find_spec("stormpy"):  # an extra of its own
+      ...     assert (from_stormpy(to_stormpy(coin)).probability == coin.probability).all()
     """
     storm = _stormpy()
     what, options = type(model).__name__.strip("_"), storm.io.UmbExportOptions()
@@ -72,6 +79,13 @@ def to_stormpy(model: Any) -> Any:
 
     Raises:
       ValueError: stormpy (version 2 or later) is not installed.
+
+    Example:
+      >>> from importlib.util import find_spec
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0])
+      >>> if find_spec("stormpy"):  # an extra of its own
+      ...     assert to_stormpy(coin).nr_states == 3
     """
     storm = _stormpy()
     sparse = to_sparse(exact_part(model.mdp if isinstance(model, Game) else model))
