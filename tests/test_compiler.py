@@ -5,11 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxltl.app.programs import known_flags
+
 # As users get their programs; other tests are compiled in haste.
 DEFAULT = {
     "xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False,
     "xla_cpu_use_fusion_emitters": True,
 }
+DEFAULT = {name: value for name, value in DEFAULT.items() if known_flags({name: "1"})}
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
