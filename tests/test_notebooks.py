@@ -1,0 +1,59 @@
+"""The notebooks are saved with outputs that are current, and small, and whose pictures are told."""
+
+import importlib.util
+
+import nbformat
+import pytest
+
+from notebooks.execute import (
+    HERE,
+    _difference,
+    differences,
+    execute,
+    faults,
+    open_with_picture,
+    packages,
+    paths,
+)
+
+EVERY = paths([])
+
+
+@pytest.mark.parametrize("path", EVERY, ids=lambda path: path.stem)
+def test_a_notebook_is_saved_with_what_it_shows(path):
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    assert not faults(notebook, path.stem)
+    text = notebook.cells[0].source
+    picture = open_with_picture(notebook, path.stem)
+    assert (HERE / "pictures" / f"{path.stem}.png").read_bytes() == picture
+    assert notebook.cells[0].source == text, "the opening picture is another one"
+
+
+@pytest.mark.notebook
+@pytest.mark.parametrize("path", EVERY, ids=lambda path: path.stem)
+def test_the_outputs_of_a_notebook_are_current(path):
+    notebook = nbformat.read(path, as_version=4)
+    missing = [name for name in packages(notebook) if importlib.util.find_spec(name) is None]
+    if missing:
+        pytest.skip(f"{path.stem} needs {', '.join(missing)}")
+    fresh = execute(notebook)
+    assert not faults(fresh, path.stem)
+    assert not differences(notebook, fresh)
+
+
+@pytest.mark.parametrize(("old", "new", "tolerance"), [
+    ("P >= 0.9385", "P >= 0.9386", 0), ("[ 0.1  2. ]", "[0.1 2.]", 0), ("3 of 5", "4 of 5", 0.4),
+    ("1,234 steps", "1,240 steps", 0.01), ("2.3e-06", "2.2e-06", 0), ("-1.5", "-1.6", 0),
+])
+def test_numbers_may_differ_a_little(old, new, tolerance):
+    assert not _difference(old, new, tolerance)
+
+
+@pytest.mark.parametrize(("old", "new", "tolerance"), [
+    ("P >= 0.9385", "P >= 0.9387", 0), ("3 of 5", "4 of 5", 0), ("won from g1", "won from g2", 9),
+    ("-1.5", "1.5", 0), ("2.3e-06", "2.3e-05", 0), ("True", "False", 1), ("1 2", "1", 1),
+    ("1,234 steps", "1,250 steps", 0.01),
+])
+def test_more_is_a_difference(old, new, tolerance):
+    assert _difference(old, new, tolerance)
