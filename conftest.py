@@ -1,4 +1,4 @@
-"""Examples of texts that ask for packages: left out where one is missing, else as the package is."""
+"""Examples that ask for packages are left out where one is missing, else run as the package is."""
 
 import contextlib
 import importlib
