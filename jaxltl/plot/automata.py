@@ -51,6 +51,12 @@ def automaton(
 
     Raises:
       ValueError: graphviz is asked for and cannot be run.
+
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> figure = automaton(to_automaton("F a"), layout="matplotlib")
+      >>> len(figure.axes)
+      1
     """
     table = on_the_host(automaton)
     doomed = drawing.rejecting(table)

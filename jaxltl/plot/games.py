@@ -77,6 +77,13 @@ def game_values(
 
     Raises:
       ValueError: values or policy do not fit the board, or an action has no direction.
+
+    Example:
+      >>> from jaxltl.envs.robots import robots
+      >>> game = robots(2)  # four cells, two robots, and who moves
+      >>> figure = game_values(np.linspace(0, 1, game.num_states), 2, label="value")
+      >>> len(figure.axes)  # four maps and a scale
+      5
     """
     world = board_of(board, wall)
     table = _of_turns(np.asarray(values, float), world, "values")
@@ -118,6 +125,12 @@ def game_region(
 
     Raises:
       ValueError: the region does not fit the board.
+
+    Example:
+      >>> from jaxltl.envs.robots import robots
+      >>> game = robots(2)  # four cells, two robots, and who moves
+      >>> len(game_region(np.ones(game.num_states, bool), 2, environment=[0, 3]).axes)
+      2
     """
     world = board_of(board, wall)
     table = _of_turns(np.asarray(region, bool), world, "region")
@@ -166,6 +179,12 @@ def game_moves(
 
     Raises:
       ValueError: an array does not fit the board, or an action has no direction.
+
+    Example:
+      >>> from jaxltl.envs.robots import robots
+      >>> game = robots(2)  # four cells, two robots, and who moves
+      >>> len(game_moves(game.available, 2, environment=3, system=0).axes)
+      1
     """
     world = board_of(board, wall)
     _require_place(world, environment)
@@ -304,6 +323,11 @@ def compare(
 
     Raises:
       ValueError: there is nothing to show, or lengths differ.
+
+    Example:
+      >>> figure = compare({"optimal": [1.0, 0.5], "safe": [0.75, 0.5]}, groups=["near", "far"])
+      >>> len(figure.axes)
+      1
     """
     series = {name: np.asarray(value, float) for name, value in values.items()}
     sizes = {len(value) for value in series.values()}

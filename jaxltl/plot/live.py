@@ -40,6 +40,15 @@ def live_automaton(automaton: Automaton, name: str) -> str:
     Args:
       automaton: the automaton.
       name: what the ids begin with.
+
+    Returns:
+      The text of an SVG.
+
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> text = live_automaton(to_automaton("F a"), "task")
+      >>> text.startswith("<svg"), text.count('data-memory')
+      (True, 2)
     """
     table = on_the_host(automaton)
     doomed = layout.rejecting(table)
@@ -166,6 +175,15 @@ def live_map(
       actions: A names, of up, down, left and right.
       wall: the kind of cell that is not a place.
       pieces: how many are moved on the map, ``circle.token``.
+
+    Returns:
+      The text of an SVG.
+
+    Example:
+      >>> place = np.array([[".", "g"]])
+      >>> text = live_map(place, "map", {"0": ([0.5, 1.0], None)}, runs=[[0, 1]])
+      >>> text.startswith("<svg"), 'data-run' in text
+      (True, True)
     """
     ground = _ground(place, wall)
     rows, columns = ground.shape
@@ -269,6 +287,10 @@ def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
 
     Returns:
       The SVG; its scale is logarithmic where positive values span more than a hundredfold.
+
+    Example:
+      >>> live_curve("loss", [[4.0, 5.0], [2.0, 3.0]], [1, 2]).startswith("<svg")
+      True
     """
     wide, high, left, below = 320.0, 180.0, 64.0, 26.0
     shown, x = np.asarray(values, float), np.asarray(steps, float)

@@ -49,6 +49,11 @@ def model(model: Any) -> Figure:
 
     Raises:
       ValueError: there is no map, and there are too many states for a graph.
+
+    Example:
+      >>> from jaxltl.envs.gridworld import gridworld
+      >>> len(model(gridworld("a . #")).axes)
+      1
     """
     world = model.mdp if hasattr(model, "automaton") else model
     system = getattr(world, "system", None)
@@ -78,6 +83,14 @@ def solution(solution: Solution, model: Any = None, *, memories: Any = None) -> 
     Raises:
       ValueError: the model has no map and is too large for a graph, or the solution is another
         one's.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> coin = jl.make_sparse(
+      ...     None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], label={"heads": [1]})
+      >>> found = jl.reachability_probability(coin, coin.states_where("heads"))
+      >>> len(solution(found).axes), len(solution(found, coin).axes)
+      (1, 1)
     """
     if model is None:
         return _strip(solution)

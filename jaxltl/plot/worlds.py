@@ -64,6 +64,17 @@ def temporal_gridworld(
 
     Raises:
       ValueError: policy, value, memory or trajectories do not fit the world.
+
+    Example:
+      >>> from jaxltl.io.colored_world import read_world
+      >>> world = read_world('''
+      ... rbrp
+      ... brbp
+      ... rbry
+      ... ''')
+      >>> policy = np.full((2, 4), 0.25)
+      >>> len(temporal_gridworld(world, policy, value=[0.5, 1.0]).axes)
+      3
     """
     chosen = [memory] if isinstance(memory, int | np.integer) else list(memory)
     size, shape = int(np.prod(world.shape)), world.shape
