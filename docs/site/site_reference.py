@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any
 
 from docutils import nodes
+from sphinx import addnodes
 from sphinx.util import logging
 from sphinx.util.nodes import make_refnode
 
@@ -247,9 +248,14 @@ def mend(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str
 
 
 def restore(app: Any, doctree: Any) -> None:
-    """Puts the spaces back."""
+    """Puts the spaces back, and makes types known by where they are documented."""
     for text in [x for x in doctree.findall(nodes.Text) if SPACE in x]:
         text.parent.replace(text, nodes.Text(text.replace(SPACE, " ")))
+    for node in doctree.findall(addnodes.pending_xref):  # `State` is that of its own module
+        if node.get("refdomain") == "py" and node.get("reftype") == "class":
+            value, found = resolve(node["reftarget"], node.get("py:module") or "")
+            if found and id(value) in _home:
+                node["reftarget"] = _home[id(value)]
 
 
 def find(app: Any, env: Any, node: Any, contnode: Any) -> Any:

@@ -13,7 +13,7 @@ large on average, costs Z at most the task's limit:
 ====  =========================================  ==================================  =====
 task  J                                          Z                                   limit
 ====  =========================================  ==================================  =====
-1     1 for each state in the goal, and 2 abs y   -1 if the goal is reached, where    -0.5
+1     1 for each state in the goal, and 2 abs y  -1 if the goal is reached, where    -0.5
       for each in the strip -2 <= y <= -0.2      the robot then stays
 2     30 times the least signed distance         -1 if the goal is visited           -0.5
       from the obstacle
