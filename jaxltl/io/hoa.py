@@ -122,7 +122,7 @@ def write_hoa(automaton: Automaton, name: str = "") -> str:
     Example:
       >>> from jaxltl.core.automata.translate import to_automaton
       >>> text = write_hoa(to_automaton("F a"))
-      >>> print(text[: text.index("--BODY--")])
+      >>> print(text[: text.index("--BODY--")].strip())
       HOA: v1
       tool: "jaxltl"
       States: 2
@@ -131,8 +131,7 @@ def write_hoa(automaton: Automaton, name: str = "") -> str:
       acc-name: Buchi
       Acceptance: 1 Inf(0)
       properties: trans-labels explicit-labels state-acc complete deterministic weak terminal
-      <BLANKLINE>
-      >>> print(text[text.index("--BODY--"):])
+      >>> print(text[text.index("--BODY--"):].strip())
       --BODY--
       State: 0 "F a"
       [!0] 0
@@ -140,7 +139,6 @@ def write_hoa(automaton: Automaton, name: str = "") -> str:
       State: 1 "true" {0}
       [t] 1
       --END--
-      <BLANKLINE>
     """
     names = automaton.propositions
     lines = ["HOA: v1", 'tool: "jaxltl"']
