@@ -152,7 +152,8 @@ def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:
       certified: insist on bounds; False accepts ``UNCERTIFIED``, a small residual, too.
 
     Returns:
-      The solution that was given.
+      The solution that was given. Values are read, so that derivatives are taken of the solver's
+      own call.
 
     Raises:
       NotConverged: some lane did not converge. The message names the status, the

@@ -88,7 +88,7 @@ def states_where(model: Any, condition: States, place: str = "condition") -> jax
       place: what is asked for, to begin an error with.
 
     Returns:
-      ``bool[S]``, or ``bool[S, Q]`` in a product.
+      ``bool[S]``, or ``bool[S, Q]`` in a product. Boolean: there is no derivative.
 
     Raises:
       ValueError: wrong shape or dtype, an unknown proposition, or a temporal operator.

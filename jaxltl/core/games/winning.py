@@ -93,6 +93,8 @@ def winning_region(
 
     Returns:
       :class:`Winning`. :func:`~jaxltl.core.games.verify.verify` checks it independently.
+      Exact and Boolean: there is no derivative, but regions and moves may be computed under ``jit``
+      and ``vmap``.
 
     Raises:
       ValueError: a formula over unknown propositions, or an unknown `chance`.

@@ -71,7 +71,8 @@ def attractor(
       among: ``bool[S]``, the states outside the goal that may join; default all.
 
     Returns:
-      :class:`Attractor`. With ``"exists"`` the action is the one that makes progress.
+      :class:`Attractor`. With ``"exists"`` the action is the one that makes progress. Exact and
+      Boolean: there is no derivative.
 
     Raises:
       ValueError: unknown rule or chance.
@@ -122,7 +123,7 @@ def avoidable(model: Any, goal: jax.Array, allowed: jax.Array | None = None) -> 
       allowed: ``bool[S, A]``, the actions that count; default the available ones.
 
     Returns:
-      ``bool[S]``.
+      ``bool[S]``. Boolean: there is no derivative.
 
     Example:
       >>> import jaxltl as jl
@@ -161,6 +162,7 @@ def almost_surely_reaching(
 
     Returns:
       :class:`Attractor`: the region and, outside the goal, the actions of such a policy.
+      Boolean: there is no derivative.
 
     Example:
       >>> import jaxltl as jl

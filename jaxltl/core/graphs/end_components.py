@@ -51,7 +51,7 @@ def end_components(
         model ``bool[R]``, as is `inside`.
 
     Returns:
-      :class:`EndComponents`.
+      :class:`EndComponents`. Exact and Boolean: there is no derivative.
 
     Example:
       >>> import numpy as np

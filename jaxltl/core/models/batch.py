@@ -223,7 +223,8 @@ def lift_memory(policy: jax.Array, task: Automaton | int) -> jax.Array:
       task: the second automaton of :func:`synchronize`, or its number Q2 of states.
 
     Returns:
-      ``[S, Q1 * Q2, ...]``: the policy does not see the task's state.
+      ``[S, Q1 * Q2, ...]``: the policy does not see the task's state. Differentiable in
+      the policy.
 
     Example:
       >>> lift_memory(jnp.array([[[0.0, 1.0], [1.0, 0.0]]]), 2)[0, :, 1].tolist()

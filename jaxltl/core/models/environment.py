@@ -448,7 +448,7 @@ def run_episode(
       num_steps: T; static.
 
     Returns:
-      :class:`Episode`.
+      :class:`Episode`. Differentiable where the environment and the agent are.
 
     Raises:
       ValueError: a number below 1.

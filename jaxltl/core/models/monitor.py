@@ -150,7 +150,7 @@ def monitor_step(monitor: Monitor, state: chex.Array, letter: chex.Array) -> jax
       letter: ``int[...]`` in 0..L-1, of a shape that broadcasts with the state's.
 
     Returns:
-      ``int32[...]``; its verdict is ``monitor.verdict[state]``.
+      ``int32[...]``; its verdict is ``monitor.verdict[state]``. Integers: there is no derivative.
 
     Raises:
       TypeError: letters that are not integers, such as a row of booleans.
@@ -173,7 +173,7 @@ def monitor_verdict(monitor: Monitor, state: chex.Array) -> jax.Array:
       state: ``int32[...]``, of :func:`monitor_step`.
 
     Returns:
-      ``int32[...]``, of :class:`Verdict`.
+      ``int32[...]``, of :class:`Verdict`. Integers: there is no derivative.
 
     Example:
       >>> from jaxltl.core.automata.translate import to_automaton
@@ -197,7 +197,7 @@ def trace_verdicts(
       length: ``int[...]``, how many letters of each trace count; default all T.
 
     Returns:
-      ``int32[..., T + 1]``.
+      ``int32[..., T + 1]``. Integers: there is no derivative.
 
     Raises:
       TypeError: letters or lengths that are not integers.

@@ -74,7 +74,7 @@ def exists_successor(model: Any, region: jax.Array) -> jax.Array:
       region: ``bool[S]``.
 
     Returns:
-      ``bool[S, A]``.
+      ``bool[S, A]``, of a sparse model ``bool[R]``. Boolean: there is no derivative.
 
     Raises:
       TypeError: the model is none.
@@ -99,7 +99,7 @@ def forall_successor(model: Any, region: jax.Array) -> jax.Array:
       region: ``bool[S]``.
 
     Returns:
-      ``bool[S, A]``.
+      ``bool[S, A]``, of a sparse model ``bool[R]``. Boolean: there is no derivative.
 
     Raises:
       TypeError: the model is none.
@@ -136,7 +136,7 @@ def sample_successor(
       state, action: ``int32[]``.
 
     Returns:
-      ``int32[]``, the successor.
+      ``int32[]``, the successor. Drawn: there is no derivative.
 
     Raises:
       TypeError: the model is none.
@@ -200,7 +200,11 @@ def pushforward(model: Any, mass: jax.Array) -> jax.Array:
       mass: ``float[S, A]``.
 
     Returns:
-      ``float[S]``. Linear in `mass` and in the transition probabilities.
+      ``float[S]``. Linear in `mass` and in the transition probabilities, and differentiable
+      in both.
+
+    Raises:
+      TypeError: the model is none.
 
     Example:
       >>> from jaxltl.core.models.mdp import from_dense

@@ -171,7 +171,8 @@ def row_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = Non
         only reward that the model has.
 
     Returns:
-      ``float64[R]``; where anything is traced, JAX's, in the model's precision.
+      ``float64[R]``; where anything is traced, JAX's, in the model's precision, and
+      differentiable in the rewards and the probabilities.
 
     Raises:
       ValueError: there is no such reward, or its shape fits nothing.

@@ -161,7 +161,8 @@ def rollout(
         enters such a state. A start in one has length 0.
 
     Returns:
-      :class:`Trajectories` with N rows. Jit-compiled callers pass the counts statically.
+      :class:`Trajectories` with N rows. Jit-compiled callers pass the counts statically. States and
+      actions are drawn: there is no derivative.
 
     Raises:
       ValueError: a policy that is no distribution over available actions, or of another shape.
