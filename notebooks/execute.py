@@ -137,9 +137,23 @@ def differences(saved: NotebookNode, fresh: NotebookNode) -> list[str]:
         if len(old) != len(new):
             found.append(f"cell {number}: {len(old)} outputs were saved, there are {len(new)}")
         for a, b in zip(old, new, strict=False):
-            if told := _difference(a, b, tolerance):
+            if told := difference(a, b, tolerance):
                 found.append(f"cell {number}: {told}")
     return found
+
+
+def difference(old: str, new: str, tolerance: float) -> str:
+    """How a text differs from one that was saved, in words; empty if it does not."""
+    if [re.sub(r"\s", "", x) for x in _NUMBER.split(old)] != [
+            re.sub(r"\s", "", x) for x in _NUMBER.split(new)]:
+        return f"it was {old.strip()!r} and is {new.strip()!r}"
+    for a, b in zip(_NUMBER.findall(old), _NUMBER.findall(new), strict=True):
+        x, y = (float(n.replace(",", "")) for n in (a, b))
+        if abs(x - y) > 1.01 * max(_last_place(a), _last_place(b)) and (
+                abs(x - y) > tolerance * max(1.0, abs(x))):
+            line = next((n for n in new.splitlines() if b in n), new).strip()
+            return f"{a} was saved, it is {b}, in {line!r}"
+    return ""
 
 
 def _code(notebook: NotebookNode) -> str:
@@ -212,19 +226,6 @@ def _faults_of(output: NotebookNode) -> list[str]:
 def _texts(outputs: list[NotebookNode]) -> list[str]:
     return [output["text"] if output.output_type == "stream" else output.data.get("text/plain", "")
             for output in outputs if output.output_type != "error"]
-
-
-def _difference(old: str, new: str, tolerance: float) -> str:
-    if [re.sub(r"\s", "", x) for x in _NUMBER.split(old)] != [
-            re.sub(r"\s", "", x) for x in _NUMBER.split(new)]:
-        return f"it was {old.strip()!r} and is {new.strip()!r}"
-    for a, b in zip(_NUMBER.findall(old), _NUMBER.findall(new), strict=True):
-        x, y = (float(n.replace(",", "")) for n in (a, b))
-        if abs(x - y) > 1.01 * max(_last_place(a), _last_place(b)) and (
-                abs(x - y) > tolerance * max(1.0, abs(x))):
-            line = next((n for n in new.splitlines() if b in n), new).strip()
-            return f"{a} was saved, it is {b}, in {line!r}"
-    return ""
 
 
 def _last_place(number: str) -> float:

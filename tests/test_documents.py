@@ -28,7 +28,7 @@ import pytest
 from click.testing import CliRunner
 
 from jaxltl.cli import main
-from notebooks.execute import _difference
+from notebooks.execute import difference
 from tests.pages import MARKS, PAGES, ROOT, Block, blocks, name_of
 
 RUN = ("python", "sh", "pycon", "console")
@@ -179,7 +179,7 @@ def steady(text: str) -> str:
 def compare(promised: str, printed: str, block: Block, where: str) -> None:
     """Words are as they stand; numbers with decimals may differ in their last place."""
     within = float(block.marks.get("within") or 1e-6)
-    told = _difference(steady(promised), steady(printed), within)
+    told = difference(steady(promised), steady(printed), within)
     assert not told, f"{where}: {told}"
 
 
@@ -194,7 +194,7 @@ def kept_promises(block: Block, printed: str, where: str) -> None:
             if words and words[-1] != line.split()[-1]:
                 words[-1] = words[-1].rstrip(":;,'")
             within = float(block.marks.get("within") or 1e-6)
-            if words and not _difference(" ".join(words), " ".join(line.split()), within):
+            if words and not difference(" ".join(words), " ".join(line.split()), within):
                 lines = lines[i + 1 :]
                 break
         else:

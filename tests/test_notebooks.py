@@ -7,7 +7,7 @@ import pytest
 
 from notebooks.execute import (
     HERE,
-    _difference,
+    difference,
     differences,
     execute,
     faults,
@@ -47,7 +47,7 @@ def test_the_outputs_of_a_notebook_are_current(path):
     ("1,234 steps", "1,240 steps", 0.01), ("2.3e-06", "2.2e-06", 0), ("-1.5", "-1.6", 0),
 ])
 def test_numbers_may_differ_a_little(old, new, tolerance):
-    assert not _difference(old, new, tolerance)
+    assert not difference(old, new, tolerance)
 
 
 @pytest.mark.parametrize(("old", "new", "tolerance"), [
@@ -56,4 +56,4 @@ def test_numbers_may_differ_a_little(old, new, tolerance):
     ("1,234 steps", "1,250 steps", 0.01),
 ])
 def test_more_is_a_difference(old, new, tolerance):
-    assert _difference(old, new, tolerance)
+    assert difference(old, new, tolerance)
