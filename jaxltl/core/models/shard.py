@@ -170,8 +170,8 @@ def to_mesh(model: ShardedMDP, quantity: Any, fill: Any = 0) -> jax.Array:
       fill: where there is no such state or choice.
 
     Returns:
-      ``[N, ...]``, of rows ``[N, A]``. Put there from the host; derivatives begin with what is on the
-      mesh.
+      ``[N, ...]``, of rows ``[N, A]``. Put there from the host: derivatives begin with what is on
+      the mesh.
 
     Raises:
       ValueError: the shape is wrong.
