@@ -70,6 +70,9 @@ def read_evidence(
       graph: what is known of successors; see :func:`~jaxltl.core.models.counts.counted_model`.
       option: how an option stands where it was given, for messages.
 
+    Returns:
+      :class:`Evidence`.
+
     Raises:
       ValueError: naming the file and the line, or the option.
     """
@@ -116,7 +119,29 @@ def _named(model: SparseMDP, counts: np.ndarray) -> Evidence:
 
 
 def certify(evidence: Evidence, asked: Asked) -> DataGuarantee:
-    """What the log guarantees."""
+    """What the log guarantees, by :func:`~jaxltl.core.values.data_guarantee.learn_guarantee`.
+
+    Args:
+      evidence: of :func:`read_evidence`.
+      asked: the formula, and with which confidence.
+
+    Returns:
+      :class:`~jaxltl.core.values.data_guarantee.DataGuarantee`.
+
+    Raises:
+      ValueError: an unknown label, or a confidence that is none.
+
+    Example:
+      >>> import tempfile
+      >>> path = Path(tempfile.mkdtemp()) / "log.csv"
+      >>> _ = path.write_text("state,action,next,count\\ndock,go,bay,900\\ndock,go,pit,100\\n")
+      >>> labels = path.with_name("labels.csv")
+      >>> _ = labels.write_text("state,label\\nbay,bay\\n")
+      >>> seen = read_evidence(path, labels=labels, initial=["dock"], terminal=["bay", "pit"])
+      >>> found = certify(seen, Asked("F bay", 0.95, "anytime", "max"))
+      >>> 0.85 < found.bound < 0.9
+      True
+    """
     return learn_guarantee(
         evidence.model, evidence.counts, asked.formula, asked.confidence,
         method=asked.method, objective=asked.objective)  # type: ignore[arg-type]

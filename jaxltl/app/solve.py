@@ -77,8 +77,18 @@ def asked_for(arguments: Sequence[str]) -> list[Asked]:
 
     A mistake in one does not hide the others.
 
+    Args:
+      arguments: texts.
+
+    Returns:
+      One for each property, or for each text that is none.
+
     Raises:
       ValueError: a file cannot be read.
+
+    Example:
+      >>> [one.parsed is not None for one in asked_for(['P=? [ F "a" ]; P=? [ X "a" ]', 'Q=?'])]
+      [True, True, False]
     """
     found = []
     for argument in arguments:
@@ -108,6 +118,12 @@ def _text_of(path: Path) -> str:
 def load(path: Path) -> SparseMDP | IntervalMDP:
     """A chain or decision process from a model file, with intervals or without.
 
+    Args:
+      path: the file, of any format that :func:`~jaxltl.io.model_files.read_model` knows.
+
+    Returns:
+      The model, in double precision.
+
     Raises:
       ValueError: it is none.
     """
@@ -126,7 +142,24 @@ def load(path: Path) -> SparseMDP | IntervalMDP:
 def solve(
     model: SparseMDP | IntervalMDP, asked: Sequence[Asked], tolerance: float
 ) -> Iterator[Result]:
-    """The result of each property, as soon as it is there."""
+    """The result of each property, as soon as it is there.
+
+    Args:
+      model: of :func:`load`.
+      asked: of :func:`asked_for`.
+      tolerance: the width of the bounds, absolute for probabilities and relative for the rest.
+
+    Yields:
+      :class:`Result`, in the order of the properties; a mistake in one does not end the others.
+
+    Example:
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                    initial=[1, 0, 0], label={"a": [1]})
+      >>> first, second = solve(coin, asked_for(['P=? [ F "a" ]', 'P=? [ F "b" ]']), 1e-6)
+      >>> first.answer.value.tolist(), first.exit_status, "b" in second.error
+      ([0.5], 0, True)
+    """
     from scipy.sparse import csgraph, linalg  # noqa: F401 - their time is no property's
 
     for one in asked:
@@ -217,7 +250,14 @@ def _number(x: Any) -> Any:
 
 
 def text(result: Result) -> str:
-    """A result for people."""
+    """A result for people.
+
+    Args:
+      result: of :func:`solve`.
+
+    Returns:
+      A line, or a few.
+    """
     lines = [result.asked.text]
     parsed, found = result.asked.parsed, result.answer
     if parsed is not None and parsed.name is not None:

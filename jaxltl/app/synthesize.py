@@ -120,6 +120,9 @@ def synthesize(file: GameFile, progress: Progress = lambda stage: None) -> Synth
       file: from :func:`~jaxltl.app.files.game.read_game`.
       progress: is told each of :data:`STAGES` as it begins.
 
+    Returns:
+      :class:`Synthesis`.
+
     Raises:
       ValueError: something in the file is wrong, or the strategy that it asks for does not
         exist although the system wins.

@@ -520,6 +520,17 @@ def summarize(
 
     Raises:
       ValueError: names are missing, double or unknown, or no world is left.
+
+    Example:
+      >>> from jaxltl.core.models.batch import stack_products
+      >>> from jaxltl.core.models.mdp import from_dense
+      >>> def world(p):
+      ...     return from_dense([[[0, p, 1 - p]], [[0, 1.0, 0]], [[0, 0, 1.0]]], initial=[1, 0, 0],
+      ...                       label=[[0], [1], [0]], propositions=["a"])
+      >>> both = stack_products([world(0.25), world(0.75)], "F a", label_on="exit")
+      >>> found = summarize(both, task_performances(both, jnp.ones((3, 2, 1))), names=["rough", "fair"])
+      >>> round(found.mean, 6), found.worst_world, found.infeasible
+      (0.5, 'rough', ())
     """
     count = num_worlds(models)
     names = [f"world {w}" for w in range(count)] if names is None else list(names)

@@ -144,6 +144,8 @@ def robust_product_satisfaction(
 
     Raises:
       ValueError: the product's actions are restricted, or a policy is none.
+
+    Concrete arrays only, on the host; not differentiable.
     """
     if not isinstance(model, Product) or not isinstance(model.mdp, IntervalMDP):
         raise ValueError(f"{type(model).__name__} is no product of an interval model; give "

@@ -177,6 +177,16 @@ def product_satisfaction(
 
     Raises:
       ValueError: the product's actions are restricted, or a policy is none.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl.core.models.product import product
+      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                    initial=[1, 0, 0], label={"a": [1]})
+      >>> product_satisfaction(product(coin, "F a")).value[:, 0].tolist()
+      [0.5, 1.0, 0.0]
     """
     if model.allowed is not None:
         raise ValueError("a product of a sparse model takes no mask of actions; restrict the world "
