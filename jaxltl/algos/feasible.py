@@ -126,7 +126,8 @@ class Hparams:
       optimizer: ``"adam"``, ``"rmsprop"``, ``"sgd"``, or ``"sign"``, which takes the signs of the
         gradient alone; static; default ``"adam"``.
       tolerance: of the solves of decision processes, see
-        :func:`~jaxltl.core.values.prepared.solve_prepared`; None is its default.
+        :func:`~jaxltl.core.values.prepared.solve_prepared`, also for what None stands for; default
+        None.
     """
 
     learning_rate: Schedule = 0.1

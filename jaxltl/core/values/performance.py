@@ -528,7 +528,8 @@ def summarize(
       ...     return from_dense([[[0, p, 1 - p]], [[0, 1.0, 0]], [[0, 0, 1.0]]], initial=[1, 0, 0],
       ...                       label=[[0], [1], [0]], propositions=["a"])
       >>> both = stack_products([world(0.25), world(0.75)], "F a", label_on="exit")
-      >>> found = summarize(both, task_performances(both, jnp.ones((3, 2, 1))), names=["rough", "fair"])
+      >>> shares = task_performances(both, jnp.ones((3, 2, 1)))
+      >>> found = summarize(both, shares, names=["rough", "fair"])
       >>> round(found.mean, 6), found.worst_world, found.infeasible
       (0.5, 'rough', ())
     """
