@@ -24,6 +24,7 @@ from jaxltl.plot.style import (
     bottom_labels,
     panel_rows,
     plain_axes,
+    settle,
 )
 
 
@@ -45,6 +46,11 @@ def curves(
 
     Raises:
       ValueError: there is nothing to show.
+
+    Example:
+      >>> of_two_seeds = {"loss": [[3.0, 2.0, 1.0], [4.0, 3.0, 1.0]], "share": np.full((2, 3), 0.5)}
+      >>> len(curves(of_two_seeds).axes)
+      2
     """
     series = {k: np.atleast_2d(v) for k, v in _shown("curves", metrics, show).items()}
     chosen = list(series)
@@ -101,8 +107,18 @@ def bands(
       limits: by the titles of row and column, a number at which a dashed line is drawn.
       label: of the horizontal axis.
 
+    Returns:
+      The figure.
+
     Raises:
       ValueError: there is nothing to show.
+
+    Example:
+      >>> band = ([1, 2], [0.5, 0.75], [0.1, 0.1])  # steps, means, and how far to either side
+      >>> figure = bands({"small": {"reward": {"PPO": band, "CPO": band}, "cost": {"CPO": band}}},
+      ...                limits={"small": {"cost": 0.8}})
+      >>> len(figure.axes)
+      2
     """
     figure, panels = panel_rows(rows, "bands", (3.6, 1.9))
     names = list(dict.fromkeys(n for row in rows.values() for cell in row.values() for n in cell))
@@ -143,6 +159,11 @@ def sweep(
 
     Raises:
       ValueError: there is nothing to show, or figures of another number of axes or settings.
+
+    Example:
+      >>> loss = np.ones((2, 3, 5))  # settings, seeds, steps
+      >>> len(sweep({"loss": loss}, ["slow", "fast"]).axes)
+      1
     """
     series, count = _shown("sweep", metrics, show), len(settings)
     if count > len(SERIES):
@@ -175,8 +196,16 @@ def lines(
       labels: of the horizontal axes, one for each column.
       names: of the runs and of the reference.
 
+    Returns:
+      The figure.
+
     Raises:
       ValueError: there is nothing to show.
+
+    Example:
+      >>> runs = np.zeros((4, 10))
+      >>> len(lines({"one": {"value": (runs, np.ones(10)), "cost": (runs, None)}}).axes)
+      2
     """
     figure, panels = panel_rows(rows, "lines", (2.1, 1.5))
     for (row, column), axes in panels.items():
@@ -205,8 +234,16 @@ def guarantees(
       reference: what they come near to.
       names: of the axes.
 
+    Returns:
+      The figure.
+
     Raises:
       ValueError: there is nothing to show.
+
+    Example:
+      >>> figure = guarantees([10, 100, 1000], {"at least": [0.2, 0.6, 0.7]}, reference=0.75)
+      >>> figure.axes[0].get_xscale(), len(figure.axes[0].lines)
+      ('log', 2)
     """
     if not bounds:
         raise ValueError("guarantees: nothing to show; give a bound.")
@@ -246,8 +283,17 @@ def paths(
       bounds: the box that is shown.
       columns: of maps.
 
+    Returns:
+      The figure.
+
     Raises:
       ValueError: there is nothing to show.
+
+    Example:
+      >>> figure = paths({"before": ([[0, 1]], [[0, 2]]), "after": ([[0, 2]], [[0, 2]])},
+      ...                {"goal": ((1.5, 1.5), (2, 2))}, bounds=((0, 0), (2, 2)))
+      >>> len(figure.axes)
+      2
     """
     if not maps:
         raise ValueError("paths: nothing to show; give at least one map.")
@@ -278,4 +324,5 @@ def paths(
         ("o", INK), ("s", SERIES[1]))]
     figure.legend([*handles, *ends], [*boxes, "first", "last"], loc="outside lower center",
                   ncols=len(boxes) + 2, frameon=False, fontsize=8.5, labelcolor=INK)
+    settle(figure)
     return figure

@@ -27,7 +27,18 @@ from jaxltl.plot.board import (
     rule_cells,
     short_name,
 )
-from jaxltl.plot.style import FAINT, INK, KINDS, PAPER, SCALE, head, note, scale_bar, value_limits
+from jaxltl.plot.style import (
+    FAINT,
+    INK,
+    KINDS,
+    PAPER,
+    SCALE,
+    head,
+    note,
+    scale_bar,
+    settle,
+    value_limits,
+)
 
 # Cells are often named for a colour, and then have it.
 _NAMED = {"r": "#f0b9b1", "y": "#f7e08e", "g": "#bfe3c4", "b": "#bcd3f2"}
@@ -62,6 +73,12 @@ def grid(
 
     Raises:
       ValueError: values or policy do not fit the map, or an action has no direction.
+
+    Example:
+      >>> nan = float("nan")  # of the wall
+      >>> figure = grid("a . #", [[0.1, 0.5, nan], [0.4, 1.0, nan]], titles=["first", "then"])
+      >>> len(figure.axes)  # a map for each, and a scale
+      3
     """
     kinds = parse_map(cells) if isinstance(cells, str) else np.asarray(cells)
     panels, arrows = _panels(kinds, values, policy, len(actions))
@@ -91,11 +108,8 @@ def grid(
         keep_out_of_layout(axes)
     if panels is not None:
         scale_bar(figure, image, all_axes.tolist(), label)
-    engine = figure.get_layout_engine()
-    if engine is not None and any(titles):
-        # Titles find their height above the numbers only when these have found theirs: once more
-        # than drawing does it.
-        engine.execute(figure)
+    if any(titles):
+        settle(figure)
     return figure
 
 
@@ -215,6 +229,11 @@ def strategies(
 
     Raises:
       ValueError: an array does not fit the map, or an action has no direction.
+
+    Example:
+      >>> play = np.array([[0.98, 0.0, 0.0, 0.02], [np.nan] * 4])
+      >>> len(strategies(". .", play, seldom=0.05).axes)
+      1
     """
     require_directions(actions)
     kinds = parse_map(cells) if isinstance(cells, str) else np.asarray(cells)
