@@ -361,7 +361,8 @@ def reward(
       >>> reward(Late(), {}, model, jnp.eye(2))[0, :, 0].tolist()
       [0.0, 1.0]
     """
-    return network.apply(parameters, *_inputs(model, observation))
+    found: Any = network.apply(parameters, *_inputs(model, observation))
+    return found
 
 
 def plan(
