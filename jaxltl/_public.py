@@ -42,22 +42,25 @@ from jaxltl.core.models.batch import lift_memory, stack_products
 from jaxltl.core.models.convert import to_padded, to_sparse
 from jaxltl.core.models.counts import TransitionCounts, counted_model, counts_on, make_counts
 from jaxltl.core.models.environment import (
-    Agent,
     Box,
     Environment,
-    Episode,
     Finite,
     Timestep,
-    agent_of,
     make_box,
     make_environment,
-    run_episode,
-    step_or_reset,
 )
+from jaxltl.core.models.episodes import Agent, Episode, agent_of, run_episode, step_or_reset
 from jaxltl.core.models.finite_task import FiniteTask, Shares, finite_shares, make_finite_task
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows, make_interval
 from jaxltl.core.models.lanes import on_host, vmap_over_mesh
+from jaxltl.core.models.lifting import (
+    FiniteMemoryPolicy,
+    lift_policy,
+    lift_trajectories,
+    project_policy,
+    project_trajectories,
+)
 from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp, to_dense
 from jaxltl.core.models.monitor import (
     Monitor,
@@ -76,16 +79,7 @@ from jaxltl.core.models.operators import (
     sample_successor,
 )
 from jaxltl.core.models.parametric import ParametricMDP, make_parametric
-from jaxltl.core.models.product import (
-    FiniteMemoryPolicy,
-    Product,
-    letters_of,
-    lift_policy,
-    lift_trajectories,
-    product,
-    project_policy,
-    project_trajectories,
-)
+from jaxltl.core.models.product import Product, letters_of, product
 from jaxltl.core.models.restrict import Restriction, restrict, with_allowed
 from jaxltl.core.models.sequence_task import (
     SequenceSampler,

@@ -16,9 +16,10 @@ import numpy as np
 from jaxltl.core.host.quickest import until_read
 from jaxltl.core.host.reach import policy_row, steps_until
 from jaxltl.core.models.concrete import namespace, to_jax
+from jaxltl.core.models.lifting import lift_trajectories
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.operators import expectation
-from jaxltl.core.models.product import Product, expected_reads, lift_trajectories
+from jaxltl.core.models.product import Product, expected_reads
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.show import brief
 from jaxltl.core.types import Solution

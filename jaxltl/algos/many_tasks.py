@@ -65,7 +65,8 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.host import given
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models import sequence_task
-from jaxltl.core.models.environment import Agent, Box, Finite, as_partial, flat_observation
+from jaxltl.core.models.environment import Box, Finite, as_partial, flat_observation
+from jaxltl.core.models.episodes import Agent
 from jaxltl.core.show import brief
 
 
@@ -250,7 +251,7 @@ def sequence_agent(
       sampled: whether actions are drawn; else the most likely one is taken.
 
     Returns:
-      An :class:`~jaxltl.core.models.environment.Agent` for observations
+      An :class:`~jaxltl.core.models.episodes.Agent` for observations
       :class:`~jaxltl.core.models.task_environment.TaskObservation` of that formula, one-hot in the
       automaton's state.
 

@@ -69,8 +69,9 @@ from jaxltl.algos._features import progress_states as progress_states
 from jaxltl.algos._features import task_features as task_features
 from jaxltl.algos._features import world_features as world_features
 from jaxltl.core.models.concrete import to_jax
+from jaxltl.core.models.lifting import allowed_steps, lift_trajectories
 from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.models.product import Product, allowed_steps, lift_trajectories
+from jaxltl.core.models.product import Product
 from jaxltl.core.models.restrict import with_allowed
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.show import brief, history
@@ -229,7 +230,7 @@ def make_problem(
       allowed: ``bool[S, A]`` (``[S, Q, A]``), the actions that policies choose from, such as those
         that lose nothing of the task (:func:`~jaxltl.core.values.optimal_actions.optimal_actions`);
         default all. Demonstrated steps that take others are left out:
-        :func:`~jaxltl.core.models.product.allowed_steps` tells which.
+        :func:`~jaxltl.core.models.lifting.allowed_steps` tells which.
 
     Returns:
       :class:`Problem`.

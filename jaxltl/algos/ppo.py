@@ -85,13 +85,13 @@ from jaxltl.algos.schedules import at as _at
 from jaxltl.core.host import given
 from jaxltl.core.models import lanes
 from jaxltl.core.models.environment import (
-    Agent,
     Box,
     Environment,
     Finite,
     require_environment,
     require_key,
 )
+from jaxltl.core.models.episodes import Agent
 from jaxltl.core.show import brief, history
 from jaxltl.core.types import Status
 
@@ -358,16 +358,16 @@ def _check(problem: Problem, hparams: Hparams) -> None:
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
-    """What was learned, an :class:`~jaxltl.core.models.environment.Agent` that draws its actions.
+    """What was learned, an :class:`~jaxltl.core.models.episodes.Agent` that draws its actions.
 
-    Never one that is not allowed. For :func:`~jaxltl.core.models.environment.run_episode`.
+    Never one that is not allowed. For :func:`~jaxltl.core.models.episodes.run_episode`.
 
     Args:
       state: of one run, as of ``train``.
       problem, hparams: of the run.
 
     Returns:
-      :class:`~jaxltl.core.models.environment.Agent`, a pytree.
+      :class:`~jaxltl.core.models.episodes.Agent`, a pytree.
 
     Raises:
       ValueError: the state or the problem is none of PPO's.
@@ -383,7 +383,7 @@ def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
       problem, hparams: of the run.
 
     Returns:
-      :class:`~jaxltl.core.models.environment.Agent`, a pytree.
+      :class:`~jaxltl.core.models.episodes.Agent`, a pytree.
 
     Raises:
       ValueError: the state or the problem is none of PPO's.

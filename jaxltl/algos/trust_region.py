@@ -89,7 +89,6 @@ from jaxltl.algos._value_fit import advantages, fitted, positive, weighted_varia
 from jaxltl.algos.moments import Moments, no_moments, updated_moments
 from jaxltl.core.host import given
 from jaxltl.core.models.environment import (
-    Agent,
     Box,
     Environment,
     Timestep,
@@ -97,6 +96,7 @@ from jaxltl.core.models.environment import (
     flat_observation,
     some_action,
 )
+from jaxltl.core.models.episodes import Agent
 from jaxltl.core.show import brief, history
 from jaxltl.core.types import Status, require_shape, status_code
 
@@ -359,7 +359,7 @@ def _check(problem: Problem, hparams: Hparams) -> None:
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
-    """What was learned, an :class:`~jaxltl.core.models.environment.Agent` that draws its actions.
+    """What was learned, an :class:`~jaxltl.core.models.episodes.Agent` that draws its actions.
 
     :func:`act` tells the distribution that they are drawn from.
 
@@ -368,7 +368,7 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
       problem, hparams: of the run.
 
     Returns:
-      :class:`~jaxltl.core.models.environment.Agent`, a pytree.
+      :class:`~jaxltl.core.models.episodes.Agent`, a pytree.
     """
     return Agent(Partial(_drawn, state, problem, hparams))
 
@@ -381,7 +381,7 @@ def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
       problem, hparams: of the run.
 
     Returns:
-      :class:`~jaxltl.core.models.environment.Agent`, a pytree.
+      :class:`~jaxltl.core.models.episodes.Agent`, a pytree.
     """
     return Agent(Partial(_mean, state, problem, hparams))
 

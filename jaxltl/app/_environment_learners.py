@@ -18,7 +18,8 @@ from jaxltl.algos.exponential_family import diagonal_gaussian
 from jaxltl.algos.schedules import Linear
 from jaxltl.app.files.task_environment import EnvironmentTask
 from jaxltl.app.job import settings
-from jaxltl.core.models.environment import Agent, Box, Environment, Finite, Timestep
+from jaxltl.core.models.environment import Box, Environment, Finite, Timestep
+from jaxltl.core.models.episodes import Agent
 from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.values.episode_scores import episode_evaluator
 from jaxltl.envs.networks import make_network, network_agent

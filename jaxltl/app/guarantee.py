@@ -10,8 +10,9 @@ import numpy as np
 
 from jaxltl.app.files.task import World
 from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.models.lifting import memory_along
 from jaxltl.core.models.monitor import Verdict, verdicts
-from jaxltl.core.models.product import Product, memory_along
+from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution
 from jaxltl.core.values.mixture import (
@@ -108,8 +109,19 @@ def _losing(
 def check_formula(automaton: Automaton) -> str | None:
     """What is to be said of a formula that is true of every run.
 
+    Args:
+      automaton: of the formula.
+
+    Returns:
+      A sentence, or None.
+
     Raises:
       ValueError: no run can satisfy it.
+
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> check_formula(to_automaton("F a")), check_formula(to_automaton("a | !a")) is None
+      (None, False)
     """
     verdict = verdicts(automaton)[int(automaton.initial)]
     if verdict == Verdict.VIOLATED:

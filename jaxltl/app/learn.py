@@ -51,7 +51,8 @@ from jaxltl.app.job import (
 from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.app.job import postfix as postfix
 from jaxltl.core.models.concrete import to_jax
-from jaxltl.core.models.product import Product, lift_policy, product
+from jaxltl.core.models.lifting import lift_policy
+from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.hitting_time import hitting_time

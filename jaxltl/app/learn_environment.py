@@ -41,14 +41,8 @@ from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.labels import require_known
-from jaxltl.core.models.environment import (
-    Agent,
-    Environment,
-    Episode,
-    Finite,
-    require_environment,
-    run_episode,
-)
+from jaxltl.core.models.environment import Environment, Finite, require_environment
+from jaxltl.core.models.episodes import Agent, Episode, run_episode
 from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.models.task_environment import task_environment
 from jaxltl.core.values.evaluation import (
@@ -405,11 +399,14 @@ def load_policy(
 
     Returns:
       What :func:`~jaxltl.core.values.evaluation.evaluate` and
-      :func:`~jaxltl.core.models.environment.run_episode` take.
+      :func:`~jaxltl.core.models.episodes.run_episode` take.
 
     Raises:
       ValueError: no such file, or none of a policy; a mistake in the task, or functions that are
         not there; arrays that are not of its policy.
+
+    Of a run into `out`, ``environment, agent = load_policy("out/policy.npz")``, and
+    ``evaluate(key, agent, environment)`` gives the evidence anew.
     """
     policy_file = Path(policy_file)
     with errors_in(f"{policy_file}: "):

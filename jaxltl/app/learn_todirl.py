@@ -63,8 +63,9 @@ from jaxltl.app.job import postfix as postfix
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.models.batch import lift_memory, narrow, stack_products
+from jaxltl.core.models.lifting import allowed_steps
 from jaxltl.core.models.operators import action_mean, expectation
-from jaxltl.core.models.product import Product, allowed_steps, product
+from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.restrict import with_allowed
 from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values.optimal_actions import optimal_actions

@@ -21,13 +21,13 @@ from jax.tree_util import Partial
 
 from jaxltl.core.host import given
 from jaxltl.core.models.environment import (
-    Agent,
     Box,
     Environment,
     Finite,
     clipped_action,
     flat_observation,
 )
+from jaxltl.core.models.episodes import Agent
 from jaxltl.core.show import brief
 
 ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
@@ -320,7 +320,7 @@ def network_agent(network: Network, environment: Environment) -> Partial:
 
     Returns:
       A function of parameters, a pytree, that gives an
-      :class:`~jaxltl.core.models.environment.Agent`.
+      :class:`~jaxltl.core.models.episodes.Agent`.
 
     Raises:
       ValueError: other inputs than the environment observes, or outputs than it has actions.

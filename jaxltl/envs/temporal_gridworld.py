@@ -29,8 +29,9 @@ from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.models import operators
 from jaxltl.core.models.concrete import to_jax
+from jaxltl.core.models.lifting import project_trajectories
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.product import Product, product, project_trajectories
+from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.trajectories import Trajectories, rollout
 from jaxltl.core.show import brief
 from jaxltl.core.values.performance import infeasible_starts

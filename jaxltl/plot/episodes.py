@@ -57,7 +57,7 @@ def draw_episode(environment: Any, episode: Any, *, title: str | None = None) ->
 
     Args:
       environment: the world, with or without a time limit, or a task's environment of it.
-      episode: of :func:`~jaxltl.core.models.environment.run_episode`, of one trajectory.
+      episode: of :func:`~jaxltl.core.models.episodes.run_episode`, of one trajectory.
       title: default what held on the way, in order.
 
     Returns:
@@ -68,7 +68,8 @@ def draw_episode(environment: Any, episode: Any, *, title: str | None = None) ->
 
     Example:
       >>> import jax.numpy as jnp
-      >>> from jaxltl.core.models.environment import Episode, Timestep, make_box, make_environment
+      >>> from jaxltl.core.models.environment import Timestep, make_box, make_environment
+      >>> from jaxltl.core.models.episodes import Episode
       >>> def step(world, action, key):
       ...     return Timestep({"place": world["place"] + action}, 0.0, False)
       >>> walk = make_environment(
@@ -335,7 +336,8 @@ def play_episode(environment: Any, episode: Any, *, title: str | None = None) ->
 
     Example:
       >>> import jax.numpy as jnp
-      >>> from jaxltl.core.models.environment import Episode, Timestep, make_box, make_environment
+      >>> from jaxltl.core.models.environment import Timestep, make_box, make_environment
+      >>> from jaxltl.core.models.episodes import Episode
       >>> def step(world, action, key):
       ...     return Timestep({"place": world["place"] + action}, 0.0, False)
       >>> walk = make_environment(

@@ -15,8 +15,9 @@ import numpy as np
 from jaxltl.algos import learner
 from jaxltl.algos import mlirl as irl
 from jaxltl.app.job import plain
+from jaxltl.core.models.lifting import lift_policy
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.product import Product, lift_policy, product
+from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.restrict import restrict
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.types import NotConverged, Status, check

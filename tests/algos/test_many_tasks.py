@@ -10,7 +10,8 @@ import pytest
 
 from jaxltl.algos import many_tasks, ppo
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.environment import Timestep, make_box, make_environment, run_episode
+from jaxltl.core.models.environment import Timestep, make_box, make_environment
+from jaxltl.core.models.episodes import run_episode
 from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.models.sequence_task import Sequence, SequenceObservation, events_of
 from jaxltl.core.models.tabulate import tabulate

@@ -369,7 +369,7 @@ def test_inside_a_mask_the_policy_and_the_gradient_are_those_of_a_model_without_
 
 def test_steps_outside_the_mask_are_left_out_by_name():
     lazy, allowed, demonstrations, problem = masked()
-    kept = jl.core.models.product.allowed_steps(jl.with_allowed(lazy, allowed), demonstrations)
+    kept = jl.core.models.lifting.allowed_steps(jl.with_allowed(lazy, allowed), demonstrations)
     assert 0 < (~kept & np.asarray(demonstrations.mask)).sum() < demonstrations.length.sum()
     assert problem.counts.sum() == kept.sum()
     assert (problem.counts[~np.asarray(allowed)] == 0).all()

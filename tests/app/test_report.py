@@ -16,7 +16,8 @@ from jaxltl.app import explorer as exploring
 from jaxltl.app.drawing import Picture, draw, drawing
 from jaxltl.app.explorer import START, Layer, TooLarge, curves, demonstrated_runs, learned_runs
 from jaxltl.app.reports.live import Said, live_page
-from jaxltl.core.models.product import lift_trajectories, product
+from jaxltl.core.models.lifting import lift_trajectories
+from jaxltl.core.models.product import product
 from jaxltl.core.models.trajectories import make_trajectories
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map

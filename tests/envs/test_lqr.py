@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from jaxltl.core.models.environment import run_episode
+from jaxltl.core.models.episodes import run_episode
 from jaxltl.core.values.episode_scores import episode_evaluator
 from jaxltl.envs.lqr import as_environment, evaluator, lqr, optimum, simulate
 from jaxltl.envs.networks import apply, make_network, network_agent

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.models.environment import run_episode
+from jaxltl.core.models.episodes import run_episode
 from jaxltl.core.models.task_environment import task_environment
 from jaxltl.core.values.episode_scores import episode_evaluator
 from jaxltl.core.values.evaluation import evaluate

@@ -21,8 +21,9 @@ from jaxltl.app.files.tables import COUNT, NAMES, TEXT, Rule, choice, is_list, i
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.counts import listed
+from jaxltl.core.models.lifting import project_trajectories
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.product import Product, project_trajectories
+from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.types import Solution
 from jaxltl.envs.gridworld import ACTIONS, gridworld

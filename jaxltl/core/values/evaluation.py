@@ -24,17 +24,14 @@ from jaxltl.core.host import given
 from jaxltl.core.host.binomial import anytime, clopper_pearson
 from jaxltl.core.host.bounded_mean import bounded_mean
 from jaxltl.core.models.environment import (
-    Agent,
     Environment,
     allowed_in,
     as_partial,
-    begin_episode,
-    continue_episode,
-    require_agent,
     require_environment,
     require_key,
     some_action,
 )
+from jaxltl.core.models.episodes import Agent, begin_episode, continue_episode, require_agent
 from jaxltl.core.models.lanes import on_host, require_split, vmap_split
 from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.show import brief
@@ -57,7 +54,7 @@ class EpisodeTotals(NamedTuple):
       discounted_visits: the k-th reading, from 0, counts ``discount ** k``.
 
     Example:
-      >>> from jaxltl.core.models.environment import agent_of
+      >>> from jaxltl.core.models.episodes import agent_of
       >>> from jaxltl.core.models.mdp import from_dense
       >>> from jaxltl.core.models.simulated_model import environment_of
       >>> clock = environment_of(from_dense([[[0.0, 1.0]], [[1.0, 0.0]]]))
@@ -192,7 +189,7 @@ class Evaluation:
         finite, whose mean is then not either.
 
     Example:
-      >>> from jaxltl.core.models.environment import agent_of
+      >>> from jaxltl.core.models.episodes import agent_of
       >>> from jaxltl.core.models.mdp import from_dense
       >>> from jaxltl.core.models.simulated_model import environment_of
       >>> clock = environment_of(from_dense([[[0.0, 1.0]], [[1.0, 0.0]]]))
@@ -305,7 +302,7 @@ def evaluate(
     Not differentiable: what is returned is numbers of Python, from concrete arguments.
 
     Example:
-      >>> from jaxltl.core.models.environment import agent_of
+      >>> from jaxltl.core.models.episodes import agent_of
       >>> from jaxltl.core.models.mdp import from_dense
       >>> from jaxltl.core.models.simulated_model import environment_of
       >>> from jaxltl.core.models.task_environment import task_environment

@@ -12,14 +12,8 @@ from jaxltl.core.games.permissive import permissive_strategy
 from jaxltl.core.games.shielded_environment import ShieldedWorld, shield_environment
 from jaxltl.core.games.winning import winning_region
 from jaxltl.core.models.convert import to_sparse
-from jaxltl.core.models.environment import (
-    Agent,
-    Timestep,
-    make_box,
-    make_environment,
-    random_action,
-    run_episode,
-)
+from jaxltl.core.models.environment import Timestep, make_box, make_environment, random_action
+from jaxltl.core.models.episodes import Agent, run_episode
 from jaxltl.core.models.mdp import from_dense
 from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.models.product import product

@@ -9,20 +9,17 @@ import pytest
 from jax.tree_util import Partial
 
 from jaxltl.core.models.environment import (
-    Agent,
     Box,
     Environment,
     Finite,
     Timestep,
-    agent_of,
     allowed_in,
     make_box,
     make_environment,
     random_action,
-    run_episode,
     some_action,
-    step_or_reset,
 )
+from jaxltl.core.models.episodes import Agent, agent_of, run_episode, step_or_reset
 from jaxltl.core.models.time_limit import with_time_limit
 
 

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.models.environment import Timestep, agent_of, make_environment, run_episode
+from jaxltl.core.models.environment import Timestep, make_environment
+from jaxltl.core.models.episodes import agent_of, run_episode
 from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.models.sequence_task import (
     draw_sequence,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from jaxltl.core.models.convert import to_sparse
-from jaxltl.core.models.environment import agent_of, random_action, run_episode
+from jaxltl.core.models.environment import random_action
+from jaxltl.core.models.episodes import agent_of, run_episode
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import to_dense
 from jaxltl.core.models.product import product

@@ -10,14 +10,8 @@ from jax.tree_util import Partial
 
 from jaxltl.core.automata.automaton import accepts_lasso, make_automaton, run
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.environment import (
-    Timestep,
-    agent_of,
-    make_box,
-    make_environment,
-    random_action,
-    run_episode,
-)
+from jaxltl.core.models.environment import Timestep, make_box, make_environment, random_action
+from jaxltl.core.models.episodes import agent_of, run_episode
 from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.simulated_model import environment_of
 from jaxltl.core.models.task_environment import (

@@ -8,13 +8,8 @@ from jax.tree_util import Partial
 
 from jaxltl.algos import cce
 from jaxltl.algos.exponential_family import diagonal_gaussian
-from jaxltl.core.models.environment import (
-    Timestep,
-    agent_of,
-    make_box,
-    make_environment,
-    run_episode,
-)
+from jaxltl.core.models.environment import Timestep, make_box, make_environment
+from jaxltl.core.models.episodes import agent_of, run_episode
 from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.models.task_environment import task_environment
 from jaxltl.core.values.episode_scores import episode_evaluator

@@ -13,7 +13,8 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jax.tree_util import Partial
 
 from jaxltl.core.host.binomial import anytime, clopper_pearson
-from jaxltl.core.models.environment import Timestep, agent_of, make_environment, run_episode
+from jaxltl.core.models.environment import Timestep, make_environment
+from jaxltl.core.models.episodes import agent_of, run_episode
 from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.models.task_environment import task_environment
 from jaxltl.core.models.time_limit import with_time_limit

@@ -11,7 +11,8 @@ from jax.tree_util import Partial
 
 from jaxltl.core.automata.automaton import accepts_lasso, letter_index
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.environment import Agent, Timestep, make_environment, run_episode
+from jaxltl.core.models.environment import Timestep, make_environment
+from jaxltl.core.models.episodes import Agent, run_episode
 from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.tabulate import tabulate
 from jaxltl.core.models.task_environment import task_environment

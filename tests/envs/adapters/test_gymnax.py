@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from jaxltl import from_gymnax
-from jaxltl.core.models.environment import Box, Finite, agent_of, run_episode
+from jaxltl.core.models.environment import Box, Finite
+from jaxltl.core.models.episodes import agent_of, run_episode
 from tests.envs.adapters.harness import (  # noqa: F401
     both_ends,
     load,
