@@ -3,7 +3,8 @@
 A learner has ``Problem``, ``Hparams``, ``State`` and ``Metrics``; ``make_problem``, then
 ``train(key, problem, hparams, num_steps=...)``, or ``init``, ``step`` and ``run``; and
 ``policy(state, problem, hparams)``, what was learned. Modules are imported when they are first
-used, ``jaxltl.algos.ppo`` as well as ``from jaxltl.algos import ppo``.
+used, ``jaxltl.algos.ppo`` as well as ``from jaxltl.algos import ppo``. Steps and runs are for
+``jit`` and ``vmap``, not to be differentiated through; what has derivatives says in what.
 
 From demonstrations: ``mlirl``, ``todirl``, ``behavioral_cloning``. By trying, in a model:
 ``maximin_q``, ``rmax``, ``interval_learning``. By trying, in a simulated world: ``ppo``,
