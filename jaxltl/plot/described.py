@@ -47,8 +47,8 @@ class Described(NamedTuple):
 def described(figure: Figure, text: str, *, page: str | None = None) -> Described:
     """A figure with a text alternative.
 
-    As the last line of a notebook's cell it is shown as a picture, and the text goes where readers
-    of screens, and tools that make pages of notebooks, look for it.
+    As the last line of a notebook's cell it is shown as a picture. The text is the output's plain
+    text, and the ``alt`` of the picture's metadata, from which pages of notebooks are made.
 
     Args:
       figure: the figure.
