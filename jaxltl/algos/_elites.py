@@ -140,7 +140,7 @@ def elite_weights(
 
     Example:
       >>> half = jnp.log(jnp.array([3.0, 1.0]))
-      >>> elite_weights(half, jnp.ones(2, bool), jnp.bool_(True)).tolist()
+      >>> [round(x, 6) for x in elite_weights(half, jnp.ones(2, bool), jnp.bool_(True)).tolist()]
       [0.75, 0.25]
     """
     least = jnp.finfo(objective.dtype).min

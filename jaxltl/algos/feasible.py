@@ -36,8 +36,8 @@ A run is made of steps, begins where one likes, goes on from a state, and may en
 
   >>> state = search.start_at(jnp.array([0.5, 0.5]), jax.random.key(0), problem, hparams)
   >>> value, status = search.evaluate(state.parameters, problem, hparams)
-  >>> value.item(), search.within(problem, 0.4, 0.6).low.round(3).tolist()
-  (0.25, [0.4, 0.4])
+  >>> value.item(), search.within(problem, 0.25, 0.5).low.tolist()
+  (0.25, [0.25, 0.25])
   >>> state, metrics = search.run(state, problem, hparams, num_steps=2)  # after init, or start_at
   >>> after, figures = jax.eval_shape(search.step, state, problem, hparams)
   >>> early = jax.eval_shape(  # train_until begins with a key

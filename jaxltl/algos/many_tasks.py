@@ -289,7 +289,7 @@ def sequence_policy(
       >>> plan = make_plan("F a", np.eye(2, 1, -1, bool), ["a"], depth=1, most=1)
       >>> def network(observation):  # says what it is asked to reach
       ...     return jnp.log(1.0 + observation.sequence.reach[0]), jnp.array(0.0)
-      >>> sequence_policy(network, plan, jnp.zeros(1), 0).round(3).tolist()
+      >>> [round(x, 3) for x in sequence_policy(network, plan, jnp.zeros(1), 0).tolist()]
       [0.333, 0.667]
     """
     actions, values = _judged(network, plan, observation, jnp.asarray(memory))

@@ -436,8 +436,8 @@ def recover_hat_strategy(hat: Game, strategy: chex.Array) -> jax.Array:
       >>> game = Game(from_dense([[[1.0], [1.0]]]), jnp.array([True]))
       >>> hat = hat_game(game, jnp.array([[False, True]]), 0.25)
       >>> alike = hat.available / hat.available.sum(-1, keepdims=True)
-      >>> recover_hat_strategy(hat, alike).round(3).tolist()
-      [[0.125, 0.875]]
+      >>> [round(x, 3) for x in recover_hat_strategy(hat, alike)[0].tolist()]
+      [0.125, 0.875]
     """
     require_shape("strategy", strategy, hat.available.shape)
     num_states, last = hat.num_states // 3, hat.num_actions - 1

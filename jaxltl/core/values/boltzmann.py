@@ -240,7 +240,7 @@ def boltzmann_fixed_points(
       >>> loop_or_end = make_mdp([[[0], [1]], [[1], [1]]], [[[1.0], [1.0]], [[1.0], [0.0]]])
       >>> reward = jnp.array([[0.2, 0.0], [0.0, 0.0]])  # for going round
       >>> found = boltzmann_fixed_points(
-      ...     loop_or_end, reward, 0.99, jax.random.key(0), tolerance=1e-2)
+      ...     loop_or_end, reward, 0.99, jax.random.key(0), tolerance=0.1)
       >>> [round(one.value[0].item(), 1) for one in found]
       [0.3, 2.5, 20.0]
     """

@@ -70,8 +70,8 @@ def episode_evaluator(
       ValueError: an unknown score, one of a task without a task, episodes that never end, or no
         episodes.
 
-    Not made for derivatives: an episode is a loop that ends by itself, through which forward mode goes
-    alone; searches such as ``cce`` need none.
+    Not made for derivatives: an episode is a loop that ends by itself, through which forward mode
+    goes alone; searches such as ``cce`` need none.
 
     Example:
       >>> from jaxltl.core.models.environment import Timestep, make_box, make_environment
