@@ -22,7 +22,7 @@ from jaxltl import _public
 PUBLIC = {name: getattr(jaxltl, name) for name in jaxltl.__all__}
 # Types inside of public ones that nobody has to name, in modules whose text tells of them.
 DOCUMENTED = (
-    "jaxltl.core.host.product", "jaxltl.core.host.sparse", "jaxltl.core.logic.properties",
+    "jaxltl.core.host.product", "jaxltl.core.host.sparse", "jaxltl.core.logic.bounded",
     "jaxltl.core.models.product", "jaxltl.core.models.sharded", "jaxltl.core.values.sweeps",
 )
 

@@ -43,19 +43,20 @@ class Automaton:
     - `"buchi"`: 0 on accepting transitions, else 1.
     - `"parity"`: any.
 
-    Args:
-        delta: int32 `[Q, L]`, the state after reading letter l in state q.
-        initial: int32 scalar, the state before anything is read.
-        priority: int32 `[Q, L]`, of reading letter l in state q.
-        letters: bool `[L, P]`, whether proposition p holds in letter l.
-        propositions: `[P]` names.
-        acceptance: `"cosafe"`, `"safety"`, `"buchi"` or `"parity"`.
-        state_names: `[Q]` readable names, one formula per state, or empty.
+    Attributes:
+      delta: int32 `[Q, L]`, the state after reading letter l in state q.
+      initial: int32 scalar, the state before anything is read.
+      priority: int32 `[Q, L]`, of reading letter l in state q.
+      letters: bool `[L, P]`, whether proposition p holds in letter l.
+      propositions: `[P]` names.
+      acceptance: `"cosafe"`, `"safety"`, `"buchi"` or `"parity"`.
+      state_names: `[Q]` readable names, one formula per state, or empty.
 
-    >>> import jaxltl as jl
-    >>> task = jl.to_automaton("F a")
-    >>> task.acceptance, task.delta.tolist(), task.letters.tolist(), task.final.tolist()
-    ('cosafe', [[0, 1], [1, 1]], [[False], [True]], [False, True])
+    Example:
+      >>> import jaxltl as jl
+      >>> task = jl.to_automaton("F a")
+      >>> task.acceptance, task.delta.tolist(), task.letters.tolist(), task.final.tolist()
+      ('cosafe', [[0, 1], [1, 1]], [[False], [True]], [False, True])
     """
 
     delta: NDArray[np.int32]
@@ -71,7 +72,7 @@ class Automaton:
         """bool `[Q]`, the final states of a co-safe or safety automaton.
 
         Raises:
-            ValueError: For Buchi and parity acceptance, which is on transitions.
+          ValueError: for Buchi and parity acceptance, which is on transitions.
         """
         if self.acceptance not in ("cosafe", "safety"):
             raise ValueError(
@@ -101,26 +102,27 @@ def make_automaton(
     """An `Automaton` from checked tables.
 
     Args:
-        delta: `[Q, L]` integers in 0..Q-1.
-        initial: In 0..Q-1.
-        letters: `[L, P]` booleans, no two rows equal.
-        propositions: `[P]` distinct names.
-        final: `[Q]` booleans, absorbing as `acceptance` asks.
-        accepting: `[Q]` or `[Q, L]` booleans, visited infinitely often (Buchi).
-        priority: `[Q]` or `[Q, L]` integers from 0 up; the least one met infinitely often is even.
-        acceptance: `"cosafe"` or `"safety"` with `final`; else follows from what is given.
-        state_names: `[Q]` names, or none.
+      delta: `[Q, L]` integers in 0..Q-1.
+      initial: in 0..Q-1.
+      letters: `[L, P]` booleans, no two rows equal.
+      propositions: `[P]` distinct names.
+      final: `[Q]` booleans, absorbing as `acceptance` asks.
+      accepting: `[Q]` or `[Q, L]` booleans, visited infinitely often (Buchi).
+      priority: `[Q]` or `[Q, L]` integers from 0 up; the least one met infinitely often is even.
+      acceptance: `"cosafe"` or `"safety"` with `final`; else follows from what is given.
+      state_names: `[Q]` names, or none.
 
     Returns:
-        The `Automaton`, on the host.
+      The `Automaton`, on the host.
 
     Raises:
-        ValueError: Naming the table, the entry and the fix.
+      ValueError: naming the table, the entry and the fix.
 
-    >>> eventually_a = make_automaton([[0, 1], [1, 1]], 0, [[False], [True]], ["a"],
-    ...                               final=[False, True], acceptance="cosafe")
-    >>> int(eventually_a.delta[0, 1])
-    1
+    Example:
+      >>> eventually_a = make_automaton([[0, 1], [1, 1]], 0, [[False], [True]], ["a"],
+      ...                               final=[False, True], acceptance="cosafe")
+      >>> int(eventually_a.delta[0, 1])
+      1
     """
     names, states = tuple(propositions), tuple(state_names)
     table = np.asarray(delta)
@@ -239,15 +241,16 @@ def letter_index(automaton: Automaton, letter: Letter) -> int:
     """The index l of a letter, so that `delta[q, l]` reads it.
 
     Args:
-        automaton: The automaton.
-        letter: The propositions that hold; names unknown to the automaton are ignored.
+      automaton: the automaton.
+      letter: the propositions that hold; names unknown to the automaton are ignored.
 
     Raises:
-        ValueError: For a combination of propositions that is not among the letters.
+      ValueError: for a combination of propositions that is not among the letters.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> letter_index(to_automaton("F a"), {"a", "unrelated"})
-    1
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> letter_index(to_automaton("F a"), {"a", "unrelated"})
+      1
     """
     return _read(automaton, [letter], "letter_index: letter")[0]
 
@@ -277,15 +280,16 @@ def run(automaton: Automaton, word: Iterable[Letter]) -> NDArray[np.int32]:
     `q[0] = initial` and `q[t+1] = delta[q[t], w[t]]`.
 
     Args:
-        automaton: The automaton.
-        word: `[T]` letters, each the collection of the propositions that hold.
+      automaton: the automaton.
+      word: `[T]` letters, each the collection of the propositions that hold.
 
     Returns:
-        int32 `[T+1]`.
+      int32 `[T+1]`.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> run(to_automaton("F a"), [set(), {"a"}, set()]).tolist()
-    [0, 0, 1, 1]
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> run(to_automaton("F a"), [set(), {"a"}, set()]).tolist()
+      [0, 0, 1, 1]
     """
     states = [int(automaton.initial)]
     for letter in _read(automaton, word, "run: letter"):
@@ -297,19 +301,20 @@ def accepts_lasso(automaton: Automaton, prefix: Iterable[Letter], cycle: Iterabl
     """Whether the automaton accepts the infinite word prefix·cycle^ω.
 
     Args:
-        automaton: The automaton.
-        prefix: `[n]` letters, may be empty.
-        cycle: `[m]` letters, at least one.
+      automaton: the automaton.
+      prefix: `[n]` letters, may be empty.
+      cycle: `[m]` letters, at least one.
 
     Returns:
-        Whether the word is accepted.
+      Whether the word is accepted.
 
     Raises:
-        ValueError: If the cycle is empty, or a letter is not among the automaton's.
+      ValueError: if the cycle is empty, or a letter is not among the automaton's.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> accepts_lasso(to_automaton("F a"), prefix=[set()], cycle=[set(), {"a"}])
-    True
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> accepts_lasso(to_automaton("F a"), prefix=[set()], cycle=[set(), {"a"}])
+      True
     """
     laps = _read(automaton, cycle, "accepts_lasso: cycle letter")
     if not laps:
@@ -345,9 +350,10 @@ def complement(automaton: Automaton) -> Automaton:
     Returns:
       The automaton of the other words, over the same letters.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> complement(to_automaton("F a")).state_names
-    ('!(F a)', 'false')
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> complement(to_automaton("F a")).state_names
+      ('!(F a)', 'false')
     """
     constants = {"true": "false", "false": "true"}
     kind = automaton.acceptance

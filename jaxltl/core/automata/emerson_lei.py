@@ -31,12 +31,13 @@ def holds(condition: Condition, colors: int) -> bool:
     """Whether a condition holds of the set of colors that occur infinitely often.
 
     Args:
-        condition: `("true",)`, `("false",)`, `("inf", i)`: color i occurs infinitely often,
-            `("fin", i)`: it does not, `("and", ...)` or `("or", ...)` of conditions.
-        colors: The set, as a number with color i as bit i.
+      condition: `("true",)`, `("false",)`, `("inf", i)`: color i occurs infinitely often,
+        `("fin", i)`: it does not, `("and", ...)` or `("or", ...)` of conditions.
+      colors: the set, as a number with color i as bit i.
 
-    >>> holds(("and", ("inf", 0), ("fin", 1)), 0b01)
-    True
+    Example:
+      >>> holds(("and", ("inf", 0), ("fin", 1)), 0b01)
+      True
     """
     match condition[0]:
         case "true" | "false":
@@ -87,20 +88,20 @@ def to_parity(
     """A deterministic min-even parity automaton with the language of an Emerson-Lei one.
 
     Args:
-        delta: `[Q, L]` successors.
-        colors: int64 `[Q, L]`, the set of colors of each transition, color i as bit i.
-        initial: The initial state.
-        condition: See `holds`.
-        max_states: The number of states at which to give up.
+      delta: `[Q, L]` successors.
+      colors: int64 `[Q, L]`, the set of colors of each transition, color i as bit i.
+      initial: the initial state.
+      condition: see `holds`.
+      max_states: the number of states at which to give up.
 
     Returns:
-        `delta [Q', L]`, `priority [Q', L]`, the initial state, and `[Q']` the old state of each
-        new one. Only reachable states are kept, the initial one first. Transitions on no cycle
-        have priority 1.
+      `delta [Q', L]`, `priority [Q', L]`, the initial state, and `[Q']` the old state of each
+      new one. Only reachable states are kept, the initial one first. Transitions on no cycle
+      have priority 1.
 
     Raises:
-        ValueError: For more than `max_states` states, too many parts to examine, or a color
-            above 61.
+      ValueError: for more than `max_states` states, too many parts to examine, or a color
+        above 61.
     """
     inf, fin = polarities(condition)
     if (inf | fin) >> MAX_COLORS:

@@ -29,14 +29,15 @@ def find_accepted(automaton: Automaton) -> Lasso | None:
     4.4, for one priority).
 
     Args:
-        automaton: The automaton.
+      automaton: the automaton.
 
     Returns:
-        `(prefix, cycle)`, each a list of letters, or None if no word is accepted.
+      `(prefix, cycle)`, each a list of letters, or None if no word is accepted.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> find_accepted(to_automaton("F a"))
-    ([frozenset({'a'})], [frozenset()])
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> find_accepted(to_automaton("F a"))
+      ([frozenset({'a'})], [frozenset()])
     """
     return find_lasso([automaton], [(EVEN,)])
 
@@ -44,9 +45,10 @@ def find_accepted(automaton: Automaton) -> Lasso | None:
 def is_empty(automaton: Automaton) -> bool:
     """Whether the automaton accepts no word.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> is_empty(to_automaton("F a", letters=[set()]))
-    True
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> is_empty(to_automaton("F a", letters=[set()]))
+      True
     """
     return not some_loop(joint_runs([automaton]), [(EVEN,)])
 
@@ -54,9 +56,10 @@ def is_empty(automaton: Automaton) -> bool:
 def is_universal(automaton: Automaton) -> bool:
     """Whether the automaton accepts every word over its letters.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> is_universal(to_automaton("F a")), is_universal(to_automaton("F a", letters=[{"a"}]))
-    (False, True)
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> is_universal(to_automaton("F a")), is_universal(to_automaton("F a", letters=[{"a"}]))
+      (False, True)
     """
     return not some_loop(joint_runs([automaton]), [(ODD,)])
 
@@ -65,18 +68,19 @@ def find_difference(a: Task, b: Task) -> Lasso | None:
     """A word that exactly one of two automata accepts, as a short lasso.
 
     Args:
-        a: An automaton, a formula or its text.
-        b: Another; both are aligned first, see `align`.
+      a: an automaton, a formula or its text.
+      b: another; both are aligned first, see `align`.
 
     Returns:
-        `(prefix, cycle)`, or None if both accept the same words over their joint letters.
+      `(prefix, cycle)`, or None if both accept the same words over their joint letters.
 
     Raises:
-        ValueError: If there is no joint letter, or too many.
+      ValueError: if there is no joint letter, or too many.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> find_difference(to_automaton("F a"), to_automaton("X F a"))
-    ([frozenset({'a'})], [frozenset()])
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> find_difference(to_automaton("F a"), to_automaton("X F a"))
+      ([frozenset({'a'})], [frozenset()])
     """
     return find_lasso(_aligned(a, b), [(EVEN, ODD), (ODD, EVEN)])
 
@@ -91,13 +95,14 @@ def is_equivalent(a: Task, b: Task) -> bool:
       Whether they do; :func:`find_difference` gives a word that tells them apart.
 
     Raises:
-        ValueError: If there is no joint letter, or too many.
+      ValueError: if there is no joint letter, or too many.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> is_equivalent(to_automaton("F a"), to_automaton("a | X F a"))
-    True
-    >>> is_equivalent("F (a | b)", "F a | F b")
-    True
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> is_equivalent(to_automaton("F a"), to_automaton("a | X F a"))
+      True
+      >>> is_equivalent("F (a | b)", "F a | F b")
+      True
     """
     return not some_loop(joint_runs(_aligned(a, b)), [(EVEN, ODD), (ODD, EVEN)])
 
@@ -109,18 +114,19 @@ def find_not_included(a: Task, b: Task) -> Lasso | None:
     and r. Neither acceptance has to be converted.
 
     Args:
-        a: The automaton whose words are questioned.
-        b: The automaton that should accept them; both are aligned first, see `align`.
+      a: the automaton whose words are questioned.
+      b: the automaton that should accept them; both are aligned first, see `align`.
 
     Returns:
-        `(prefix, cycle)`, or None if `b` accepts whatever `a` accepts.
+      `(prefix, cycle)`, or None if `b` accepts whatever `a` accepts.
 
     Raises:
-        ValueError: If there is no joint letter, or too many.
+      ValueError: if there is no joint letter, or too many.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> find_not_included(to_automaton("a U b"), to_automaton("F b & a"))
-    ([frozenset({'b'})], [frozenset()])
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> find_not_included(to_automaton("a U b"), to_automaton("F b & a"))
+      ([frozenset({'b'})], [frozenset()])
     """
     return find_lasso(_aligned(a, b), [(EVEN, ODD)])
 
@@ -129,18 +135,19 @@ def is_included(a: Task, b: Task) -> bool:
     """Whether the second automaton accepts whatever the first accepts, over joint letters.
 
     Args:
-        a: The automaton whose words are questioned; or a formula, or its text.
-        b: The one that should accept them, likewise; both are aligned first, see `align`.
+      a: the automaton whose words are questioned; or a formula, or its text.
+      b: the one that should accept them, likewise; both are aligned first, see `align`.
 
     Returns:
-        Whether it does; :func:`find_not_included` gives a word that `a` accepts and `b` does not.
+      Whether it does; :func:`find_not_included` gives a word that `a` accepts and `b` does not.
 
     Raises:
-        ValueError: If there is no joint letter, or too many.
+      ValueError: if there is no joint letter, or too many.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> is_included(to_automaton("a U b"), to_automaton("F b"))
-    True
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> is_included(to_automaton("a U b"), to_automaton("F b"))
+      True
     """
     return not some_loop(joint_runs(_aligned(a, b)), [(EVEN, ODD)])
 
@@ -149,19 +156,20 @@ def intersection(a: Task, b: Task) -> Automaton:
     """The automaton that accepts the words that both accept.
 
     Args:
-        a: An automaton, a formula or its text.
-        b: Another; both are aligned first, see `align`.
+      a: an automaton, a formula or its text.
+      b: another; both are aligned first, see `align`.
 
     Returns:
-        A deterministic automaton, simplified.
+      A deterministic automaton, simplified.
 
     Raises:
-        ValueError: If there is no joint letter, or too many, or too many priorities.
+      ValueError: if there is no joint letter, or too many, or too many priorities.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> both = intersection(to_automaton("F a"), to_automaton("F b"))
-    >>> is_equivalent(both, to_automaton("F a & F b"))
-    True
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> both = intersection(to_automaton("F a"), to_automaton("F b"))
+      >>> is_equivalent(both, to_automaton("F a & F b"))
+      True
     """
     return _combine(a, b, "and")
 
@@ -171,10 +179,11 @@ def union(a: Task, b: Task) -> Automaton:
 
     Arguments, result and errors are as in `intersection`.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> either = union(to_automaton("F a"), to_automaton("F b"))
-    >>> is_equivalent(either, to_automaton("F (a | b)"))
-    True
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> either = union(to_automaton("F a"), to_automaton("F b"))
+      >>> is_equivalent(either, to_automaton("F (a | b)"))
+      True
     """
     return _combine(a, b, "or")
 
@@ -184,9 +193,10 @@ def difference(a: Task, b: Task) -> Automaton:
 
     Arguments, result and errors are as in `intersection`.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> is_empty(difference(to_automaton("a U b"), to_automaton("F b")))
-    True
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> is_empty(difference(to_automaton("a U b"), to_automaton("F b")))
+      True
     """
     return _combine(a, complement(as_automaton(b)), "and")
 
@@ -231,11 +241,11 @@ def _colored(
     decide when no other is met infinitely often.
 
     Args:
-        priority: `[N, L]`.
-        first: The number of the first colour.
+      priority: `[N, L]`.
+      first: the number of the first colour.
 
     Returns:
-        int64 `[N, L]` bit masks, the condition, and the number after the last colour.
+      int64 `[N, L]` bit masks, the condition, and the number after the last colour.
     """
     values, place = np.unique(priority, return_inverse=True)
     level_of = np.concatenate([[0], np.cumsum(np.diff(values % 2) != 0)])

@@ -19,9 +19,10 @@ def minimize(automaton: Automaton) -> Automaton:
     and safety automata of one language, over the same letters, give identical tables. A merged
     state keeps the shortest of the names.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> minimize(to_automaton("F a & F b")).delta.shape
-    (4, 4)
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> minimize(to_automaton("F a & F b")).delta.shape
+      (4, 4)
     """
     return quotient(automaton, equivalence_classes(automaton))
 
@@ -30,8 +31,8 @@ def quotient(automaton: Automaton, classes: NDArray[np.int32]) -> Automaton:
     """The automaton whose states are classes of equivalent states.
 
     Args:
-        automaton: The automaton.
-        classes: int32 `[Q]`, the class of each state, -1 to drop it (see `equivalence_classes`).
+      automaton: the automaton.
+      classes: int32 `[Q]`, the class of each state, -1 to drop it (see `equivalence_classes`).
     """
     kept = np.flatnonzero(classes >= 0)
     _, first = np.unique(classes[kept], return_index=True)
@@ -58,7 +59,7 @@ def equivalence_classes(automaton: Automaton) -> NDArray[np.int32]:
     automaton"), and numbered breadth first from the initial state.
 
     Returns:
-        int32 `[Q]`.
+      int32 `[Q]`.
     """
     reached = _breadth_first(automaton.delta, int(automaton.initial))
     position = np.full(len(automaton.delta), -1)

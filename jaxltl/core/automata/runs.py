@@ -26,9 +26,10 @@ EVEN, ODD = 0, 1
 def live_states(automaton: Automaton) -> NDArray[np.bool_]:
     """bool `[Q]`, the states from which some word is accepted.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> live_states(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}])).tolist()
-    [True, True, False]
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> live_states(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}])).tolist()
+      [True, True, False]
     """
     return _states_that_may(automaton, EVEN)
 
@@ -36,9 +37,10 @@ def live_states(automaton: Automaton) -> NDArray[np.bool_]:
 def universal_states(automaton: Automaton) -> NDArray[np.bool_]:
     """bool `[Q]`, the states from which every word is accepted.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> universal_states(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}])).tolist()
-    [False, True, False]
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> universal_states(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}])).tolist()
+      [False, True, False]
     """
     return ~_states_that_may(automaton, ODD)
 
@@ -51,19 +53,20 @@ def align(a: Automaton, b: Automaton) -> tuple[Automaton, Automaton]:
     2^P if both have all of theirs, and the common letters if the propositions are the same.
 
     Args:
-        a: An automaton.
-        b: Another.
+      a: an automaton.
+      b: another.
 
     Returns:
-        The two automata, that read the joint letters and are otherwise the same.
+      The two automata, that read the joint letters and are otherwise the same.
 
     Raises:
-        ValueError: If there is no joint letter, or too many.
+      ValueError: if there is no joint letter, or too many.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> left, right = align(to_automaton("F a"), to_automaton("F b"))
-    >>> left.propositions, left.delta.tolist(), right.delta.tolist()
-    (('a', 'b'), [[0, 1, 0, 1], [1, 1, 1, 1]], [[0, 0, 1, 1], [1, 1, 1, 1]])
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> left, right = align(to_automaton("F a"), to_automaton("F b"))
+      >>> left.propositions, left.delta.tolist(), right.delta.tolist()
+      (('a', 'b'), [[0, 1, 0, 1], [1, 1, 1, 1]], [[0, 0, 1, 1], [1, 1, 1, 1]])
     """
     shared = [name for name in a.propositions if name in b.propositions]
     read_by_a, read_by_b = _agreeing(_columns(a, shared), _columns(b, shared))
@@ -129,9 +132,9 @@ class Runs(NamedTuple):
     """K automata that read the same word, as one graph that starts in node 0.
 
     Attributes:
-        delta: `[N, L]`, the node after reading a letter; nodes are numbered breadth first.
-        priorities: K tables `[N, L]`, what each automaton reads.
-        states: `[N, K]`, the state of each automaton.
+      delta: `[N, L]`, the node after reading a letter; nodes are numbered breadth first.
+      priorities: k tables `[N, L]`, what each automaton reads.
+      states: `[N, K]`, the state of each automaton.
     """
 
     delta: NDArray[np.int32]
@@ -198,9 +201,9 @@ def _loops(runs: Runs, parities: tuple[int, ...]) -> Iterator[_Loops]:
     """The loops on which the least priority of automaton k has parity `parities[k]`.
 
     Yields:
-        For each choice of the least priorities that has such loops, the transitions inside of
-        strongly connected parts that read nothing less and read each of them, and for each
-        automaton those of these transitions that read its least priority.
+      For each choice of the least priorities that has such loops, the transitions inside of
+      strongly connected parts that read nothing less and read each of them, and for each
+      automaton those of these transitions that read its least priority.
     """
     choices = [
         [value for value in np.unique(priority) if value % 2 == parity]

@@ -32,16 +32,17 @@ class Sequences:
     """For each state of an automaton at most M sequences of at most D steps, shortest first.
 
     Attributes:
-        reach: bool `[Q, M, D, E]`, the events of which a step asks for one.
-        avoid: bool `[Q, M, D, E]`, those that set back the task before it.
-        length: int32 `[Q, M]`, how many steps there are in all, also beyond D; for an infinite
-            task, up to and with the first accepting round. 0: there is no such sequence.
+      reach: bool `[Q, M, D, E]`, the events of which a step asks for one.
+      avoid: bool `[Q, M, D, E]`, those that set back the task before it.
+      length: int32 `[Q, M]`, how many steps there are in all, also beyond D; for an infinite
+        task, up to and with the first accepting round. 0: there is no such sequence.
 
-    >>> import jaxltl as jl
-    >>> task = jl.to_automaton("F b", letters=[{}, {"b"}])
-    >>> found = jl.reach_avoid_sequences(task, [[0], [1]], ("b",), depth=1, most=1)
-    >>> found.reach[0, 0].tolist(), found.length.tolist()
-    ([[False, True]], [[1], [0]])
+    Example:
+      >>> import jaxltl as jl
+      >>> task = jl.to_automaton("F b", letters=[{}, {"b"}])
+      >>> found = jl.reach_avoid_sequences(task, [[0], [1]], ("b",), depth=1, most=1)
+      >>> found.reach[0, 0].tolist(), found.length.tolist()
+      ([[False, True]], [[1], [0]])
     """
 
     reach: NDArray[np.bool_]
@@ -78,28 +79,29 @@ def reach_avoid_sequences(
     accepted, or none is, have no sequence.
 
     Args:
-        automaton: the task, with any acceptance.
-        events: bool `[E, P]`, the labels that occur in the world; others are not looked at.
-        propositions: names of the P columns; the automaton need not use all.
-        depth: D, the steps that are kept.
-        most: M, the sequences that are kept; they differ within their first D steps, or in
-            their length.
+      automaton: the task, with any acceptance.
+      events: bool `[E, P]`, the labels that occur in the world; others are not looked at.
+      propositions: names of the P columns; the automaton need not use all.
+      depth: d, the steps that are kept.
+      most: m, the sequences that are kept; they differ within their first D steps, or in
+        their length.
 
     Returns:
-        `Sequences`, whose tables are arrays of the host.
+      `Sequences`, whose tables are arrays of the host.
 
     Raises:
-        ValueError: An event that the automaton cannot read, an unknown proposition, or a size
-            below 1.
+      ValueError: an event that the automaton cannot read, an unknown proposition, or a size
+        below 1.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> task = to_automaton("!a U (b & F c)", letters=[{}, {"a"}, {"b"}, {"c"}])
-    >>> events = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
-    >>> found = reach_avoid_sequences(task, events, ("a", "b", "c"), depth=2, most=1)
-    >>> found.length[0].tolist(), found.reach[0, 0].astype(int).tolist()
-    ([2], [[0, 0, 1, 0], [0, 0, 0, 1]])
-    >>> found.avoid[0, 0].astype(int).tolist()
-    [[0, 1, 0, 0], [0, 0, 0, 0]]
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> task = to_automaton("!a U (b & F c)", letters=[{}, {"a"}, {"b"}, {"c"}])
+      >>> events = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+      >>> found = reach_avoid_sequences(task, events, ("a", "b", "c"), depth=2, most=1)
+      >>> found.length[0].tolist(), found.reach[0, 0].astype(int).tolist()
+      ([2], [[0, 0, 1, 0], [0, 0, 0, 1]])
+      >>> found.avoid[0, 0].astype(int).tolist()
+      [[0, 1, 0, 0], [0, 0, 0, 0]]
     """
     depth, most = (given.whole(name, number, least=1, most=2**16)
                    for name, number in (("depth", depth), ("most", most)))

@@ -21,9 +21,10 @@ def guards(automaton: Automaton) -> dict[tuple[int, int], str]:
     it says of combinations that are no letter is left to brevity. It is an irredundant
     disjunction of prime cubes, not always the shortest.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> guards(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}]))
-    {(0, 0): '!g & !r', (0, 1): 'g', (0, 2): 'r', (1, 1): 'true', (2, 2): 'true'}
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> guards(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}]))
+      {(0, 0): '!g & !r', (0, 1): 'g', (0, 2): 'r', (1, 1): 'true', (2, 2): 'true'}
     """
     same = np.zeros_like(np.asarray(automaton.priority))
     return {(q, end): text for (q, end, _), text in _guards(automaton, same).items()}
@@ -32,9 +33,10 @@ def guards(automaton: Automaton) -> dict[tuple[int, int], str]:
 def edge_guards(automaton: Automaton) -> dict[tuple[int, int, int], str]:
     """The condition of each (state, successor, priority) that some letter has, see `guards`.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> edge_guards(to_automaton("G F a"))
-    {(0, 0, 0): 'a', (0, 0, 1): '!a'}
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> edge_guards(to_automaton("G F a"))
+      {(0, 0, 0): 'a', (0, 0, 1): '!a'}
     """
     return _guards(automaton, np.asarray(automaton.priority))
 
@@ -70,12 +72,13 @@ def prime_cover(chosen: set[int], others: set[int], width: int) -> list[Cube]:
     Letters that are in neither set may fall on either side; see `diagram.prime_cubes`.
 
     Args:
-        chosen: Letters as numbers, with proposition p as bit p.
-        others: More letters.
-        width: The number of propositions.
+      chosen: letters as numbers, with proposition p as bit p.
+      others: more letters.
+      width: the number of propositions.
 
-    >>> prime_cover({0b01, 0b11}, {0b00}, 2)
-    [((0, True),)]
+    Example:
+      >>> prime_cover({0b01, 0b11}, {0b00}, 2)
+      [((0, True),)]
     """
     if len(chosen) + len(others) < 1 << width:
         # Where few letters occur, a few propositions tell, and guards of others would be long.
@@ -131,19 +134,20 @@ def to_text(automaton: Automaton) -> str:
     In a Buchi automaton `*` marks the accepting transitions instead, and in a parity automaton
     each transition is followed by its priority in braces.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> print(to_text(to_automaton("F a")))
-    cosafe automaton: 2 states, 2 letters over a
-    >  0: F a
-         !a -> 0
-         a -> 1
-     * 1: true
-         true -> 1
-    >>> print(to_text(to_automaton("G F a")))
-    buchi automaton: 1 state, 2 letters over a
-    >  0: G F a
-         a -> 0 *
-         !a -> 0
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> print(to_text(to_automaton("F a")))
+      cosafe automaton: 2 states, 2 letters over a
+      >  0: F a
+           !a -> 0
+           a -> 1
+       * 1: true
+           true -> 1
+      >>> print(to_text(to_automaton("G F a")))
+      buchi automaton: 1 state, 2 letters over a
+      >  0: G F a
+           a -> 0 *
+           !a -> 0
     """
     lines = [f"{automaton.acceptance} automaton: {extent_text(automaton)}"]
     final = _final_states(automaton)
@@ -177,15 +181,16 @@ def to_dot(automaton: Automaton) -> str:
     The accepting transitions of a Buchi automaton are bold and have a dot after their condition,
     and those of a parity automaton have their priority in braces there.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> print(to_dot(to_automaton("true")))
-    digraph automaton {
-      rankdir=LR;
-      start [shape=point, label=""];
-      start -> 0;
-      0 [shape=doublecircle, label="0: true"];
-      0 -> 0 [label="true"];
-    }
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> print(to_dot(to_automaton("true")))
+      digraph automaton {
+        rankdir=LR;
+        start [shape=point, label=""];
+        start -> 0;
+        0 [shape=doublecircle, label="0: true"];
+        0 -> 0 [label="true"];
+      }
     """
     lines = ["rankdir=LR;", 'start [shape=point, label=""];', f"start -> {automaton.initial};"]
     final = _final_states(automaton)
@@ -207,9 +212,10 @@ def _dot_string(text: str) -> str:
 def to_dict(automaton: Automaton) -> dict[str, Any]:
     """The automaton as lists, numbers and strings, for JSON; `from_dict` is the inverse.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> to_dict(to_automaton("F a"))["delta"]
-    [[0, 1], [1, 1]]
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> to_dict(to_automaton("F a"))["delta"]
+      [[0, 1], [1, 1]]
     """
     table = {"buchi": "accepting", "parity": "priority"}.get(automaton.acceptance, "final")
     return {
@@ -227,11 +233,12 @@ def from_dict(tables: Mapping[str, Any]) -> Automaton:
     """The automaton that `to_dict` wrote.
 
     Raises:
-        ValueError: For a missing or unknown entry, or tables that are no automaton.
+      ValueError: for a missing or unknown entry, or tables that are no automaton.
 
-    >>> from jaxltl.core.automata.translate import to_automaton
-    >>> from_dict(to_dict(to_automaton("F a"))).acceptance
-    'cosafe'
+    Example:
+      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from_dict(to_dict(to_automaton("F a"))).acceptance
+      'cosafe'
     """
     table = {"buchi": "accepting", "parity": "priority"}.get(tables.get("acceptance", ""), "final")
     fields = set(Automaton.__dataclass_fields__) - {"priority"} | {table}

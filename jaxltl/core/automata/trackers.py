@@ -97,18 +97,18 @@ def track(
     """The trackers of a combination as one automaton with an Emerson-Lei condition.
 
     Args:
-        parts: The combination.
-        letters: bool `[L, P]`.
-        propositions: `[P]` names.
-        max_states: The number of states at which to give up.
-        max_nodes: The number of diagrams at which to give up.
+      parts: the combination.
+      letters: bool `[L, P]`.
+      propositions: `[P]` names.
+      max_states: the number of states at which to give up.
+      max_nodes: the number of diagrams at which to give up.
 
     Returns:
-        `delta [Q, K]` and color sets `[Q, K]` over K classes of letters, state 0 initial; the
-        condition; and the class `[L]` of each letter.
+      `delta [Q, K]` and color sets `[Q, K]` over K classes of letters, state 0 initial; the
+      condition; and the class `[L]` of each letter.
 
     Raises:
-        ValueError: For too many states.
+      ValueError: for too many states.
     """
     trackers: dict[Part, Tracker] = {}
     for part in _leaves(parts):

@@ -63,30 +63,31 @@ def to_automaton(
     does. Where the verdict of a word depends on more, acceptance is on transitions.
 
     Args:
-        formula: A formula or its text (see `parse_ltl`).
-        letters: The letters that occur, each a collection of proposition names; names that are
-            not in the formula are ignored. None stands for all 2^P subsets of its propositions.
-        max_states: The number of states, at any stage, at which to give up.
-        acceptance: `"auto"`, the simplest that the language has: `"cosafe"` or `"safety"`, where
-            a finite prefix proves or refutes; else `"buchi"`, where a deterministic Buchi
-            automaton exists; else `"parity"`. `"dfa"`, `"buchi"` and `"parity"` ask for that
-            form, by `"dfa"` either of the first two.
+      formula: a formula or its text (see `parse_ltl`).
+      letters: the letters that occur, each a collection of proposition names; names that are
+        not in the formula are ignored. None stands for all 2^P subsets of its propositions.
+      max_states: the number of states, at any stage, at which to give up.
+      acceptance: `"auto"`, the simplest that the language has: `"cosafe"` or `"safety"`, where
+        a finite prefix proves or refutes; else `"buchi"`, where a deterministic Buchi
+        automaton exists; else `"parity"`. `"dfa"`, `"buchi"` and `"parity"` ask for that
+        form, by `"dfa"` either of the first two.
 
     Returns:
-        An automaton over the sorted propositions of the formula. Letters are in the order of the
-        binary numbers with proposition p as bit p, states in breadth-first order, and each state
-        is named by the formula that is left to satisfy there.
+      An automaton over the sorted propositions of the formula. Letters are in the order of the
+      binary numbers with proposition p as bit p, states in breadth-first order, and each state
+      is named by the formula that is left to satisfy there.
 
     Raises:
-        ValueError: For a language without the acceptance asked for, more than 12 propositions
-            without `letters`, a letter that is no collection, or too many states.
+      ValueError: for a language without the acceptance asked for, more than 12 propositions
+        without `letters`, a letter that is no collection, or too many states.
 
-    >>> automaton = to_automaton("!r U g", letters=[{}, {"r"}, {"g"}])
-    >>> automaton.delta.tolist(), automaton.state_names
-    ([[0, 1, 2], [1, 1, 1], [2, 2, 2]], ('!r U g', 'true', 'false'))
-    >>> often = to_automaton("G F a & G F b")
-    >>> often.acceptance, often.accepting.astype(int).tolist()
-    ('buchi', [[0, 1, 0, 1], [0, 0, 1, 1]])
+    Example:
+      >>> automaton = to_automaton("!r U g", letters=[{}, {"r"}, {"g"}])
+      >>> automaton.delta.tolist(), automaton.state_names
+      ([[0, 1, 2], [1, 1, 1], [2, 2, 2]], ('!r U g', 'true', 'false'))
+      >>> often = to_automaton("G F a & G F b")
+      >>> often.acceptance, often.accepting.astype(int).tolist()
+      ('buchi', [[0, 1, 0, 1], [0, 0, 1, 1]])
     """
     if acceptance not in ("auto", "dfa", "buchi", "parity"):
         raise ValueError(

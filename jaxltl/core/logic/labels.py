@@ -52,8 +52,9 @@ def satisfying(
     Raises:
       ValueError: an unknown proposition or a temporal operator.
 
-    >>> satisfying(np.array([[1, 0], [1, 1]], bool), ["a", "b"], "a & !b", "here").tolist()
-    [True, False]
+    Example:
+      >>> satisfying(np.array([[1, 0], [1, 1]], bool), ["a", "b"], "a & !b", "here").tolist()
+      [True, False]
     """
     condition = as_formula(condition)
     temporal = [f for f in subformulas(condition) if f.operator not in _BOOLEAN]

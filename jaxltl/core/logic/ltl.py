@@ -39,17 +39,18 @@ class Formula:
     which are associative and kept flat. Equality and hashing compare a digest of the structure.
     Python's `~ & | ^ >>` build `! & | xor ->`.
 
-    Args:
-        operator: `true false ap ! & | -> <-> xor X F G U R W M`; `ap` is a proposition.
-        operands: The formulas under the operator.
-        proposition: The name, for `ap` only.
+    Attributes:
+      operator: `true false ap ! & | -> <-> xor X F G U R W M`; `ap` is a proposition.
+      operands: the formulas under the operator.
+      proposition: the name, for `ap` only.
 
     Raises:
-        ValueError: For an unknown operator or a wrong number of operands.
+      ValueError: for an unknown operator or a wrong number of operands.
 
-    >>> a = Formula("ap", proposition="a")
-    >>> print(~a | Formula("X", (a,)))
-    !a | X a
+    Example:
+      >>> a = Formula("ap", proposition="a")
+      >>> print(~a | Formula("X", (a,)))
+      !a | X a
     """
 
     operator: str
@@ -100,7 +101,8 @@ class Formula:
         return texts[self]
 
     def __repr__(self) -> str:
-        return f"parse_ltl({str(self)!r})"
+        text = repr(str(self))
+        return f"parse_ltl({text})" if len(text) < 900 else f"parse_ltl({text[:800]}...)"
 
     def __invert__(self) -> Formula:
         return Formula("!", (self,))
@@ -125,8 +127,9 @@ FALSE = Formula("false")
 def subformulas(formula: Formula) -> tuple[Formula, ...]:
     """The distinct subformulas, each after its operands; the formula itself is last.
 
-    >>> [str(f) for f in subformulas(parse_ltl("a & X a"))]
-    ['a', 'X a', 'a & X a']
+    Example:
+      >>> [str(f) for f in subformulas(parse_ltl("a & X a"))]
+      ['a', 'X a', 'a & X a']
     """
     done: dict[Formula, None] = {}
     stack = [(formula, False)]
@@ -201,16 +204,17 @@ def parse_ltl(text: str) -> Formula:
     - Any other name is quoted, with `\\` before a quote or backslash in it: `F "Goal 1"`.
 
     Args:
-        text: The formula.
+      text: the formula.
 
     Returns:
-        The `Formula`; its ``str`` is text that is read as the same formula.
+      The `Formula`; its ``str`` is text that is read as the same formula.
 
     Raises:
-        ValueError: With the column of the first error and what was expected there.
+      ValueError: with the column of the first error and what was expected there.
 
-    >>> print(parse_ltl("GFa -> b U c && d"))
-    G F a -> ((b U c) & d)
+    Example:
+      >>> print(parse_ltl("GFa -> b U c && d"))
+      G F a -> ((b U c) & d)
     """
     if not isinstance(text, str) or not text.strip():
         raise ValueError(
@@ -268,10 +272,10 @@ def pointed(place: str, text: str, position: int, found: str, wanted: str) -> st
     """What is wrong at a position of a text, with a caret under it.
 
     Args:
-        place: What read the text, the subject of the message.
-        text: All of it.
-        position: Of the error.
-        found, wanted: In words.
+      place: what read the text, the subject of the message.
+      text: all of it.
+      position: of the error.
+      found, wanted: in words.
     """
     line_start = text.rfind("\n", 0, position) + 1
     line = text[line_start:].split("\n")[0]
@@ -293,8 +297,9 @@ def as_formula(formula: Formula | str) -> Formula:
 def proposition_text(name: str) -> str:
     """The name as `parse_ltl` reads it: plain where it can be, else quoted.
 
-    >>> print(proposition_text("goal"), proposition_text("Goal"))
-    goal "Goal"
+    Example:
+      >>> print(proposition_text("goal"), proposition_text("Goal"))
+      goal "Goal"
     """
     if re.fullmatch(_NAME, name, re.ASCII):
         return name
@@ -330,8 +335,9 @@ def negation_normal_form(formula: Formula) -> Formula:
     Negation is pushed inwards by the dualities `!X f = X !f`, `!F f = G !f`,
     `!(f U g) = !f R !g` and `!(f W g) = !f M !g` (Baier & Katoen 2008, section 5.1.5).
 
-    >>> print(negation_normal_form(parse_ltl("!(a U (b -> X c))")))
-    !a R (b & X !c)
+    Example:
+      >>> print(negation_normal_form(parse_ltl("!(a U (b -> X c))")))
+      !a R (b & X !c)
     """
     forms: dict[Formula, tuple[Formula, Formula]] = {}  # the normal forms of f and of !f
     for node in subformulas(formula):
@@ -357,12 +363,13 @@ def offending_subformula(formula: Formula, fragment: Fragment) -> Formula | None
     """The outermost subformula of the normal form that leaves a fragment, or None.
 
     Args:
-        formula: Any formula; its negation normal form is examined.
-        fragment: `"cosafe"` allows `X F U M`, `"safety"` allows `X G R W`; both allow
-            literals, `&` and `|` (Kupferman & Vardi 2001, "Model checking of safety properties").
+      formula: any formula; its negation normal form is examined.
+      fragment: `"cosafe"` allows `X F U M`, `"safety"` allows `X G R W`; both allow
+        literals, `&` and `|` (Kupferman & Vardi 2001, "Model checking of safety properties").
 
-    >>> print(offending_subformula(parse_ltl("a & G F b"), "safety"))
-    F b
+    Example:
+      >>> print(offending_subformula(parse_ltl("a & G F b"), "safety"))
+      F b
     """
     allowed = _BOOLEAN | _TEMPORAL[fragment]
     nodes = reversed(subformulas(negation_normal_form(formula)))
@@ -372,8 +379,9 @@ def offending_subformula(formula: Formula, fragment: Fragment) -> Formula | None
 def is_syntactically_cosafe(formula: Formula) -> bool:
     """Whether the normal form uses only `X F U M`, so a finite prefix proves the formula.
 
-    >>> is_syntactically_cosafe(parse_ltl("!(G a)")), is_syntactically_cosafe(parse_ltl("G a"))
-    (True, False)
+    Example:
+      >>> is_syntactically_cosafe(parse_ltl("!(G a)")), is_syntactically_cosafe(parse_ltl("G a"))
+      (True, False)
     """
     return offending_subformula(formula, "cosafe") is None
 
@@ -381,8 +389,9 @@ def is_syntactically_cosafe(formula: Formula) -> bool:
 def is_syntactically_safe(formula: Formula) -> bool:
     """Whether the normal form uses only `X G R W`, so a finite prefix refutes the formula.
 
-    >>> is_syntactically_safe(parse_ltl("!F a")), is_syntactically_safe(parse_ltl("F a"))
-    (True, False)
+    Example:
+      >>> is_syntactically_safe(parse_ltl("!F a")), is_syntactically_safe(parse_ltl("F a"))
+      (True, False)
     """
     return offending_subformula(formula, "safety") is None
 
@@ -398,7 +407,7 @@ def as_letters(letters: Iterable[Letter], place: str) -> list[frozenset[str]]:
     """The letters as sets of proposition names.
 
     Raises:
-        ValueError: Where a letter is a bare string, which would be read character by character.
+      ValueError: where a letter is a bare string, which would be read character by character.
     """
     result = []
     for index, letter in enumerate(letters):
@@ -421,18 +430,19 @@ def holds_on_lasso(
     `f U g = g | (f & X(f U g))` (Baier & Katoen 2008, section 5.1.4).
 
     Args:
-        formula: A formula or its text.
-        prefix: `[n]` letters, each the collection of the propositions true there; may be empty.
-        cycle: `[m]` letters, at least one.
+      formula: a formula or its text.
+      prefix: `[n]` letters, each the collection of the propositions true there; may be empty.
+      cycle: `[m]` letters, at least one.
 
     Returns:
-        Whether it does.
+      Whether it does.
 
     Raises:
-        ValueError: For an empty cycle or a letter that is a bare string.
+      ValueError: for an empty cycle or a letter that is a bare string.
 
-    >>> holds_on_lasso("G F a", prefix=[], cycle=[{"a"}, set()])
-    True
+    Example:
+      >>> holds_on_lasso("G F a", prefix=[], cycle=[{"a"}, set()])
+      True
     """
     return truth_on_lasso(formula, prefix, cycle)[0]
 
@@ -442,8 +452,9 @@ def truth_on_lasso(
 ) -> list[bool]:
     """Whether the formula holds from each of the `n + m` positions on, see `holds_on_lasso`.
 
-    >>> truth_on_lasso("a & X a", prefix=[], cycle=[{"a"}, {"a"}, set()])
-    [True, False, False]
+    Example:
+      >>> truth_on_lasso("a & X a", prefix=[], cycle=[{"a"}, {"a"}, set()])
+      [True, False, False]
     """
     formula = as_formula(formula)
     stem = as_letters(prefix, "holds_on_lasso: prefix")

@@ -244,13 +244,13 @@ def combination(
     """A positive combination of Sigma-2 and Pi-2 formulas and limits.
 
     Args:
-        formula: A simplified formula.
-        grouped: Leave conjuncts, and disjuncts, of one class together in one part.
-        dual: Normalise negations, which gives Pi-2 where Sigma-2 comes else.
-        steps: The work at which to give up.
+      formula: a simplified formula.
+      grouped: leave conjuncts, and disjuncts, of one class together in one part.
+      dual: normalise negations, which gives Pi-2 where Sigma-2 comes else.
+      steps: the work at which to give up.
 
     Raises:
-        ValueError: For too many steps or parts.
+      ValueError: for too many steps or parts.
     """
     parts = _combine(formula, grouped, dual, Rewriter(steps))
     if _size(parts) > MAX_PARTS:

@@ -28,14 +28,14 @@ class Progression:
     """Diagrams of formulas in negation normal form, and their successors under letters.
 
     Args:
-        formulas: All formulas to progress.
-        letters: bool `[L, P]`.
-        propositions: `[P]` names.
-        max_nodes: The number of diagrams at which to give up.
+      formulas: all formulas to progress.
+      letters: bool `[L, P]`.
+      propositions: `[P]` names.
+      max_nodes: the number of diagrams at which to give up.
 
     Attributes:
-        representative: One letter of each class of letters that no formula tells apart.
-        class_of: int `[L]`, the class of each letter.
+      representative: one letter of each class of letters that no formula tells apart.
+      class_of: int `[L]`, the class of each letter.
     """
 
     def __init__(

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Literal, NamedTuple
 
+from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula, pointed
 from jaxltl.core.show import brief
@@ -18,86 +19,29 @@ Relation = Literal["<", "<=", ">", ">="]
 MAX_UNFOLDED_STEPS = 100  # of a step bound inside of a formula, which becomes so many X
 
 
-@dataclass(frozen=True)
-class Bounded:
-    """A temporal operator on state formulas that must be decided within a bound.
-
-    Attributes:
-        operator: `"U"` or `"R"`. `F<=k b` is `true U<=k b`, and `G<=k b` is `false R<=k b`.
-        left, right: Boolean formulas.
-        lower, upper: The steps between which `right` counts, both included; without an upper
-            bound None.
-        reward: The name of the reward that is bounded in place of steps, empty for the only one
-            that the model has; None for steps.
-        limit: How much reward may be earned, for a reward.
-        strict: Whether it must be less than the limit.
-    """
-
-    operator: Literal["U", "R"]
-    left: Formula
-    right: Formula
-    lower: int = 0
-    upper: int | None = None
-    reward: str | None = None
-    limit: Fraction | None = None
-    strict: bool = False
-
-    def __str__(self) -> str:
-        if self.reward is not None:
-            name = f'{{"{self.reward}"}}' if self.reward else "{}"
-            bound = f"{name}{'<' if self.strict else '<='}{self.limit}"
-        elif self.upper is None:
-            bound = f">={self.lower}"
-        else:
-            bound = f"[{self.lower},{self.upper}]" if self.lower else f"<={self.upper}"
-        left, right = (f"({f})" if len(f.operands) > 1 else str(f) for f in (self.left, self.right))
-        if self.operator == "U" and self.left == TRUE:
-            return f"F{bound} {right}"
-        if self.operator == "R" and self.left == FALSE:
-            return f"G{bound} {right}"
-        return f"{left} {self.operator}{bound} {right}"
-
-
-@dataclass(frozen=True)
-class Earned:
-    """What of a reward is asked for, where it is not the sum until a state is reached.
-
-    Attributes:
-        kind: `"total"` (`C`), `"cumulative"` (`C<=k`: in the first k steps), `"instantaneous"`
-            (`I=k`: in the step after k steps) or `"average"` (`S`, `LRA`: in the long run).
-        steps: k.
-    """
-
-    kind: Literal["total", "cumulative", "instantaneous", "average"]
-    steps: int | None = None
-
-    def __str__(self) -> str:
-        return {"total": "C", "cumulative": f"C<={self.steps}",
-                "instantaneous": f"I={self.steps}", "average": "LRA"}[self.kind]
-
-
 @brief(facts=lambda self: [self.text])
 @dataclass(frozen=True)
 class Property:
     """A question about a model: a number, or whether a number meets a threshold.
 
     Attributes:
-        text: As it was written.
-        operator: `"P"` (a probability), `"R"` (an expected reward), `"T"` (expected steps),
-            `"LRA"` (the part of the time that a state formula holds in the long run), `"multi"`.
-        objective: `"max"`, `"min"`, or None where it is not said.
-        nature: The second of two directions, `"max"` in `Pminmax`: what nature makes of the number
-            within intervals; None where only one is said, or none.
-        relation, threshold: The comparison, None for `=?`.
-        reward: For `"R"`, the name, or None for the only one that the model has.
-        path: For `"P"` a formula or a bounded one, for `"T"` and `"R"` `F` of a state formula or
-            an :class:`Earned`, for `"LRA"` a state formula.
-        parts: Of `"multi"`, its objectives.
-        name: The name before the colon, or None.
+      text: as it was written.
+      operator: `"P"` (a probability), `"R"` (an expected reward), `"T"` (expected steps),
+        `"LRA"` (the part of the time that a state formula holds in the long run), `"multi"`.
+      objective: `"max"`, `"min"`, or None where it is not said.
+      nature: the second of two directions, `"max"` in `Pminmax`: what nature makes of the number
+        within intervals; None where only one is said, or none.
+      relation, threshold: the comparison, None for `=?`.
+      reward: for `"R"`, the name, or None for the only one that the model has.
+      path: for `"P"` a formula or a bounded one, for `"T"` and `"R"` `F` of a state formula or
+        an :class:`~jaxltl.core.logic.bounded.Earned`, for `"LRA"` a state formula.
+      parts: of `"multi"`, its objectives.
+      name: the name before the colon, or None.
 
-    >>> asked = parse_property('Pmax>=0.9 [ F "goal" ]')
-    >>> asked.operator, asked.objective, asked.relation, str(asked.threshold), str(asked.path)
-    ('P', 'max', '>=', '9/10', 'F goal')
+    Example:
+      >>> asked = parse_property('Pmax>=0.9 [ F "goal" ]')
+      >>> asked.operator, asked.objective, asked.relation, str(asked.threshold), str(asked.path)
+      ('P', 'max', '>=', '9/10', 'F goal')
     """
 
     text: str
@@ -140,19 +84,20 @@ def parse_properties(text: str) -> tuple[Property, ...]:
     begins a comment.
 
     Args:
-        text: One property or several.
+      text: one property or several.
 
     Returns:
-        The properties, in their order.
+      The properties, in their order.
 
     Raises:
-        ValueError: With the place of the first error and what was expected there.
+      ValueError: with the place of the first error and what was expected there.
 
-    >>> (p,) = parse_properties('Pmax=? [ G F "a" & !"b" ]')
-    >>> print(p.operator, p.objective, p.path)
-    P max G F (a & !b)
-    >>> print(*(q.direction for q in parse_properties('P>=0.9 [ X "a" ]; P<0.5 [ F<=3 "a" ]')))
-    min max
+    Example:
+      >>> (p,) = parse_properties('Pmax=? [ G F "a" & !"b" ]')
+      >>> print(p.operator, p.objective, p.path)
+      P max G F (a & !b)
+      >>> print(*(q.direction for q in parse_properties('P>=0.9 [ X "a" ]; P<0.5 [ F<=3 "a" ]')))
+      min max
     """
     if not isinstance(text, str):
         raise ValueError(f"parse_properties: expected text, got {type(text).__name__} {text!r}.")
@@ -168,16 +113,17 @@ def parse_property(text: str) -> Property:
     """The one property that a text writes; see :func:`parse_properties`.
 
     Args:
-        text: One property.
+      text: one property.
 
     Returns:
-        The property.
+      The property.
 
     Raises:
-        ValueError: There is an error, or not exactly one property.
+      ValueError: there is an error, or not exactly one property.
 
-    >>> print(parse_property('R{"steps"}min=? [ F "goal" ]').reward)
-    steps
+    Example:
+      >>> print(parse_property('R{"steps"}min=? [ F "goal" ]').reward)
+      steps
     """
     found = parse_properties(text)
     if len(found) != 1:
@@ -574,31 +520,3 @@ _CONTENT: dict[str, Callable[[_Parser], Formula | Bounded | Earned]] = {
     "P": _Parser.path_content, "R": _Parser.reward_content, "T": _Parser.steps_content,
     "LRA": _Parser.state_content,
 }
-
-
-def unfolded(path: Bounded) -> Formula:
-    """The formula without bounds that says the same as one with a bound on steps.
-
-    `a U[l,u] b` is `a & X(a U[l-1,u-1] b)`, and `a U<=u b` is `b | a & X(a U<=u-1 b)`; `R` dually.
-
-    >>> print(unfolded(Bounded("U", TRUE, Formula("ap", proposition="a"), upper=1)))
-    a | X a
-    """
-    if path.operator == "R":
-        left = TRUE if path.left == FALSE else ~path.left
-        return ~unfolded(replace(path, operator="U", left=left, right=~path.right))
-    left, right = path.left, path.right
-
-    def step(rest: Formula) -> Formula:
-        ahead = Formula("X", (rest,))
-        return ahead if left == TRUE else left & ahead
-
-    if path.upper is None:
-        found = Formula("U", (left, right))
-    else:
-        found = right
-        for _ in range(path.upper - path.lower):
-            found = right | step(found)
-    for _ in range(path.lower):
-        found = step(found)
-    return found

@@ -149,9 +149,10 @@ def is_invariant(formula: Formula) -> bool:
 def simplify(formula: Formula) -> Formula:
     """An equivalent formula in negation normal form, with limits pulled outwards.
 
-    >>> from jaxltl.core.logic.ltl import parse_ltl
-    >>> print(simplify(parse_ltl("G F (a | X F b) & F F c")))
-    (G F a | G F b) & F c
+    Example:
+      >>> from jaxltl.core.logic.ltl import parse_ltl
+      >>> print(simplify(parse_ltl("G F (a | X F b) & F F c")))
+      (G F a | G F b) & F c
     """
     form: dict[Formula, Formula] = {}
     for node in subformulas(negation_normal_form(formula)):

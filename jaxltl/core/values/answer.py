@@ -10,16 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.host.given import shown
+from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import TRUE, Formula
-from jaxltl.core.logic.properties import (
-    MAX_UNFOLDED_STEPS,
-    Bounded,
-    Earned,
-    Property,
-    parse_property,
-    unfolded,
-)
+from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.models.state_formulas import states_satisfying

@@ -8,15 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxltl.core.logic.bounded import Bounded, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import TRUE, Formula
-from jaxltl.core.logic.properties import (
-    MAX_UNFOLDED_STEPS,
-    Bounded,
-    Property,
-    parse_property,
-    unfolded,
-)
+from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
 from jaxltl.core.models.sparse import SparseMDP, row_reward
 from jaxltl.core.models.state_formulas import states_satisfying
 from jaxltl.core.types import Status

@@ -7,14 +7,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula, holds_on_lasso, parse_ltl
-from jaxltl.core.logic.properties import (
-    Bounded,
-    Earned,
-    parse_properties,
-    parse_property,
-    unfolded,
-)
+from jaxltl.core.logic.properties import parse_properties, parse_property
 
 
 def path(text):

@@ -1,0 +1,96 @@
+"""What properties ask for that no formula says: bounds on steps and rewards, and sums."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Literal
+
+from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
+
+
+@dataclass(frozen=True)
+class Bounded:
+    """A temporal operator on state formulas that must be decided within a bound.
+
+    Attributes:
+      operator: `"U"` or `"R"`. `F<=k b` is `true U<=k b`, and `G<=k b` is `false R<=k b`.
+      left, right: Boolean formulas.
+      lower, upper: the steps between which `right` counts, both included; without an upper
+        bound None.
+      reward: the name of the reward that is bounded in place of steps, empty for the only one
+        that the model has; None for steps.
+      limit: how much reward may be earned, for a reward.
+      strict: whether it must be less than the limit.
+    """
+
+    operator: Literal["U", "R"]
+    left: Formula
+    right: Formula
+    lower: int = 0
+    upper: int | None = None
+    reward: str | None = None
+    limit: Fraction | None = None
+    strict: bool = False
+
+    def __str__(self) -> str:
+        if self.reward is not None:
+            name = f'{{"{self.reward}"}}' if self.reward else "{}"
+            bound = f"{name}{'<' if self.strict else '<='}{self.limit}"
+        elif self.upper is None:
+            bound = f">={self.lower}"
+        else:
+            bound = f"[{self.lower},{self.upper}]" if self.lower else f"<={self.upper}"
+        left, right = (f"({f})" if len(f.operands) > 1 else str(f) for f in (self.left, self.right))
+        if self.operator == "U" and self.left == TRUE:
+            return f"F{bound} {right}"
+        if self.operator == "R" and self.left == FALSE:
+            return f"G{bound} {right}"
+        return f"{left} {self.operator}{bound} {right}"
+
+
+@dataclass(frozen=True)
+class Earned:
+    """What of a reward is asked for, where it is not the sum until a state is reached.
+
+    Attributes:
+      kind: `"total"` (`C`), `"cumulative"` (`C<=k`: in the first k steps), `"instantaneous"`
+        (`I=k`: in the step after k steps) or `"average"` (`S`, `LRA`: in the long run).
+      steps: k.
+    """
+
+    kind: Literal["total", "cumulative", "instantaneous", "average"]
+    steps: int | None = None
+
+    def __str__(self) -> str:
+        return {"total": "C", "cumulative": f"C<={self.steps}",
+                "instantaneous": f"I={self.steps}", "average": "LRA"}[self.kind]
+
+
+def unfolded(path: Bounded) -> Formula:
+    """The formula without bounds that says the same as one with a bound on steps.
+
+    `a U[l,u] b` is `a & X(a U[l-1,u-1] b)`, and `a U<=u b` is `b | a & X(a U<=u-1 b)`; `R` dually.
+
+    Example:
+      >>> print(unfolded(Bounded("U", TRUE, Formula("ap", proposition="a"), upper=1)))
+      a | X a
+    """
+    if path.operator == "R":
+        left = TRUE if path.left == FALSE else ~path.left
+        return ~unfolded(replace(path, operator="U", left=left, right=~path.right))
+    left, right = path.left, path.right
+
+    def step(rest: Formula) -> Formula:
+        ahead = Formula("X", (rest,))
+        return ahead if left == TRUE else left & ahead
+
+    if path.upper is None:
+        found = Formula("U", (left, right))
+    else:
+        found = right
+        for _ in range(path.upper - path.lower):
+            found = right | step(found)
+    for _ in range(path.lower):
+        found = step(found)
+    return found
