@@ -232,8 +232,8 @@ def boltzmann_fixed_points(
     Raises:
       ValueError: the reward has the wrong shape.
 
-    The list is made on the host; each solution alone is differentiable as of
-    :func:`boltzmann_value`.
+    The list is made on the host and not differentiable; :func:`boltzmann_value` is, and goes on
+    from one of these by `initial`.
 
     Example:
       >>> from jaxltl.core.models.mdp import make_mdp

@@ -108,8 +108,8 @@ def task_performance(
         actions (under ``jit`` the status is then INVALID), blocks are asked for another kind of
         task, or an unknown method.
 
-    Differentiable as :func:`~jaxltl.core.values.satisfaction.satisfaction_probability` is, in the
-    policy and in the world's probabilities, with the support held fixed.
+    Differentiable in the policy and in the world's probabilities, with the support held fixed: in
+    forward mode, and with ``method="general"`` in reverse mode too.
 
     Example:
       >>> from jaxltl.core.models.mdp import from_dense
@@ -281,7 +281,7 @@ def task_performances(
     Raises:
       ValueError: the models are not stacked or the policies have the wrong shape.
 
-    Not differentiable; under ``vmap`` and ``grad`` take :func:`task_performance`.
+    Not differentiable; :func:`task_performance` is.
 
     Example:
       >>> from jaxltl.core.models.batch import stack_products
