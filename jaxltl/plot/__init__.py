@@ -8,6 +8,7 @@ return the text of an SVG for pages that move, and ``playback`` that of one that
 from jaxltl.plot.automata import automaton
 from jaxltl.plot.curves import bands, curves, guarantees, lines, paths, sweep
 from jaxltl.plot.described import described
+from jaxltl.plot.episodes import draw_episode, draw_episodes, play_episode
 from jaxltl.plot.games import compare, game_moves, game_region, game_values
 from jaxltl.plot.live import live_automaton, live_curve, live_map
 from jaxltl.plot.maps import grid, strategies
@@ -22,6 +23,8 @@ __all__ = [
     "compare",
     "curves",
     "described",
+    "draw_episode",
+    "draw_episodes",
     "game_moves",
     "game_region",
     "game_values",
@@ -33,6 +36,7 @@ __all__ = [
     "live_map",
     "model",
     "paths",
+    "play_episode",
     "playback",
     "solution",
     "strategies",
