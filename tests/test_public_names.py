@@ -49,9 +49,9 @@ def test_namespaces_come_when_they_are_asked_for():
     program = """
 import sys, jaxltl
 dir(jaxltl.algos), dir(jaxltl.io), dir(jaxltl.envs)
-assert "jax" not in sys.modules and "jaxltl.algos.ppo" not in sys.modules
-jaxltl.algos.ppo.Problem, jaxltl.io.read_umb
-assert "jaxltl.algos.mlirl" not in sys.modules and "jaxltl.io.storm" not in sys.modules
+assert "jax" not in sys.modules and "jaxltl.algos.schedules" not in sys.modules
+jaxltl.algos.schedules.Linear, jaxltl.io.read_hoa
+assert "optax" not in sys.modules and "jaxltl.io.storm" not in sys.modules
 """
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=False)
@@ -161,18 +161,25 @@ def examples_in(text):
     return doctest.DocTestParser().get_examples(text)
 
 
+@functools.cache
+def source_and_makers(module):
+    """All that the examples of a module say, and its functions with the types that they return."""
+    beside = [(path.rpartition(".")[2], thing) for path, thing in EVERYTHING.items()
+              if path.startswith(f"{module}.")]
+    source = "".join(
+        x.source for thing in [sys.modules[module], *(thing for _, thing in beside)]
+        for x in examples_in(inspect.getdoc(thing) or ""))
+    return source, {name: str(inspect.signature(thing).return_annotation)
+                    for name, thing in beside if inspect.isfunction(inspect.unwrap(thing))}
+
+
 def shown_in_module(path):
     """Of namespaces: whether an example of the module uses a name, or what makes such a thing."""
     module, _, name = path.rpartition(".")
     if not module.startswith(tuple(_public.NAMESPACES)):
         return False
-    beside = [(other.rpartition(".")[2], thing) for other, thing in EVERYTHING.items()
-              if other.startswith(f"{module}.")]
-    source = "".join(
-        x.source for thing in [sys.modules[module], *(thing for _, thing in beside)]
-        for x in examples_in(inspect.getdoc(thing) or ""))
-    makers = {other for other, thing in beside if inspect.isfunction(inspect.unwrap(thing))
-              and re.search(rf"\b{name}\b", str(inspect.signature(thing).return_annotation))}
+    source, returned = source_and_makers(module)
+    makers = {other for other, kind in returned.items() if re.search(rf"\b{name}\b", kind)}
     return any(re.search(rf"\b{used}\b", source) for used in {name, *makers})
 
 
