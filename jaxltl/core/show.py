@@ -81,7 +81,7 @@ def _safe(facts: Facts, plain: Facts, value: Any) -> list[str]:
     """Trees hold all kinds of things for a while, such as axes and shardings."""
     for told in (facts, plain):
         try:
-            return [text for text in told(value) if text]
+            return [text for text in told(value) if isinstance(text, str) and text]
         except Exception:
             continue
     return ["..."]
@@ -97,7 +97,7 @@ def laid_out(name: str, facts: Sequence[str]) -> str:
         return line
     lines = [f"{name}("]
     for i, fact in enumerate(facts):
-        text = cut(fact, WIDTH - 4) + ("," if i + 1 < len(facts) else ")")
+        text = cut(fact, WIDTH - 5) + ("," if i + 1 < len(facts) else ")")
         if len(lines) > 1 and len(lines[-1]) + 1 + len(text) <= WIDTH:
             lines[-1] += " " + text
         else:
@@ -137,9 +137,15 @@ def count(number: Any, noun: str, nouns: str = "") -> str:
 
 
 def names(words: Iterable[Any], width: int = _HEAD) -> str:
-    """Names one after the other; of many, the first and how many there are in all."""
-    listed = [str(word) for word in words]
-    kept = list(listed)
+    """Names one after the other; of many, the first and how many there are in all.
+
+    >>> names(f"a{i}" for i in range(1000))
+    'a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, a10, a11, a12, a13, ... (1000 in all)'
+    """
+    if is_array(words):
+        return array(words)
+    listed = list(words)
+    kept = [str(word) for word in listed[:width]]
     while len(kept) > 1 and len(", ".join(kept)) > width:
         kept.pop()
     text = cut(", ".join(kept), width)
@@ -278,7 +284,9 @@ def fields(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]:
     step = getattr(value, "step", None)
     if step is not None and is_array(step):
         yield lanes(step.shape)
-    keys = getattr(value, "_fields", None) or [x.name for x in dataclasses.fields(value) if x.repr]
+    keys = getattr(value, "_fields", None)
+    if keys is None:
+        keys = [x.name for x in dataclasses.fields(value) if x.repr]
     for name in keys:
         given = getattr(value, name)
         if not (is_array(given) and str(given.dtype).startswith("key<")):  # of random numbers
@@ -346,7 +354,7 @@ def history(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]
     if not shape or readable(value.status) is None:
         yield from fields(value, codes)
         return
-    yield f"{' x '.join(str(n) for n in shape)} rows, the last{'s' * (len(shape) > 1)}:"
+    yield f"the last of {' x '.join(f'{n:,}' for n in shape)} rows"
     for one in dataclasses.fields(value):
         given = getattr(value, one.name)
         if one.name in (codes or {}) or not is_array(given) or given.ndim < len(shape):

@@ -24,7 +24,7 @@ from jaxltl.core.host.binomial import (
 from jaxltl.core.host.given import number, one_of, whole
 from jaxltl.core.host.rows import Booleans, Integers
 from jaxltl.core.host.sparse import Floats
-from jaxltl.core.show import brief, count, span
+from jaxltl.core.show import brief, count, readable, span
 
 Method = Literal["clopper-pearson", "hoeffding", "weissman", "anytime"]
 
@@ -39,9 +39,10 @@ _MOST = 2**53  # throws of a row, up to which doubles count
 
 def _facts(sets: Any) -> Iterator[str]:
     yield count(sets.num_samples.size, "row")
-    yield count(sets.num_samples.sum(), "sample")
+    samples, low, high = (readable(x) for x in (sets.num_samples, sets.lower, sets.upper))
+    yield count(samples.sum(), "sample") if samples is not None else ""
     yield f"{sets.method}, confidence {sets.confidence:g} shared by {sets.num_claims:,}"
-    yield f"intervals {span(sets.upper - sets.lower)} wide"
+    yield f"intervals {span(high - low)} wide" if low is not None and high is not None else ""
     yield f"radius {span(sets.radius)}" if sets.radius is not None else ""
 
 

@@ -150,7 +150,8 @@ def memory_policy(value: Any) -> Iterator[str]:
 
 def counts(value: Any) -> Iterator[str]:
     """Of TransitionCounts."""
-    yield count(value.num_samples, "sample")
+    samples = readable(value.count)
+    yield count(samples.sum(), "sample") if samples is not None else ""
     yield f"of {count(len(value.count), 'transition')}"
     yield f"{count(len(value.states), 'state')}: {names(value.states)}"
     yield f"{count(len(value.actions), 'action')}: {names(value.actions)}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from jaxltl.core.show import apart, array, coded, count, cut, head, number, span, told
+from jaxltl.core.show import apart, array, coded, count, cut, head, number, readable, span, told
 from jaxltl.core.types import Status
 
 _INNER = 92
@@ -37,7 +37,8 @@ def guarantee(value: Any) -> Iterator[str]:
         f"at most {value.bound:.6g}")
     yield f"no policy beyond {value.optimistic:.6g}"
     yield f"confidence {value.confidence:g}"
-    yield f"{int(value.sets.num_samples.sum()):,} samples"
+    samples = readable(value.sets.num_samples)
+    yield count(samples.sum(), "sample") if samples is not None else ""
     yield head(value.model, _INNER)
     yield head(value.satisfaction.automaton, _INNER)
 
@@ -48,7 +49,8 @@ def gap(value: Any) -> Iterator[str]:
     for name, ends in (("gap", value.mean), ("value", value.mean_value),
                        ("optimum", value.mean_optimum)):
         yield f"mean {name} in [{ends[0]:.6g}, {ends[1]:.6g}]"
-    yield f"gap at most {float(value.upper.max(initial=0.0)):.6g}"
+    most = readable(value.upper)
+    yield f"gap at most {number(most.max(initial=0.0))}" if most is not None else ""
     yield f"evidence {value.evidence!r}"
 
 
