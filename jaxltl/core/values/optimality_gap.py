@@ -81,9 +81,9 @@ def tabulate_policy(
     """What an agent does in each world of a table and each memory of a task.
 
     Args:
-      policy: ``(observation, memory) -> `` an action, or the probabilities ``float[A]``, of one
-        world; `memory` is ``int32[]``, the state of the task's automaton. A ``Partial`` with a
-        network's parameters is compiled once.
+      policy: a function of ``(observation, memory)``: an action, or the probabilities
+        ``float[A]``, of one world; `memory` is ``int32[]``, the state of the task's automaton. A
+        ``Partial`` with a network's parameters is compiled once.
       environment: the one that was tabulated.
       table: of it.
       num_memory: Q.
