@@ -29,6 +29,7 @@ from jaxltl.core.host.confidence import samples_needed
 from jaxltl.core.host.given import listed, number, one_of, whole
 from jaxltl.core.host.l1_ball import l1_expectation
 from jaxltl.core.models import environment as en
+from jaxltl.core.models import episodes as ep
 from jaxltl.core.models import sequence_task as st
 from jaxltl.core.models import task_environment as te
 from jaxltl.core.models.time_limit import with_time_limit
@@ -170,7 +171,7 @@ def simulated():
         "starts": None, "outcomes": None}
     world = en.make_environment(**corridor)
     task = te.task_environment(world, "F goal")
-    agent = en.agent_of(lambda seen, key: jnp.int32(0))
+    agent = ep.agent_of(lambda seen, key: jnp.int32(0))
     events, key = st.events_of(["home", "goal"]), jax.random.key(0)
     sets = st.proposition_sets(events)
     asked = {"propositions": ["home", "goal"], "reward": "auto", "discount": None, "ratio": None,
@@ -178,9 +179,9 @@ def simulated():
     told = {"events": events, "propositions": ("home", "goal"), "depth": 2, "most": 2}
     table, plan = jl.tabulate(world), many_tasks.make_plan("F goal", **told)
     return [
-        (en.box, {"low": 0.0, "high": 1.0, "shape": (2,), "dtype": None}),
-        (en.make_environment, corridor), (en.agent_of, {"function": step}),
-        (en.run_episode, {"key": key, "environment": world, "agent": agent, "num_steps": 2}),
+        (en.make_box, {"low": 0.0, "high": 1.0, "shape": (2,), "dtype": None}),
+        (en.make_environment, corridor), (ep.agent_of, {"function": step}),
+        (ep.run_episode, {"key": key, "environment": world, "agent": agent, "num_steps": 2}),
         (with_time_limit, {"environment": world, "num_steps": 2}),
         (te.make_task_tables, {"formula": "F goal", **asked}),
         (te.task_environment, {"environment": world, "formula": "F goal", "labels": None, **asked}),
