@@ -30,7 +30,7 @@ extensions = [
     "site_pages",
 ]
 root_doc = "docs/index"
-include_patterns = ["docs/**", "notebooks/*.ipynb", "notebooks/pictures/*", "CHANGELOG.md"]
+include_patterns = ["docs/**", "notebooks/*.ipynb", "notebooks/pictures/*", "CHANGELOG.md", "CONTRIBUTING.md"]
 exclude_patterns = ["build", "out", "**/__pycache__", "**/.ipynb_checkpoints"]
 nitpicky = True
 
@@ -65,6 +65,8 @@ html_theme = "furo"
 html_title = "jaxltl"
 html_static_path = ["site/static"]
 html_css_files = ["site.css"]
+html_js_files = ["site.js"]
+html_favicon = "site/static/icon.svg"
 templates_path = ["site/templates"]
 html_additional_pages = {"index": "to_front_page.html"}
 html_show_sphinx = False

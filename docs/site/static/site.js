@@ -1,0 +1,12 @@
+// What the theme leaves out for keyboards and readers of screens.
+function tell() {
+  document.querySelector(".sidebar-drawer")?.setAttribute("aria-label", "All pages");
+  document.querySelector(".toc-drawer")?.setAttribute("aria-label", "On this page");
+  for (const box of document.querySelectorAll("pre, .table-wrapper, .math-block, dt.sig, .output")) {
+    if (box.scrollWidth > box.clientWidth) box.tabIndex = 0;
+    else box.removeAttribute("tabindex");
+  }
+}
+document.addEventListener("DOMContentLoaded", tell);
+window.addEventListener("load", tell);
+window.addEventListener("resize", tell);
