@@ -116,7 +116,7 @@ def _see(world):
 
 FACTS = {
     "MDP": "20 states, 4 actions, 240 transitions, over g, r, s, y, starts in 15",
-    "DenseMDP": "20 states, 4 actions, over g, r, s, y",
+    "DenseMDP": "20 states, 4 actions, 214 transitions, over g, r, s, y",
     "Automaton": "Automaton(cosafe, 3 states, 4 letters over r, y, for !r U y)",
     "Product": "60 states with 3 memories, MDP(20 states, 4 actions, beside Automaton(cosafe, 3",
     "SparseMDP": "3 states, 4 choices, 6 transitions, over done, lost, rewards steps, starts in 0",

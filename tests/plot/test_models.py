@@ -30,13 +30,17 @@ def test_the_map_is_read_off_the_moves(text, slip):
 
 
 def test_cells_that_are_never_left_are_no_walls_where_they_are_entered_or_labelled():
-    world = jl.gridworld("a.b\n...", absorbing=["b"])
+    world = jl.gridworld("a.b\n...", absorbing=["b"], initial="a")
     np.testing.assert_array_equal(map_of(world), parse_map("a.b\n..."))
 
 
 def test_other_moves_lie_on_no_map():
     torus = np.stack([np.roll(np.arange(6), k) for k in (3, -3, 1, -1)], axis=1)[..., None]
     assert map_of(jl.make_mdp(torus, np.ones((6, 4, 1)))) is None
+    around = np.arange(6)[:, None] + [0, 0, -1, 1]
+    around = np.clip(around, 0, 5)
+    around[:3, 1] += 3  # down; from the ends of rows one goes on to the next row
+    assert map_of(jl.make_mdp(around[..., None], np.ones((6, 4, 1)))) is None
     stay = np.tile(np.arange(6)[:, None, None], (1, 4, 1))
     assert map_of(jl.make_mdp(stay, np.ones((6, 4, 1)))) is None
     rng = np.random.default_rng(0)
