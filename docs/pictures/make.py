@@ -21,7 +21,9 @@ import time
 import matplotlib
 
 HERE = pathlib.Path(__file__).parent
-BLOCK = re.compile(r"(<!-- alone -->\n)?```python\n(.*?)```(?:\n\n(?:<!--.*?-->\n)?```\n(.*?)```)?", re.DOTALL)
+BLOCK = re.compile(
+    r"(<!-- alone -->\n)?```python\n(.*?)```(?:\n\n(?:<!--.*?-->\n)?```\n(.*?)```)?", re.DOTALL
+)
 
 
 def run(page: pathlib.Path, keep: bool) -> bool:
