@@ -38,13 +38,10 @@ A run is made of steps, begins where one likes, goes on from a state, and may en
   >>> value, status = search.evaluate(state.parameters, problem, hparams)
   >>> value.item(), search.within(problem, 0.25, 0.5).low.tolist()
   (0.25, [0.25, 0.25])
-  >>> state, metrics = search.run(state, problem, hparams, num_steps=2)  # after init, or start_at
-  >>> after, figures = jax.eval_shape(search.step, state, problem, hparams)
-  >>> early = jax.eval_shape(  # train_until begins with a key
-  ...     lambda state: search.run_until(state, problem, hparams, num_steps=9, until=(
-  ...         lambda before, after, metrics: metrics.best_value > 0.3)), state)
-  >>> figures.value.shape, early.num_steps.shape
-  ((), ())
+  >>> state, metrics = search.run(state, problem, hparams, num_steps=2)  # step after step
+  >>> until = lambda before, after, metrics: metrics.best_value > 0.3  # for run_until, train_until
+  >>> state.step.item()  # init begins anywhere in the box
+  2
 
 Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``;
 :func:`feasible` does it, and proves what it finds.
@@ -546,8 +543,7 @@ def feasible(
       ValueError: the threshold is not finite, or starts are none or not in the box.
 
     Example:
-      >>> from jaxltl.core.models.parametric import make_parametric
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_parametric, make_sparse
       >>> twice = make_sparse(None, [0, 2, 4, 5, 6], [1, 3, 2, 3, 2, 3], [0.5] * 4 + [1, 1],
       ...                     initial=[1, 0, 0, 0])
       >>> def numbers(x):  # head, then tail

@@ -37,16 +37,11 @@ Example: to come to the goal ``g`` and never to ``r``, where nobody knows the pr
 
 A run is made of steps, goes on from a state, and may end early:
 
-  >>> state = interval_learning.init(jax.random.key(0), problem, hparams)
-  >>> state, metrics = interval_learning.run(state, problem, hparams, num_steps=2)
+  >>> state = interval_learning.init(jax.random.key(0), problem, hparams)  # train is init and run
+  >>> state, metrics = interval_learning.run(state, problem, hparams, num_steps=2)  # step after step
+  >>> until = interval_learning.known_within(0.01)  # for run_until and train_until
   >>> state.step.item()
   2
-  >>> after, figures = jax.eval_shape(interval_learning.step, state, problem, hparams)
-  >>> until = interval_learning.known_within(0.01)  # for train_until too
-  >>> ended = jax.eval_shape(lambda state: interval_learning.run_until(
-  ...     state, problem, hparams, until=until, num_steps=9), state)
-  >>> figures.samples.shape, ended.num_steps.shape
-  ((), ())
   >>> play = interval_learning.behavior(state, problem, hparams)
   >>> interval_learning.wins_almost_surely(problem, play)  # always
   True
@@ -229,7 +224,7 @@ def make_problem(world: Any, task: Task) -> Problem:
       ValueError: the world is a game or no model, or the formula has unknown labels.
 
     Example:
-      >>> from jaxltl.core.models.mdp import make_mdp
+      >>> from jaxltl import make_mdp
       >>> world = make_mdp([[[1, 2], [0, 1]], [[1, 0], [1, 0]], [[2, 0], [2, 0]]],
       ...                  [[[.7, .3], [.5, .5]], [[1, 0], [1, 0]], [[1, 0], [1, 0]]],
       ...                  initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["home"])

@@ -39,16 +39,11 @@ Example: in one state the system may stay or go to the other, which pays.
 
 A run is made of steps, goes on from a state, and may end early:
 
-  >>> state = maximin_q.init(jax.random.key(0), problem, hparams)
-  >>> state, metrics = maximin_q.run(state, problem, hparams, num_steps=10)
+  >>> state = maximin_q.init(jax.random.key(0), problem, hparams)  # train is init and run
+  >>> state, metrics = maximin_q.run(state, problem, hparams, num_steps=10)  # step after step
+  >>> until = maximin_q.value_rests(1e-6)  # for run_until and train_until
   >>> state.step.item()
   10
-  >>> after, figures = jax.eval_shape(maximin_q.step, state, problem, hparams)
-  >>> until = maximin_q.value_rests(1e-6)  # for train_until too
-  >>> ended = jax.eval_shape(lambda state: maximin_q.run_until(
-  ...     state, problem, hparams, until=until, num_steps=9), state)
-  >>> figures.residual.shape, ended.num_steps.shape
-  ((), ())
   >>> maximin_q.measure(state, problem, hparams).moves.item()  # of 4 chains, 8 a step
   320.0
 
@@ -258,7 +253,7 @@ def make_problem(
         are no distributions, or a game that does not fit the method.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]])
       >>> problem = make_problem(mdp, [[0.0, 0.0], [1.0, 1.0]], allowed=[[False, True]] * 2)
       >>> problem.allowed.tolist(), problem.method

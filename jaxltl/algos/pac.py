@@ -369,7 +369,7 @@ def hat_game(game: Game, near: chex.Array, exploration: chex.Numeric) -> Game:
       ValueError: the game's model is not an MDP, or `near` has the wrong shape.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> game = Game(from_dense([[[1.0], [1.0]]]), jnp.array([True]))
       >>> hat = hat_game(game, jnp.array([[False, True]]), 0.25)
       >>> hat.mdp.successor[0, 2].tolist(), hat.mdp.probability[0, 2].tolist()
@@ -432,7 +432,7 @@ def recover_hat_strategy(hat: Game, strategy: chex.Array) -> jax.Array:
       ValueError: the strategy has the wrong shape.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> game = Game(from_dense([[[1.0], [1.0]]]), jnp.array([True]))
       >>> hat = hat_game(game, jnp.array([[False, True]]), 0.25)
       >>> alike = hat.available / hat.available.sum(-1, keepdims=True)

@@ -274,7 +274,7 @@ def make_problem(
         that is not the network's; a box of integers; no environment.
 
     Example:
-      >>> from jaxltl.core.models.environment import Timestep, make_environment
+      >>> from jaxltl import Timestep, make_environment
       >>> def go(place, action, key):
       ...     place = place + 2 * action - 1
       ...     return Timestep(place, reward=1.0 * (place == 3), terminated=abs(place) == 3)

@@ -77,7 +77,7 @@ def enclose(problem: Problem, low: Any = None, high: Any = None) -> tuple[float,
     Example:
       >>> import pathlib, tempfile
       >>> from jaxltl.algos.feasible import make_problem
-      >>> from jaxltl.io.parametric import read_parametric
+      >>> from jaxltl import read_parametric
       >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
       >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n3\\n@model\\n"
       ...     "state 0 init\\n\\taction 0\\n\\t\\t1 : p\\n\\t\\t2 : 1-p\\n"
@@ -181,7 +181,7 @@ def prove_regions(
     Example:
       >>> import pathlib, tempfile
       >>> from jaxltl.algos.feasible import make_problem
-      >>> from jaxltl.io.parametric import read_parametric
+      >>> from jaxltl import read_parametric
       >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
       >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n3\\n@model\\n"
       ...     "state 0 init\\n\\taction 0\\n\\t\\t1 : p\\n\\t\\t2 : 1-p\\n"
@@ -251,7 +251,7 @@ def prove_around(
     Example:
       >>> import pathlib, tempfile
       >>> from jaxltl.algos.feasible import make_problem
-      >>> from jaxltl.io.parametric import read_parametric
+      >>> from jaxltl import read_parametric
       >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
       >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n3\\n@model\\n"
       ...     "state 0 init\\n\\taction 0\\n\\t\\t1 : p\\n\\t\\t2 : 1-p\\n"

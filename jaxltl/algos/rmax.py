@@ -287,7 +287,7 @@ def make_problem(
         that is not finite; a task that is no Buchi condition; or a start outside the region.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[1.0, 0], [1.0, 0]]],
       ...                    label=[[0], [1]], propositions=["home"], initial=[1, 0])
       >>> problem = make_problem(world, "G F home", [[1.0, 0.0], [0.0, 0.0]])

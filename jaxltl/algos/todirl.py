@@ -31,18 +31,13 @@ Example: a reward of what is seen, here of which state it is, that plans in anot
 
 A run is made of steps, goes on from a state, and may end early:
 
-  >>> state = todirl.init(jax.random.key(0), problem, hparams)
-  >>> state, metrics = todirl.run(state, problem, hparams, num_steps=2)
+  >>> state = todirl.init(jax.random.key(0), problem, hparams)  # train is init and run
+  >>> state, metrics = todirl.run(state, problem, hparams, num_steps=2)  # step after step
+  >>> until = learner.has_stopped  # for run_until and train_until
   >>> state.step.item()
   2
-  >>> after, figures = jax.eval_shape(todirl.step, state, problem, hparams)
-  >>> until = learner.has_stopped  # for train_until too
-  >>> ended = jax.eval_shape(lambda state: todirl.run_until(
-  ...     state, problem, hparams, until=until, num_steps=9), state)
-  >>> figures.loss.shape, ended.num_steps.shape
-  ((), ())
-  >>> loss, parts = jax.eval_shape(todirl.objective, state.parameters, problem, hparams)
-  >>> jax.eval_shape(todirl.solve, state.parameters, problem, hparams).value.shape
+  >>> solution = todirl.solve(state.parameters, problem, hparams)  # which todirl.objective judges
+  >>> solution.value.shape
   (1, 3, 3)
 
 Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
@@ -351,15 +346,14 @@ def reward(
       ``float[S, Q, A]``; differentiable in the parameters and the observation.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.product import product
+      >>> from jaxltl import from_dense, product
       >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
       >>> model = product(world, "F g")
       >>> class Late(nn.Module):  # one for what is done with the task done
       ...     def __call__(self, observation, memory, action):
       ...         return 0 * observation[..., 0] + memory[..., 1] + 0 * action[..., 0]
-      >>> reward(Late(), {}, model, jnp.eye(2))[0, :, 0].tolist()
-      [0.0, 1.0]
+      >>> jax.eval_shape(lambda seen: reward(Late(), {}, model, seen), jnp.eye(2)).shape
+      (2, 2, 1)
     """
     found: Any = network.apply(parameters, *_inputs(model, observation))
     return found

@@ -36,19 +36,15 @@ Example: a point that is pushed about; the reward is for being near, the cost is
   >>> hparams = trust_region.Hparams(
   ...     discount=0.9, method="cpo", num_trajectories=6, hidden=(3,), value_hidden=(), cg_steps=3,
   ...     value_epochs=1, value_batches=2)
-  >>> state = trust_region.init(jax.random.key(0), problem, hparams)
-  >>> state, metrics = trust_region.run(  # both at once: train; till something holds: run_until
-  ...     state, problem, hparams, num_steps=2)  # or train_until
+  >>> state = trust_region.init(jax.random.key(0), problem, hparams)  # train is init and run
+  >>> state, metrics = trust_region.run(state, problem, hparams, num_steps=2)  # or run_until
   >>> metrics.trajectories.tolist(), metrics.cost.shape  # as many were drawn for the moments first
   ([12, 18], (2,))
   >>> agent = trust_region.greedy(state, problem, hparams)  # or trust_region.policy, which draws
-  >>> mean, deviation = trust_region.act(state, hparams, jnp.zeros(2))
-  >>> mean.shape, deviation.shape
+  >>> mean, deviation = jax.eval_shape(  # of its actions; trust_region.rollout has trajectories
+  ...     lambda seen: trust_region.act(state, hparams, seen), jnp.zeros(2))
+  >>> mean.shape, deviation.shape  # train_until ends early
   ((2,), (2,))
-  >>> shapes = jax.eval_shape(lambda key: trust_region.rollout(
-  ...     key, state, problem, hparams, num_trajectories=5), jax.random.key(1))
-  >>> shapes.reward.shape
-  (4, 5)
 
 ``train`` is ``init`` and ``run``, which is ``step`` after ``step``; ``train_until`` and
 ``run_until`` end early. Many seeds are
@@ -291,7 +287,7 @@ def make_problem(
         that is no number.
 
     Example:
-      >>> from jaxltl.core.models.environment import make_box, make_environment
+      >>> from jaxltl import make_box, make_environment
       >>> def reset(key):
       ...     return jax.random.uniform(key, (1,))
       >>> def move(place, action, key):

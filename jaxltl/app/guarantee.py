@@ -119,7 +119,7 @@ def check_formula(automaton: Automaton) -> str | None:
       ValueError: no run can satisfy it.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> check_formula(to_automaton("F a")), check_formula(to_automaton("a | !a")) is None
       (None, False)
     """

@@ -153,7 +153,7 @@ def solve(
       :class:`Result`, in the order of the properties; a mistake in one does not end the others.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
       ...                    initial=[1, 0, 0], label={"a": [1]})
       >>> first, second = solve(coin, asked_for(['P=? [ F "a" ]', 'P=? [ F "b" ]']), 1e-6)

@@ -120,7 +120,7 @@ def write_hoa(automaton: Automaton, name: str = "") -> str:
       ValueError: for priorities above 255, whose acceptance formula no reader would bear.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> text = write_hoa(to_automaton("F a"))
       >>> print(text[: text.index("--BODY--")].strip())
       HOA: v1

@@ -93,7 +93,7 @@ def read_hoa_game(source: str | os.PathLike[str]) -> HoaGame:
         `controllable-AP:`, or guards of too many classes.
 
     Example:
-      >>> from jaxltl.core.games.winning import winning_region
+      >>> from jaxltl import winning_region
       >>> text = '''HOA: v1 States: 1 Start: 0 AP: 2 "request" "grant" controllable-AP: 1
       ...   acc-name: parity max even 3 Acceptance: 3 Inf(2) | (Fin(1) & Inf(0))
       ...   --BODY-- State: 0 [0 & 1] 0 {2} [0 & !1] 0 {1} [!0] 0 {0} --END--'''
@@ -397,9 +397,7 @@ def write_hoa_game(
         no objective is known.
 
     Example:
-      >>> from jaxltl.core.games.objective import parity
-      >>> from jaxltl.core.models.game import make_game
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense, make_game, parity
       >>> world = from_dense([[[0, 1.0], [1, 0]], [[1.0, 0], [1, 0]]], initial=[1, 0])
       >>> game = make_game(world, [True, False])
       >>> text = write_hoa_game(game, parity(game, [0, 1]))

@@ -42,8 +42,7 @@ class LearnedReward:
       over: of which initial states a probability is, their ``"mean"`` or the ``"worst"``.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense, to_automaton
       >>> linear = {"kernel": np.zeros((5, 1)), "bias": np.zeros(1)}  # of seen, memory and action
       >>> learned = LearnedReward(
       ...     parameters={"params": linear}, hidden=(),
@@ -96,16 +95,14 @@ def plan_in(learned: LearnedReward, world: MDP, observation: Any) -> tuple[Produ
     Differentiable as :func:`~jaxltl.algos.todirl.plan` is, where nothing is guaranteed.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense, to_automaton
       >>> linear = {"kernel": np.zeros((5, 1)), "bias": np.zeros(1)}  # of seen, memory and action
       >>> learned = LearnedReward(
       ...     parameters={"params": linear}, hidden=(),
       ...     memory=to_automaton("F g"), label_on="exit", discount=0.9, horizon=None, radius=0,
       ...     formula="F g", kinds=("plain", "goal"))
       >>> world = from_dense([[[0.5, 0.5]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
-      >>> model, solution = plan_in(learned, world, np.eye(2))
-      >>> solution.policy.shape
+      >>> jax.eval_shape(lambda seen: plan_in(learned, world, seen)[1], np.eye(2)).policy.shape
       (2, 2, 1)
     """
     model = product(world, learned.memory, label_on=learned.label_on)
@@ -155,8 +152,7 @@ def save_reward(path: str | Path, learned: LearnedReward) -> None:
 
     Example:
       >>> import pathlib, tempfile
-      >>> from jaxltl.core.automata.translate import to_automaton
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense, to_automaton
       >>> linear = {"kernel": np.zeros((5, 1)), "bias": np.zeros(1)}  # of seen, memory and action
       >>> learned = LearnedReward(
       ...     parameters={"params": linear}, hidden=(),
@@ -188,8 +184,7 @@ def load_reward(path: str | Path) -> LearnedReward:
 
     Example:
       >>> import pathlib, tempfile
-      >>> from jaxltl.core.automata.translate import to_automaton
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense, to_automaton
       >>> linear = {"kernel": np.zeros((5, 1)), "bias": np.zeros(1)}  # of seen, memory and action
       >>> learned = LearnedReward(
       ...     parameters={"params": linear}, hidden=(),

@@ -82,7 +82,7 @@ def read_model(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
 
     Example:
       >>> import tempfile
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
       ...                    label={"heads": [1]})
       >>> path = Path(tempfile.mkdtemp()) / "coin.drn.gz"
@@ -108,7 +108,7 @@ def write_model(path: str | os.PathLike[str], model: Any) -> None:
 
     Example:
       >>> import tempfile
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> path = Path(tempfile.mkdtemp()) / "coin.umb"
       >>> write_model(path, make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1]))
       >>> read_model(path).successor.tolist()

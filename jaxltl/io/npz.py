@@ -286,7 +286,7 @@ def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
 
     Example:
       >>> import pathlib, tempfile
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
       ...                    label={"heads": [1]})
       >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.npz"
@@ -336,7 +336,7 @@ def write_npz(path: str | os.PathLike[str], model: Any) -> None:
 
     Example:
       >>> import pathlib, tempfile
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
       ...                    label={"heads": [1]})
       >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.npz"

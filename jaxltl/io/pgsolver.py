@@ -67,7 +67,7 @@ def read_pgsolver(path: str | os.PathLike[str]) -> ParityGame:
 
     Example:
       >>> import tempfile
-      >>> from jaxltl.core.games.winning import winning_region
+      >>> from jaxltl import winning_region
       >>> with tempfile.NamedTemporaryFile("w", suffix=".pg") as file:
       ...     _ = file.write('parity 2; start 0; 0 1 0 1,2 "a"; 1 2 1 0; 2 3 1 2;')
       ...     file.flush()
@@ -289,9 +289,7 @@ def write_pgsolver(
 
     Example:
       >>> import pathlib, tempfile
-      >>> from jaxltl.core.games.objective import parity
-      >>> from jaxltl.core.models.game import make_game
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense, make_game, parity
       >>> world = from_dense([[[0, 1.0], [1, 0]], [[1.0, 0], [1, 0]]], initial=[1, 0])
       >>> game = make_game(world, [True, False])
       >>> path = pathlib.Path(tempfile.mkdtemp()) / "game.pg"

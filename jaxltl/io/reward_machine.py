@@ -254,8 +254,7 @@ def machine_reward(product: Any, reward: ArrayLike | jax.Array) -> Any:
       ... (0, 1, 'goal', ConstantRewardFunction(1))
       ... (0, 0, '!goal', ConstantRewardFunction(0))
       ... ''')
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.product import product
+      >>> from jaxltl import from_dense, product
       >>> world = from_dense([[[0.5, 0.5]], [[0, 1.0]]], label=[[0], [1]], propositions=["goal"])
       >>> machine_reward(product(world, machine.automaton), machine.reward)[0, :, 0].tolist()
       [0.5, 0.0]

@@ -40,7 +40,7 @@ def from_stormpy(model: Any) -> SparseMDP | IntervalMDP | Game:
 
     Example:
       >>> from importlib.util import find_spec
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0])
       >>> if find_spec("stormpy"):  # an extra of its own
       ...     assert (from_stormpy(to_stormpy(coin)).probability == coin.probability).all()
@@ -82,7 +82,7 @@ def to_stormpy(model: Any) -> Any:
 
     Example:
       >>> from importlib.util import find_spec
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0])
       >>> if find_spec("stormpy"):  # an extra of its own
       ...     assert to_stormpy(coin).nr_states == 3

@@ -76,7 +76,7 @@ def read_sharded(
 
     Example:
       >>> import tempfile, jax
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> from jaxltl.io.umb import write_umb
       >>> path = tempfile.mkdtemp() + "/coin.umb"
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])

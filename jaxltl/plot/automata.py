@@ -53,7 +53,7 @@ def automaton(
       ValueError: graphviz is asked for and cannot be run.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> figure = automaton(to_automaton("F a"), layout="matplotlib")
       >>> len(figure.axes)
       1

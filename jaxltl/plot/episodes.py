@@ -68,8 +68,7 @@ def draw_episode(environment: Any, episode: Any, *, title: str | None = None) ->
 
     Example:
       >>> import jax.numpy as jnp
-      >>> from jaxltl.core.models.environment import Timestep, make_box, make_environment
-      >>> from jaxltl.core.models.episodes import Episode
+      >>> from jaxltl import Episode, Timestep, make_box, make_environment
       >>> def step(world, action, key):
       ...     return Timestep({"place": world["place"] + action}, 0.0, False)
       >>> walk = make_environment(
@@ -336,8 +335,7 @@ def play_episode(environment: Any, episode: Any, *, title: str | None = None) ->
 
     Example:
       >>> import jax.numpy as jnp
-      >>> from jaxltl.core.models.environment import Timestep, make_box, make_environment
-      >>> from jaxltl.core.models.episodes import Episode
+      >>> from jaxltl import Episode, Timestep, make_box, make_environment
       >>> def step(world, action, key):
       ...     return Timestep({"place": world["place"] + action}, 0.0, False)
       >>> walk = make_environment(

@@ -45,7 +45,7 @@ def live_automaton(automaton: Automaton, name: str) -> str:
       The text of an SVG.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> text = live_automaton(to_automaton("F a"), "task")
       >>> text.startswith("<svg"), text.count('data-memory')
       (True, 2)

@@ -51,7 +51,7 @@ def model(model: Any) -> Figure:
       ValueError: there is no map, and there are too many states for a graph.
 
     Example:
-      >>> from jaxltl.envs.gridworld import gridworld
+      >>> from jaxltl import gridworld
       >>> len(model(gridworld("a . #")).axes)
       1
     """
@@ -171,7 +171,7 @@ def map_of(world: Any) -> NDArray[np.str_] | None:
     """The cells of a map on which a model's moves lie, ``str[rows, columns]``, or None.
 
     Example:
-      >>> from jaxltl.envs.gridworld import gridworld
+      >>> from jaxltl import gridworld
       >>> map_of(gridworld("b.#y")).tolist()
       [['b', '.', '#', 'y']]
     """

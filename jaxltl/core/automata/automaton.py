@@ -248,7 +248,7 @@ def letter_index(automaton: Automaton, letter: Letter) -> int:
       ValueError: for a combination of propositions that is not among the letters.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> letter_index(to_automaton("F a"), {"a", "unrelated"})
       1
     """
@@ -287,7 +287,7 @@ def run(automaton: Automaton, word: Iterable[Letter]) -> NDArray[np.int32]:
       int32 `[T+1]`.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> run(to_automaton("F a"), [set(), {"a"}, set()]).tolist()
       [0, 0, 1, 1]
     """
@@ -312,7 +312,7 @@ def accepts_lasso(automaton: Automaton, prefix: Iterable[Letter], cycle: Iterabl
       ValueError: if the cycle is empty, or a letter is not among the automaton's.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> accepts_lasso(to_automaton("F a"), prefix=[set()], cycle=[set(), {"a"}])
       True
     """
@@ -351,7 +351,7 @@ def complement(automaton: Automaton) -> Automaton:
       The automaton of the other words, over the same letters.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> complement(to_automaton("F a")).state_names
       ('!(F a)', 'false')
     """

@@ -35,7 +35,7 @@ def find_accepted(automaton: Automaton) -> Lasso | None:
       `(prefix, cycle)`, each a list of letters, or None if no word is accepted.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> find_accepted(to_automaton("F a"))
       ([frozenset({'a'})], [frozenset()])
     """
@@ -46,7 +46,7 @@ def is_empty(automaton: Automaton) -> bool:
     """Whether the automaton accepts no word.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> is_empty(to_automaton("F a", letters=[set()]))
       True
     """
@@ -57,7 +57,7 @@ def is_universal(automaton: Automaton) -> bool:
     """Whether the automaton accepts every word over its letters.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> is_universal(to_automaton("F a")), is_universal(to_automaton("F a", letters=[{"a"}]))
       (False, True)
     """
@@ -78,7 +78,7 @@ def find_difference(a: Task, b: Task) -> Lasso | None:
       ValueError: if there is no joint letter, or too many.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> find_difference(to_automaton("F a"), to_automaton("X F a"))
       ([frozenset({'a'})], [frozenset()])
     """
@@ -98,7 +98,7 @@ def is_equivalent(a: Task, b: Task) -> bool:
       ValueError: if there is no joint letter, or too many.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> is_equivalent(to_automaton("F a"), to_automaton("a | X F a"))
       True
       >>> is_equivalent("F (a | b)", "F a | F b")
@@ -124,7 +124,7 @@ def find_not_included(a: Task, b: Task) -> Lasso | None:
       ValueError: if there is no joint letter, or too many.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> find_not_included(to_automaton("a U b"), to_automaton("F b & a"))
       ([frozenset({'b'})], [frozenset()])
     """
@@ -145,7 +145,7 @@ def is_included(a: Task, b: Task) -> bool:
       ValueError: if there is no joint letter, or too many.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> is_included(to_automaton("a U b"), to_automaton("F b"))
       True
     """
@@ -166,7 +166,7 @@ def intersection(a: Task, b: Task) -> Automaton:
       ValueError: if there is no joint letter, or too many, or too many priorities.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> both = intersection(to_automaton("F a"), to_automaton("F b"))
       >>> is_equivalent(both, to_automaton("F a & F b"))
       True
@@ -180,7 +180,7 @@ def union(a: Task, b: Task) -> Automaton:
     Arguments, result and errors are as in `intersection`.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> either = union(to_automaton("F a"), to_automaton("F b"))
       >>> is_equivalent(either, to_automaton("F (a | b)"))
       True
@@ -194,7 +194,7 @@ def difference(a: Task, b: Task) -> Automaton:
     Arguments, result and errors are as in `intersection`.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> is_empty(difference(to_automaton("a U b"), to_automaton("F b")))
       True
     """

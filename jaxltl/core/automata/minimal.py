@@ -20,7 +20,7 @@ def minimize(automaton: Automaton) -> Automaton:
     state keeps the shortest of the names.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> minimize(to_automaton("F a & F b")).delta.shape
       (4, 4)
     """

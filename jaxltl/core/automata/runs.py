@@ -27,7 +27,7 @@ def live_states(automaton: Automaton) -> NDArray[np.bool_]:
     """bool `[Q]`, the states from which some word is accepted.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> live_states(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}])).tolist()
       [True, True, False]
     """
@@ -38,7 +38,7 @@ def universal_states(automaton: Automaton) -> NDArray[np.bool_]:
     """bool `[Q]`, the states from which every word is accepted.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> universal_states(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}])).tolist()
       [False, True, False]
     """
@@ -63,7 +63,7 @@ def align(a: Automaton, b: Automaton) -> tuple[Automaton, Automaton]:
       ValueError: if there is no joint letter, or too many.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> left, right = align(to_automaton("F a"), to_automaton("F b"))
       >>> left.propositions, left.delta.tolist(), right.delta.tolist()
       (('a', 'b'), [[0, 1, 0, 1], [1, 1, 1, 1]], [[0, 0, 1, 1], [1, 1, 1, 1]])

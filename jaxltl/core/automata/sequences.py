@@ -94,7 +94,7 @@ def reach_avoid_sequences(
         below 1.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> task = to_automaton("!a U (b & F c)", letters=[{}, {"a"}, {"b"}, {"c"}])
       >>> events = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
       >>> found = reach_avoid_sequences(task, events, ("a", "b", "c"), depth=2, most=1)

@@ -22,7 +22,7 @@ def guards(automaton: Automaton) -> dict[tuple[int, int], str]:
     disjunction of prime cubes, not always the shortest.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> guards(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}]))
       {(0, 0): '!g & !r', (0, 1): 'g', (0, 2): 'r', (1, 1): 'true', (2, 2): 'true'}
     """
@@ -34,7 +34,7 @@ def edge_guards(automaton: Automaton) -> dict[tuple[int, int, int], str]:
     """The condition of each (state, successor, priority) that some letter has, see `guards`.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> edge_guards(to_automaton("G F a"))
       {(0, 0, 0): 'a', (0, 0, 1): '!a'}
     """
@@ -135,7 +135,7 @@ def to_text(automaton: Automaton) -> str:
     each transition is followed by its priority in braces.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> print(to_text(to_automaton("F a")))
       cosafe automaton: 2 states, 2 letters over a
       >  0: F a
@@ -182,7 +182,7 @@ def to_dot(automaton: Automaton) -> str:
     and those of a parity automaton have their priority in braces there.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> print(to_dot(to_automaton("true")))
       digraph automaton {
         rankdir=LR;
@@ -213,7 +213,7 @@ def to_dict(automaton: Automaton) -> dict[str, Any]:
     """The automaton as lists, numbers and strings, for JSON; `from_dict` is the inverse.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> to_dict(to_automaton("F a"))["delta"]
       [[0, 1], [1, 1]]
     """
@@ -236,7 +236,7 @@ def from_dict(tables: Mapping[str, Any]) -> Automaton:
       ValueError: for a missing or unknown entry, or tables that are no automaton.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> from_dict(to_dict(to_automaton("F a"))).acceptance
       'cosafe'
     """

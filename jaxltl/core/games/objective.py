@@ -94,7 +94,7 @@ def states_where(model: Any, condition: States, place: str = "condition") -> jax
       ValueError: wrong shape or dtype, an unknown proposition, or a temporal operator.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> world = from_dense([[[1.0, 0]], [[0, 1.0]]], label=[[0], [1]], propositions=["a"])
       >>> states_where(world, "!a").tolist()
       [True, False]

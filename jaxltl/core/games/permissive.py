@@ -108,8 +108,7 @@ def permissive_strategy(
         does not fit the objective.
 
     Example:
-      >>> from jaxltl.core.models.game import make_game
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense, make_game
       >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]],
       ...                    label=[[0], [1]], propositions=["crash"], initial=[1, 0])
       >>> shield_ = permissive_strategy(world, "G !crash")

@@ -104,9 +104,7 @@ def shield_environment(
         strategy on a world without successor lists, or `state_of` that does not return integers.
 
     Example:
-      >>> from jaxltl.core.games.permissive import permissive_strategy
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.simulated_model import environment_of
+      >>> from jaxltl import environment_of, from_dense, permissive_strategy
       >>> model = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]],
       ...                    label=[[0], [1]], propositions=["crash"], initial=[1, 0])
       >>> safe = shield_environment(environment_of(model), permissive_strategy(model, "G !crash"))

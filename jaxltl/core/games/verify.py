@@ -81,8 +81,7 @@ def verify(winning: Any) -> Verification:
 
     Example:
       >>> from types import SimpleNamespace
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.games.objective import reach
+      >>> from jaxltl import from_dense, reach
       >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]])
       >>> found = SimpleNamespace(
       ...     game=world, objective=reach(world, np.array([False, True])),

@@ -100,8 +100,7 @@ def winning_region(
       ValueError: a formula over unknown propositions, or an unknown `chance`.
 
     Example:
-      >>> from jaxltl.core.models.game import make_game
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense, make_game
       >>> world = from_dense([[[0, 1.0], [1.0, 0]], [[1.0, 0], [0, 1.0]]],
       ...                    label=[[0], [1]], propositions=["a"])
       >>> winning_region(make_game(world, [True, True]), buchi(world, "a")).region.tolist()
@@ -164,7 +163,7 @@ def almost_sure_buchi(game: Any, accepting: States) -> Winning:
       ValueError: as of :func:`buchi`.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> world = from_dense([[[1.0, 0, 0, 0]], [[0.5, 0.5, 0, 0]], [[0.5, 0, 0, 0.5]],
       ...                     [[0, 0, 0, 1.0]]])
       >>> almost_sure_buchi(world, np.arange(4) == 0).region.tolist()

@@ -78,7 +78,7 @@ def attractor(
       ValueError: unknown rule or chance.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[0, 1.0]], [[0, 1.0]]])
       >>> attractor(mdp, np.array([True, False])).region.tolist()
       [True, False]

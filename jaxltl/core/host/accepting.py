@@ -36,7 +36,7 @@ def accepting_region(mdp: HostMDP, priority: Integers) -> AcceptingRegion:
       priority: ``int[T]``, what each entry reads.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> ring = make_sparse(None, [0, 1, 2, 3], [1, 0, 2], [1.0, 1.0, 1.0]).host
       >>> accepting_region(ring, np.array([1, 0, 1])).region.tolist()
       [True, True, False]

@@ -77,7 +77,7 @@ def host_product(
       ValueError: there are more than 2^31 pairs, with their number.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> ring = make_sparse(None, [0, 1, 2], [1, 0], [1.0, 1.0]).host
       >>> found = host_product(ring, np.array([[0, 1], [1, 1]]), np.array([0, 1]), [0], [0])
       >>> found.base_state.tolist(), found.memory.tolist(), found.host.successor.tolist()

@@ -150,7 +150,7 @@ def simplify(formula: Formula) -> Formula:
     """An equivalent formula in negation normal form, with limits pulled outwards.
 
     Example:
-      >>> from jaxltl.core.logic.ltl import parse_ltl
+      >>> from jaxltl import parse_ltl
       >>> print(simplify(parse_ltl("G F (a | X F b) & F F c")))
       (G F a | G F b) & F c
     """

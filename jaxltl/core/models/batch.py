@@ -47,7 +47,7 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
         message names the world, counted from 0.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> one = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["goal"])
       >>> two = from_dense([[[1.0]]], label=[[1]], propositions=["goal"])
       >>> stack_products([one, two], "F goal").letter.tolist()
@@ -120,7 +120,7 @@ def pad_states(mdp: MDP, num_states: int) -> MDP:
       ValueError: there are more states already.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> pad_states(from_dense([[[1.0]]]), 3).successor[:, 0, 0].tolist()
       [0, 1, 2]
     """
@@ -185,7 +185,7 @@ def world(model: Product, number: int) -> Product:
     """The product of one of the stacked worlds, padding included.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> one = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["goal"])
       >>> world(stack_products([one, one], "F goal"), 1).state_shape
       (2, 2)

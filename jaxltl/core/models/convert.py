@@ -31,7 +31,7 @@ def to_sparse(model: Any) -> SparseMDP:
       ValueError: the model is none of these.
 
     Example:
-      >>> from jaxltl.core.models.mdp import make_mdp
+      >>> from jaxltl import make_mdp
       >>> mdp = make_mdp([[[0, 1], [1, 0]], [[1, 0], [0, 0]]],
       ...                [[[0.5, 0.5], [1, 0]], [[1, 0], [0, 0]]])
       >>> sparse = to_sparse(mdp)

@@ -307,7 +307,7 @@ def counts_on(model: MDP | DenseMDP | SparseMDP, counts: TransitionCounts) -> ND
       ValueError: naming the transition: the model does not have it; or as :func:`places`.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
       >>> counts_on(coin, make_counts([0, 0, 0], [0, 0, 0], [2, 1, 2])).tolist()
       [1, 2, 0, 0]

@@ -109,7 +109,7 @@ def make_game(model: Any, system: Sequence[bool] | chex.Array) -> Game:
       ValueError: a state has no owner, or no move.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> game = make_game(from_dense([[[0, 1.0]], [[1.0, 0]]]), [True, False])
       >>> game.system.tolist()
       [True, False]

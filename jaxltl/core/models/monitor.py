@@ -56,7 +56,7 @@ class Monitor:
       verdict: ``int32[Q]``, the :class:`Verdict` in each state.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> monitor = make_monitor(to_automaton("F a"))
       >>> monitor.delta.tolist(), monitor.verdict.tolist()
       ([[0, 1], [1, 1]], [0, 1])
@@ -83,7 +83,7 @@ def verdict(automaton: Automaton, word: Iterable[Letter]) -> Verdict:
       ValueError: a letter is not among the automaton's.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> verdict(to_automaton("F a"), [set(), {"a"}]).name, verdict(to_automaton("F a"), []).name
       ('SATISFIED', 'UNDECIDED')
     """
@@ -105,7 +105,7 @@ def lasting_verdicts(automaton: Automaton) -> np.ndarray:
     never undecided. On the host.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> lasting_verdicts(to_automaton("G F a"))[0].tolist()
       [2, 1]
     """
@@ -130,7 +130,7 @@ def make_monitor(automaton: Automaton) -> Monitor:
       :class:`Monitor`, for :func:`monitor_step`.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> make_monitor(to_automaton("G a")).verdict.tolist()
       [0, 2]
     """
@@ -156,7 +156,7 @@ def monitor_step(monitor: Monitor, state: chex.Array, letter: chex.Array) -> jax
       TypeError: letters that are not integers, such as a row of booleans.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> monitor = make_monitor(to_automaton("F a"))
       >>> monitor_step(monitor, monitor.initial, jnp.array([0, 1])).tolist()
       [0, 1]
@@ -176,7 +176,7 @@ def monitor_verdict(monitor: Monitor, state: chex.Array) -> jax.Array:
       ``int32[...]``, of :class:`Verdict`. Integers: there is no derivative.
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> Verdict(int(monitor_verdict(make_monitor(to_automaton("true")), 0))).name
       'SATISFIED'
     """
@@ -205,7 +205,7 @@ def trace_verdicts(
         letter is not looked at).
 
     Example:
-      >>> from jaxltl.core.automata.translate import to_automaton
+      >>> from jaxltl import to_automaton
       >>> trace_verdicts(make_monitor(to_automaton("F a")), [[0, 1, 0], [0, 1, 1]], [3, 1]).tolist()
       [[0, 0, 1, 1], [0, 0, 0, 0]]
     """

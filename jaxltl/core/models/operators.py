@@ -55,7 +55,7 @@ def expectation(model: Any, value: jax.Array) -> jax.Array:
       TypeError: the model is none.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
       >>> expectation(mdp, jnp.array([0.0, 4.0])).tolist()
       [[2.0], [4.0]]
@@ -207,7 +207,7 @@ def pushforward(model: Any, mass: jax.Array) -> jax.Array:
       TypeError: the model is none.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
       >>> pushforward(mdp, jnp.array([[1.0], [2.0]])).tolist()
       [0.5, 2.5]

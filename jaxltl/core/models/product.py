@@ -187,7 +187,7 @@ def letters_of(
       The letters, each once.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> world = from_dense([[[1.0, 0]], [[0, 1.0]]], label=[[0], [1]], propositions=["a"])
       >>> [sorted(letter) for letter in letters_of(world)]
       [[], ['a']]
@@ -218,7 +218,7 @@ def product(world: Any, task: Automaton | Formula | str, *, label_on: str = "ent
         shows a letter that the automaton was not built for.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["goal"])
       >>> product(world, "F goal").state_shape
       (2, 2)

@@ -36,7 +36,7 @@ def with_allowed(model: Any, allowed: chex.Array) -> Any:
         leaves a state without any (the latter two unless something is traced).
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[1.0], [1.0]]])
       >>> with_allowed(mdp, np.array([[False, True]])).available.tolist()
       [[False, True]]

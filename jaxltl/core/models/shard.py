@@ -89,7 +89,7 @@ def shard(
       ValueError: the model, the axis or the order is none.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> mesh = jax.make_mesh((1,), ("states",))
       >>> sharded = shard(from_dense([[[0.5, 0.5]], [[0.0, 1.0]]]), mesh)
       >>> from_mesh(sharded, to_mesh(sharded, np.array([1.0, 2.0]))).tolist()

@@ -49,7 +49,7 @@ def environment_of(
         the task to ``task_environment``), or an opponent without a game.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> coin = environment_of(from_dense(
       ...     [[[.5, .5]], [[0, 1]]], label=[[0], [1]], propositions=["heads"]))
       >>> coin.actions.num, coin.observations.shape, coin.labels(1).tolist()

@@ -53,7 +53,7 @@ def states_satisfying(
       ValueError: an unknown label or a temporal operator.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse(None, [0, 1, 2], [1, 1], [1.0, 1.0], initial=[1, 0],
       ...                     label=[[1], [0]], propositions=["a"])
       >>> states_satisfying(model, "!a | init").tolist()

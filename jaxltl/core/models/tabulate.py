@@ -109,7 +109,7 @@ def tabulate(
         otherwise than it is drawn, more states than `max_states`, or a world without any action.
 
     Example:
-      >>> from jaxltl.core.models.environment import make_environment
+      >>> from jaxltl import make_environment
       >>> def step(place, action, key):
       ...     place = jnp.clip(place + 2 * action - 1, 0, 4)
       ...     return Timestep(place, reward=1.0, terminated=place == 4)

@@ -367,8 +367,7 @@ def stack_tasks(environments: Sequence[Environment]) -> Environment:
       ValueError: none, or worlds of different structure.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.simulated_model import environment_of
+      >>> from jaxltl import environment_of, from_dense
       >>> walk = environment_of(from_dense(
       ...     [[[.5, .5]], [[.5, .5]]], label=[[0], [1]], propositions=["a"]))
       >>> both = stack_tasks([task_environment(walk, "F a"), task_environment(walk, "G F a")])

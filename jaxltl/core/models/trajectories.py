@@ -69,7 +69,7 @@ def make_trajectories(
         step and the values (all counted from 0).
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]])
       >>> make_trajectories(world, [[(0, 0), (1, 0)], [(1, 0)]]).length.tolist()
       [2, 1]

@@ -59,7 +59,7 @@ class PropertyStrategy(NamedTuple):
         product's entries. Else None.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> safe_or_not = make_sparse([0, 2, 3, 4], [0, 1, 3, 4, 5], [1, 1, 2, 1, 2],
       ...                           [1, 0.5, 0.5, 1, 1], initial=[1, 0, 0], label={"a": [1]})
       >>> solve_property(safe_or_not, 'Pmin=? [ F "a" ]').strategy.row.tolist()  # in each state
@@ -85,7 +85,7 @@ class Answer(NamedTuple):
       strategy: what attains the value; None where nothing is chosen.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
       ...                    initial=[1, 0, 0], label={"a": [1]})
       >>> found = solve_property(coin, 'P>=0.4 [ F "a" ]')
@@ -151,7 +151,7 @@ def solve_property(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
       ...                    initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["a"])
       >>> solve_property(coin, 'P=? [ F "a" ]').value.tolist()

@@ -52,7 +52,7 @@ def answer_several(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
       >>> answer_several(model, 'multi(P>=0.5 [ F "a" ], P>=0.4 [ F "b" ])').holds

@@ -44,7 +44,7 @@ def average_reward(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 2, 3, 4, 5], [1, 2, 0, 1, 2],
       ...                     [0.25, 0.75, 1, 1, 1])
       >>> found = average_reward(model, [3.0, 8.0, 4.0])

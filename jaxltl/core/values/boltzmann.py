@@ -108,7 +108,7 @@ def boltzmann_value(
     Value and policy are differentiable in the reward, the discount and the probabilities.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[1.0], [1.0]]])
       >>> round(boltzmann_value(mdp, jnp.ones((1, 2)), 0.5).value.item(), 4)
       2.0
@@ -236,7 +236,7 @@ def boltzmann_fixed_points(
     from one of these by `initial`.
 
     Example:
-      >>> from jaxltl.core.models.mdp import make_mdp
+      >>> from jaxltl import make_mdp
       >>> loop_or_end = make_mdp([[[0], [1]], [[1], [1]]], [[[1.0], [1.0]], [[1.0], [0.0]]])
       >>> reward = jnp.array([[0.2, 0.0], [0.0, 0.0]])  # for going round
       >>> found = boltzmann_fixed_points(

@@ -39,7 +39,7 @@ def next_probability(model: Any, target: Any, *, objective: str = "max") -> Solu
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse([0, 2, 3], [0, 2, 3, 4], [0, 1, 0, 1], [0.75, 0.25, 1, 1])
       >>> found = next_probability(model, [False, True])
       >>> found.value.tolist(), found.policy.tolist()
@@ -89,7 +89,7 @@ def bounded_reachability(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse(None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0])
       >>> bounded_reachability(model, [False, True], 3).value.tolist()
       [0.875, 1.0]
@@ -122,7 +122,7 @@ def cumulative_reward(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse(None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0])
       >>> cumulative_reward(model, [1.0, 0.0], 3).value.tolist()
       [1.75, 0.0]
@@ -157,7 +157,7 @@ def instantaneous_reward(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse(None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0])
       >>> instantaneous_reward(model, [1.0, 0.0], 3).value.tolist()
       [0.125, 0.0]
@@ -200,7 +200,7 @@ def reward_bounded_reachability(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse(None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0])
       >>> reward_bounded_reachability(model, [False, True], [0.1, 0], 0.3).value.tolist()
       [0.875, 1.0]

@@ -41,7 +41,7 @@ class DataGuarantee:
         order, if a choice were known to be what its frequencies say.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [.5, .5, 1, 1], initial=[1, 0, 0],
       ...                    label=[[0], [1], [0]], propositions=["a"])
       >>> found = learn_guarantee(coin, np.array([900, 100, 0, 0]), "F a", confidence=0.95)
@@ -94,7 +94,7 @@ def learn_guarantee(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [.5, .5, 1, 1], initial=[1, 0, 0],
       ...                    label=[[0], [1], [0]], propositions=["a"])
       >>> found = learn_guarantee(coin, np.array([900, 100, 0, 0]), "F a", 0.95,
@@ -196,7 +196,7 @@ def guarantee_curve(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [.5, .5, 1, 1], initial=[1, 0, 0],
       ...                    label=[[0], [1], [0]], propositions=["a"])
       >>> curve = guarantee_curve(coin, np.array([900, 100, 0, 0]), "F a", 0.95, [10, 100, 1000])

@@ -211,7 +211,7 @@ def policy_value(
     Differentiable in the policy, the reward, the discount and the probabilities.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[1.0]]])
       >>> round(policy_value(mdp, jnp.array([0]), jnp.ones((1, 1)), 0.5).value.item(), 4)
       2.0
@@ -292,7 +292,7 @@ def optimal_value(
     greedy policy is unique.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]])
       >>> best = optimal_value(mdp, jnp.array([[0.0, 0.0], [1.0, 1.0]]), 0.5)
       >>> [round(v, 4) for v in best.value.tolist()], best.policy.tolist()

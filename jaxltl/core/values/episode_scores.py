@@ -74,8 +74,7 @@ def episode_evaluator(
     goes alone; searches such as ``cce`` need none.
 
     Example:
-      >>> from jaxltl.core.models.environment import Timestep, make_box, make_environment
-      >>> from jaxltl.core.models.episodes import agent_of
+      >>> from jaxltl import Timestep, agent_of, make_box, make_environment
       >>> def step(place, action, key):
       ...     return Timestep(place + action, -jnp.sum(place**2), False, cost=jnp.sum(action**2))
       >>> cart = make_environment(

@@ -54,9 +54,7 @@ class EpisodeTotals(NamedTuple):
       discounted_visits: the k-th reading, from 0, counts ``discount ** k``.
 
     Example:
-      >>> from jaxltl.core.models.episodes import agent_of
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.simulated_model import environment_of
+      >>> from jaxltl import agent_of, environment_of, from_dense
       >>> clock = environment_of(from_dense([[[0.0, 1.0]], [[1.0, 0.0]]]))
       >>> agent = agent_of(lambda observation, key: jnp.int32(0))
       >>> keys = jax.random.split(jax.random.key(0), 4)
@@ -189,14 +187,18 @@ class Evaluation:
         finite, whose mean is then not either.
 
     Example:
-      >>> from jaxltl.core.models.episodes import agent_of
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.simulated_model import environment_of
-      >>> clock = environment_of(from_dense([[[0.0, 1.0]], [[1.0, 0.0]]]))
+      >>> from jaxltl import agent_of, environment_of, from_dense
+      >>> from jaxltl.core.models.task_environment import task_environment
+      >>> coin = from_dense(
+      ...     [[[.0, .6, .4]], [[.0, 1., .0]], [[.0, .0, 1.]]], initial=[1, 0, 0],
+      ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["heads", "tails"])
+      >>> task = task_environment(environment_of(coin), "!tails U heads")
       >>> agent = agent_of(lambda observation, key: jnp.int32(0))
-      >>> found = evaluate(jax.random.key(0), agent, clock, num_episodes=4, num_steps=3)
-      >>> found.length.mean, found.cut_off, found.success, found.status.name
-      (3.0, 4, None, 'CONVERGED')
+      >>> found = evaluate(jax.random.key(0), agent, task, num_episodes=256, num_steps=5)
+      >>> found.success.lower < 0.6 < found.success.upper, found.success.method
+      (True, 'Clopper-Pearson')
+      >>> found.length.mean, found.threshold, found.status.name
+      (1.0, None, 'CONVERGED')
     """
 
     success: Estimate | None
@@ -302,10 +304,7 @@ def evaluate(
     Not differentiable: what is returned is numbers of Python, from concrete arguments.
 
     Example:
-      >>> from jaxltl.core.models.episodes import agent_of
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.simulated_model import environment_of
-      >>> from jaxltl.core.models.task_environment import task_environment
+      >>> from jaxltl import agent_of, environment_of, from_dense, task_environment
       >>> coin = from_dense(
       ...     [[[.0, .6, .4]], [[.0, 1., .0]], [[.0, .0, 1.]]], initial=[1, 0, 0],
       ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["heads", "tails"])

@@ -36,7 +36,7 @@ def hitting_time(model: Any, policy: Any, target: Any) -> NDArray[np.float64]:
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
       >>> hitting_time(mdp, np.array([0, 0]), np.array([False, True])).tolist()
       [2.0, 0.0]

@@ -56,8 +56,7 @@ def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> S
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.game import make_game
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense, make_game
       >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[1.0, 0], [0, 1.0]]])
       >>> game = make_game(world, [True, False])
       >>> mean = mean_payoff(game, jnp.array([[1.0, 4.0], [0.0, 3.0]]))

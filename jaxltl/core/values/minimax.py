@@ -98,8 +98,7 @@ def minimax_value(
     choices are unique.
 
     Example:
-      >>> from jaxltl.core.models.game import make_game
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense, make_game
       >>> world = from_dense([[[0, 1.0], [0, 1.0]], [[1.0, 0], [1.0, 0]]])
       >>> game = make_game(world, [True, False])
       >>> reward = jnp.array([[1.0, 2.0], [0.0, 1.0]])
@@ -167,8 +166,7 @@ def strategy_value(
     wherever the environment's best answer is unique.
 
     Example:
-      >>> from jaxltl.core.models.game import make_game
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense, make_game
       >>> world = from_dense([[[0, 1.0], [0, 1.0]], [[1.0, 0], [1.0, 0]]])
       >>> game = make_game(world, [True, False])
       >>> reward = jnp.array([[1.0, 2.0], [0.0, 1.0]])

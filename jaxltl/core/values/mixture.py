@@ -141,9 +141,7 @@ def reaching(
       over: ``"mean"`` of the initial states, or the ``"worst"``.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.product import product
-      >>> from jaxltl.core.values.optimal_actions import optimal_actions
+      >>> from jaxltl import from_dense, optimal_actions, product
       >>> world = from_dense([[[0, 1.0, 0], [0, 0, 1.0]], [[0, 1.0, 0]] * 2, [[0, 0, 1.0]] * 2],
       ...                    label=[[0], [1], [0]], propositions=["goal"], initial=[1, 0, 0])
       >>> model = product(world, "F goal")

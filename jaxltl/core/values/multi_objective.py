@@ -44,7 +44,7 @@ class Front(NamedTuple):
       product: the model beside what the objectives remember; rows are the model's `base_row`.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
       >>> front = pareto(model, [Objective(target="a"), Objective(target="b")]).front
@@ -73,7 +73,7 @@ class NearestMixture(NamedTuple):
       gap: ``float64[n]``, how far it may miss each threshold at most.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
       >>> both = [Objective(target="a"), Objective(target="b")]
@@ -101,7 +101,7 @@ class Achievable(NamedTuple):
       nearest: of None, the mixture of policies that comes nearest to the thresholds.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
       >>> both = [Objective(target="a"), Objective(target="b")]
@@ -137,7 +137,7 @@ class ConstrainedOptimum(NamedTuple):
         among those that come nearest to them.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
       >>> both = [Objective(target="a"), Objective(target="b", threshold=0.25)]
@@ -168,7 +168,7 @@ class Pareto(NamedTuple):
       status: CONVERGED if the gap is as small as asked.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
       >>> curve = pareto(model, [Objective(target="a"), Objective(target="b")])
@@ -209,7 +209,7 @@ def achievable(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                     initial=[1, 0, 0], label=[[0, 0], [1, 0], [0, 1]],
       ...                     propositions=["a", "b"])
@@ -252,7 +252,7 @@ def pareto(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                     initial=[1, 0, 0], label=[[0, 0], [1, 0], [0, 1]],
       ...                     propositions=["a", "b"])
@@ -305,7 +305,7 @@ def multi_objective(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
       >>> one, other = Objective(target="a"), Objective(target="b", threshold=0.4)

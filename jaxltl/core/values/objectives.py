@@ -43,8 +43,7 @@ class Objective:
         none or several of the four are given, or a direction, a label or a shape is wrong.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
-      >>> from jaxltl.core.values.multi_objective import multi_objective
+      >>> from jaxltl import make_sparse, multi_objective
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
       >>> wanted = [Objective(formula="F G a"), Objective(target="b", threshold=0.25)]

@@ -52,7 +52,7 @@ def occupancy_measure(
     Differentiable in the policy, the discount, `initial` and the probabilities.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[0, 1.0]], [[0, 1.0]]], initial=[1, 0])
       >>> x = occupancy_measure(mdp, jnp.array([0, 0]), 0.5).value
       >>> [round(v, 4) for v in x[:, 0].tolist()]

@@ -55,8 +55,7 @@ class OptimalActions:
       status: CONVERGED if the loss is within the tolerance, else PRECISION.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.product import product
+      >>> from jaxltl import from_dense, product
       >>> world = from_dense([[[0, 1.0, 0], [0, 0.5, 0.5]], [[0, 1.0, 0]] * 2, [[0, 0, 1.0]] * 2],
       ...                    label=[[0], [1], [0]], propositions=["goal"])
       >>> found = optimal_actions(product(world, "F goal"))
@@ -114,8 +113,7 @@ def optimal_actions(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.product import product
+      >>> from jaxltl import from_dense, product
       >>> world = from_dense([[[0, 1.0, 0], [0, 0.5, 0.5]], [[0, 1.0, 0]] * 2, [[0, 0, 1.0]] * 2],
       ...                    label=[[0], [1], [0]], propositions=["goal"])
       >>> optimal_actions(product(world, "F goal")).allowed[0].tolist()

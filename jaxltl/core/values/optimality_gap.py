@@ -49,8 +49,7 @@ class OptimalityGap(NamedTuple):
         :class:`~jaxltl.core.models.tabulate.Table`.
 
     Example:
-      >>> from jaxltl.core.models.environment import Timestep, make_environment
-      >>> from jaxltl.core.models.tabulate import tabulate
+      >>> from jaxltl import Timestep, make_environment, tabulate
       >>> corridor = make_environment(
       ...     lambda key: jnp.int32(2),
       ...     lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),
@@ -98,8 +97,7 @@ def tabulate_policy(
     Not differentiable: the answer is a NumPy array.
 
     Example:
-      >>> from jaxltl.core.models.environment import Timestep, make_environment
-      >>> from jaxltl.core.models.tabulate import tabulate
+      >>> from jaxltl import Timestep, make_environment, tabulate
       >>> corridor = make_environment(
       ...     lambda key: jnp.int32(2),
       ...     lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),
@@ -172,8 +170,7 @@ def optimality_gap(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.environment import Timestep, make_environment
-      >>> from jaxltl.core.models.tabulate import tabulate
+      >>> from jaxltl import Timestep, make_environment, tabulate
       >>> corridor = make_environment(
       ...     lambda key: jnp.int32(2),
       ...     lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),

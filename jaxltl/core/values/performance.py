@@ -60,8 +60,7 @@ class Performance:
       status: whether the bounds at all starts are as narrow as asked.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.product import product
+      >>> from jaxltl import from_dense, product
       >>> world = from_dense([[[0, 0.5, 0.5]], [[0, 1.0, 0]], [[0, 0, 1.0]]], initial=[0.5, 0.5, 0],
       ...                    label=[[0], [1], [0]], propositions=["a"])
       >>> found = task_performance(product(world, "F a", label_on="exit"), jnp.ones((3, 2, 1)))
@@ -112,8 +111,7 @@ def task_performance(
     forward mode, and with ``method="general"`` in reverse mode too.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.product import product
+      >>> from jaxltl import from_dense, product
       >>> world = from_dense([[[0.5, 0.25, 0.25]], [[0, 1.0, 0]], [[0, 0, 1.0]]],
       ...                    label=[[0], [1], [0]], propositions=["a"], initial=[1, 0, 0])
       >>> model = product(world, "F a", label_on="exit")
@@ -284,8 +282,7 @@ def task_performances(
     Not differentiable; :func:`task_performance` is.
 
     Example:
-      >>> from jaxltl.core.models.batch import stack_products
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense, stack_products
       >>> def world(p):
       ...     return from_dense([[[0, p, 1 - p]], [[0, 1.0, 0]], [[0, 0, 1.0]]], initial=[1, 0, 0],
       ...                       label=[[0], [1], [0]], propositions=["a"])
@@ -452,8 +449,7 @@ def infeasible_starts(model: Product) -> jax.Array:
       ``bool[S]``; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.product import product
+      >>> from jaxltl import from_dense, product
       >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
       >>> [infeasible_starts(product(world, task)).tolist() for task in ("G F g", "G !g")]
       [[False, False], [True, True]]
@@ -522,8 +518,7 @@ def summarize(
       ValueError: names are missing, double or unknown, or no world is left.
 
     Example:
-      >>> from jaxltl.core.models.batch import stack_products
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense, stack_products
       >>> def world(p):
       ...     return from_dense([[[0, p, 1 - p]], [[0, 1.0, 0]], [[0, 0, 1.0]]], initial=[1, 0, 0],
       ...                       label=[[0], [1], [0]], propositions=["a"])

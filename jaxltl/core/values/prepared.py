@@ -54,7 +54,7 @@ class Prepared:
       levels, choices, terms, groups: see the plan, static.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
       >>> prepared = prepare(coin, [False, True, False])
       >>> prepared.question, prepared.objective, prepared.num_states, prepared.num_rows
@@ -128,7 +128,7 @@ def prepare(
     Not differentiable: it reads the graph, on the host; :func:`solve_prepared` has the derivatives.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
       >>> prepared = prepare(coin, [False, True, False])
       >>> solve = jax.jit(lambda p: solve_prepared(prepared, probability=p).value[0])
@@ -238,14 +238,16 @@ def solve_prepared(
     a policy, along distributions; of an optimum with its policy held fixed.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
       >>> prepared = prepare(coin, [False, True, False])
-      >>> def value(p):
-      ...     probability = jnp.array([p, 1 - p, 1, 1])
-      ...     return solve_prepared(prepared, probability=probability).value[0]
-      >>> value(0.25).item(), round(jax.grad(value)(0.25).item(), 6)
-      (0.25, 1.0)
+      >>> solve = jax.jit(lambda p: solve_prepared(prepared, probability=p))
+      >>> found = solve(jnp.array([0.25, 0.75, 1, 1]))
+      >>> round(found.value[0].item(), 3), found.status.item()
+      (0.25, 0)
+      >>> slope = jax.eval_shape(jax.grad(lambda p: solve(p).value[0]), prepared.probability)
+      >>> slope.shape
+      (4,)
     """
     probability, reward = given_numbers(prepared, probability, reward)
     policy = None if policy is None else jnp.asarray(policy)

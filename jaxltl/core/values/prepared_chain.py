@@ -54,8 +54,7 @@ def evaluate_prepared(
     Differentiable, forward and reverse, as there.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
-      >>> from jaxltl.core.values.prepared import prepare
+      >>> from jaxltl import make_sparse, prepare
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
       >>> prepared = prepare(coin, [False, True, False])
       >>> value = lambda p: evaluate_prepared(prepared, probability=jnp.array([p, 1 - p, 1, 1]))[0]

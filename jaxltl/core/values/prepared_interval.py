@@ -67,7 +67,7 @@ class PreparedInterval:
       circling: whether who gets out may stay for ever, static.
 
     Example:
-      >>> from jaxltl.core.models.interval import interval_rows
+      >>> from jaxltl import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1])
       >>> prepared = prepare_interval(coin, [False, True, False])
       >>> prepared.objective, prepared.nature, prepared.size, prepared.node.tolist()
@@ -134,8 +134,7 @@ def prepare_interval(
     derivatives.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
-      >>> from jaxltl.core.models.interval import make_interval
+      >>> from jaxltl import make_interval, make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
       >>> model = make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
       >>> prepared = prepare_interval(model, [False, True, False])
@@ -260,7 +259,7 @@ def solve_prepared_interval(
     order of each row's successors held fixed: where neither is tied, that is the derivative.
 
     Example:
-      >>> from jaxltl.core.models.interval import interval_rows
+      >>> from jaxltl import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1])
       >>> prepared = prepare_interval(coin, [False, True, False])
       >>> value = jax.jit(lambda low: solve_prepared_interval(prepared, lower=low).value[0])

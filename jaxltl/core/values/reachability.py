@@ -111,7 +111,7 @@ def reachability_probability(
     Differentiable in the policy and in the probabilities, with the support held fixed.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[0.5, 0.25, 0.25]], [[0, 1.0, 0]], [[0, 0, 1.0]]])
       >>> round(reachability_probability(mdp, jnp.array([False, True, False])).value[0].item(), 3)
       0.5

@@ -94,8 +94,7 @@ def robust_reachability(
     ends.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
-      >>> from jaxltl.core.models.interval import make_interval
+      >>> from jaxltl import make_interval, make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
       >>> model = make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
       >>> robust_reachability(model, [False, True, False]).value.tolist()
@@ -142,7 +141,7 @@ def robust_total_reward(
     ends.
 
     Example:
-      >>> from jaxltl.core.models.interval import interval_rows
+      >>> from jaxltl import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
       >>> found = robust_total_reward(coin, [1.0, 0.0], [False, True], objective="min")
       >>> found.value.round(6).tolist(), found.nature.tolist()  # tosses, if nature is against it
@@ -185,7 +184,7 @@ def robust_discounted_value(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.interval import interval_rows
+      >>> from jaxltl import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
       >>> found = robust_discounted_value(coin, [1.0, 0.0], 0.5)
       >>> found.value.round(6).tolist(), found.nature.tolist()
@@ -230,7 +229,7 @@ def robust_expectation(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.interval import interval_rows
+      >>> from jaxltl import interval_rows
       >>> model = interval_rows(None, [0, 2, 3], [0, 1, 1], [.25, .5, 1], [.5, .75, 1])
       >>> robust_expectation(model, [0.0, 4.0])[0].tolist()
       [2.0, 4.0]

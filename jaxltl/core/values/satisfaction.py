@@ -71,8 +71,7 @@ def satisfaction_probability(
     Not so of products of sparse and of interval models, which are solved on the host.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.product import product
+      >>> from jaxltl import from_dense, product
       >>> world = from_dense([[[0, 1.0, 0], [0, 0.5, 0.5]], [[0, 1.0, 0]] * 2, [[0, 0, 1.0]] * 2],
       ...                    label=[[0], [1], [0]], propositions=["goal"], initial=[1, 0, 0])
       >>> model = product(world, "F goal")
@@ -158,8 +157,7 @@ def optimal_satisfaction(
     held fixed; not so of products of sparse and of interval models, which are solved on the host.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
-      >>> from jaxltl.core.models.product import product
+      >>> from jaxltl import from_dense, product
       >>> world = from_dense([[[0, 0.5, 0.5], [0, 0.75, 0.25]], [[0, 1, 0]] * 2, [[0, 0, 1]] * 2],
       ...                    label=[[0], [1], [0]], propositions=["goal"], initial=[1, 0, 0])
       >>> best = optimal_satisfaction(product(world, "F goal"))

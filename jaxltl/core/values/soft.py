@@ -68,7 +68,7 @@ def soft_value(
     with constants up to the discount, as MacQueen's bounds need.
 
     Example:
-      >>> from jaxltl.core.models.mdp import from_dense
+      >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[1.0], [1.0]]])
       >>> round(soft_value(mdp, jnp.zeros((1, 2)), 0.5).value.item(), 4)  # 2 log 2
       1.3863

@@ -37,7 +37,7 @@ class Satisfaction(NamedTuple):
       row: ``int32[N]``, the row of the model that the policy takes in each of them.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> two_ways = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                        initial=[1, 0, 0], label={"a": [1]})
       >>> found = sparse_satisfaction(two_ways, "F a")
@@ -89,7 +89,7 @@ def sparse_satisfaction(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
       ...                    initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["a"])
       >>> sparse_satisfaction(coin, "F G a").solution.value.tolist()
@@ -181,8 +181,7 @@ def product_satisfaction(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.core.models.product import product
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse, product
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
       ...                    initial=[1, 0, 0], label={"a": [1]})
       >>> product_satisfaction(product(coin, "F a")).value[:, 0].tolist()

@@ -80,7 +80,7 @@ def total_reward(
     with the support held fixed.
 
     Example:
-      >>> from jaxltl.core.models.sparse import make_sparse
+      >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0])
       >>> total_reward(coin, np.ones(2), np.array([False, True])).value.round(6).tolist()
       [2.0, 0.0]
