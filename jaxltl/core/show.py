@@ -322,7 +322,9 @@ def told(value: Any) -> str:
 def _tree(value: Any) -> str:
     """What is no single array: the name of its type or function, and how many arrays are in it."""
     leaves = [x for x in _leaves(value) if is_array(x)]
-    inner = getattr(value, "func", value)
+    inner = value
+    while hasattr(inner, "func"):  # of partial functions
+        inner = inner.func
     name = getattr(inner, "__name__", type(value).__name__)
     if not leaves and (callable(value) or not isinstance(value, dict | list | tuple)):
         return cut(name)

@@ -95,7 +95,8 @@ def _facts(solution: Any) -> Iterator[str]:
         coded(solution.status, Status))
     yield f"value {told(solution.value)}"
     yield apart(solution.lower, solution.upper)
-    yield f"{span(solution.num_steps)} steps"
+    steps = span(solution.num_steps)
+    yield "1 step" if steps == "1" else f"{steps} steps"
     yield f"residual {span(solution.residual)}"
     yield f"by {solution.method}" if str(solution.method) else ""
     yield f"policy {array(solution.policy)}" if is_array(solution.policy) else ""
