@@ -1,5 +1,6 @@
-"""``solvers_over_processes NAMES COORDINATOR PROCESS PROCESSES``: on a mesh of all of them."""
+"""``solvers_over_processes NAMES REACHES COORDINATOR PROCESS PROCESSES``: on a mesh of all."""
 
+import ast
 import os
 import sys
 
@@ -7,7 +8,7 @@ import jax
 import numpy as np
 
 
-def main(names: str, coordinator: str, process: str, processes: str) -> None:
+def main(names: str, reaches: str, coordinator: str, process: str, processes: str) -> None:
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_num_cpu_devices", 2)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
@@ -19,7 +20,7 @@ def main(names: str, coordinator: str, process: str, processes: str) -> None:
     from tests.core.values.test_over_mesh import SOLVERS, quantities
 
     mesh = jax.make_mesh((jax.device_count(),), ("states",))
-    for reach in (2, None):
+    for reach in ast.literal_eval(reaches):
         mdp = world(0, reach)
         sharded = shard(mdp, mesh)
         given = [to_mesh(sharded, x) for x in quantities(mdp)]

@@ -28,12 +28,12 @@ TASKS = ("F(a & F b)", "!a U b", "F(a & F c) & F b", "(!c U (b & F c)) & F a")
 
 def way(grid, wanted, avoided):
     """Steps to a wanted cell across cells that are not avoided, from each cell of a torus."""
-    far = jnp.where(wanted, 0.0, 99.0)
-    for _ in range(16):
+    def nearer(_, far):
         near = jnp.minimum(jnp.minimum(jnp.roll(far, 1, 0), jnp.roll(far, -1, 0)),
                            jnp.minimum(jnp.roll(far, 1, 1), jnp.roll(far, -1, 1)))
-        far = jnp.where(wanted, 0.0, jnp.where(avoided, 99.0, jnp.minimum(far, near + 1)))
-    return far
+        return jnp.where(wanted, 0.0, jnp.where(avoided, 99.0, jnp.minimum(far, near + 1)))
+
+    return jax.lax.fori_loop(0, 16, nearer, jnp.where(wanted, 0.0, 99.0))
 
 
 def knowing(observation):
@@ -83,8 +83,8 @@ def test_who_follows_what_is_asked_for_does_formulas_that_nobody_trained(verdict
 
 def test_a_lane_of_stacked_plans_is_the_plan(plans, verdicts):
     agent = many_tasks.sequence_agent(knowing, plans[1], sampled=False)
-    alone = episodes(task_environment(WORLD, TASKS[1]), agent, jax.random.split(
-        jax.random.key(0), 64))
+    alone = jax.jit(lambda keys: episodes(task_environment(WORLD, TASKS[1]), agent, keys))(
+        jax.random.split(jax.random.key(0), 64))
     assert (np.asarray(alone.world.verdict[:, -1]) == verdicts[1]).all()
 
 
@@ -227,9 +227,10 @@ def test_a_network_of_ppo_does_the_same_with_boxes(squash):
         own = of(state, problem, hparams)
         other = many_tasks.sequence_agent(
             network, told, actions=space, squash=squash, sampled=sampled)
-        act = jax.vmap(lambda key, own=own: own.act(
-            own.memory, SequenceObservation(here, sequence), None, key)[0])
-        same = jax.vmap(lambda key, other=other: other.act(other.memory, seen, None, key)[0])
+        act = jax.jit(jax.vmap(lambda key, own=own: own.act(
+            own.memory, SequenceObservation(here, sequence), None, key)[0]))
+        same = jax.jit(jax.vmap(
+            lambda key, other=other: other.act(other.memory, seen, None, key)[0]))
         keys = jax.random.split(jax.random.key(2), 64)
         np.testing.assert_allclose(same(keys), act(keys), rtol=1e-6)
         ends.append(np.asarray(same(keys)))

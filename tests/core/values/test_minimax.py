@@ -102,8 +102,11 @@ def batch(cases):
 # --- minimax values ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("per", PER)
-@pytest.mark.parametrize("method", METHODS)
+# Of the other methods the games below ask by the system's moves.
+@pytest.mark.parametrize(("method", "per"), [
+    *((method, "move") for method in METHODS), (METHODS[0], "system_move"),
+    *(pytest.param(method, "system_move", marks=pytest.mark.exhaustive)
+      for method in METHODS[1:])])
 def test_minimax_values_are_those_of_all_strategy_pairs(batch, exact, method, per):
     games, rewards, discounts = batch
     solution = solver(method, per)(games, rewards, discounts, games.available, 1e-8)
@@ -141,8 +144,10 @@ def test_a_lane_is_as_if_alone(batch, method):
     games, rewards, discounts = batch
     together = solver(method, "move")(games, rewards, discounts, games.available, 1e-8)
     for i in (0, 7):
+        # Numbers of the kind that others ask with, for whom this is compiled too.
         alone = minimax_value(
-            lane(games, i), rewards[i], discounts[i], method=method, tolerance=1e-8)
+            lane(games, i), np.asarray(rewards[i]), float(discounts[i]), method=method,
+            max_steps=10_000, tolerance=1e-8)
         assert_solutions_agree(lane(together, i), alone)
         assert lane(together, i).num_steps == alone.num_steps
 
@@ -222,7 +227,9 @@ def test_evaluating_both_players_greedy_choices_in_full_goes_in_circles():
         policy = (sign * (reward + 0.99 * value[successor])).argmax(1)
     assert tuple(policy) != seen[-1]
 
-    game = make_game(from_dense(np.eye(4)[successor]), system)
+    both, sure = np.stack([successor] * 2, -1), np.broadcast_to([1.0, 0.0], (*successor.shape, 2))
+    game = as_game(
+        reference.Model(both, sure, np.ones(SHAPE[:2], bool), np.eye(4)[0]), system)
     full = {"tolerance": 1e-9, "max_steps": 5000}
     found = {method: check(minimax_value(game, reward, 0.99, method=method, **full))
              for method in METHODS}
@@ -299,7 +306,8 @@ def robots(size):
 
 @pytest.mark.parametrize(("size", "method", "states", "counts"), [
     *((3, method, 120, {10.0: 56, 9.0: 16}) for method in METHODS),
-    (4, METHODS[0], 432, {10.0: 132, 9.0: 44, 8.1: 48, 7.29: 16}),
+    pytest.param(4, METHODS[0], 432, {10.0: 132, 9.0: 44, 8.1: 48, 7.29: 16},
+                 marks=pytest.mark.exhaustive),
 ])
 def test_robots_on_a_grid(size, method, states, counts):
     """The dissertation's Example 1 (section 5.5, figure 13 and table 5)."""
@@ -496,8 +504,7 @@ def test_how_it_ends_when_it_cannot_converge(cases, method):
     assert short.status == Status.MAX_STEPS
     assert short.num_steps == 1
     assert_encloses(short, brute.minimax_value(model, system, reward, 0.9, "move"))
-    single = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, game)
-    vain = minimax_value(single, reward, 0.9, method=method, tolerance=1e-12, max_steps=10_000)
+    vain = minimax_value(game, reward, 0.9, method=method, tolerance=1e-20, max_steps=10_000)
     assert vain.status == Status.PRECISION
     assert vain.num_steps < 1000
     for bad in (minimax_value(game, reward, 1.0, **options),

@@ -95,7 +95,7 @@ def _cases(seed, count):
     return successor, *map(np.array, zip(*ends, strict=True)), cost
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize(("objective", "nature"), DIRECTIONS)
 def test_all_ends_of_a_batch_are_enclosed_as_by_brute_force(seed, objective, nature):
     successor, lower, upper, cost = _cases(seed, 12)
@@ -153,8 +153,12 @@ def test_given_policies_are_evaluated():
         np.testing.assert_allclose(found.value, host.value, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("objective", "nature"), DIRECTIONS)
-def test_derivatives_in_the_ends_are_differences(objective, nature):
+# Compiling derivatives takes seconds; by default each direction and each question occurs.
+@pytest.mark.parametrize(("objective", "nature", "question"), [
+    pytest.param(*ways, question, marks=[] if usual else pytest.mark.exhaustive)
+    for i, ways in enumerate(DIRECTIONS) for usual, question in (
+        (i in (0, 3), "probability"), (i in (1, 2), "reward"))])
+def test_derivatives_in_the_ends_are_differences(objective, nature, question):
     rng = np.random.default_rng(5)
     successor = np.concatenate([[0, 1], *([0, 1, s] for s in (2, 3, 4, 2, 3, 4))])
     p = np.concatenate([[1, 1], *rng.dirichlet(3 * np.ones(3), 6)])
@@ -163,37 +167,37 @@ def test_derivatives_in_the_ends_are_differences(objective, nature):
     way = rng.normal(size=(2, 20)) * (wide > 0)
     cost, weight = np.append([0, 0], rng.random(6)), rng.random(5)
     ask = {"objective": objective, "nature": nature}
-    for reward in (None, cost):
-        # The reward is earned until either end is met, where it is finite.
-        goal = GOAL if reward is None else ~np.array([False, False, True, True, True])
+    reward = cost if question == "reward" else None
+    # The reward is earned until either end is met, where it is finite.
+    goal = GOAL if reward is None else ~np.array([False, False, True, True, True])
 
-        def host(model, goal=goal, reward=reward):
-            if reward is None:
-                return robust_reachability(model, goal, stay=STAY, tolerance=1e-12, **ask)
-            return robust_total_reward(model, reward, goal, tolerance=1e-12, **ask)
+    def host(model):
+        if reward is None:
+            return robust_reachability(model, goal, stay=STAY, tolerance=1e-12, **ask)
+        return robust_total_reward(model, reward, goal, tolerance=1e-12, **ask)
 
-        prepared = prepare_interval(
-            model, goal, stay=STAY if reward is None else None, reward=reward, **ask)
+    prepared = prepare_interval(
+        model, goal, stay=STAY if reward is None else None, reward=reward, **ask)
 
-        def derivatives(ends, prepared=prepared):
-            """The slope and the change on the way, both of one linear program."""
-            _, forward = jax.linearize(
-                lambda a, b: solve_prepared_interval(prepared, lower=a, upper=b).value @ weight,
-                *ends)
-            return jax.linear_transpose(forward, *ends)(1.0), forward(*way)
+    def derivatives(ends):
+        """The slope and the change on the way, both of one linear program."""
+        _, forward = jax.linearize(
+            lambda a, b: solve_prepared_interval(prepared, lower=a, upper=b).value @ weight,
+            *ends)
+        return jax.linear_transpose(forward, *ends)(1.0), forward(*way)
 
-        ends = np.asarray(model.lower), np.asarray(model.upper)
-        there, back = (host(model.replace(lower=ends[0] + h * way[0], upper=ends[1] + h * way[1]))
-                       for h in (1e-6, -1e-6))
-        change = (there.value - back.value) @ weight / 2e-6
-        assert abs(change) > 1e-4
-        slope, forward = jax.jit(derivatives)(ends)
-        small = robust_sensitivity(
-            model, host(model), goal, nature=nature, initial=weight,
-            stay=STAY if reward is None else None)
-        np.testing.assert_allclose(slope[0] @ way[0] + slope[1] @ way[1], change, rtol=1e-5)
-        np.testing.assert_allclose(forward, change, rtol=1e-5)
-        np.testing.assert_allclose(small.lower @ way[0] + small.upper @ way[1], change, rtol=1e-5)
+    ends = np.asarray(model.lower), np.asarray(model.upper)
+    there, back = (host(model.replace(lower=ends[0] + h * way[0], upper=ends[1] + h * way[1]))
+                   for h in (1e-6, -1e-6))
+    change = (there.value - back.value) @ weight / 2e-6
+    assert abs(change) > 1e-4
+    slope, forward = jax.jit(derivatives)(ends)
+    small = robust_sensitivity(
+        model, host(model), goal, nature=nature, initial=weight,
+        stay=STAY if reward is None else None)
+    np.testing.assert_allclose(slope[0] @ way[0] + slope[1] @ way[1], change, rtol=1e-5)
+    np.testing.assert_allclose(forward, change, rtol=1e-5)
+    np.testing.assert_allclose(small.lower @ way[0] + small.upper @ way[1], change, rtol=1e-5)
 
 
 def test_other_graphs_are_refused_inside_jit():
