@@ -25,16 +25,11 @@ Example: a policy of what is seen, here of which state it is, and of the task's 
 
 A run is made of steps, goes on from a state, and may end early:
 
-  >>> state = cloning.init(jax.random.key(0), problem, hparams)
-  >>> state, metrics = cloning.run(state, problem, hparams, num_steps=2)
+  >>> state = cloning.init(jax.random.key(0), problem, hparams)  # train is init and run
+  >>> state, metrics = cloning.run(state, problem, hparams, num_steps=2)  # step after step
+  >>> until = learner.has_stopped  # for run_until and train_until
   >>> state.step.item()
   2
-  >>> after, figures = jax.eval_shape(cloning.step, state, problem, hparams)
-  >>> until = learner.has_stopped  # for train_until too
-  >>> ended = jax.eval_shape(lambda state: cloning.run_until(
-  ...     state, problem, hparams, until=until, num_steps=9), state)
-  >>> figures.loss.shape, ended.num_steps.shape
-  ((), ())
   >>> cloning.policy_in_world(network, state.best.parameters, model, jnp.eye(3)).shape
   (3, 3, 2)
   >>> jax.eval_shape(cloning.neg_log_likelihood, state.parameters, problem, problem.counts).shape

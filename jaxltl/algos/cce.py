@@ -35,16 +35,11 @@ Example: to be near (1, 1), with a first coordinate of at most 0.5.
 
 A run is made of steps, goes on from a state, and may end early:
 
-  >>> state = cce.init(jax.random.key(0), problem, hparams)
-  >>> state, metrics = cce.run(state, problem, hparams, num_steps=50)
+  >>> state = cce.init(jax.random.key(0), problem, hparams)  # train is init and run
+  >>> state, metrics = cce.run(state, problem, hparams, num_steps=50)  # step after step
+  >>> until = lambda before, after, metrics: metrics.spread < 1e-3  # for run_until and train_until
   >>> state.step.item()
   50
-  >>> after, figures = jax.eval_shape(cce.step, state, problem, hparams)
-  >>> until = lambda before, after, metrics: metrics.spread < 1e-3  # for train_until too
-  >>> ended = jax.eval_shape(lambda state: cce.run_until(
-  ...     state, problem, hparams, until=until, num_steps=9), state)
-  >>> figures.spread.shape, ended.num_steps.shape
-  ((), ())
   >>> anew = jax.eval_shape(  # as result does it
   ...     lambda x, key: cce.assess(problem, x, key, num_evaluations=10), problem.family.mean, key)
   >>> anew.upper.shape

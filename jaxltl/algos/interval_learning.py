@@ -38,7 +38,7 @@ Example: to come to the goal ``g`` and never to ``r``, where nobody knows the pr
 A run is made of steps, goes on from a state, and may end early:
 
   >>> state = interval_learning.init(jax.random.key(0), problem, hparams)  # train is init and run
-  >>> state, metrics = interval_learning.run(state, problem, hparams, num_steps=2)  # step after step
+  >>> state, metrics = interval_learning.run(state, problem, hparams, num_steps=2)  # by step
   >>> until = interval_learning.known_within(0.01)  # for run_until and train_until
   >>> state.step.item()
   2

@@ -36,8 +36,8 @@ A run is made of steps, goes on from a state, and may end early:
   >>> until = learner.has_stopped  # for run_until and train_until
   >>> state.step.item()
   2
-  >>> solution = todirl.solve(state.parameters, problem, hparams)  # which todirl.objective judges
-  >>> solution.value.shape
+  >>> solution = jax.eval_shape(todirl.solve, state.parameters, problem, hparams)
+  >>> solution.value.shape  # todirl.objective judges its policy
   (1, 3, 3)
 
 Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are

@@ -19,7 +19,8 @@ of a sum of rewards. Where the environment truncates an episode something would 
 would be worth is added, as the value network expects it of the last observation. Costs are limited
 as they are drawn: what would come after a trajectory never counts in them.
 
-Example: a point that is pushed about; the reward is for being near, the cost is the push.
+Example: a point that is pushed about; the reward is for being near, the cost is the push. (What is
+compiled for a step takes seconds, so shapes alone are shown.)
 
   >>> import jax, jax.numpy as jnp
   >>> import jaxltl as jl
@@ -36,14 +37,15 @@ Example: a point that is pushed about; the reward is for being near, the cost is
   >>> hparams = trust_region.Hparams(
   ...     discount=0.9, method="cpo", num_trajectories=6, hidden=(3,), value_hidden=(), cg_steps=3,
   ...     value_epochs=1, value_batches=2)
-  >>> state = trust_region.init(jax.random.key(0), problem, hparams)  # train is init and run
-  >>> state, metrics = trust_region.run(state, problem, hparams, num_steps=2)  # or run_until
-  >>> metrics.trajectories.tolist(), metrics.cost.shape  # as many were drawn for the moments first
-  ([12, 18], (2,))
-  >>> agent = trust_region.greedy(state, problem, hparams)  # or trust_region.policy, which draws
-  >>> mean, deviation = jax.eval_shape(  # of its actions; trust_region.rollout has trajectories
-  ...     lambda seen: trust_region.act(state, hparams, seen), jnp.zeros(2))
-  >>> mean.shape, deviation.shape  # train_until ends early
+  >>> state = jax.eval_shape(  # of train, which is init and run
+  ...     lambda key: trust_region.init(key, problem, hparams), jax.random.key(0))
+  >>> after, metrics = jax.eval_shape(  # run is step after step; run_until, train_until end early
+  ...     lambda state: trust_region.step(state, problem, hparams), state)
+  >>> metrics.reward.shape, metrics.unexplained.shape  # of rewards and of costs
+  ((), (2,))
+  >>> mean, deviation = jax.eval_shape(  # trust_region.policy draws; greedy takes the mean
+  ...     lambda state: trust_region.act(state, hparams, jnp.zeros(2)), state)
+  >>> mean.shape, deviation.shape  # trust_region.rollout has whole trajectories
   ((2,), (2,))
 
 ``train`` is ``init`` and ``run``, which is ``step`` after ``step``; ``train_until`` and
