@@ -3,6 +3,8 @@
 //   mkdir -p /tmp/check && cd /tmp/check && npm install playwright-core axe-core
 //   node REPOSITORY/docs/site/check.mjs REPOSITORY/build/site [--shots FOLDER] [--only TEXT]
 //
+// --only TEXT looks at the pages whose names hold it; --only none at none, but asks the questions.
+//
 // Chromium is that of the system (CHROMIUM=/usr/bin/chromium). Every page is opened by http and from
 // the disk, at three widths, light and dark; the exit status is 1 if anything is amiss.
 import { createRequire } from "node:module";
@@ -80,7 +82,7 @@ const WIDTHS = [390, 1280, 1920];
 
 async function look(page, name, scheme, base) {
   await page.goto(base + name);
-  for (const width of WIDTHS) {
+  for (const width of base === here ? WIDTHS : [390]) {
     const where = `${name} at ${width} ${scheme}`;
     await page.setViewportSize({ width, height: 900 });
     const wide = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
@@ -207,7 +209,7 @@ for (const scheme of ["light", "dark"]) {
 }
 console.log(`${pages.length} pages at ${WIDTHS} pixels, light and dark`);
 const page = await open("light");
-if (!only) {
+if (!only || only === "none") {
   await keyboard(page);
   await drawers(page);
   for (const base of [here, disk]) {
