@@ -1,10 +1,8 @@
 """The command line: what it prints and writes, and that mistakes come as one plain line."""
 
-import doctest
 import json
 import os
 import re
-import shlex
 import subprocess
 import sys
 from concurrent.futures import BrokenExecutor
@@ -95,23 +93,6 @@ def test_graphviz_draws_if_it_is_there(monkeypatch, tmp_path):
     assert "by graphviz" in run("automaton", "F a", "--to", "svg").output
     program.write_text("#!/bin/sh\nexit 1\n")
     assert "matplotlib" in run("automaton", "F a", "--to", "svg").output
-
-
-def test_what_the_page_on_logic_shows_is_real(monkeypatch):
-    monkeypatch.setattr("shutil.which", lambda name: None)
-    page = (Path(__file__).parent.parent / "docs" / "logic.md").read_text()
-    shown = "\n".join(re.findall(r"```console\n(.*?)```", page, re.DOTALL))
-    first, *commands = re.split(r"^\$ ", shown, flags=re.MULTILINE)
-    assert not first and len(commands) >= 5
-    for command in commands:
-        line, output = command.split("\n", 1)
-        assert run(*shlex.split(line)[1:]).output.strip() == output.strip(), line
-    blocks = "\n".join(re.findall(r"```pycon\n(.*?)```", page, re.DOTALL))
-    test = doctest.DocTestParser().get_doctest(blocks, {}, "logic.md", None, None)
-    assert len(test.examples) > 20
-    assert doctest.DocTestRunner().run(test).failed == 0
-    for picture in re.findall(r"\((pictures/.*?)\)", page):
-        assert (Path(__file__).parent.parent / "docs" / picture).exists()
 
 
 def test_mistakes_in_formulas(tmp_path):
