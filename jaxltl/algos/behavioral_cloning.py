@@ -20,8 +20,10 @@ Example: a policy of what is seen, here of which state it is, and of the task's 
   >>> problem = cloning.make_problem(model, jnp.eye(3), shown, network=network, held_out=0.5)
   >>> hparams = cloning.Hparams(batch=5)
   >>> state, metrics = cloning.train(jax.random.key(0), problem, hparams, num_steps=2)
-  >>> metrics.loss.shape, cloning.policy(state, problem, hparams).shape  # [W, S, Q, A]
-  ((2,), (1, 3, 3, 2))
+  >>> metrics.loss.shape
+  (2,)
+  >>> jax.eval_shape(cloning.policy, state, problem, hparams).shape  # [W, S, Q, A]
+  (1, 3, 3, 2)
 
 A run is made of steps, goes on from a state, and may end early:
 
@@ -30,7 +32,9 @@ A run is made of steps, goes on from a state, and may end early:
   >>> until = learner.has_stopped  # for run_until and train_until
   >>> state.step.item()
   2
-  >>> cloning.policy_in_world(network, state.best.parameters, model, jnp.eye(3)).shape
+  >>> jax.eval_shape(  # in any world that is seen the same way
+  ...     lambda other: cloning.policy_in_world(
+  ...         network, state.best.parameters, other, jnp.eye(3)), model).shape
   (3, 3, 2)
   >>> jax.eval_shape(cloning.neg_log_likelihood, state.parameters, problem, problem.counts).shape
   ()

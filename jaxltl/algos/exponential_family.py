@@ -16,10 +16,13 @@ Example:
   >>> import jax, jax.numpy as jnp
   >>> from jaxltl.algos import exponential_family as families
   >>> start = families.diagonal_gaussian(jnp.zeros(2), 1.0)
-  >>> samples = families.sample(start, jax.random.key(0), 8)
-  >>> moved = families.project(start, samples, jnp.ones(8), rate=0.5)
-  >>> samples.shape, jax.eval_shape(families.log_density, moved, samples).shape
-  ((8, 2), (8,))
+  >>> def moved(key):  # halfway to eight draws of its own
+  ...     samples = families.sample(start, key, 8)
+  ...     family = families.project(start, samples, jnp.ones(8), rate=0.5)
+  ...     return family, families.log_density(family, samples)
+  >>> family, density = jax.eval_shape(moved, jax.random.key(0))
+  >>> family.mean.shape, density.shape
+  ((2,), (8,))
   >>> families.standard_deviation(families.widen(start, 3.0)).tolist()
   [2.0, 2.0]
   >>> families.at_least(start, 4.0).variance.tolist()

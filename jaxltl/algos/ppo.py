@@ -11,6 +11,7 @@ What published implementations list (Huang et al. 2022, Andrychowicz et al. 2021
 in :class:`Hparams`.
 
 Example: a corridor of which one leaves at its beginning; to go to the end and back earns most.
+(A step is compiled in some seconds, so its shapes alone are shown.)
 
   >>> import jax, jax.numpy as jnp, numpy as np
   >>> from jax.tree_util import Partial
@@ -33,18 +34,16 @@ Example: a corridor of which one leaves at its beginning; to go to the end and b
   >>> hparams = ppo.Hparams(
   ...     discount=0.9, learning_rate=0.01, num_envs=4, num_steps=6, num_epochs=1,
   ...     num_minibatches=2, normalize_observation=True, normalize_reward=True)
-  >>> state = ppo.init(jax.random.key(0), problem, hparams)
-  >>> state, metrics = ppo.run(state, problem, hparams, num_steps=2)  # both at once: ppo.train
-  >>> metrics.transitions.tolist(), metrics.status.tolist()
-  ([24, 48], [0, 0])
+  >>> state = ppo.init(jax.random.key(0), problem, hparams)  # ppo.train is init and run
+  >>> after, metrics = jax.eval_shape(  # run is step after step; run_until, train_until end early
+  ...     lambda state: ppo.step(state, problem, hparams), state)
+  >>> state.transitions.item(), metrics.episode_return.shape
+  (0, ())
   >>> agent = ppo.greedy(state, problem, hparams)  # or ppo.policy, which draws
   >>> episode = jax.eval_shape(
   ...     lambda key: jl.run_episode(key, corridor, agent, num_steps=5), jax.random.key(1))
   >>> episode.reward.shape
   (5,)
-  >>> state, _ = ppo.run(state, problem, hparams, num_steps=2)  # run_until, train_until end early
-  >>> state.step.item()
-  4
 
 Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
 many settings, by ``vmap`` over the numbers of ``Hparams``.

@@ -32,14 +32,11 @@ Example: to come home again and again, and to be paid for staying away.
 
 A run is made of steps, goes on from a state, and may take its moves from elsewhere:
 
-  >>> state = rmax.init(jax.random.key(0), problem, hparams)  # then step, or run, or run_until
-  >>> seen = rmax.observe(state, problem, hparams, action=1, successor=1, reward=0.0)
+  >>> state = rmax.init(jax.random.key(0), problem, hparams)  # rmax.train goes on with rmax.run
+  >>> seen = rmax.observe(  # a step of one's own; run_until goes on from any state
+  ...     state, problem, hparams, action=1, successor=1, reward=0.0)
   >>> seen.position.item(), rmax.measure(seen, problem, hparams).moves.item()
   (1, 1)
-  >>> after, metrics = jax.eval_shape(  # train does it with init
-  ...     lambda state: rmax.run(state, problem, hparams, num_steps=2), seen)
-  >>> metrics.value.shape
-  (2,)
 
 Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``.
 """

@@ -21,8 +21,10 @@ Example: a reward of what is seen, here of which state it is, that plans in anot
   ...     model, jnp.eye(3), shown, network=todirl.RewardNetwork((3,)), held_out=0.5)
   >>> hparams = todirl.Hparams(discount=0.9, patience=3, optimizer="sgd")
   >>> state, metrics = todirl.train(jax.random.key(0), problem, hparams, num_steps=2)
-  >>> metrics.held_out.shape, todirl.policy(state, problem, hparams).shape  # [W, S, Q, A]
-  ((2,), (1, 3, 3, 2))
+  >>> metrics.held_out.shape
+  (2,)
+  >>> jax.eval_shape(todirl.policy, state, problem, hparams).shape  # [W, S, Q, A]
+  (1, 3, 3, 2)
   >>> parameters = state.best.parameters
   >>> shape = jax.eval_shape(  # in any world that is seen the same way
   ...     lambda other: todirl.plan(problem.network, parameters, other, jnp.eye(3), hparams), model)

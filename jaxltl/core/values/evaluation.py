@@ -194,10 +194,10 @@ class Evaluation:
       ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["heads", "tails"])
       >>> task = task_environment(environment_of(coin), "!tails U heads")
       >>> agent = agent_of(lambda observation, key: jnp.int32(0))
-      >>> found = evaluate(jax.random.key(0), agent, task, num_episodes=256, num_steps=5)
-      >>> found.success.lower < 0.6 < found.success.upper, found.success.method
-      (True, 'Clopper-Pearson')
-      >>> found.length.mean, found.threshold, found.status.name
+      >>> found = evaluate(jax.random.key(0), agent, task, num_steps=5, threshold=0.8)
+      >>> found.success.lower < 0.6 < found.success.upper, found.decision
+      (True, False)
+      >>> found.length.mean, found.discounted_reward, found.status.name
       (1.0, None, 'CONVERGED')
     """
 

@@ -286,8 +286,8 @@ def task_performances(
       >>> def world(p):
       ...     return from_dense([[[0, p, 1 - p]], [[0, 1.0, 0]], [[0, 0, 1.0]]], initial=[1, 0, 0],
       ...                       label=[[0], [1], [0]], propositions=["a"])
-      >>> both = stack_products([world(0.25), world(0.75)], "F a", label_on="exit")
-      >>> found = task_performances(both, jnp.ones((3, 2, 1)))  # one policy in both worlds
+      >>> both = stack_products([world(0.25), world(0.75)], "G F a", label_on="exit")
+      >>> found = task_performances(both, jnp.ones((3, 1, 1)))  # one policy in both worlds
       >>> found.mean.round(6).tolist(), found.value.shape
       ([0.25, 0.75], (2, 3))
     """
@@ -522,8 +522,8 @@ def summarize(
       >>> def world(p):
       ...     return from_dense([[[0, p, 1 - p]], [[0, 1.0, 0]], [[0, 0, 1.0]]], initial=[1, 0, 0],
       ...                       label=[[0], [1], [0]], propositions=["a"])
-      >>> both = stack_products([world(0.25), world(0.75)], "F a", label_on="exit")
-      >>> shares = task_performances(both, jnp.ones((3, 2, 1)))
+      >>> both = stack_products([world(0.25), world(0.75)], "G F a", label_on="exit")
+      >>> shares = task_performances(both, jnp.ones((3, 1, 1)))
       >>> found = summarize(both, shares, names=["rough", "fair"])
       >>> round(found.mean, 6), found.worst_world, found.infeasible
       (0.5, 'rough', ())
