@@ -30,7 +30,13 @@ extensions = [
     "site_pages",
 ]
 root_doc = "docs/index"
-include_patterns = ["docs/**", "notebooks/*.ipynb", "notebooks/pictures/*", "CHANGELOG.md", "CONTRIBUTING.md"]
+include_patterns = [
+    "docs/**",
+    "notebooks/*.ipynb",
+    "notebooks/pictures/*",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+]
 exclude_patterns = ["build", "out", "**/__pycache__", "**/.ipynb_checkpoints"]
 nitpicky = True
 
