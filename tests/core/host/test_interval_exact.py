@@ -13,7 +13,7 @@ from jaxltl.core.host.sums import exact_sum
 from jaxltl.core.models.interval import interval_rows
 from tests.reference_fractions import values
 
-COUNTS = [10, pytest.param(1000, marks=pytest.mark.exhaustive)]
+COUNTS = [4, pytest.param(1000, marks=pytest.mark.exhaustive)]
 UNIT = 2.0**-52
 
 

@@ -11,7 +11,7 @@ from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.values.robust_satisfaction import _largest
 from tests.reference_intervals import chains, optima, parity, random_model, reach, reward
 
-COUNTS = [25, pytest.param(500, marks=pytest.mark.exhaustive)]
+COUNTS = [10, pytest.param(500, marks=pytest.mark.exhaustive)]
 
 
 def enclosed(found, value):
