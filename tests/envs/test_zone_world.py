@@ -68,9 +68,14 @@ def slow_lidar(place, heading, zones):
 def test_what_the_robot_sees():
     made = world()
     keys = jax.random.split(jax.random.key(1), 40)
-    states = jax.vmap(made.reset)(keys)
-    found = jax.vmap(made.step)(states, jax.random.uniform(keys[0], (40, 2), minval=-1), keys).world
-    seen, labels = jax.vmap(made.observe)(found), jax.vmap(made.labels)(found)
+
+    @jax.jit
+    def moved(keys, push):
+        found = jax.vmap(made.step)(jax.vmap(made.reset)(keys), push, keys).world
+        return found, jax.vmap(made.observe)(found), jax.vmap(made.labels)(found)
+
+    found, seen, labels = jax.tree.map(
+        np.asarray, moved(keys, jax.random.uniform(keys[0], (40, 2), minval=-1)))
     for i in range(40):
         one = jax.tree.map(lambda x, i=i: np.asarray(x[i], float), found)
         lidar = [slow_lidar(one.place, one.heading, zones) for zones in one.zone]

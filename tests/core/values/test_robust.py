@@ -24,6 +24,7 @@ from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_p
 from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
 from jaxltl.core.values.total_reward import total_reward
 from tests.reference_intervals import chains, parity, random_model, reach, reward
+from tests.support import counts
 
 DIRECTIONS = [("max", "max"), ("max", "min"), ("min", "max"), ("min", "min")]
 TASKS = ["F a", "G !b", "!b U a", "G F a", "F G a", "G F a & F G !b", "G (a -> F b)",
@@ -199,10 +200,11 @@ def test_mixed_policies():
         np.testing.assert_allclose(again.value, high.value, atol=1e-6)
 
 
-def test_games():
+@counts(10, 100)
+def test_games(count):
     """Against all choices of both players and all vertices of nature's."""
     rng = np.random.default_rng(10)
-    for _ in range(25):
+    for _ in range(count):
         host = random_model(rng)
         model = labelled(rng, host)
         system = rng.random(4) < 0.5
