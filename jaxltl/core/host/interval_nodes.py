@@ -210,8 +210,18 @@ class Nodes:
         row = towards(graph, np.arange(end + 2) == end, np.ones(graph.num_rows, bool))
         return row[:-2].astype(np.int64), self.anything()
 
-    def improved(self, found: Choice, z: Floats, extra: float) -> tuple[Choice, float]:
-        """The choices that are better at some values, and by how much they are."""
+    def improved(
+        self, found: Choice, z: Floats, extra: float, least: float = 0.0, *,
+        everywhere: bool = False,
+    ) -> tuple[Choice, float]:
+        """The choices that are better at some values, and by how much they are.
+
+        Args:
+          found, z, extra: the choices, the values, and what a step earns besides.
+          least: what others must gain, for values that are only about those of the choices: who
+            takes their noise for gain may go round for ever.
+          everywhere: whether all rows are judged by what they gain, however little that is.
+        """
         values, chosen, p = self.values(z), found.chosen, []
         gain, now, noise = (np.empty(self.row.size) for _ in range(3))
         for block, before in zip(self.blocks, found.p, strict=True):
@@ -219,8 +229,9 @@ class Nodes:
             mass, row = self.answer(block, ahead), block.table.row
             gain[row] = np.einsum("wn,wn->n", mass, ahead)
             now[row] = np.einsum("wn,wn->n", before, ahead)
-            noise[row] = 4 * _EPS * (np.abs(z[block.owner]) + block.table.rounding)
-            if (fine := block.table.fine).size:  # what hardly leaves gains little
+            noise[row] = 4 * _EPS * (np.abs(z[block.owner]) + block.table.rounding) + least
+            fine = np.arange(row.size) if everywhere else block.table.fine
+            if fine.size:  # what hardly leaves gains little
                 noise[row[fine]] = np.einsum(
                     "wn,wn->n", (mass + before)[:, fine], np.abs(ahead[:, fine])
                 ) * block.table.rounding[fine]

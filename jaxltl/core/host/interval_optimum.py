@@ -28,6 +28,7 @@ _AIM = 0.25  # of the tolerance: how much of it the extra of all steps may take
 _ABOUT = 0.1  # residual of systems then, as a share of it
 _NEARLY = 1e-4  # change up to which choices are improved without it, as a share of the tolerance
 _ROUGH = 0.1  # residual of systems that are solved for these, as a share of what changed
+_DOUBT = 0.2  # what others must gain, as a share of that residual
 _LARGE = 500  # nodes from which choices of a model that does not mix are improved by sweeps first,
 _STARTS = 40  # so many times,
 _SWEEPS = 40  # after so many sweeps of each,
@@ -217,7 +218,7 @@ class _Search:
             found = self.worth(choice, left)
             if found is None:
                 return None
-            choice, change = self.nodes.improved(found, found.value, 0.0)
+            choice, change = self.nodes.improved(found, found.value, 0.0, _DOUBT * left)
             if change <= _NEARLY * self.tolerance * self.scale(found.value):
                 break
             left = _ROUGH * change
@@ -314,14 +315,24 @@ class _Search:
             if cost is None or not np.isfinite(cost).all():
                 return None
             z = value - cost
-            if nodes.attains(z, choice):
+            holds = nodes.attains(z, choice)
+            if not holds and nodes.against:
+                # Where next to nothing is lacking a step costs next to nothing, not less: that
+                # hides what nature could still gain there.
+                steps = self.systems.direct(chain.matrix, np.ones(nodes.size))
+                if steps is None:
+                    return None
+                cost += self.tolerance / (8 * steps.max(initial=1)) * steps
+                z = value - cost
+                holds = nodes.attains(z, choice)
+            if holds:
                 if cost.max(initial=0) > self.tolerance / 4:
                     return None
                 # The sum is rounded, and may be so upwards.
                 lower = np.nextafter(z + top, -np.inf) if top else z
                 self.last = choice._replace(value=value + top, z=lower)
                 return self.last
-            choice = nodes.improved(choice, z, 0.0)[0]
+            choice = nodes.improved(choice, z, 0.0, everywhere=True)[0]
         return None
 
     @property
