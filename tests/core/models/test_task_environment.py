@@ -279,16 +279,12 @@ def test_outcomes_are_those_of_the_steps():
 
 # --- bad input ------------------------------------------------------------------------------------
 
-CALLS = []
-
-
-def remembers(state, action, key):
-    CALLS.append(state)
-    return Timestep(state, 0.0, False)
+def draws_by_itself(state, action, key):
+    return Timestep(state + int(np.random.default_rng().integers(1 << 30)), 0.0, False)
 
 
 def impure():
-    return walk().replace(step=Partial(remembers))
+    return walk().replace(step=Partial(draws_by_itself))
 
 
 @pytest.mark.parametrize(("arguments", "options", "text"), [
