@@ -293,7 +293,17 @@ LEARNERS = {
     "intervals": intervals,
 }
 
-by_learner = pytest.mark.parametrize("name", LEARNERS)
+# Two ways to write a problem of one learner down, and a network that remembers, which takes
+# longest to compile, have the laws of the others; the last is tested beside its learner, too.
+MORE = ("mlirl-world", "ppo-memory")
+
+
+def each(names):
+    return pytest.mark.parametrize("name", [
+        pytest.param(x, marks=pytest.mark.exhaustive) if x in MORE else x for x in names])
+
+
+by_learner = each(LEARNERS)
 
 
 @cache
@@ -475,7 +485,7 @@ REWARDS = {"mlirl-world": "features", "mlirl-product": "features", "rmax": "rewa
            "q-generalized": "reward", "q-maximin": "reward"}
 
 
-@pytest.mark.parametrize("name", [*REWARDS, "todirl", "intervals"])
+@each([*REWARDS, "todirl", "intervals"])
 def test_what_is_not_available_changes_nothing(name):
     """Bit for bit: what was learned, and all figures."""
     module, problem, hparams, _ = case(name)

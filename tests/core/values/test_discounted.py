@@ -69,6 +69,13 @@ def assert_certified(solution, exact, tolerance=None):
 SINGLE = 200  # lanes that are repeated in single precision
 
 
+def some(usual, other):
+    """Methods and tolerances; that of the usual method without one is compiled below, too."""
+    more = [(usual, None), (other, 1e-6)]
+    return [(usual, 1e-6), (other, None),
+            *(pytest.param(*x, marks=pytest.mark.exhaustive) for x in more)]
+
+
 @pytest.mark.parametrize("tolerance", [None, 1e-6])
 def test_policy_values_are_enclosed(batch, exact_policy, tolerance):
     solution = jax.jit(jax.vmap(
@@ -76,8 +83,8 @@ def test_policy_values_are_enclosed(batch, exact_policy, tolerance):
     assert_certified(solution, exact_policy, tolerance)
 
 
-@pytest.mark.parametrize("tolerance", [None, 1e-6])
-@pytest.mark.parametrize("method", ["modified_policy_iteration", "value_iteration"])
+@pytest.mark.parametrize(("method", "tolerance"), some(
+    "modified_policy_iteration", "value_iteration"))
 def test_optimal_values_are_enclosed(cases, batch, exact_optimal, method, tolerance):
     mdps, _, rewards, discounts = batch
     solution = jax.jit(jax.vmap(
@@ -118,8 +125,7 @@ def soft(cases):
     return discounts, smooth_reference(cases, discounts, "soft", 750)
 
 
-@pytest.mark.parametrize("tolerance", [None, 1e-6])
-@pytest.mark.parametrize("method", ["newton", "value_iteration"])
+@pytest.mark.parametrize(("method", "tolerance"), some("newton", "value_iteration"))
 def test_soft_values_are_enclosed(batch, soft, method, tolerance):
     mdps, _, rewards, _ = batch
     discounts, exact = soft

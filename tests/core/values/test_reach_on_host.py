@@ -62,22 +62,24 @@ def random_case(rng, size):
     return model, jnp.arange(size) == size - 1
 
 
+def solve(model, goal, policy, objective):
+    given = {"policy": policy} if objective == "policy" else {"objective": objective}
+    return reachability_probability(model, goal, tolerance=1e-7, **given)
+
+
+traced = jax.jit(solve, static_argnames="objective")
+
+
 @pytest.mark.parametrize("objective", ["max", "min", "policy"])
 @pytest.mark.parametrize("dense_limit", [host.DENSE_LIMIT, 0])
 def test_both_engines_give_the_same_bounds_and_regions(objective, dense_limit, monkeypatch):
     monkeypatch.setattr(host, "DENSE_LIMIT", dense_limit)
     rng = np.random.default_rng(3)
-
-    def solve(model, goal, policy):
-        given = {"policy": policy} if objective == "policy" else {"objective": objective}
-        return reachability_probability(model, goal, tolerance=1e-7, **given)
-
-    traced = jax.jit(solve)
     compared = 0
     for _ in range(20):
         model, goal = random_case(rng, 7)
         policy = jnp.asarray(rng.dirichlet(np.ones(2), 7))
-        one, other = solve(model, goal, policy), traced(model, goal, policy)
+        one, other = (f(model, goal, policy, objective) for f in (solve, traced))
         assert int(one.status) == Status.CONVERGED
         assert (one.lower <= other.upper).all() and (other.lower <= one.upper).all()
         for certain in (0, 1):

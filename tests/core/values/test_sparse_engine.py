@@ -17,6 +17,7 @@ from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_p
 from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
 from jaxltl.core.values.total_reward import total_reward
 from tests.core.models.test_sparse import random_padded
+from tests.support import counts
 
 ROUNDING = 1e-12  # of the policies
 
@@ -136,8 +137,9 @@ def test_lazy_products_of_sparse_worlds(formula, label_on):
                 1e-9)
 
 
-def test_discounted_values():
-    for rng, sparse, padded, _ in cases(20, 4):
+@counts(6, 60)  # of each size the padded model's program is another one
+def test_discounted_values(count):
+    for rng, sparse, padded, _ in cases(count, 4):
         reward = rng.normal(size=padded.available.shape)
         rows = reward[sparse.host.state, sparse.action]
         discount = float(rng.choice([0.0, 0.5, 0.95, 0.999]))
