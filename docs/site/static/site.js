@@ -4,6 +4,9 @@ if (location.protocol === "file:" && typeof DOCUMENTATION_OPTIONS !== "undefined
   DOCUMENTATION_OPTIONS.SHOW_SEARCH_SUMMARY = false;
 
 function tell() {
+  const results = document.querySelector("#search-results");
+  if (results && !document.querySelector("h1"))
+    results.before(Object.assign(document.createElement("h1"), { textContent: "Search" }));
   document.querySelector(".sidebar-drawer")?.setAttribute("aria-label", "All pages");
   document.querySelector(".toc-drawer")?.setAttribute("aria-label", "On this page");
   for (const box of document.querySelectorAll("pre, .table-wrapper, .math-block, dt.sig, .output")) {
