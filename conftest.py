@@ -1,4 +1,7 @@
-"""Examples that ask for packages are left out where one is missing, else run as the package is."""
+"""Examples of docstrings: those that compile run with the pages, as ``notebook``.
+
+Those that ask for packages are left out where one is missing, else run as the package is.
+"""
 
 import contextlib
 import importlib
@@ -9,6 +12,8 @@ import warnings
 
 import pytest
 
+_COMPILED = ("jaxltl.algos.", "jaxltl.core.values.", "jaxltl.envs.")
+
 
 def _asked_for(item):
     """The modules that an example imports."""
@@ -16,9 +21,12 @@ def _asked_for(item):
     return re.findall(r"^(?:import|from) ([\w.]+)", source, re.MULTILINE)
 
 
+@pytest.hookimpl(tryfirst=True)  # before markers choose
 def pytest_collection_modifyitems(items):
     for item in items:
         if isinstance(item, pytest.DoctestItem):
+            if item.name.startswith(_COMPILED):
+                item.add_marker(pytest.mark.notebook)
             for root in {name.partition(".")[0] for name in _asked_for(item)}:
                 if importlib.util.find_spec(root) is None:
                     item.add_marker(pytest.mark.skip(reason=f"{root} is not installed"))
