@@ -110,7 +110,7 @@ def test_representations_agree():
     """A product, its explicit copy and a dense world get one verdict."""
     rng = np.random.default_rng(2)
     seen = set()
-    for i in range(40):
+    for i in range(100):
         label_on = ("entry", "exit")[i % 2]
         lazy, explicit = random_product(rng, label_on=label_on)
         size = explicit.num_states

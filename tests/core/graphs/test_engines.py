@@ -20,7 +20,7 @@ from tests import reference
 from tests.support import as_mdp, bit_labels, lane, stack
 
 KINDS = ("sparse", "dense", "entry", "exit")
-COUNT, PRIORITIES = 20, 4
+COUNT, PRIORITIES = 60, 4
 
 
 def random_model(rng, kind):
