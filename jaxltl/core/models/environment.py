@@ -116,7 +116,8 @@ def make_box(
             f"shape {shape}; give numbers, or arrays of that shape.")
     if (least > most).any():
         place = np.argwhere(least > most)[0].tolist()
-        raise ValueError(f"make_box: low is above high at {place}; exchange them.")
+        where = f" at {place}" if place else f": {least} above {most}"
+        raise ValueError(f"make_box: low is above high{where}; exchange them.")
     try:
         kind = jnp.dtype(jnp.result_type(float) if dtype is None else dtype)
     except (TypeError, ValueError):
