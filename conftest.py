@@ -1,4 +1,4 @@
-"""Examples of docstrings: those that compile run with the pages, as ``notebook``.
+"""Examples of docstrings: those that compile run with the pages, as ``slow``.
 
 Those that ask for packages are left out where one is missing, else run as the package is.
 """
@@ -26,7 +26,7 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if isinstance(item, pytest.DoctestItem):
             if item.name.startswith(_COMPILED):
-                item.add_marker(pytest.mark.notebook)
+                item.add_marker(pytest.mark.slow)
             for root in {name.partition(".")[0] for name in _asked_for(item)}:
                 if importlib.util.find_spec(root) is None:
                     item.add_marker(pytest.mark.skip(reason=f"{root} is not installed"))

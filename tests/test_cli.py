@@ -174,7 +174,7 @@ def test_what_is_done_is_told_and_not_done_again(learned, monkeypatch):
     task.write_text(task.read_text().removesuffix("\n# another\n"))
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_what_falls_short_is_told_in_red_with_what_helps(write, tmp_path):  # noqa: F811
     path = write(("[task]", '[task]\nguarantee = "none"'), shown={"demonstrations": [
         {"cells": [[2, 1], [2, 2], [1, 2]], "actions": ["right", "up", "right"]}]})
@@ -308,7 +308,7 @@ def test_check(write):  # noqa: F811
 
 @pytest.mark.parametrize("name", [
     "two_goals", "log_patrol",
-    *(pytest.param(name, marks=pytest.mark.notebook) for name in (
+    *(pytest.param(name, marks=pytest.mark.slow) for name in (
         "slippery_delivery", "one_demonstration", "patrol_two", "patrol_anywhere"))])
 def test_the_examples_are_sound(name):
     assert run("check", f"examples/{name}.toml").stdout.startswith("ok: ")
@@ -354,7 +354,7 @@ main(["learn", "task.toml"])"""
     assert alone(code, tmp_path) == f"jaxltl {jaxltl.__version__}: learning from task.toml []"
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_the_command_keeps_compiled_programs_and_the_library_does_not(tmp_path):
     names = ("ENABLE_COMPILATION_CACHE", "COMPILATION_CACHE_DIR",
              "PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES")
@@ -387,7 +387,7 @@ except SystemExit:
     assert alone(library, tmp_path) == "None"
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_short_work_is_compiled_soon_and_published_figures_as_the_library_is(tmp_path):
     def flags(command, **environment):
         code = f"""
@@ -482,7 +482,7 @@ def patrolled(tmp_path_factory):
     return json.loads(result.stdout.splitlines()[-1]), result.stdout, out
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_the_game_of_section_6_7(patrolled):
     found, _, _ = patrolled
     sizes = [found[k] for k in ("states", "system_states", "system_transitions", "transitions",
@@ -498,7 +498,7 @@ def test_the_game_of_section_6_7(patrolled):
     assert found["uniform_hat_strategy_gap"] == pytest.approx(5.878e-7, rel=1e-3)
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_what_is_learned_in_section_6_7(patrolled):
     found, _, _ = patrolled
     for anew, straight in zip(found["learned"], found["learned_without_restarts"], strict=True):
@@ -520,7 +520,7 @@ def test_what_is_learned_in_section_6_7(patrolled):
     assert marked.shape == (2, 4, 9) and marked.sum() == found["learned"][0]["eps_optimal_states"]
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_the_best_moves_by_the_reward_alone(patrolled):
     found, _, _ = patrolled
     on, off = np.array(found["figure17"]["best"])  # for each cell: up, down, left, right
@@ -530,7 +530,7 @@ def test_the_best_moves_by_the_reward_alone(patrolled):
     assert on.sum(axis=1).tolist() == off.sum(axis=1).tolist() == [1] * 9
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_the_table_and_the_pictures_of_section_6_7(patrolled):
     found, printed, out = patrolled
     for words in ("published", "measured", "58.05", "29.77", "1.545417: 16",

@@ -6,7 +6,7 @@ printed is compared: with the block without a language that follows, with the co
 say what is not so, see CONTRIBUTING.md:
 
 - ``<!-- not run: why -->``: it needs a cluster, another program, a file that is not there.
-- ``<!-- minutes: why -->``: it runs with ``-m notebook`` only, with all of its page.
+- ``<!-- minutes: why -->``: it runs with ``-m slow`` only, with all of its page.
 - ``<!-- needs: package -->``: it runs where that is installed.
 - ``<!-- alone -->``: a namespace and a test of its own, as have those that come after it.
 - ``<!-- single precision -->``: JAX's own setting, for all of the page; the tests' is double.
@@ -57,7 +57,7 @@ def chapters() -> list[Any]:
                 found.append(pytest.param(name, quick, id=place))
             if slow:
                 found.append(
-                    pytest.param(name, part, id=f"{place}-whole", marks=pytest.mark.notebook)
+                    pytest.param(name, part, id=f"{place}-whole", marks=pytest.mark.slow)
                 )
     return found
 

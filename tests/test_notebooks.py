@@ -30,7 +30,7 @@ def test_a_notebook_is_saved_with_what_it_shows(path):
     assert notebook.cells[0].source == text, "the opening picture is another one"
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 @pytest.mark.parametrize("path", EVERY, ids=lambda path: path.stem)
 def test_the_outputs_of_a_notebook_are_current(path):
     notebook = nbformat.read(path, as_version=4)

@@ -33,7 +33,7 @@ def check_the_robots_rows(rows, methods):
         assert (low <= x["cost"]).all() and (x["cost"] <= high).all()
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_section_4_5_in_little():
     """Keys, table and pictures of both parts, with the search alone."""
     result = figures("CCE")

@@ -277,7 +277,7 @@ def test_single_precision(tmp_path):
             within(problem, 0.5, 0.5 + 1e-12)
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_the_script_of_the_page_runs(capsys):
     page = Path(__file__).parents[2] / "docs" / "parameters.md"
     (script,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)

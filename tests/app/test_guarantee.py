@@ -231,7 +231,7 @@ def check_many(count, grid, over, place):
 
 
 @pytest.mark.parametrize(("count", "grid"), [
-    pytest.param(3, np.logspace(-2, 2, 4), marks=pytest.mark.notebook),
+    pytest.param(3, np.logspace(-2, 2, 4), marks=pytest.mark.slow),
     pytest.param(50, np.logspace(-3, 5, 64), marks=pytest.mark.exhaustive),
 ])
 def test_a_probability_is_reached_and_nothing_given_away(tmp_path, count, grid):
@@ -369,7 +369,7 @@ def test_steps_that_lose_nothing_by_themselves_are_left_out_truly_told(write):  
     assert result["satisfaction"]["minimum"]["lower"] == 1
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_where_what_was_learned_dawdles_the_quickest_policy_is_mixed_in(write):  # noqa: F811
     """Up and down for ever is what was shown, so that any share of a loss would come to pass."""
     shown = {"demonstrations": [ERRING["demonstrations"][1]]}

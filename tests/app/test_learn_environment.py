@@ -204,7 +204,7 @@ def test_what_is_done_is_not_done_again(learned, monkeypatch):
     assert "done before" in run("learn", path, "--seeds", 2, "--out", out).stdout
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch, tmp_path):
     path, out, _ = learned
     save, count = learner.files.save, []
@@ -241,8 +241,8 @@ def test_interrupted_before_it_learns(learned, monkeypatch, tmp_path):
 @pytest.mark.parametrize(("method", "table", "boxed"), [
     ("cce", CCE, False),
     pytest.param("cce", (CCE[0], CCE[1] + '\ncost = "violation"\nlimit = 0.2'), True,
-                 marks=pytest.mark.notebook),
-    pytest.param("cpo", CPO, True, marks=pytest.mark.notebook),
+                 marks=pytest.mark.slow),
+    pytest.param("cpo", CPO, True, marks=pytest.mark.slow),
 ])
 def test_other_methods(write, tmp_path, method, table, boxed):
     path = write(table, ('"ppo"', f'"{method}"'), ("steps = 20", "steps = 10"),
@@ -258,7 +258,7 @@ def test_other_methods(write, tmp_path, method, table, boxed):
     assert again.success.mean > 0.9
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_tasks_without_end_are_told_by_visits(write, tmp_path):
     path = write(("!pit U goal", "G F goal & G F !goal"), ("steps = 20", "steps = 1"))
     told = run("learn", path, "--out", tmp_path / "out")
@@ -350,7 +350,7 @@ def test_a_fingerprint_changes_with_the_function(write, tmp_path):
     assert read_task(path).digest != before
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_the_library_s_worlds_have_pictures(tmp_path):
     path = tmp_path / "letters.toml"
     path.write_text(

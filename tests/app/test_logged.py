@@ -204,7 +204,7 @@ def test_mistakes_in_its_files(write, files, message):
     assert message in failure("check", write(**files)).replace("\n", " ")
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_what_is_learned_is_told_with_its_guarantee(write, tmp_path):
     path, out = write(), tmp_path / "out"
     result = run("learn", path, "--out", out, "--json")

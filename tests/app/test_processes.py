@@ -169,7 +169,7 @@ def check_end(others, seconds):
         assert seconds < 90
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_a_run_goes_on_when_a_process_has_died(tmp_path):
     """With as many processes and with one: to the same bits as a run that nothing befell."""
     others, seconds = killed(tmp_path, 2, 1, saved_once(tmp_path))

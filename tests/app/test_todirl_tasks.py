@@ -83,7 +83,7 @@ def own(setup, w):
 # --- tasks without end -------------------------------------------------------------------------
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_a_task_without_end_is_learned_and_done_in_worlds_never_seen(write, tmp_path):
     path = write()
     result = run("learn", path, "--out", tmp_path / "out", "--json")
@@ -260,7 +260,7 @@ def check_reached(outcome, asked, over):
     return mixed
 
 
-@pytest.mark.notebook
+@pytest.mark.slow
 def test_a_probability_is_reached_in_every_world(write, tmp_path):
     (tmp_path / "shown.json").write_text(json.dumps(CARELESS))
     outcome, result = learned(write(text=RISKY))
