@@ -1,7 +1,7 @@
 """Executes the notebooks and saves them with their outputs, or tells what has become of these.
 
-    python -m slows.execute [NAME ...]           execute, and save
-    python -m slows.execute --check [NAME ...]   execute, and compare with what is saved
+    python -m notebooks.execute [NAME ...]           execute, and save
+    python -m notebooks.execute --check [NAME ...]   execute, and compare with what is saved
 
 A NAME is the beginning of a file's name, such as 03. What is saved is small and is the same from
 one time to the next: pictures with their text alternatives, text, no times, no widgets. The picture
@@ -237,7 +237,7 @@ def _last_place(number: str) -> float:
 
 def main() -> int:
     """Executes what the command line names."""
-    parser = argparse.ArgumentParser(description=__doc__, prog="python -m slows.execute",
+    parser = argparse.ArgumentParser(description=__doc__, prog="python -m notebooks.execute",
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME")
     parser.add_argument("--check", action="store_true", help="save nothing, compare")
