@@ -153,51 +153,71 @@ class _Policy(NamedTuple):
     rounds: jax.Array
 
 
-def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
-    """Bounds by policy iteration, or the state as it was."""
-    core, span = problem.core, problem.span
-    sign = 1.0 if problem.given["maximize"] else -1.0
-    count, _, _, block = core.target.shape
-    size, dtype = count * block, state.low.dtype
-    keep, put = jnp.ones(size, dtype), jnp.zeros(size, dtype)
-    if "keep" in problem.given:
-        keep, put = problem.given["keep"][span], problem.given["put"][span]
-    # What comes in from before lies between its bounds, so each side is proven with its own.
-    middle = state.low.at[: core.first].set(
-        (state.low[: core.first] + high[: core.first]) / 2)
+class _Choices(NamedTuple):
+    """The rows of the blocks, and what is known of places whatever is chosen there."""
 
-    def image(outer: jax.Array, x: jax.Array) -> jax.Array:
+    problem: Problem
+    keep: jax.Array  # zero where `put` is known
+    put: jax.Array
+
+    @property
+    def sign(self) -> float:
+        return 1.0 if self.problem.given["maximize"] else -1.0
+
+    def image(self, outer: jax.Array, x: jax.Array) -> jax.Array:
         """``c + P x`` of all rows, ``[C, A, B]``."""
-        found = images(core, outer.at[span].set(x))
-        return found * keep.reshape(count, 1, block) + put.reshape(count, 1, block)
+        count, _, _, block = self.problem.core.target.shape
+        found = images(self.problem.core, outer.at[self.problem.span].set(x))
+        return found * self.keep.reshape(count, 1, block) + self.put.reshape(count, 1, block)
 
-    def of(rank: jax.Array, image: jax.Array) -> jax.Array:
-        return jnp.take_along_axis(image, rank[:, None], 1).ravel()
+    def best(self, image: jax.Array) -> tuple[jax.Array, jax.Array]:
+        rank = jnp.argmax(self.sign * image, axis=1).astype(jnp.int32)
+        return rank, _of(rank, image)
 
-    def system(rank: jax.Array) -> Chosen:
+    def system(self, rank: jax.Array) -> Chosen:
+        core = self.problem.core
+        count, _, _, block = core.target.shape
         target = jnp.take_along_axis(core.target, rank[:, None, None], 1)[:, 0]
         weight = jnp.take_along_axis(core.weight, rank[:, None, None], 1)[:, 0]
         inside = (target >= core.first) & (target < core.last)
         return Chosen(
-            jnp.where(inside, target - core.first, size),
-            jnp.where(inside, weight, 0) * keep.reshape(count, 1, block), cyclic=True)
+            jnp.where(inside, target - core.first, count * block),
+            jnp.where(inside, weight, 0) * self.keep.reshape(count, 1, block), cyclic=True)
 
-    def best(image: jax.Array) -> tuple[jax.Array, jax.Array]:
-        rank = jnp.argmax(sign * image, axis=1).astype(jnp.int32)
-        return rank, of(rank, image)
+
+def _choices(problem: Problem, dtype: Any) -> _Choices:
+    if "keep" in problem.given:
+        span = problem.span
+        return _Choices(problem, problem.given["keep"][span], problem.given["put"][span])
+    size = problem.core.last - problem.core.first
+    return _Choices(problem, jnp.ones(size, dtype), jnp.zeros(size, dtype))
+
+
+def _of(rank: jax.Array, image: jax.Array) -> jax.Array:
+    """The images of the chosen rows alone."""
+    return jnp.take_along_axis(image, rank[:, None], 1).ravel()
+
+
+def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
+    """Bounds by policy iteration, or the state as it was."""
+    core, x = problem.core, state.low[problem.span]
+    rows = _choices(problem, x.dtype)
+    sign = rows.sign
+    # What comes in from before lies between its bounds, so each side is proven with its own.
+    middle = state.low.at[: core.first].set(
+        (state.low[: core.first] + high[: core.first]) / 2)
 
     def improve(p: _Policy) -> _Policy:
         timing = (p.rounds == 1) | p.done
-        rows = system(p.rank)
-        residual = of(p.rank, image(middle, p.value)) + sign * p.extra - p.value
-        found = rows.solve(jnp.where(timing, 1, residual))
+        residual = _of(p.rank, rows.image(middle, p.value)) + sign * p.extra - p.value
+        found = rows.system(p.rank).solve(jnp.where(timing, 1, residual))
         time = jnp.where(timing, found, p.time)
         value = jnp.where(timing, p.value, p.value + found)
-        extra = jnp.where(p.rounds == 1, _extra(problem, value, time, keep), p.extra)
-        now = image(middle, value)
-        rank, optimum = best(now)
-        own = of(p.rank, now)
-        better = (sign * (optimum - own) > _KEPT * extra).reshape(count, block) & ~timing
+        extra = jnp.where(p.rounds == 1, _extra(problem, value, time, rows.keep), p.extra)
+        now = rows.image(middle, value)
+        rank, optimum = rows.best(now)
+        own = _of(p.rank, now)
+        better = (sign * (optimum - own) > _KEPT * extra).reshape(p.rank.shape) & ~timing
         exact = jnp.max(jnp.abs(own + sign * extra - value)) <= extra / 16
         done = p.done | ((p.rounds > 1) & ~jnp.any(better) & exact)
         hasty = jnp.any(better) & (p.rounds < _HASTY)
@@ -205,22 +225,27 @@ def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
         rank = lax.cond(hasty, ahead, lambda _: jnp.where(better, rank, p.rank), value)
         return _Policy(value, rank, time, extra, done, p.done, p.rounds + 1)
 
-    x = state.low[span]
     none = jnp.asarray(False)
-    p = lax.while_loop(
+    return _proven(rows, state, high, lax.while_loop(
         lambda p: ~p.ended & (p.rounds < _ROUNDS) & jnp.all(jnp.isfinite(p.value)), improve,
-        _Policy(x, best(image(middle, x))[0], jnp.ones_like(x), jnp.zeros((), dtype), none, none,
-                jnp.asarray(0, jnp.int32)))
-    rows, time = system(p.rank), p.time
+        _Policy(x, rows.best(rows.image(middle, x))[0], jnp.ones_like(x), jnp.zeros((), x.dtype),
+                none, none, jnp.asarray(0, jnp.int32))))
+
+
+def _proven(rows: _Choices, state: State, high: jax.Array, p: _Policy) -> State:
+    """The bounds that the last policy proves, or the state as it was."""
+    problem, sign, time = rows.problem, rows.sign, p.time
+    core, span = problem.core, problem.span
     far, near = p.value, p.value - sign * 1.5 * p.extra * time
     outer_far, outer_near = (high, state.low) if sign > 0 else (state.low, high)
-    beyond = sign * far - sign * best(image(outer_far, far))[1]
-    attained = sign * of(p.rank, image(outer_near, near)) - sign * near
+    beyond = sign * far - sign * rows.best(rows.image(outer_far, far))[1]
+    attained = sign * _of(p.rank, rows.image(outer_near, near)) - sign * near
     # What is known, and places without a node, which are worth nothing.
-    fixed = (keep == 0) | jnp.all(core.weight == 0, axis=(1, 2)).ravel()
-    far, near = (jnp.where(fixed, put, y) for y in (far, near))
+    fixed = (rows.keep == 0) | jnp.all(core.weight == 0, axis=(1, 2)).ravel()
+    far, near = (jnp.where(fixed, rows.put, y) for y in (far, near))
     slack = problem.unit * jnp.abs(far) * 2 + problem.least
-    onward = time - rows.image(jnp.concatenate([time, jnp.zeros(3, dtype)]))
+    onward = time - rows.system(p.rank).image(
+        jnp.concatenate([time, jnp.zeros(3, time.dtype)]))
     proven = jnp.all(fixed | ((beyond >= slack) & (attained >= slack)
                               & (time >= 0) & (onward >= 0.5)))
     low, top = (near, far) if sign > 0 else (far, near)
