@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -132,9 +133,7 @@ def restrict(
         return _restrict_sparse(model, lazy, initial, allowed)
     if not isinstance(world, MDP):
         raise ValueError("restrict needs successor lists; convert the world by from_dense.")
-    initial = np.asarray(model.initial if initial is None else initial).ravel()
-    if not (initial > 0).any():
-        raise ValueError("the initial distribution is zero; give a state to start from.")
+    initial = _start(model, initial)
     available = np.asarray(model.available)
     allowed = available if allowed is None else available & np.asarray(allowed)
     allowed = allowed.reshape(-1, model.num_actions)
@@ -144,23 +143,12 @@ def restrict(
         step, label_on = np.asarray(lazy.next_memory), lazy.label_on
     num_memory = step.shape[1]
 
-    def targets(states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def targets(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         s, q = np.divmod(states, num_memory)
         flat = flat_successor(successor[s], step, *_columns(s, q), label_on)
-        return flat, used[s] & allowed[states][:, :, None], s
+        return flat, used[s] & allowed[states][:, :, None]
 
-    number = np.full(allowed.shape[0], -1)
-    seen = initial > 0
-    frontier = np.flatnonzero(seen)
-    while frontier.size:
-        flat, real, _ = targets(frontier)
-        new = flat[real]
-        new = new[~seen[new]]
-        # One of each without sorting: of equal entries, the one that `number` has kept.
-        number[new] = np.arange(new.size)
-        frontier = new[number[new] == np.arange(new.size)]
-        seen[frontier] = True
-    states = np.flatnonzero(seen)
+    states = _reached(initial > 0, targets)
     stuck = states[~allowed[states].any(-1)]
     if stuck.size:
         place = list(divmod(int(stuck[0]), num_memory))[: 2 if num_memory > 1 else 1]
@@ -168,8 +156,9 @@ def restrict(
             f"no action is allowed in state {_named(place)}, which is reachable; the mask is empty "
             "there. Start inside the winning region, or allow an action."
         )
+    number = np.full(len(allowed), -1)
     number[states] = np.arange(states.size)
-    flat, real, s = targets(states)
+    (flat, real), s = targets(states), states // num_memory
     mdp = make_mdp(
         np.where(real, number[flat], 0),
         np.where(real, np.asarray(world.probability)[s], 0),
@@ -178,12 +167,39 @@ def restrict(
         label=np.asarray(world.label)[s],
         propositions=world.propositions,
     )
-    memory = to_jax((states - s * num_memory).astype(np.int32))
-    base = to_jax(s.astype(np.int32))
-    if not isinstance(model, Game):
-        return Restriction(mdp, base, memory)
-    owner = to_jax(np.asarray(model.system).ravel()[states])
-    return Restriction(Game(mdp, owner), base, memory)
+    return _restriction(model, mdp, states, num_memory)
+
+
+def _start(model: Any, initial: chex.Array | None) -> np.ndarray:
+    start = np.asarray(model.initial if initial is None else initial).ravel()
+    if not (start > 0).any():
+        raise ValueError("the initial distribution is zero; give a state to start from.")
+    return start
+
+
+def _reached(
+    seen: np.ndarray, targets: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+) -> np.ndarray:
+    """The numbers of the states that are seen at first, or reached from those, ascending."""
+    number = np.empty(seen.size, int)
+    frontier = np.flatnonzero(seen)
+    while frontier.size:
+        flat, real = targets(frontier)
+        new = flat[real]
+        new = new[~seen[new]]
+        # One of each without sorting: of equal entries, the one that `number` has kept.
+        number[new] = np.arange(new.size)
+        frontier = new[number[new] == np.arange(new.size)]
+        seen[frontier] = True
+    return np.flatnonzero(seen)
+
+
+def _restriction(model: Any, part: Any, states: np.ndarray, num_memory: int) -> Restriction:
+    """A model of some of the states, and what these are in the model."""
+    base, memory = to_jax(tuple(x.astype(np.int32) for x in np.divmod(states, num_memory)))
+    if isinstance(model, Game):
+        part = Game(part, to_jax(np.asarray(model.system).ravel()[states]))
+    return Restriction(part, base, memory)
 
 
 def _restrict_sparse(
@@ -191,9 +207,7 @@ def _restrict_sparse(
 ) -> Restriction:
     """The same of a sparse model, or of a product of one, which is written out for it."""
     sparse = to_sparse(lazy)
-    start = np.asarray(model.initial if initial is None else initial).ravel()
-    if not (start > 0).any():
-        raise ValueError("the initial distribution is zero; give a state to start from.")
+    start = _start(model, initial)
     rows = np.ones(sparse.num_rows, bool)
     if allowed is not None:
         rows = np.asarray(allowed)
@@ -202,12 +216,8 @@ def _restrict_sparse(
                              "choices of to_sparse(model).")
     states = reachable(sparse, start > 0, rows)
     found = part_of(replace(sparse, initial=start / start.sum()), states, rows)
-    place = np.flatnonzero(states)
     num_memory = lazy.num_memory if isinstance(lazy, Product) else 1
-    base, memory = to_jax(tuple(x.astype(np.int32) for x in np.divmod(place, num_memory)))
-    if not isinstance(model, Game):
-        return Restriction(found, base, memory)
-    return Restriction(Game(found, to_jax(np.asarray(model.system).ravel()[place])), base, memory)
+    return _restriction(model, found, np.flatnonzero(states), num_memory)
 
 
 def _columns(s: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
