@@ -442,21 +442,8 @@ def _solve(
         _gains(rows, play, over.columns(reward), columns, flat), rate.ravel(),
         jnp.zeros_like(discount), play)
     zero = jnp.zeros(flat.shape, game.dtype)
-    policies = method == "policy_iteration"
-    if method == "strategy_iteration":
-        value, image, num_steps = _strategy_iteration(rows, numbers, zero, max_steps)
-    else:
-        value, image, num_steps, *chosen = newton.solve(
-            rows, _chosen, _judge, numbers, zero, newton=policies, monotone=False,
-            first_sweeps=_FIRST_SWEEPS if flat.size > DENSE_LIMIT else 0,
-            max_steps=max_steps, weights=policies)
-    rows, numbers, play, horizon = lax.stop_gradient((rows, numbers, play, horizon))
-    weight: Any
-    if policies:
-        weight = rows.choices.unpacked(*chosen)
-    else:
-        q = newton.action_values(rows.choices, numbers, rows.expectation(value))
-        weight = _chosen(rows.choices, q, play)[1]
+    value, image, num_steps, weight = _approached(rows, numbers, zero, method, max_steps)
+    play, horizon = lax.stop_gradient((play, horizon))
     weight = over.whole(weight)
     verdict = _certify(play, value, image)
     evidence = verdict
@@ -480,6 +467,23 @@ def _solve(
     solution = jax.tree.map(lax.stop_gradient, solution)
     solution = replace(solution, value=answer(implicit(backup, solution.value)))
     return solution if drawn is None else refuse(solution, drawn.given, drawn.valid)
+
+
+def _approached(rows: Any, numbers: newton.Backup, zero: jax.Array, method: str, max_steps: Any):
+    """A value near the fixed point, its image, the steps, and the weights of the choices there."""
+    policies = method == "policy_iteration"
+    if method == "strategy_iteration":
+        value, image, num_steps = _strategy_iteration(rows, numbers, zero, max_steps)
+    else:
+        value, image, num_steps, *chosen = newton.solve(
+            rows, _chosen, _judge, numbers, zero, newton=policies, monotone=False,
+            first_sweeps=_FIRST_SWEEPS if zero.size > DENSE_LIMIT else 0,
+            max_steps=max_steps, weights=policies)
+    rows, numbers = lax.stop_gradient((rows, numbers))
+    if policies:
+        return value, image, num_steps, rows.choices.unpacked(*chosen)
+    q = newton.action_values(rows.choices, numbers, rows.expectation(value))
+    return value, image, num_steps, _chosen(rows.choices, q, numbers.extra)[1]
 
 
 _UNCHANGED = 3  # solves without a change of strategy after which more would not help
