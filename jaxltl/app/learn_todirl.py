@@ -452,18 +452,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "training": _about_worlds(setup.training, outcome.training, infeasible[:count], ()),
         "test": outcome.test and setup.test and _about_worlds(
             setup.test, outcome.test, infeasible[count:], task.test.get("leave_out", ())),
-        "learning": {
-            "loss": history["loss"][-1][i],
-            "neg_log_likelihood": history["neg_log_likelihood"][-1][i],
-            "held_out": learned.held_out[i],
-            "best_step": learned.best_step[i],
-            "stopped_early": bool(learned.stopped[i]),
-            "steps": learned.num_steps,
-            "gradient_norm": history["gradient_norm"][-1][i],
-            "solver": Status(int(history["status"][:, i].max())).name,
-            "solver_error": history["error"][:, i].max(),
-            "hyperparameters": hyperparameters(task),
-        },
+        "learning": {**_about_learning(learned, i), "hyperparameters": hyperparameters(task)},
         "history": {
             "step": history["step"],
             **{k: history[k][:, i] for k in ("loss", "per_pair", "held_out", "gradient_norm")},
@@ -487,6 +476,22 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         **took(outcome.seconds),
     }
     return plain(result)
+
+
+def _about_learning(learned: Learned, i: int) -> dict[str, Any]:
+    """How one run of the learner ended."""
+    history = learned.history
+    return {
+        "loss": history["loss"][-1][i],
+        "neg_log_likelihood": history["neg_log_likelihood"][-1][i],
+        "held_out": learned.held_out[i],
+        "best_step": learned.best_step[i],
+        "stopped_early": bool(learned.stopped[i]),
+        "steps": learned.num_steps,
+        "gradient_norm": history["gradient_norm"][-1][i],
+        "solver": Status(int(history["status"][:, i].max())).name,
+        "solver_error": history["error"][:, i].max(),
+    }
 
 
 def _about_worlds(

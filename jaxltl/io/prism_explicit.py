@@ -23,7 +23,7 @@ from jaxltl.io._intervals import (
 )
 from jaxltl.io._prism_parts import Section, read_labels, read_rewards, read_valuation
 from jaxltl.io._prism_text import written_sections
-from jaxltl.io._tokens import Floats, Integers, Text, decoded, numbered, refuse
+from jaxltl.io._tokens import Block, Floats, Integers, Text, decoded, numbered, refuse
 
 _NAME = re.compile(
     r"(?P<stem>.+)\.(?P<kind>tra|pexp)(?P<packed>\.gz|\.xz)?", re.DOTALL | re.IGNORECASE
@@ -290,25 +290,9 @@ def _read_rows(text: Text) -> _Rows:
         block = with_whole_brackets(block, width - 1)
         at = block.columns(width, 1, f"{form}, and an action or none")
         is_interval |= has_bracket(block, at + width - 1)
-        action = np.full(at.size, -1, np.int32)
-        named = block.count > width
-        action[named] = numbered(block.texts(at[named] + width), names)
-        choice = (
-            np.zeros(at.size, np.int32)
-            if is_chain
-            else block.integers(at + 1, "the number of a choice")
-        )
-        found = (
-            block.integers(at, "a state", below),
-            choice,
-            block.integers(at + width - 2, "a state", below),
-            np.stack(intervals(block, at + width - 1), 1)
-            if is_interval
-            else block.probabilities(at + width - 1),
-            action,
-            block.line.astype(np.int32),
-        )
-        for part, column in zip(parts, found, strict=True):
+        for part, column in zip(
+            parts, _columns(block, at, width, below, names, is_interval), strict=True
+        ):
             part.append(column)
     if not parts[0]:
         raise text.error(rest.line, f"the file ends without a transition; expected {form}.")
@@ -337,6 +321,28 @@ def _read_rows(text: Text) -> _Rows:
             f"{sizes[1]} choices are announced and {new.sum()} follow; the file is cut or changed.",
         )
     return rows
+
+
+def _columns(
+    block: Block, at: NDArray, width: int, below: int, names: dict[bytes, int], is_interval: bool
+) -> tuple[NDArray, ...]:
+    """The columns of :class:`_Rows` from some lines, which begin at the tokens `at`."""
+    action = np.full(at.size, -1, np.int32)
+    named = block.count > width
+    action[named] = numbered(block.texts(at[named] + width), names)
+    is_chain = width == 3
+    return (
+        block.integers(at, "a state", below),
+        np.zeros(at.size, np.int32)
+        if is_chain
+        else block.integers(at + 1, "the number of a choice"),
+        block.integers(at + width - 2, "a state", below),
+        np.stack(intervals(block, at + width - 1), 1)
+        if is_interval
+        else block.probabilities(at + width - 1),
+        action,
+        block.line.astype(np.int32),
+    )
 
 
 def _new_rows(text: Text, rows: _Rows, form: str) -> NDArray[np.bool_]:

@@ -314,15 +314,22 @@ def _contents(model: Any, place: str) -> list[tuple[str, Any]]:
     }
     contents += more
     if sparse.valuation:
-        written = write_variables(sparse.valuation, place)
-        states: dict[str, Any] = {"unique": False, "classes": [{"variables": written.variables}]}
-        if written.named:
-            states["#strings"] = len(written.texts)
-            index["file-data"]["parameters"] = {TEXTS: written.named}
-        index["valuations"] = {"states": states}
-        contents.append((f"{VALUATIONS}/valuations.bin", written.records))
-        contents += _written_texts(written.texts, VALUATIONS, place)
+        contents += _valuations(sparse.valuation, index, place)
     return [("index.json", json.dumps(index, indent=1).encode()), *contents]
+
+
+def _valuations(
+    valuation: dict[str, Any], index: dict[str, Any], place: str
+) -> list[tuple[str, Any]]:
+    """The members for a valuation, which is entered in the index."""
+    written = write_variables(valuation, place)
+    states: dict[str, Any] = {"unique": False, "classes": [{"variables": written.variables}]}
+    if written.named:
+        states["#strings"] = len(written.texts)
+        index["file-data"]["parameters"] = {TEXTS: written.named}
+    index["valuations"] = {"states": states}
+    records = (f"{VALUATIONS}/valuations.bin", written.records)
+    return [records, *_written_texts(written.texts, VALUATIONS, place)]
 
 
 def _packed(array: Any, dtype: str) -> Bytes:
