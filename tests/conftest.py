@@ -8,6 +8,7 @@ stands: ``XLA_FLAGS= pytest`` tests the programs as users get them.
 """
 
 import atexit
+import collections
 import gc
 import getpass
 import hashlib
@@ -87,6 +88,20 @@ def _share_contexts(most: int = 100) -> None:
 
 if "xla_backend_optimization_level=0" in os.environ["XLA_FLAGS"]:
     _share_contexts()
+
+
+@pytest.hookimpl(tryfirst=True)  # before markers choose
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """All cases after the first n of ``few(n)`` are slow; of those that are exhaustive, none is."""
+    seen: collections.Counter[str] = collections.Counter()
+    for item in items:
+        if item.get_closest_marker("exhaustive"):
+            item.own_markers = [mark for mark in item.own_markers if mark.name != "slow"]
+        elif few := item.get_closest_marker("few"):
+            function = item.nodeid.partition("[")[0]
+            seen[function] += 1
+            if seen[function] > few.args[0]:
+                item.add_marker(pytest.mark.slow)
 
 
 def pytest_collection_finish() -> None:

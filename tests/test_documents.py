@@ -34,7 +34,11 @@ from tests.pages import MARKS, PAGES, ROOT, Block, blocks, name_of
 RUN = ("python", "sh", "pycon", "console")
 # Of a page that says nothing of how it is tested: what is slow in it, by a text.
 SLOW = {"README.md": ("ppo.train(", "jaxltl learn", "mlirl.train(")}
-ALL_SLOW = ("docs/gallery.md", "docs/guides/")
+ALL_SLOW = (
+    "docs/data.md", "docs/devices.md", "docs/gallery.md", "docs/guides/", "docs/models.md",
+    "docs/parameters.md", "docs/prepared.md", "docs/tasks-in-environments.md",
+    "docs/worlds-of-the-literature.md",
+)
 INSTALLED = re.compile(r"(pip install|pytest|python -m build|git clone|cd )\b")
 PROMISE = re.compile(r"[-\[({'\"\d]|(True|False|None)\b|[!FGX] ?\(")
 

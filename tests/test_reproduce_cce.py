@@ -61,6 +61,7 @@ def test_a_penalty_changes_what_is_learned():
     assert "penalised TRPO" in cce.table(result)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("task", nav.TASKS)
 def test_steps_add_up_to_the_scores(task):
     """The rewards and costs of steps are those of whole trajectories, from the same robot."""
@@ -86,6 +87,7 @@ def test_steps_add_up_to_the_scores(task):
         as_environment(world, 5)
 
 
+@pytest.mark.slow
 def test_steps_fit_the_trust_region_learner_and_its_precision():
     problem = tr.make_problem(as_environment(nav.navigation(), 3, dtype=jnp.float32), limit=-5.0)
     batch = jax.eval_shape(

@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 
 from jaxltl.algos import rmax
 from jaxltl.algos._data_evidence import data_evidence
@@ -39,6 +40,7 @@ def test_bounds_hold_and_close_in():
         assert gap < 0.1
 
 
+@pytest.mark.slow
 def test_a_learner_says_what_its_counts_guarantee():
     """Beside the certificate of the true game; of what was not seen at all, too."""
     game = random_game(np.random.default_rng(3))

@@ -210,6 +210,7 @@ def test_gradients_are_those_of_differences(tmp_path, seed):
                 slope[d], float((ends[0] - ends[1]) / (2 * step)), rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_values_over_policies(tmp_path):
     """Two ways to the goal, of p and of q (1 - p): against the best and the worst of both."""
     model = drn(tmp_path, "p q", [
@@ -258,6 +259,7 @@ def test_points_without_a_model_are_left_again():
     assert np.isnan(stopped.parameters[[0, 3]]).all() and not stopped.feasible[[0, 2, 3]].any()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("optimizer", ["rmsprop", "sgd", "sign"])
 def test_other_optimisers(optimizer):
     problem = make_problem(ruin(), "won", bound=">=")

@@ -93,6 +93,7 @@ def wins(problem, play):
     return True
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("task", TASKS)
 def test_every_policy_on_the_way_wins_almost_surely(task):
     """Where that is possible: those that are sampled, and those that are learned."""
@@ -269,6 +270,7 @@ def test_frequencies_that_are_rounded_beyond_one_make_no_nan():
 # --- values -------------------------------------------------------------------------------------
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("task", TASKS)
 def test_settled_values_are_the_robust_values_of_the_intervals(task):
     """By another solver, from all states; from values of other intervals, 40 steps on end."""
@@ -290,6 +292,7 @@ def test_settled_values_are_the_robust_values_of_the_intervals(task):
                 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", learning.INTERVALS)
 def test_values_come_near_the_optimum(kind):
     for i in range(3):
@@ -309,6 +312,7 @@ def test_values_come_near_the_optimum(kind):
         assert reached > best - 0.02
 
 
+@pytest.mark.slow
 def test_guarantees_hold_and_come_near():
     """Data that were drawn by what they said; at most one in ten may fail."""
     failed, gaps = 0, []

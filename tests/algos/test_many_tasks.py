@@ -203,6 +203,7 @@ def test_masks_are_kept():
         assert int(agent.act(agent.memory, seen, allowed, jax.random.key(0))[0]) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("squash", ["clip", "tanh"])
 def test_a_network_of_ppo_does_the_same_with_boxes(squash):
     """Scaled to its box, clipped or squashed, by normalised observations, as it was trained."""

@@ -102,6 +102,7 @@ def exact_problem(size: int, **options: Any) -> maximin_q.Problem:
         safe.part, safe.reward, exact=exact, measured=measured, **options)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("size", "counts"),
     [(3, {9.0: 16, 10.0: 56}), (4, {7.29: 16, 8.1: 48, 9.0: 44, 10.0: 132})],
@@ -125,6 +126,7 @@ def test_robots_learn_the_exact_value(size, counts):
     np.testing.assert_allclose(chosen[recurrent], exact[recurrent], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_ten_million_moves_stay_in_the_region():
     """In the whole game under the mask, where other moves lead to collisions."""
     safe = safe_robots(4)
@@ -228,6 +230,7 @@ def test_maximin_is_generalized_on_the_robots():
     assert not np.asarray(state.visits)[~np.isfinite(state.q)].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["generalized", "maximin"])
 def test_chance_is_averaged_out_by_decaying_steps(method):
     game, reward = random_game(2, width=3, alternating=method == "maximin")

@@ -186,6 +186,7 @@ def test_the_objective_by_hand():
     np.testing.assert_allclose(loss, expected, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_learning_reaches_the_optimum():
     problem = problem_in("world")
     hparams = mlirl.Hparams(discount=0.5, l2=1e-2)
@@ -345,6 +346,7 @@ def masked(reward=mlirl.linear_reward, **options):
         lazy, features, demonstrations, allowed=allowed, **options)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("kind", "mu"), [
     ("boltzmann", None), ("soft", 0.5),
     pytest.param("boltzmann", 0.5, marks=pytest.mark.exhaustive),

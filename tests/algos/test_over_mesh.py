@@ -166,6 +166,7 @@ def split_cases():
             yield pytest.param(name, number, marks=() if quick else pytest.mark.exhaustive)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "number"), list(split_cases()))
 def test_environments_over_devices_are_the_environments(name, number):
     problem, hparams = SPLIT[name]()

@@ -465,6 +465,7 @@ def certain_gap(optimal, value):
     return np.asarray(jnp.max(optimal.upper - value.lower, axis=-1))
 
 
+@pytest.mark.slow
 def test_what_rare_bad_moves_cost():  # lemma 7
     rng = np.random.default_rng(12)
     game, reward = random_games(rng, TRIALS)

@@ -353,6 +353,7 @@ def two_steps(name):
     return problem, hparams, state, ppo.run(state, problem, hparams, num_steps=2)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", DRIFTERS)
 def test_a_policy_that_does_not_change_has_ratios_of_one(name):
     """Scales and memories are in the update what they were when actions were drawn."""
@@ -426,6 +427,7 @@ RECALL = make_environment(
     recall_observe, actions=2)
 
 
+@pytest.mark.slow
 def test_a_memory_remembers():
     """By chance a half."""
     problem = ppo.make_problem(
@@ -440,6 +442,7 @@ def test_a_memory_remembers():
     assert episodes.reward.sum(1).mean() == 1.0
 
 
+@pytest.mark.slow
 def test_a_short_walk_is_learned():
     """To the right is worth most: 1.5 + 2 + 2.5 ... against 0 to the left at once."""
     problem = ppo.make_problem(WALK, network=ppo.ActorCritic(2, hidden=(8,)))

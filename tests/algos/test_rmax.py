@@ -120,6 +120,7 @@ class Plain:
         self.best = self.allowed & self.system[:, None] & (q >= most[:, None] - slack)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("update", rmax.UPDATES)
 def test_observed_moves_are_kept_as_by_plain_bookkeeping(update):
     problem, rng = random_problem(1, num_states=9, least=7)
@@ -157,6 +158,7 @@ def test_observed_moves_are_kept_as_by_plain_bookkeeping(update):
     np.testing.assert_allclose(state.value[live], plain.value[live], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_walk_and_the_same_moves_observed_come_to_the_same():
     """The loop's own records, against its counts by a second way: sums of what was seen."""
     problem, _ = random_problem(5)
@@ -194,6 +196,7 @@ def followed(key, problem, hparams, num_steps):
     return state, won
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [8, pytest.param(100, marks=pytest.mark.exhaustive)])
 def test_every_strategy_on_the_example_wins_almost_surely(seeds):
     keys = jax.random.split(jax.random.key(0), seeds)
@@ -240,6 +243,7 @@ def test_the_graph_check_refuses_what_does_not_win():
 # --- what is promised -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_with_restarts_nearly_all_states_become_optimal():
     problem, hparams = example(), settings()
     keys = jax.random.split(jax.random.key(7), 10)
@@ -281,6 +285,7 @@ def test_the_printed_update_fails_where_the_corrected_one_does_not():
     assert worth["printed"] < 0.01, "the loss is thought to pay the bound for ever"
 
 
+@pytest.mark.slow
 def test_a_seldom_successor_seen_late_still_counts():
     """Known before all of its successors were seen: the reward of the last enters later."""
     mdp = jl.make_mdp([[[0, 1]], [[0, 0]]], [[[0.97, 0.03]], [[1, 0]]], initial=[1, 0])

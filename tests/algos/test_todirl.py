@@ -240,6 +240,7 @@ class Table(nn.Module):
         return jnp.repeat(result[..., None], action.shape[-1], axis=-1)
 
 
+@pytest.mark.slow
 def test_the_expert_is_recovered_with_the_features_of_its_reward():
     """Wilks: twice the gap of log-likelihoods is chi-squared with as many parameters at most."""
     model = lazy()

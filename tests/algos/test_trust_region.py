@@ -548,6 +548,7 @@ def tree_observe(world):
     return {"time": world[0], "late": world[0] > 1, "luck": world[1:]}
 
 
+@pytest.mark.slow
 def test_a_policy_runs_as_an_agent_on_trees_within_the_box():
     """Observations become one vector, and actions are those of the box."""
     def step(world, action, key):
@@ -708,6 +709,7 @@ def chosen(state):
     return float(mean[0])
 
 
+@pytest.mark.slow
 def test_one_choice_ends_at_the_limit():
     state, metrics = trust_region.train(jax.random.key(0), one_choice(1.0), ONE, num_steps=60)
     assert abs(chosen(state) - 1) < 0.05

@@ -77,6 +77,7 @@ def fetched():
     return learned(EXAMPLES / "one_demonstration.toml")
 
 
+@pytest.mark.slow
 def test_one_demonstration_is_enough(fetched):
     outcome, result = fetched
     assert result["satisfaction"]["minimum"]["lower"] == 1
@@ -94,6 +95,7 @@ def test_the_demonstrated_route_is_the_most_likely_one(fetched):
     assert first > 0.9 and second < 0.01
 
 
+@pytest.mark.slow
 def test_one_round_shown_is_repeated_for_ever():
     outcome, result = learned(EXAMPLES / "patrol_two.toml")
     model, shown = outcome.setup.model, outcome.setup.demonstrations
@@ -238,6 +240,7 @@ def test_a_probability_is_reached_and_nothing_given_away(tmp_path, count, grid):
     check_many(count, grid, "mean", tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "grid"), [
     (1, np.logspace(-2, 2, 4)),
     pytest.param(8, np.logspace(-3, 5, 64), marks=pytest.mark.exhaustive),
@@ -354,6 +357,7 @@ def test_to_ask_for_certainty_is_to_ask_for_the_best(write):  # noqa: F811
     assert at_starts(setup.model, np.ones(setup.model.state_shape), "mean")[0] == 1
 
 
+@pytest.mark.slow
 def test_steps_that_lose_nothing_by_themselves_are_left_out_truly_told(write):  # noqa: F811
     """From a, where it may stay for ever, on to b; but back and forth it would fail."""
     path = write((". . r\nb . y", "a . b"), ('"y"', '"b"'), ("!r & !y", "a"),

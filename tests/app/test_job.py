@@ -28,6 +28,7 @@ def seeds():
     return partial(run_seeds, module, (3, 3), problem, hparams, None, num_steps=6, chunk=2)
 
 
+@pytest.mark.slow
 def test_seeds_over_devices_are_the_seeds(seeds, tmp_path):
     """Also where they cannot be split evenly, and where a run goes on on other devices."""
     found, history = seeds()

@@ -238,6 +238,7 @@ def test_interrupted_before_it_learns(learned, monkeypatch, tmp_path):
         assert told.exit_code == 130 and told.stderr.endswith("interrupted\n"), told.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "table", "boxed"), [
     ("cce", CCE, False),
     pytest.param("cce", (CCE[0], CCE[1] + '\ncost = "violation"\nlimit = 0.2'), True,

@@ -232,6 +232,7 @@ def learned(tmp_path_factory):
     return place, result.stdout, json.loads(result.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 def test_the_reward_carries_over(learned):
     _, printed, result = learned
     for key in ("training", "test"):

@@ -42,6 +42,7 @@ class Left(Exception):
     """In place of a death."""
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("other", [2, 4])
 def test_bounds_are_gone_on_from_there_and_elsewhere(often, tmp_path, monkeypatch, other):
     whole = solved(2, None).answer
@@ -77,6 +78,7 @@ def test_bounds_of_another_question_are_left_alone(often, tmp_path, monkeypatch)
     assert refused.answer is None and "not solved for over a mesh" in refused.error
 
 
+@pytest.mark.slow
 def test_from_the_command_line(tmp_path):
     assert len(jax.devices()) == 4  # made before, so that no other test has fewer
     write_model(tmp_path / "walk.umb", walk(16))

@@ -282,6 +282,7 @@ def test_an_unknown_proposition_in_a_models_initial(write):
         load_world(task)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("discount", ["discount = 0.9", ""])
 def test_synthetic_demonstrations_do_the_task(write, discount):
     synthetic = ('file = "shown.json"', f"synthetic = 5\n{discount}\nlength = 9")

@@ -114,6 +114,7 @@ def test_a_task_without_end_is_learned_and_done_in_worlds_never_seen(write, tmp_
         assert sure[starts, np.asarray(model.initial_memory)[starts]].all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("formula", "kind"), [
     ("G F a & G F b & G !c", "buchi"), ("F G !a | G F b", "parity"), ("G !c & !b", "safety"),
     ("!c U (a & (!c U b))", "cosafe")])
@@ -301,6 +302,7 @@ def test_probabilities_are_reached_from_the_worst_start_too(write, tmp_path, ask
     assert setup.asked == asked
 
 
+@pytest.mark.slow
 def test_a_task_without_end_has_its_probability_by_moves_that_lose_nothing(write):
     """Any share of others would fail it in the end, and no weight changes that."""
     outcome, result = learned(write(("[task]", "[task]\nguarantee = 0.7"),

@@ -138,6 +138,7 @@ def test_moves_stop_at_the_bounds_and_shares_are_limited():
     np.testing.assert_allclose([*most], [-0.5, 0, math.pi / 6])
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("absorbing", [False, True])
 @pytest.mark.parametrize("world", [WORLD, crowded()], ids=["default", "crowded"])
 def test_runs_against_a_plain_simulation(world, absorbing):
@@ -176,6 +177,7 @@ def test_starts_are_uniform():
     assert np.abs(correlation - np.eye(3)).max() < 0.03
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("task", nav.TASKS)
 def test_tasks_against_table_4(task):
     world = crowded()

@@ -20,6 +20,7 @@ NETWORK = nav.policy_network(WORLD, (4,))
 PARAMETERS = 0.7 * jax.random.normal(jax.random.key(5), (3, NETWORK.num_parameters))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("task", nav.TASKS)
 def test_episodes_are_trajectories(task):
     """The same places, J and Z as of the run that starts alike."""
@@ -47,6 +48,7 @@ def test_episodes_are_trajectories(task):
         WORLD, jax.tree.map(lambda x: x[0], run.state)))
 
 
+@pytest.mark.slow
 def test_a_formula_is_judged_on_it():
     """Table 4's reading of task 4: reached, and the obstacle never met."""
     environment = as_environment(WORLD, 4)

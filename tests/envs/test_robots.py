@@ -217,6 +217,7 @@ def test_rewards_of_conditions_masks_and_products():
         arrival_reward(game, "corner")
 
 
+@pytest.mark.slow
 def test_the_reward_that_opposes_the_task_is_never_attained():
     game, reward = reward_against_task()
     assert game.system.all()

@@ -93,6 +93,7 @@ def test_what_the_robot_sees():
     assert made.labels(inside).tolist() == [True, False, True, False]
 
 
+@pytest.mark.slow
 def test_zones_and_robot_are_apart():
     places = draw_places(8, 2.5, 50)
     states = jax.vmap(world().reset)(jax.random.split(jax.random.key(2), 300))

@@ -166,6 +166,7 @@ def letter_by_letter(body, names, controllable):
     return vertices
 
 
+@pytest.mark.slow
 def test_classes_of_letters_agree_with_single_letters(tmp_path):
     rng = np.random.default_rng(0)
     count = np.zeros(2, int)

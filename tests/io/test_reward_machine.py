@@ -175,6 +175,7 @@ def random_world(rng, states=5, actions=2):
                     propositions=["f", "g", "n"])  # fmt: skip
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("label_on", ["entry", "exit"])
 def test_the_reward_of_a_product(label_on):
     rng = np.random.default_rng(1)

@@ -80,6 +80,7 @@ def test_safety_is_maximal_and_gives_the_values_of_example_1(size, expected):
     np.testing.assert_array_equal(again.available, found.available)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("bound", "size", "best"),
     [(4, 260, 8.092178), (10, 788, 9.464660), (20, 1668, 9.861597), *(

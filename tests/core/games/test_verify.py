@@ -85,6 +85,7 @@ def random_memory_claim(rng):
     return game, sets, region ^ (rng.random(num_states) < rng.choice([0, 0.15])), action, counter
 
 
+@pytest.mark.slow
 def test_verdicts_with_memory_equal_brute_force():
     """The strategies are written into the states, where they have no memory."""
     rng = np.random.default_rng(1)

@@ -79,6 +79,7 @@ def all_values(model):
     return np.stack([satisfied(model, np.eye(A)[list(c)].reshape(S, Q, A)) for c in choices])
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("label_on", ["entry", "exit"])
 @pytest.mark.parametrize("seed", [
     pytest.param(seed, marks=[] if seed < 5 else pytest.mark.exhaustive) for seed in range(12)])

@@ -100,6 +100,7 @@ def as_pairs(table):
     return list(zip(np.asarray(table.world["state"]).tolist(), over.tolist(), strict=True))
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("seed", range(6))
 def test_a_told_world_is_its_process(seed):
     p = random_process(seed)

@@ -54,6 +54,7 @@ def asked(sharded, text, steps=1000):
         bounds, times = (found.lower, found.upper), times + 1
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("text", PROPERTIES)
 def test_the_answers_are_those_of_the_host(model, sharded, text):
     there, _ = asked(sharded, text)

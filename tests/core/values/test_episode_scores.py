@@ -89,6 +89,7 @@ def test_scores_are_means_over_episodes():
                      together, alone)
 
 
+@pytest.mark.slow
 def test_a_search_keeps_a_task_and_saves_effort():
     """The least effort with which the task fails at most one time in five."""
     evaluate = episode_evaluator(

@@ -96,6 +96,7 @@ def test_the_given_fixed_point_is_returned_and_its_own_derivative_dropped():
     np.testing.assert_allclose(jax.grad(root)(0.5, jnp.array(2.0)), 4.0)
 
 
+@pytest.mark.slow
 def test_implicit_derivatives_of_both_kinds_inside_jit_and_vmap_and_of_second_order():
     """``v = 1 + w[i] a v`` has ``v = 1 / (1 - w[i] a)``; the index is traced, and no number."""
     weight = jnp.array([0.2, 0.4])

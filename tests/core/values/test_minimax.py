@@ -304,6 +304,7 @@ def robots(size):
     return game, jnp.asarray(reward.reshape(flat)), available & ~lost[:, None] & ~to_lost
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("size", "method", "states", "counts"), [
     *((3, method, 120, {10.0: 56, 9.0: 16}) for method in METHODS),
     pytest.param(4, METHODS[0], 432, {10.0: 132, 9.0: 44, 8.1: 48, 7.29: 16},

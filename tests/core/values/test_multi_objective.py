@@ -255,6 +255,7 @@ def arc(corners):
     return model, x[:-1], y[:-1]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("corners", (20, 1000))
 def test_a_border_of_many_corners(corners):
     model, x, y = arc(corners)

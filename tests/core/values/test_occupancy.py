@@ -32,6 +32,7 @@ def batch_of(cases):
     return stack([as_mdp(m) for m in models]), stack(policies), stack(discounts)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("tolerance", [None, 1e-6])
 def test_occupancies_are_enclosed(cases, tolerance):
     solution = jax.jit(jax.vmap(
@@ -54,6 +55,7 @@ def test_occupancies_are_enclosed_in_single_precision(cases):
         )
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", REPRESENTATIONS)
 def test_occupancy_and_value_are_dual(kind):
     """``<x, R> = <initial, V>``: the reward collected is the value of the start."""
@@ -100,6 +102,7 @@ def test_bad_policies_are_named():
         jl.occupancy_measure(mdp, jnp.zeros((5, 2)), 0.9)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", ["padded", "rows"])
 def test_what_flows_into_a_hub_is_enclosed_in_single_precision(kind):
     """Of a sum of many terms more is lost than of a few."""

@@ -91,6 +91,7 @@ def on_table(table, policy):
     return policy[np.asarray(table.world)]
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("kind", ["stochastic", "deterministic"])
 def test_bounds_enclose_the_recursion(seed, kind):
@@ -174,6 +175,7 @@ def shortest(letter, place, automaton, decided):
     return 16
 
 
+@pytest.mark.slow
 def test_a_network_is_what_it_does_in_its_tasks_environment():
     world = letter_world(layout="a . .\n. b .\n. . a", letters=2, horizon=8)
     task = "!a U b"

@@ -98,6 +98,7 @@ def test_solvers_where_one_table_holds_all(solver):
     case.agree(one, other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("formula", FORMULAS)
 @pytest.mark.parametrize(("count", "reach"), MESHES)
 def test_formulas(count, reach, formula):
@@ -217,6 +218,7 @@ def test_gradients(count, reach):
             from_mesh(case.sharded, y) * case.mdp.available, x * case.mdp.available, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "reach"), MESHES)
 def test_derivatives_in_the_probabilities(count, reach):
     case = Case(count, reach)

@@ -70,6 +70,7 @@ def assert_correct(found, models, exact):
     assert float(jnp.max(found.upper - found.lower)) < 1e-10
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("acceptance", "label_on"),
     [("cosafe", "exit"), ("cosafe", "entry"), ("safety", "exit"),
@@ -221,6 +222,7 @@ def test_infeasible_starts_are_found():
 KINDS = ("cosafe", "safety", "buchi", "parity")
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("kind", KINDS)
 def test_starts_from_which_nothing_does_any_task_are_found(kind):
     rng = np.random.default_rng(KINDS.index(kind))
@@ -249,6 +251,7 @@ def random_choice(rng, model):
     return (rng.random(available.shape) * available).argmax(-1)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", ["buchi", "parity"])
 def test_tasks_without_end_are_enclosed_in_every_world(kind):
     rng = np.random.default_rng(len(kind))

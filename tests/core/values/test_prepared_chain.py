@@ -58,6 +58,7 @@ def test_values_are_those_of_the_host_engine(kind, asks_reward):
         assert (value <= bounded.upper * (1 + 1e-12)).all()
 
 
+@pytest.mark.slow
 def test_elimination_and_passes_say_the_same(monkeypatch):
     _, model, target, _ = case(1, "circles", trap=3)
     prepared = prepare(model, target)

@@ -95,6 +95,7 @@ def _cases(seed, count):
     return successor, *map(np.array, zip(*ends, strict=True)), cost
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize(("objective", "nature"), DIRECTIONS)
 def test_all_ends_of_a_batch_are_enclosed_as_by_brute_force(seed, objective, nature):
@@ -120,6 +121,7 @@ def test_all_ends_of_a_batch_are_enclosed_as_by_brute_force(seed, objective, nat
             assert (high[finite] - low[finite] <= 1e-6 * size).all()
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("objective", "nature"), DIRECTIONS)
 def test_policy_and_nature_attain_what_they_are_shown_for(objective, nature):
     successor, lower, upper, _ = _cases(3, 1)
@@ -154,6 +156,7 @@ def test_given_policies_are_evaluated():
 
 
 # Compiling derivatives takes seconds; by default each direction and each question occurs.
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("objective", "nature", "question"), [
     pytest.param(*ways, question, marks=[] if usual else pytest.mark.exhaustive)
     for i, ways in enumerate(DIRECTIONS) for usual, question in (

@@ -108,6 +108,7 @@ def test_the_examples_are_not_trivial(cases, exact):
     assert several > 100
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("objective", "tolerance"), [
     ("max", None), ("min", None), ("max", 1e-12),
     pytest.param("min", 1e-12, marks=pytest.mark.exhaustive)])
@@ -174,6 +175,7 @@ def exact_satisfaction(lazy, explicit, policy):
     return value if cosafe else 1 - value
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("acceptance", "label_on", "count"),
     [

@@ -174,6 +174,7 @@ USUAL = ("policy_value", "optimal_value-policy_iteration", "soft_value-newton",
          "occupancy_measure")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [
     pytest.param(n, marks=[] if n in USUAL else pytest.mark.exhaustive) for n in SOLVERS])
 def test_derivatives(name):
@@ -241,6 +242,7 @@ def lanes(name: str) -> dict[str, jl.Solution]:
     return {case: lane(batch, i) for i, case in enumerate(cases())}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LANES)
 def test_every_lane_is_as_if_alone(name):
     for case in ("usual", "other", "slow"):
@@ -347,6 +349,7 @@ def test_where_the_boltzmann_operator_contracts_is_known_inside_jit():
             jax.jit(boltzmann_expansion)(jnp.int32(count)), expected, rtol=1e-12)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("label_on", ["entry", "exit"])
 def test_products_are_solved_without_padding(label_on):
     model, _, _, _ = example()

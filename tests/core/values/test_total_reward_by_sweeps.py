@@ -123,6 +123,7 @@ def mesh_agrees(seed, devices, objectives=("max", "min", "policy")):
             attains(model, reward, target, found, objective, taken)
 
 
+@pytest.mark.slow
 def test_over_a_mesh_it_is_that_of_the_host():
     mesh_agrees(1, 4, ("min",))
 
@@ -229,6 +230,7 @@ def test_what_rounding_forbids_is_not_claimed():
     assert tiny.status != Status.CONVERGED and tiny.upper[1] > 0
 
 
+@pytest.mark.slow
 def test_single_precision():
     with jax.enable_x64(False):
         for seed in range(8):
