@@ -192,46 +192,13 @@ def swap_players(game: Game) -> Game:
 # --- the primitives: those of the model -----------------------------------------------------
 
 
-@choices.register
-def _(game: Game) -> Any:
-    return choices(game.mdp)
+def _that_of_the_model(primitive: Any) -> None:
+    primitive.register(Game, lambda game, *given, **named: primitive(game.mdp, *given, **named))
 
 
-@choice_shape.register
-def _(game: Game) -> tuple[int, ...]:
-    return choice_shape(game.mdp)
-
-
-@operators.expectation.register
-def _(game: Game, value: jax.Array) -> jax.Array:
-    return operators.expectation(game.mdp, value)
-
-
-@operators.exists_successor.register
-def _(game: Game, region: jax.Array) -> jax.Array:
-    return operators.exists_successor(game.mdp, region)
-
-
-@operators.forall_successor.register
-def _(game: Game, region: jax.Array) -> jax.Array:
-    return operators.forall_successor(game.mdp, region)
-
-
-@operators.least_successor.register
-def _(game: Game, value: jax.Array) -> jax.Array:
-    return operators.least_successor(game.mdp, value)
-
-
-@operators.sample_successor.register
-def _(game: Game, key: chex.PRNGKey, state: jax.Array, action: jax.Array) -> jax.Array:
-    return operators.sample_successor(game.mdp, key, state, action)
-
-
-@operators.induced_chain.register
-def _(game: Game, policy: jax.Array) -> Any:
-    return operators.induced_chain(game.mdp, policy)
-
-
-@operators.transition_matrix.register
-def _(game: Game, policy: jax.Array) -> jax.Array:
-    return operators.transition_matrix(game.mdp, policy)
+for _primitive in (
+    choices, choice_shape, operators.expectation, operators.exists_successor,
+    operators.forall_successor, operators.least_successor, operators.sample_successor,
+    operators.induced_chain, operators.transition_matrix,
+):
+    _that_of_the_model(_primitive)
