@@ -84,10 +84,11 @@ def enclose(
     rounding = rounding / gap
     down = discount / gap * jnp.min(change, axis=0) - rounding
     up = discount / gap * jnp.max(change, axis=0) + rounding
-    return _judged(down, up, rounding, tolerance)
+    return judged(down, up, rounding, tolerance)
 
 
-def _judged(down, up, rounding, tolerance) -> Enclosure:
+def judged(down: Any, up: Any, rounding: Any, tolerance: Any) -> Enclosure:
+    """What ends of an enclosure show, seen from the image, that rounding may have moved so far."""
     half = (up - down) / 2
     finite = jnp.isfinite(half)
     goal = 4 * rounding if tolerance is None else tolerance

@@ -35,7 +35,7 @@ from jaxltl.core.models.tables import table
 from jaxltl.core.types import Solution, require_shape, status_code
 from jaxltl.core.values import newton
 from jaxltl.core.values.discounted import best_action, expected_reward
-from jaxltl.core.values.evidence import refuse, rounding_unit
+from jaxltl.core.values.evidence import Enclosure, judged, refuse, rounding_unit
 from jaxltl.core.values.fixed_point import implicit
 from jaxltl.core.values.iterate import iterate
 from jaxltl.core.values.linear import DENSE_LIMIT, System, solver
@@ -360,17 +360,7 @@ def _horizon(rows: Any, play: _Play, moves, live, per: str, defined, max_steps) 
     return jnp.where(valid, horizon, jnp.nan)
 
 
-class _Evidence(NamedTuple):
-    """An enclosure seen from an image, and what it shows; as of evidence.Enclosure, by state."""
-
-    shift: jax.Array
-    half: jax.Array
-    converged: jax.Array
-    exhausted: jax.Array  # as narrow as rounding lets it be
-    finite: jax.Array
-
-
-def _certify(play: _Play, value: jax.Array, image: jax.Array) -> _Evidence:
+def _certify(play: _Play, value: jax.Array, image: jax.Array) -> Enclosure:
     """``T v + [down, up]`` encloses the fixed point of T; `horizon` for each state or its largest.
 
     With ``c = max(T v - v)``: if c >= 0, ``u = v + c h`` has ``T u <= u``, so the fixed point
@@ -385,16 +375,8 @@ def _certify(play: _Play, value: jax.Array, image: jax.Array) -> _Evidence:
     least = play.discount / (1 - play.discount)
     up = top * jnp.where(top > 0, horizon - 1, least) + unit * horizon
     down = bottom * jnp.where(bottom < 0, horizon - 1, least) - unit * horizon
-    half = (up - down) / 2
-    known = jnp.isfinite(half)
-    goal = 4 * unit * horizon if play.tolerance is None else play.tolerance
-    return _Evidence(
-        shift=jnp.where(known, (up + down) / 2, 0),
-        half=jnp.where(known, half, jnp.inf),
-        converged=known & (half <= goal),
-        exhausted=known & (half <= 2 * unit * horizon),
-        finite=jnp.isfinite(top - bottom) & jnp.isfinite(play.size) & ~jnp.isnan(horizon),
-    )
+    finite = jnp.isfinite(top - bottom) & jnp.isfinite(play.size) & ~jnp.isnan(horizon)
+    return judged(down, up, unit * horizon, play.tolerance)._replace(finite=finite)
 
 
 def _judge(value: jax.Array, image: jax.Array, play: _Play) -> tuple[jax.Array, jax.Array]:
