@@ -210,7 +210,7 @@ def reward_bounded_reachability(
     stay = np.ones_like(target) if stay is None else states(model, stay, "stay")
     if not 0 <= bound < math.inf:
         raise ValueError(f"bound={bound}; it must be finite and not negative.")
-    cost = _entry_reward(model, structure(model, reward))
+    cost = _entry_reward(model, reward_parts(model, reward))
     if (cost < 0).any():
         e = int(np.flatnonzero(cost < 0)[0])
         raise ValueError(f"the reward is {cost[e]:.9g} from state {mdp.state[mdp.row[e]]} to "
@@ -251,18 +251,13 @@ def states(model: SparseMDP, given: Any, name: str) -> np.ndarray:
     return given
 
 
-def structure(model: SparseMDP, reward: Any) -> Rewards:
-    """A reward as a structure, whatever it is given as; see :func:`row_reward`."""
-    return reward_parts(model, reward)
-
-
 def state_reward(model: SparseMDP, reward: Any) -> np.ndarray:
     """What states earn, ``float64[S]``.
 
     Raises:
       ValueError: nothing of the reward is on states, or some is not finite.
     """
-    given = structure(model, reward)
+    given = reward_parts(model, reward)
     if given.state is None:
         raise ValueError("the reward of a state after so many steps needs a reward on states, and "
                          "this one has none; give an array of one number a state.")
@@ -275,7 +270,7 @@ def finite_reward(model: SparseMDP, reward: Any) -> tuple[np.ndarray, np.ndarray
     Raises:
       ValueError: some reward is not finite.
     """
-    given = structure(model, reward)
+    given = reward_parts(model, reward)
     earned = row_reward(model, given)
     if not np.isfinite(earned).all():
         row = int(np.flatnonzero(~np.isfinite(earned))[0])

@@ -15,9 +15,9 @@ from jaxltl.core.host.interval_values import Robust
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.operators import is_deterministic, row_weights
-from jaxltl.core.models.sparse import Rewards, SparseMDP, row_reward
+from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts, row_reward
 from jaxltl.core.types import Method, Solution, Status, require_shape
-from jaxltl.core.values.bounded import states, structure
+from jaxltl.core.values.bounded import states
 
 TOLERANCE = 1e-6
 
@@ -250,7 +250,7 @@ def entry_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
     Raises:
       ValueError: some of it is not finite.
     """
-    given = structure(model.nominal, reward)
+    given = reward_parts(model.nominal, reward)
     host = model.nominal.host
     apart = row_reward(model.nominal, Rewards(state=given.state, choice=given.choice))
     earned = apart[host.row]
@@ -277,7 +277,7 @@ def interval_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
         raise ValueError(f"the reward of state {state}, choice "
                          f"{row - int(model.nominal.row_start[state])} is {earned[row]}; it must "
                          "be finite and at least 0.")
-    of = structure(model.nominal, reward).transition
+    of = reward_parts(model.nominal, reward).transition
     if of is not None:
         each = np.asarray(of)
         start = model.nominal.host.entry_start[:-1]
