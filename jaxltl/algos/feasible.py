@@ -71,7 +71,7 @@ from jaxltl.core.models.parametric import Ends, ParametricMDP
 from jaxltl.core.models.sparse import row_reward
 from jaxltl.core.show import brief, history
 from jaxltl.core.types import Status, require_shape
-from jaxltl.core.values.mixture import safe_mean
+from jaxltl.core.values.mixture import safe_ends
 from jaxltl.core.values.prepared import Prepared, prepare, solve_prepared
 from jaxltl.core.values.prepared_chain import evaluate_prepared, is_direct
 from jaxltl.core.values.robust import width_asked
@@ -685,11 +685,4 @@ def _bounds(problem: Problem, model: Any, tolerance: float) -> tuple[float, floa
     else:
         earned = row_reward(model, problem.reward)
         found = optimal.total_reward(model.host, earned, problem.target, **given)
-    weight = np.asarray(model.initial, np.float64)
-    start = np.flatnonzero(weight)
-    highest = 1.0 if problem.reward is None else np.inf
-    low, high = (
-        safe_mean(weight[start], x[start], up=up, highest=highest)
-        for x, up in ((found.lower, False), (found.upper, True))
-    )
-    return low, high
+    return safe_ends(model, found, highest=1.0 if problem.reward is None else np.inf)

@@ -20,7 +20,7 @@ from jaxltl.core.host.given import whole as count
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.parametric import box_of
 from jaxltl.core.show import brief
-from jaxltl.core.values.mixture import safe_mean
+from jaxltl.core.values.mixture import safe_ends
 
 ACCEPTED, REJECTED, OPEN = 1, -1, 0
 Problem = Any  # as jaxltl.algos.feasible.make_problem makes it
@@ -126,13 +126,7 @@ def _value(
         earned = reward.upper if large else np.maximum(reward.lower, 0)
         found = interval_values.total_reward(
             model.host, earned, problem.target, maximize=maximize, large=large, depth=depth)
-    share = np.asarray(model.initial, np.float64)
-    start = np.flatnonzero(share)
-    highest = 1.0 if problem.reward is None else np.inf
-    low, high = (
-        safe_mean(share[start], x[start], up=up, highest=highest)
-        for x, up in ((found.lower, False), (found.upper, True)))
-    return low, high
+    return safe_ends(model, found, highest=1.0 if problem.reward is None else np.inf)
 
 
 def verdict_of(problem: Problem, threshold: float, lower: float, upper: float) -> int:

@@ -177,3 +177,12 @@ def safe_mean(share: np.ndarray, bound: np.ndarray, *, up: bool, highest: float 
     slack = (share.size + 4) * float(np.finfo(np.float64).eps)
     mean = float(share @ bound / share.sum())
     return min(mean * (1 + slack), highest) if up else mean * (1 - slack)
+
+
+def safe_ends(model: Any, found: Any, *, highest: float = np.inf) -> tuple[float, float]:
+    """What encloses the mean over the initial distribution of what `lower` and `upper` enclose."""
+    share = np.asarray(model.initial, np.float64)
+    start = np.flatnonzero(share)
+    low, high = (safe_mean(share[start], x[start], up=up, highest=highest)
+                 for x, up in ((found.lower, False), (found.upper, True)))
+    return low, high
