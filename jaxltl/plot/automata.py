@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -64,8 +64,21 @@ def automaton(
     graph = drawing.arrange(
         table.delta, int(table.initial), doomed, texts, _places(table, texts, layout)
     )
+    figure, axes = canvas(graph, _notes(table, texts, graph.size[0]) if names else [])
+    for edge in graph.edges:
+        draw_edge(axes, edge.curve, _edge_color(table, edge.key, doomed))
+    for label in graph.labels:
+        draw_label(axes, label, MUTED if doomed[label.key[1]] else INK)
+    draw_start(axes, graph.position[int(table.initial)])
+    final = table.final if table.acceptance in ("cosafe", "safety") else doomed & False
+    for q, center in enumerate(graph.position):
+        draw_state(axes, center, str(q), bool(final[q]), bool(doomed[q]))
+    return figure
+
+
+def canvas(graph: drawing.Graph, lines: Sequence[str]) -> tuple[Figure, Axes]:
+    """Room for a graph, above lines of notes."""
     width, height = graph.size
-    lines = _notes(table, texts, width) if names else []
     # As wide as the notes, at 8 points a character of a monospaced font.
     full = max([width, *(0.5 + 0.602 * 8 / 72 * len(line) for line in lines)])
     below = 0.19 * len(lines) + (0.25 if lines else 0.0)
@@ -73,22 +86,12 @@ def automaton(
     axes = figure.add_axes((0, below / (height + below), 1, height / (height + below)))
     axes.set(xlim=((width - full) / 2, (width + full) / 2), ylim=(0, height), aspect="equal")
     axes.axis("off")
-    for edge in graph.edges:
-        draw_edge(axes, edge.curve, _edge_color(table, edge.key, doomed))
-    for label in graph.labels:
-        draw_label(axes, label, MUTED if doomed[label.key[1]] else INK)
-    start = graph.position[int(table.initial)]
-    tail = start - [drawing.RADIUS + 0.42, 0]
-    draw_edge(axes, np.array([tail, (tail + start) / 2, start - [drawing.RADIUS, 0]]), INK)
-    final = table.final if table.acceptance in ("cosafe", "safety") else doomed & False
-    for q, center in enumerate(graph.position):
-        draw_state(axes, center, str(q), bool(final[q]), bool(doomed[q]))
     for i, line in enumerate(lines):
         figure.text(
             0.25 / full, (below - 0.19 * (i + 0.5)) / (height + below), line, fontsize=8,
             color=MUTED, va="center", family="monospace", parse_math=False,
         )
-    return figure
+    return figure, axes
 
 
 def on_the_host(automaton: Automaton) -> Automaton:
@@ -229,6 +232,12 @@ def draw_edge(axes: Axes, curve: NDArray[np.float64], color: str) -> None:
             mutation_scale=1, color=color, linewidth=1.1, zorder=2, joinstyle="miter",
         )
     )
+
+
+def draw_start(axes: Axes, center: NDArray[np.float64]) -> None:
+    """The arrow from nowhere to the initial state."""
+    tail = center - [drawing.RADIUS + 0.42, 0]
+    draw_edge(axes, np.array([tail, (tail + center) / 2, center - [drawing.RADIUS, 0]]), INK)
 
 
 def draw_state(

@@ -18,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from jaxltl.plot import layout as drawing
-from jaxltl.plot.automata import draw_edge, draw_label, draw_state
+from jaxltl.plot.automata import canvas, draw_edge, draw_label, draw_start, draw_state
 from jaxltl.plot.board import STEPS, Board
 from jaxltl.plot.maps import grid
 from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER, plain_axes
@@ -314,14 +314,7 @@ def _graph(
     starts = np.flatnonzero(np.asarray(world.initial) > 0)
     first = int(starts[0]) if starts.size else 0
     graph = drawing.arrange(delta, first, np.zeros(count, bool), rows)
-    lines = _notes(world, values)
-    width, height = graph.size
-    full = max([width, *(0.5 + 0.602 * 8 / 72 * len(line) for line in lines)])
-    below = 0.19 * len(lines) + (0.25 if lines else 0.0)
-    figure = Figure(figsize=(full, height + below), facecolor=PAPER)
-    axes = figure.add_axes((0, below / (height + below), 1, height / (height + below)))
-    axes.set(xlim=((width - full) / 2, (width + full) / 2), ylim=(0, height), aspect="equal")
-    axes.axis("off")
+    figure, axes = canvas(graph, _notes(world, values))
     taken = {(x.source, x.target) for x in arrows if policy is not None
              and policy[x.source] == x.number}
     for edge in graph.edges:
@@ -329,19 +322,12 @@ def _graph(
     for label in graph.labels:
         draw_label(axes, label, INK)
     if len(starts) == 1:
-        start = graph.position[first]
-        tail = start - [drawing.RADIUS + 0.42, 0]
-        draw_edge(axes, np.array([tail, (tail + start) / 2, start - [drawing.RADIUS, 0]]), INK)
+        draw_start(axes, graph.position[first])
     for s, center in enumerate(graph.position):
         if system is not None and not system[s]:
             _square(axes, center, str(s), region is not None and bool(region[s]))
         else:
             draw_state(axes, center, str(s), region is not None and bool(region[s]), False)
-    for i, line in enumerate(lines):
-        figure.text(
-            0.25 / full, (below - 0.19 * (i + 0.5)) / (height + below), line, fontsize=8,
-            color=MUTED, va="center", family="monospace", parse_math=False,
-        )
     return figure
 
 
