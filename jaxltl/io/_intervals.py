@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.models.interval import NEAR, IntervalMDP, refuse_ball
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.io._tokens import Block, Floats, Integers, Text, as_double, bytes_of
+from jaxltl.io._tokens import Block, Floats, Integers, Text, as_double, bytes_of, edges
 
 EXPECTED = "a probability or an interval [l, u] with 0 <= l <= u <= 1"
 _SIGN = bytes_of(b"[,]\n")
@@ -105,10 +105,7 @@ def _numbers(block: Block, token: Integers) -> Block | None:
         return None
     comma = joined == ord(",")
     data = np.frombuffer(joined.tobytes().translate(_TO_BLANKS), np.uint8)
-    blank = np.ones(data.size + 1, bool)
-    np.less_equal(data, 32, out=blank[1:])
-    edge = np.flatnonzero(blank[1:] != blank[:-1])
-    start, end = edge[::2], edge[1::2]
+    start, end = edges(data)
     count = np.diff(np.searchsorted(start, np.append(begin, data.size)))
     # One number on either side of each comma.
     of = np.searchsorted(start, np.flatnonzero(comma))

@@ -270,14 +270,19 @@ _DIGIT = bytes_of(b"0123456789 ")
 _DECIMAL_BYTE = bytes_of(b"0123456789+-.eE ")
 
 
+def edges(data: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Where what is not blank begins, and where it ends; the last byte is blank."""
+    blank = np.ones(data.size + 1, bool)
+    np.less_equal(data, 32, out=blank[1:])
+    edge = np.flatnonzero(blank[1:] != blank[:-1])
+    return edge[::2], edge[1::2]
+
+
 def _block(text: Text, data: NDArray[np.uint8], line: int, comment: bytes) -> tuple[Block, int]:
     """A block, and how many lines of the file it took."""
     if data[-1] > 32:
         data = np.append(data, np.uint8(10))
-    blank = np.ones(data.size + 1, bool)
-    np.less_equal(data, 32, out=blank[1:])
-    edge = np.flatnonzero(blank[1:] != blank[:-1])
-    start, end = edge[::2], edge[1::2]
+    start, end = edges(data)
     is_end = data == 10
     of = np.cumsum(is_end, dtype=np.int32)[start]
     first = np.flatnonzero(np.diff(of, prepend=-1))
