@@ -166,7 +166,7 @@ class _Reader:
                 f"first in line {line}; keep one of them.",
             )
         degree = np.array([text.count(",") + 1 for text in self.successors])
-        target = self._targets(degree)
+        target = self._targets()
         where = np.searchsorted(known, target)
         missing = (where == known.size) | (known[np.minimum(where, known.size - 1)] != target)
         if missing.any():
@@ -179,7 +179,7 @@ class _Reader:
             )
         return self._made(vertex, priority, degree, order[where])
 
-    def _targets(self, degree: NDArray[Any]) -> NDArray[Any]:
+    def _targets(self) -> NDArray[Any]:
         try:
             return np.array([int(x) for x in ",".join(self.successors).split(",")], np.int64)
         except (ValueError, OverflowError):  # thousands of digits, or beyond 2^63

@@ -378,7 +378,7 @@ def _assembled(
     layout = _layout(num_states, mesh, axis)
     parts = {d: _checked(part, layout, d, len(propositions)) for d in layout.mine}
     facts = np.concatenate(layout.exchanged({d: _facts(x) for d, x in parts.items()}))
-    halo = _halo(layout, parts, facts)
+    halo = _halo(layout, parts)
     total = facts[:, _INITIAL].sum()
     if abs(total - 1) > 1e-6:
         raise ValueError(f"the initial distribution sums to {total:.9g}, not 1.")
@@ -485,7 +485,7 @@ def _within(ascending: np.ndarray, start: int, stop: int) -> np.ndarray:
     return ascending[slice(*np.searchsorted(ascending, (start, stop)))]
 
 
-def _halo(layout: _Layout, parts: Mapping[int, _Range], facts: np.ndarray) -> _Halo:
+def _halo(layout: _Layout, parts: Mapping[int, _Range]) -> _Halo:
     count, size = layout.parts, layout.size
     asked = {}
     for d, part in parts.items():

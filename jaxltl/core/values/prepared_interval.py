@@ -373,7 +373,7 @@ def _answer(
     low = jnp.where(sure[0], jnp.clip(low, 0, most), 0)
     high = jnp.where(sure[1], jnp.clip(high, 0, most), most)
     middle = jnp.clip(sign * middle, low, high)
-    residual = jnp.max(jnp.abs(_image(contest, found, middle, sign) - middle), initial=0)
+    residual = jnp.max(jnp.abs(_image(contest, middle, sign) - middle), initial=0)
     value = _attached(contest, found, middle, sign) if prepared.size else middle
     scale = jnp.where(jnp.isfinite(high), high, 1) if is_reward else 1.0
     narrow = jnp.all((high - low <= tolerance * scale) & (low <= high))
@@ -407,7 +407,7 @@ def _answer(
         method=Method("policy iteration with nature"))
 
 
-def _image(contest: Contest, found: Bounds, x: jax.Array, sign: int) -> jax.Array:
+def _image(contest: Contest, x: jax.Array, sign: int) -> jax.Array:
     """What the operator makes of values."""
     if not contest.size:
         return x
