@@ -248,12 +248,33 @@ def taught(world, key):
         return jax.eval_shape(lambda: cce.init(
             key, cce.make_problem(score, family), cce.Hparams(**given)))
 
-    def trusted(**given):
-        there = trust_region.make_problem(as_environment(plane, 1), horizon=3)
-        return jax.eval_shape(lambda: trust_region.init(
-            key, there, trust_region.Hparams(discount=0.9, method="trpo", **given)))
+    there = trust_region.make_problem(as_environment(plane, 1), horizon=3, limit=1.0)
 
+    def trusted(**given):
+        return jax.eval_shape(lambda: trust_region.init(
+            key, there, trust_region.Hparams(**{"discount": 0.9, "normalize": False} | given)))
+
+    hidden = {"num_trajectories": 2, "value_batches": 2, "hidden": (2,), "value_hidden": ()}
+    bold = {"problem": there, "hparams": trust_region.Hparams(discount=0.9, **hidden)}
+    bold["state"] = blank(jax.eval_shape(lambda: trust_region.init(key, **bold)))
+    seeking = {"problem": cce.make_problem(score, family), "hparams": cce.Hparams(population=10)}
+    search = blank(jax.eval_shape(lambda: cce.init(key, **seeking)))
     return [
+        (trust_region.make_problem, {"environment": world, "horizon": 3, "limit": 1.0}),
+        (partial(traced, trust_region.rollout), {
+            "key": key, "num_trajectories": 2, "sampled": True, **bold}),
+        (trust_region.policy, bold), (partial(traced, trust_region.step), bold),
+        (partial(traced, trust_region.act), {
+            "state": bold["state"], "hparams": bold["hparams"], "observation": jnp.zeros(4)}),
+        (partial(traced, trust_region.run), bold | {"num_steps": 2}),
+        (cce.make_problem, {"evaluate": score, "family": family, "limit": 1.0, "scale": None}),
+        (partial(traced, cce.init), {"key": key, **seeking}),
+        (partial(traced, cce.step), {"state": search, **seeking}),
+        (cce.policy, {"state": search, **seeking}),
+        (cce.result, {"state": search, "key": key, **seeking}),
+        (partial(traced, cce.assess), {
+            "problem": seeking["problem"], "parameters": jnp.zeros(network.num_parameters),
+            "key": key, "num_evaluations": 2}),
         (ppo.make_problem, {"environment": world, "network": None, "memory": None}),
         (partial(ppo.make_problem, world), {
             "network": ppo.RecurrentActorCritic(num_actions=2, memory=4), "memory": None}),
@@ -283,6 +304,13 @@ def taught(world, key):
     ]
 
 
+def blank(shapes):
+    """Zeros of some shapes, and a key where there is to be one."""
+    return jax.tree.map(
+        lambda x: jax.random.key(0) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
+        else np.zeros(x.shape, x.dtype), shapes)
+
+
 class Ended(NamedTuple):
     """What training tells in which no episode ended."""
 
@@ -299,6 +327,7 @@ def traced(function, **given):
 SEVERAL = {"truths": np.array([True, False]), "axis": np.ones(3), "digits": "0.5"}
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", NONSENSE | SEVERAL)
 def test_nonsense_about_simulated_worlds_is_told(kind):
     for call, given in simulated():
@@ -324,6 +353,66 @@ def test_nonsense_given_to_adapters_is_told(name):
                     adapter(**given | {argument: value})
                 except ValueError as error:
                     assert not RAW.search(str(error)), (kind, argument, error)
+
+
+def test_what_is_of_another_run_is_named():
+    """Of settings, states, parameters and observations; nothing is compiled."""
+    key, world = jax.random.key(0), jl.letter_world(size=3, letters=2, copies=1, num_maps=2)
+    plane = navigation.navigation()
+    small = ppo.make_problem(world, network=ppo.ActorCritic(num_actions=4, hidden=(2,)))
+    large = ppo.make_problem(world, network=ppo.ActorCritic(num_actions=4, hidden=(3,)))
+    hparams = ppo.Hparams(discount=0.9, num_envs=2, num_steps=2)
+    state = blank(jax.eval_shape(lambda: ppo.init(key, small, hparams)))
+    there = trust_region.make_problem(as_environment(plane, 1), horizon=3)
+    bold = trust_region.Hparams(discount=0.9, method="trpo", hidden=(2,), normalize=False)
+    trusted = blank(jax.eval_shape(lambda: trust_region.init(key, there, bold)))
+    wide = bold.replace(hidden=(3,))
+
+    def search(size, costs):
+        def scored(x, key):
+            return x.sum(), jnp.zeros(costs)
+        return cce.make_problem(scored, diagonal_gaussian(jnp.zeros(size), 1.0))
+
+    found = cce.init(key, search(2, 1), cce.Hparams())
+    events = st.events_of(world.propositions)
+    plan = many_tasks.make_plan("F a", events, world.propositions, depth=1)
+    network = many_tasks.trained(
+        many_tasks.SequenceNetwork(num_actions=4, hidden=(2,)), state.parameters)
+    agent = many_tasks.sequence_agent(network, plan)
+    task = te.task_environment(world, "F a")
+
+    def rollout(**given):
+        return trust_region.rollout(**{
+            "key": key, "state": trusted, "problem": there, "hparams": bold,
+            "num_trajectories": 2} | given)
+
+    def acted(agent, env):
+        return jax.eval_shape(lambda: ep.run_episode(key, env, agent, num_steps=1))
+
+    for call, message in (
+            (lambda: rollout(sampled=np.ones(2, bool)), r"sampled=\[True, True\]; give True or"),
+            (lambda: rollout(sampled="yes"), "sampled='yes'; give True or False"),
+            (lambda: rollout(num_trajectories=0), "num_trajectories=0; it must be at least 1"),
+            (lambda: rollout(key=jax.random.split(key)), "give a single one"),
+            (lambda: rollout(state=found), "state is State; give one of trust_region.init"),
+            (lambda: rollout(problem=small), "problem is Problem; give one of trust_region.make"),
+            (lambda: traced(rollout, hparams=wide), "parameters are not those of this Network"),
+            (lambda: trust_region.act(trusted, bold, jnp.zeros(3)), r"trained on vectors float\["),
+            (lambda: cce.step(found, search(3, 1), cce.Hparams()),
+             r"policies float\[2\] with 1 costs, the problem of float\[3\] with 1"),
+            (lambda: cce.step(found, search(2, 2), cce.Hparams()), "with 1 costs, .* with 2"),
+            (lambda: cce.assess(search(2, 1), jnp.zeros(3), key),
+             r"parameters is .*; give those of one policy, float\[2\]"),
+            (lambda: traced(ppo.step, state=state, problem=large, hparams=hparams),
+             "parameters are not those of this ActorCritic"),
+            (lambda: acted(ppo.policy(state, large, hparams), world), "not those of this Actor"),
+            (lambda: ppo.run(state, "x", hparams, num_steps=1), "problem is 'x'; give a number or"),
+            (lambda: acted(agent, task), "not those of this SequenceNetwork"),
+            (lambda: acted(agent, world), "give that of an environment of task_environment"),
+            (lambda: many_tasks.sequence_policy(lambda x: jnp.zeros(3), plan, 0.0, 0),
+             r"network returns \(3,\) for an observation")):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 def test_flags_are_named():

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxltl.algos.moments import Moments, scale_of, standardized
+from jaxltl.algos.settings import applied
 
 
 class Network(nn.Module):
@@ -46,7 +47,7 @@ def gaussian(
     """Mean and standard deviation of the actions at some inputs."""
     log_deviation = parameters["log_deviation"]
     network = mean_network(hparams, log_deviation.shape[0], log_deviation.dtype)
-    mean = jnp.asarray(network.apply({"params": parameters["mean"]}, inputs))
+    mean = jnp.asarray(applied(network, parameters["mean"], inputs))
     return mean, jnp.broadcast_to(jnp.exp(log_deviation), mean.shape)
 
 
@@ -65,7 +66,7 @@ def kl_divergence(old: tuple[jax.Array, jax.Array], new: tuple[jax.Array, jax.Ar
 def values_at(values: Any, hparams: Any, inputs: jax.Array) -> jax.Array:
     """``float[V, ...]``, before it is scaled."""
     network = value_network(hparams, inputs.dtype)
-    return jax.vmap(lambda p: jnp.asarray(network.apply({"params": p}, inputs))[..., 0])(values)
+    return jax.vmap(lambda p: jnp.asarray(applied(network, p, inputs))[..., 0])(values)
 
 
 def value_inputs(inputs: jax.Array) -> jax.Array:

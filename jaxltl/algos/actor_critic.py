@@ -36,6 +36,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxltl.algos.settings import applied
 from jaxltl.core.host import given
 from jaxltl.core.models.environment import Finite, flat_observation
 from jaxltl.core.show import brief
@@ -283,11 +284,10 @@ def evaluated(problem: Any, parameters: Any, memory: Any, observation: Any) -> O
       >>> jax.eval_shape(first, jax.random.key(0), jnp.zeros(3)).action.shape
       (2,)
     """
-    variables = {"params": parameters}
     if has_memory(problem):
-        memory, (action, value) = problem.network.apply(variables, memory, observation)
+        memory, (action, value) = applied(problem.network, parameters, memory, observation)
     else:
-        action, value = problem.network.apply(variables, observation)
+        action, value = applied(problem.network, parameters, observation)
     return Output(memory, action, value)
 
 

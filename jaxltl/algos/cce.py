@@ -69,8 +69,11 @@ from jaxltl.algos import exponential_family as families
 from jaxltl.algos import learner
 from jaxltl.algos._elites import Pool, Sample, better, elite_weights, num_elites, rows_of, select
 from jaxltl.algos._evaluation import evaluate_all, per_cost, scores, split
-from jaxltl.algos.schedules import SLACK, Polynomial, Schedule, at
+from jaxltl.algos.schedules import SLACK, Schedule, at, is_schedule
+from jaxltl.algos.schedules import Polynomial as Polynomial
+from jaxltl.algos.settings import UNBOUNDED, require_numbers
 from jaxltl.core.host import given
+from jaxltl.core.models.environment import as_partial, require_key
 from jaxltl.core.show import brief, history
 from jaxltl.core.types import Status, require_shape
 
@@ -253,9 +256,11 @@ def make_problem(
       >>> problem.limit.tolist(), problem.scale.tolist()
       ([0.5], [0.5])
     """
-    if not isinstance(evaluate, jax.tree_util.Partial):
-        evaluate = jax.tree_util.Partial(evaluate)
-    point = families.center(family)
+    evaluate = as_partial(evaluate, "evaluate")
+    try:
+        point = families.center(family)
+    except TypeError as problem:
+        raise ValueError(f"family: {problem}") from None
     shapes = jax.eval_shape(lambda e, x, k: split(e(x, k)), evaluate, point, jax.random.key(0))
     num_costs = shapes[1].shape[0]
     if num_costs == 0 and limit is not None:
@@ -303,6 +308,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
       ValueError: settings that leave no elite or that are out of range.
     """
     _check(problem, hparams)
+    require_key(key)
     point = families.center(problem.family)
     dtype = point.dtype
 
@@ -338,6 +344,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
       The next :class:`State`, and :class:`Metrics`, figures of the step.
     """
     _check(problem, hparams)
+    _require_state(state, problem)
     draw_key, evaluate_key = jax.random.split(learner.step_key(state))
     draw = families.sample_antithetic if hparams.antithetic else families.sample
     samples = draw(state.family, draw_key, hparams.population)
@@ -400,8 +407,12 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
 
     Returns:
       ``float[D]``.
+
+    Raises:
+      ValueError: what is given is not of this search.
     """
-    del problem, hparams
+    _require_ours(problem, hparams)
+    given.instance("state", state, State, "one of cce.init or cce.train")
     return families.center(state.family)
 
 
@@ -501,7 +512,6 @@ class Result(NamedTuple):
     message: str
 
 
-@partial(jax.jit, static_argnames="num_evaluations")
 def assess(
     problem: Problem, parameters: jax.Array, key: chex.PRNGKey, *, num_evaluations: int = 1000
 ) -> Assessment:
@@ -517,13 +527,27 @@ def assess(
       :class:`Assessment`.
 
     Raises:
-      ValueError: fewer than two evaluations.
+      ValueError: fewer than two evaluations, or what is not of this search.
     """
-    from scipy.special import stdtrit
-
+    num_evaluations = given.whole("num_evaluations", num_evaluations, most=2**31 - 1)
     if num_evaluations < 2:
         raise ValueError(
             f"num_evaluations={num_evaluations}; a confidence interval needs at least 2.")
+    given.instance("problem", problem, Problem, "one of cce.make_problem")
+    shape = families.center(problem.family).shape
+    if not hasattr(parameters, "dtype") or jnp.shape(parameters) != shape:
+        raise ValueError(
+            f"parameters is {given.shown(parameters)}; give those of one policy, float{[*shape]}, "
+            "such as cce.policy(state, problem, hparams). Many are a vmap.")
+    return _assessed(problem, parameters, require_key(key), num_evaluations)
+
+
+@partial(jax.jit, static_argnames="num_evaluations")
+def _assessed(
+    problem: Problem, parameters: jax.Array, key: chex.PRNGKey, num_evaluations: int
+) -> Assessment:
+    from scipy.special import stdtrit
+
     keys = jax.random.split(key, num_evaluations)
     objective, cost = jax.vmap(partial(scores, problem), (None, 0))(parameters, keys)
     objective, (mean, deviation) = _moments(objective)[0], _moments(cost)
@@ -567,8 +591,12 @@ def result(
       :class:`Result`.
 
     Raises:
-      ValueError: no sample of the last step could be evaluated, or a batch of states.
+      ValueError: no sample of the last step could be evaluated, a batch of states, or what is not
+        of this search.
     """
+    _require_ours(problem, hparams)
+    given.instance("state", state, State, "one of cce.init or cce.train")
+    require_key(key)
     if jnp.ndim(state.step):
         raise ValueError(
             f"state holds a batch of {np.shape(state.step)} runs; take one: "
@@ -617,36 +645,55 @@ def _nan_last(x: float) -> float:
 # --- checks ---------------------------------------------------------------------------------
 
 
+_RANGES = {
+    "rate": (0, 1), "sample_share": (0, 1), "num_samples": (0, np.inf),
+    "temperature": (0, np.inf), "variance_floor": (0, np.inf), "restart_below": (0, np.inf),
+}
+_SCHEDULES = ("rate", "sample_share", "num_samples")
+_OPTIONAL = ("sample_share", "num_samples", "variance_floor", "restart_below")
+
+
+def _require_ours(problem: Problem, hparams: Hparams) -> None:
+    given.instance("problem", problem, Problem, "one of cce.make_problem")
+    given.instance("hparams", hparams, Hparams, "cce.Hparams")
+
+
+def _require_state(state: State, problem: Problem) -> None:
+    given.instance("state", state, State, "one of cce.init or cce.train")
+    found, own = (families.center(x.family).shape for x in (state, problem))
+    if found != own or state.best.cost.shape != problem.limit.shape:
+        raise ValueError(
+            f"state is of policies float{[*found]} with {len(state.best.cost)} costs, the problem "
+            f"of float{[*own]} with {len(problem.limit)}; give the state of a run on this problem.")
+
+
 def _check(problem: Problem, hparams: Hparams) -> None:
+    _require_ours(problem, hparams)
     for name in ("elite_reuse", "antithetic"):
         given.truth(name, getattr(hparams, name))
-    if hparams.weighting not in WEIGHTINGS:
-        raise ValueError(
-            f"weighting={hparams.weighting!r}; choose {', '.join(map(repr, WEIGHTINGS))}.")
+    given.one_of("weighting", hparams.weighting, WEIGHTINGS)
     rho = given.number("rho", hparams.rho)
     population = given.whole("population", hparams.population, least=1, most=2**31 - 1)
-    if not 0 < rho < 1 or rho * population < 1 - SLACK:
+    if isinstance(hparams.rho, str) or not 0 < rho < 1 or rho * population < 1 - SLACK:
         raise ValueError(
             f"rho={hparams.rho} of population={hparams.population} leaves no elite, or all; give "
             "rho in (0, 1) with rho * population at least 1."
         )
-    if np.ndim(hparams.margin):
-        require_shape("margin", hparams.margin, problem.limit.shape)
+    require_numbers(hparams, _RANGES, optional=_OPTIONAL, schedules=_SCHEDULES)
+    several = {"margin": problem.limit.shape}
+    if hparams.noise is not None and not is_schedule(hparams.noise):
+        several["noise"] = families.center(problem.family).shape
+    for name, shape in several.items():
+        number = getattr(hparams, name)
+        if np.ndim(number):
+            require_shape(name, number, shape)
+        else:
+            require_numbers(hparams, {name: UNBOUNDED})
     sharding = hparams.sharding
     if sharding is not None and not isinstance(sharding, jax.sharding.NamedSharding):
         raise ValueError(
             f"sharding is a {type(sharding).__name__}; give a jax.sharding.NamedSharding.")
-    temperature = _number(hparams.temperature)
-    if temperature is not None and not temperature > 0:
-        raise ValueError(f"temperature={temperature}; it must be positive.")
-    for name, low in (("rate", "(0"), ("sample_share", "[0")):
-        value = _number(getattr(hparams, name))
-        if value is not None and not (0 <= value <= 1 and (value > 0 or low == "[0")):
-            raise ValueError(f"{name}={value}; it must be in {low}, 1].")
-
-
-def _number(value: Any) -> float | None:
-    """A number known now; None for a schedule or a traced value."""
-    if value is None or callable(value) or isinstance(value, Polynomial | jax.core.Tracer):
-        return None
-    return float(value) if np.ndim(value) == 0 else None
+    for name in ("rate", "temperature"):
+        number = getattr(hparams, name)
+        if not is_schedule(number) and not isinstance(number, jax.core.Tracer) and not number > 0:
+            raise ValueError(f"{name}={number}; it must be positive.")

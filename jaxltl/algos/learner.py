@@ -62,7 +62,8 @@ from jax.tree_util import Partial
 
 from jaxltl.algos import checkpoint as files
 from jaxltl.algos._run_over_mesh import run_over_mesh
-from jaxltl.core.host.given import truth, whole
+from jaxltl.algos.settings import require_arrays
+from jaxltl.core.host.given import called, truth, whole
 from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.lanes import on_host
 from jaxltl.core.show import brief
@@ -145,6 +146,7 @@ def run(
         raise ValueError(f"num_steps={num_steps}, max_rows={max_rows}; both must be at least 1.")
     if num_steps > MOST:
         raise ValueError(f"num_steps={num_steps}; at most {MOST} are made at once.")
+    require_arrays(state=state, problem=problem, hparams=hparams)
     return _run(step, state, problem, hparams, _lengths(num_steps, max_rows))
 
 
@@ -235,7 +237,8 @@ def run_until(
     for name, number in {"num_steps": num_steps, "check_every": check_every}.items():
         if not isinstance(number, jax.Array):
             whole(name, number, least=1, most=MOST)
-    until = until if isinstance(until, Partial) else Partial(until)
+    until = until if isinstance(until, Partial) else Partial(called("until", until))
+    require_arrays(state=state, problem=problem, hparams=hparams, until=until)
     most = jnp.asarray(num_steps, jnp.int32)
     return _run_until(step, state, problem, hparams, until, most, check_every, keep, idle)
 

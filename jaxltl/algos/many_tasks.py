@@ -59,14 +59,22 @@ from numpy.typing import ArrayLike
 from jaxltl.algos import action_distributions
 from jaxltl.algos.actor_critic import dense
 from jaxltl.algos.moments import normalized
+from jaxltl.algos.settings import applied
 from jaxltl.core.automata import sequences
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.host import given
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models import sequence_task
-from jaxltl.core.models.environment import Box, Finite, as_partial, flat_observation
+from jaxltl.core.models.environment import (
+    Box,
+    Finite,
+    as_partial,
+    flat_observation,
+    require_key,
+)
 from jaxltl.core.models.episodes import Agent
+from jaxltl.core.models.task_environment import TaskObservation
 from jaxltl.core.show import brief
 
 
@@ -285,6 +293,10 @@ def sequence_policy(
     Returns:
       ``float[A]``, a distribution; differentiable in the network's parameters.
 
+    Raises:
+      ValueError: what is no plan or function, a memory that is no whole number, or a network of
+        actions in a box.
+
     Example:
       >>> plan = make_plan("F a", np.eye(2, 1, -1, bool), ["a"], depth=1, most=1)
       >>> def network(observation):  # says what it is asked to reach
@@ -292,7 +304,12 @@ def sequence_policy(
       >>> jax.eval_shape(lambda x: sequence_policy(network, plan, x, 0), jnp.zeros(1)).shape
       (2,)
     """
-    actions, values = _judged(network, plan, observation, jnp.asarray(memory))
+    given.instance("plan", plan, Plan, "one of make_plan")
+    if not (isinstance(memory, jax.Array) and jnp.issubdtype(memory.dtype, jnp.integer)):
+        memory = given.whole("memory", memory)
+    actions, values = _judged(given.called("network", network), plan, observation,
+                              jnp.asarray(memory))
+    _actions_of(actions)
     return jax.nn.softmax(actions[jnp.argmax(values)])
 
 
@@ -323,13 +340,16 @@ def trained(network: nn.Module, parameters: Any, moments: Any = None) -> Partial
 
     Returns:
       A function, and a pytree whose arrays are the parameters and moments.
+
+    Raises:
+      ValueError: no module; at the first call parameters that are not this network's.
     """
     given.instance("network", network, nn.Module, "a flax.linen.Module")
     return Partial(_applied, _Module(network), parameters, moments)
 
 
 def _applied(module: _Module, parameters: Any, moments: Any, observation: Any) -> Any:
-    return module.network.apply({"params": parameters}, normalized(moments, observation))
+    return applied(module.network, parameters, normalized(moments, observation))
 
 
 def _actions_of(parameters: Any) -> Finite:
@@ -347,8 +367,13 @@ def _judged(
     rows = sequence_task.Sequence(
         jnp.asarray(plan.reach)[state], jnp.asarray(plan.avoid)[state],
         jnp.asarray(plan.length)[state])
-    actions, values = jax.vmap(
-        lambda row: network(sequence_task.SequenceObservation(seen, row)))(rows)
+    found = jax.vmap(lambda row: network(sequence_task.SequenceObservation(seen, row)))(rows)
+    if not isinstance(found, tuple) or len(found) != 2 or jnp.shape(found[1]) != rows.length.shape:
+        shapes = jax.tree.map(lambda x: jnp.shape(x)[1:], found)
+        raise ValueError(
+            f"network returns {shapes} for an observation; return (parameters of the action, "
+            "value), the value a scalar.")
+    actions, values = found
     return actions, jnp.where(rows.length > 0, values, -jnp.inf)
 
 
@@ -356,6 +381,11 @@ def _act(
     how: _How, space: Finite | Box | None, network: Callable[..., Any], plan: Plan, memory: Any,
     observation: Any, allowed: Any, key: chex.PRNGKey,
 ) -> tuple[Any, Any]:
+    if not (hasattr(observation, "world") and hasattr(observation, "memory")):
+        given.instance("observation", observation, TaskObservation,
+                       "that of an environment of task_environment, with the formula of the plan")
+    given.instance("memory", memory, Choice, "the agent's own, agent.memory")
+    require_key(key)
     seen, state = observation.world, jnp.argmax(observation.memory).astype(jnp.int32)
     actions, values = _judged(network, plan, seen, state)
     best = jnp.argmax(values)

@@ -79,8 +79,9 @@ from jaxltl.algos.actor_critic import (
     require_network,
 )
 from jaxltl.algos.moments import Moments, no_moments, normalized
-from jaxltl.algos.schedules import Schedule, is_schedule
+from jaxltl.algos.schedules import Schedule
 from jaxltl.algos.schedules import at as _at
+from jaxltl.algos.settings import require_numbers
 from jaxltl.core.host import given
 from jaxltl.core.models import lanes
 from jaxltl.core.models.environment import (
@@ -338,19 +339,7 @@ def _check(problem: Problem, hparams: Hparams) -> None:
             f"{what}; choose a divisor.")
     lanes.require_split("sharding", hparams.sharding, num_envs=hparams.num_envs, **{
         "the number of rows of a minibatch": size // hparams.num_minibatches})
-    for name, (low, high) in _RANGES.items():
-        number = getattr(hparams, name)
-        if (number is None and name in _OPTIONAL) or (name in _SCHEDULES and is_schedule(number)):
-            continue
-        kind = getattr(number, "dtype", None) or np.asarray(number).dtype
-        real = kind.kind in "iu" or jnp.issubdtype(kind, jnp.floating)
-        if np.ndim(number) or not real:  # a whole number that is too large is an object
-            raise ValueError(
-                f"{name}={given.shown(number)}; give one number"
-                f"{', or a Partial(function) of the step' if name in _SCHEDULES else ''}. Many "
-                "settings are a vmap.")
-        if not isinstance(number, jax.core.Tracer) and not low <= number <= high:
-            raise ValueError(f"{name}={number}; it must lie in [{low}, {high}].")
+    require_numbers(hparams, _RANGES, optional=_OPTIONAL, schedules=_SCHEDULES)
 
 
 # --- what was learned -----------------------------------------------------------------------------

@@ -64,6 +64,7 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 from jax import lax
@@ -85,6 +86,7 @@ from jaxltl.algos._policy_networks import (
 from jaxltl.algos._trust_step import Surrogate, direction, fisher_product, line_search, surrogate
 from jaxltl.algos._value_fit import advantages, fitted, positive, weighted_variance
 from jaxltl.algos.moments import Moments, no_moments, updated_moments
+from jaxltl.algos.settings import UNBOUNDED, require_numbers
 from jaxltl.core.host import given
 from jaxltl.core.models.environment import (
     Box,
@@ -92,6 +94,8 @@ from jaxltl.core.models.environment import (
     Timestep,
     clipped_action,
     flat_observation,
+    require_environment,
+    require_key,
     some_action,
 )
 from jaxltl.core.models.episodes import Agent
@@ -285,8 +289,8 @@ def make_problem(
       :class:`Problem`.
 
     Raises:
-      ValueError: finitely many actions, episodes that never end, a horizon below 1, or a limit
-        that is no number.
+      ValueError: no environment, finitely many actions, episodes that never end, a horizon below
+        1, or a limit that is no number.
 
     Example:
       >>> from jaxltl import make_box, make_environment
@@ -303,7 +307,7 @@ def make_problem(
 
       Then ``state, metrics = train(key, problem, Hparams(discount=0.99), num_steps=100)``.
     """
-    actions = environment.actions
+    actions = require_environment(environment).actions
     if not isinstance(actions, Box) or not jnp.issubdtype(jnp.dtype(actions.dtype), jnp.floating):
         raise ValueError(
             f"the environment's actions are {actions}; trust-region search draws from a Gaussian: "
@@ -314,12 +318,13 @@ def make_problem(
         raise ValueError(
             "episodes that never end: neither the environment nor horizon says after how many "
             "steps; give horizon, or with_time_limit(environment, num_steps).")
-    if horizon < 1:
-        raise ValueError(f"horizon={horizon}; it must be at least 1.")
+    horizon = given.whole("horizon", horizon, least=1, most=2**31 - 1)
     if limit is not None:
-        limit = jnp.asarray(limit, jnp.result_type(float))
+        known = isinstance(limit, jax.Array)
+        limit = jnp.asarray(limit if known else given.numbers("limit", limit),
+                            jnp.result_type(float))
         require_shape("limit", limit, ())
-    return Problem(environment=environment, limit=limit, horizon=int(horizon))
+    return Problem(environment=environment, limit=limit, horizon=horizon)
 
 
 def _observed(problem: Problem, world: Any) -> jax.Array:
@@ -338,10 +343,37 @@ def _as_action(problem: Problem, action: jax.Array) -> jax.Array:
     return clipped_action(actions, action.reshape(actions.shape).astype(actions.dtype))
 
 
+_RANGES = {
+    "discount": (0, 1), "cost_discount": (0, 1), "gae_lambda": (0, 1), "cost_gae_lambda": (0, 1),
+    "delta": (0, np.inf), "damping": (0, np.inf), "penalty": UNBOUNDED,
+    "initial_deviation": (0, np.inf), "backtrack": (0, 1), "value_rate": (0, np.inf),
+}
+
+
+def _require_ours(problem: Problem, hparams: Hparams) -> None:
+    given.instance("problem", problem, Problem, "one of trust_region.make_problem")
+    given.instance("hparams", hparams, Hparams, "trust_region.Hparams")
+
+
+def _require_state(state: State) -> None:
+    given.instance("state", state, State, "one of trust_region.init or trust_region.train")
+
+
+def _require_observed(state: State, observation: jax.Array) -> None:
+    """Refuses what the policy was not trained on."""
+    size = state.moments.mean.shape
+    if not hasattr(observation, "dtype") or jnp.shape(observation)[-1:] != size:
+        raise ValueError(
+            f"observation is {given.shown(observation)}; the policy was trained on vectors "
+            f"float[..., {size[0]}], as flat_observation makes of an environment's.")
+
+
 def _check(problem: Problem, hparams: Hparams) -> None:
+    _require_ours(problem, hparams)
+    require_numbers(hparams, _RANGES, optional=["penalty"])
+    given.whole("value_epochs", hparams.value_epochs, most=2**31 - 1)
     given.truth("normalize", hparams.normalize)
-    if hparams.method not in METHODS:
-        raise ValueError(f'method={hparams.method!r}; choose "trpo" or "cpo".')
+    given.one_of("method", hparams.method, METHODS)
     if hparams.method == "cpo" and problem.limit is None:
         raise ValueError('method="cpo" needs a limit: pass one to make_problem, or use "trpo".')
     if hparams.method == "cpo" and hparams.penalty is not None:
@@ -368,7 +400,7 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
     Returns:
       :class:`~jaxltl.core.models.episodes.Agent`, a pytree.
     """
-    return Agent(Partial(_drawn, state, problem, hparams))
+    return _agent(_drawn, state, problem, hparams)
 
 
 def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
@@ -381,7 +413,13 @@ def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
     Returns:
       :class:`~jaxltl.core.models.episodes.Agent`, a pytree.
     """
-    return Agent(Partial(_mean, state, problem, hparams))
+    return _agent(_mean, state, problem, hparams)
+
+
+def _agent(act: Any, state: State, problem: Problem, hparams: Hparams) -> Agent:
+    _require_ours(problem, hparams)
+    _require_state(state)
+    return Agent(Partial(act, state, problem, hparams))
 
 
 def _drawn(
@@ -411,14 +449,19 @@ def act(state: State, hparams: Hparams, observation: jax.Array) -> tuple[jax.Arr
 
     Returns:
       Two arrays, in units of the action before it is clipped; differentiable in the parameters.
+
+    Raises:
+      ValueError: what is not of this learner, or an observation of another size.
     """
+    given.instance("hparams", hparams, Hparams, "trust_region.Hparams")
+    _require_state(state)
+    _require_observed(state, observation)
     return gaussian(state.parameters, hparams, normalized(state.moments, hparams, observation))
 
 
 # --- trajectories -----------------------------------------------------------------------------
 
 
-@partial(jax.jit, static_argnames=("num_trajectories", "sampled"))
 def rollout(
     key: chex.PRNGKey,
     state: State,
@@ -438,7 +481,22 @@ def rollout(
 
     Returns:
       :class:`Batch`. Sums over its first axis are those of trajectories.
+
+    Raises:
+      ValueError: what is not of this learner, no number of trajectories, or no truth value.
     """
+    _require_ours(problem, hparams)
+    _require_state(state)
+    number = given.whole("num_trajectories", num_trajectories, least=1, most=2**31 - 1)
+    return _rollout(
+        require_key(key), state, problem, hparams, number, given.truth("sampled", sampled))
+
+
+@partial(jax.jit, static_argnames=("num_trajectories", "sampled"))
+def _rollout(
+    key: chex.PRNGKey, state: State, problem: Problem, hparams: Hparams, num_trajectories: int,
+    sampled: bool,
+) -> Batch:
     start, path = jax.random.split(key)
     worlds = jax.vmap(problem.environment.reset)(jax.random.split(start, num_trajectories))
 
@@ -482,7 +540,6 @@ def rollout(
         jnp.where(truncated[:, None], last, 0), truncated)
 
 
-@partial(jax.jit)
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """Random networks. If observations are normalised, a first batch of trajectories is drawn
     for their moments, and counted.
@@ -496,9 +553,14 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
       :class:`State`, no step made.
 
     Raises:
-      ValueError: a method that does not fit the problem, or a number below 1.
+      ValueError: a method that does not fit the problem, or a number out of its range.
     """
     _check(problem, hparams)
+    return _begun(require_key(key), problem, hparams)
+
+
+@jax.jit
+def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     seen = jax.eval_shape(lambda k: _observed(problem, problem.environment.reset(k)), key)
     num_actions = _num_actions(problem)
     dtype, (size,), num_values = seen.dtype, seen.shape, 1 + (hparams.method == "cpo")
@@ -542,6 +604,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
       The next :class:`State`, and :class:`Metrics`, figures of the step.
     """
     _check(problem, hparams)
+    _require_state(state)
     draw_key, fit_key = jax.random.split(learner.step_key(state))
     batch = rollout(
         draw_key, state, problem, hparams, num_trajectories=hparams.num_trajectories

@@ -156,7 +156,8 @@ def instance(name: str, given: Any, kind: Any, remedy: str) -> Any:
       ValueError: it is of another one.
     """
     if not isinstance(given, kind):
-        raise ValueError(f"{name} is {type(given).__name__}; give {remedy}.")
+        found = "an array" if hasattr(given, "aval") else type(given).__name__
+        raise ValueError(f"{name} is {found}; give {remedy}.")
     return given
 
 
