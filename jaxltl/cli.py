@@ -50,6 +50,9 @@ def _plain_errors(command: Callable[..., None]) -> Callable[..., None]:
         except OSError as error:
             where = f"{error.filename!r}: " if error.filename else ""
             raise _Failure(f"{where}{error.strerror or error}") from None
+        except KeyboardInterrupt:
+            click.echo("interrupted", err=True)
+            raise SystemExit(130) from None
 
     return run
 

@@ -3,8 +3,10 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
@@ -13,6 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 import jaxltl
+from jaxltl import __main__ as entry
 from jaxltl.app.drawing import artist, draw, drawing
 from jaxltl.app.programs import SOON, cache_directory, known_flags
 from jaxltl.cli import main
@@ -247,6 +250,42 @@ def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch):
     assert len(first) == len(second)  # the history too is whole
 
 
+SLOW = """
+import os, signal, time
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.02)
+except BaseException:
+    raise AttributeError("half there")
+"""
+
+
+def test_an_interrupt_waits_for_what_is_imported(tmp_path, monkeypatch):
+    (tmp_path / "imported_slowly.py").write_text(SLOW)
+    monkeypatch.syspath_prepend(tmp_path)
+    before = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGALRM)]
+    signal.signal(signal.SIGINT, entry._interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            import imported_slowly  # noqa: F401
+            assert "imported_slowly" in sys.modules
+            time.sleep(5)
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)
+
+
+def test_an_interrupted_command_says_so_in_a_line():
+    program = """
+import os, signal, jaxltl.cli
+jaxltl.cli.main = lambda **_: os.kill(os.getpid(), signal.SIGINT)
+from jaxltl.__main__ import run
+run()
+"""
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (found.returncode, found.stdout, found.stderr) == (130, "", "interrupted\n")
+
+
 def test_another_task_does_not_go_on_from_a_checkpoint(learned, monkeypatch):
     place, _ = learned
     out = place / "other"
@@ -342,6 +381,7 @@ def test_the_first_line_comes_before_anything_heavy(tmp_path):
 import sys, click
 from click.testing import CliRunner
 import jaxltl
+from jaxltl import __main__ as entry
 from jaxltl.app.drawing import artist, draw, drawing
 from jaxltl.app.programs import cache_directory
 from jaxltl.cli import main

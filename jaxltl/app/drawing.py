@@ -81,8 +81,9 @@ def artist(apart: bool) -> Iterator[Artist]:
     pool = ProcessPoolExecutor(_PROCESSES, get_context("spawn"), _prepare)
 
     def begin(picture: Drawing) -> Callable[[], bytes]:
-        drawn = pool.submit(draw, picture)
-        pool.submit(int)  # so that the next process begins to load if this one is busy
+        with _undisturbed():
+            drawn = pool.submit(draw, picture)
+            pool.submit(int)  # so that the next process begins to load if this one is busy
 
         def finish() -> bytes:
             try:
@@ -93,16 +94,33 @@ def artist(apart: bool) -> Iterator[Artist]:
         return finish
 
     try:
-        pool.submit(int)
+        with _undisturbed():
+            pool.submit(int)
         yield begin
     finally:
         # Waits, else the end of this process leaves semaphores, of which Python warns.
         pool.shutdown(cancel_futures=True)
 
 
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Interrupts come afterwards, to this process alone: one that is begun here never has them.
+
+    It would tell of them while it loads, and the command itself says what is to be done.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _prepare() -> None:
     few_collections()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command itself says what is to be done
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # where it could not be kept from here
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # Else what was loaded is freed piece by piece, for half a second.
     Finalize(None, os._exit, args=(0,), exitpriority=-1)
