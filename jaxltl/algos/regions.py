@@ -4,6 +4,26 @@ Over a box every probability has a range. The interval model of these ranges, in
 anew at each step, contains the model at every point of the box (parameter lifting, Quatmann,
 Dehnert, Jansen, Junges and Katoen 2016), so that its certified values enclose all of theirs. Where
 they do not decide, the box is split.
+
+Example: a coin that shows heads with a probability p, of which at least half is asked for.
+
+  >>> import pathlib, tempfile
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import feasible
+  >>> from jaxltl.algos.regions import enclose, prove_around, prove_regions
+  >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
+  >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n3\\n@model\\n"
+  ...     "state 0 init\\n\\taction 0\\n\\t\\t1 : p\\n\\t\\t2 : 1-p\\n"
+  ...     "state 1 goal\\n\\taction 0\\n\\t\\t1 : 1\\nstate 2\\n\\taction 0\\n\\t\\t2 : 1\\n")
+  >>> coin = feasible.make_problem(jl.read_parametric(path).over(0.01, 0.99), "goal", bound=">=")
+  >>> [round(x, 6) for x in enclose(coin, 0.25, 0.75)]
+  [0.25, 0.75]
+  >>> found = prove_regions(coin, 0.5, max_boxes=31)
+  >>> found.share(1) > 0.45, found.share(-1) > 0.45, found.share(0) < 0.1
+  (True, True, True)
+  >>> low, high = prove_around(coin, 0.5, [0.75])
+  >>> low.shape, 0.5 <= low.item() < 0.55 and 0.95 < high.item() <= 0.99
+  ((1,), True)
 """
 
 from __future__ import annotations
@@ -73,18 +93,6 @@ def enclose(problem: Problem, low: Any = None, high: Any = None) -> tuple[float,
         functions whose ranges are not known.
 
     Concrete arrays only, on the host; not differentiable.
-
-    Example:
-      >>> import pathlib, tempfile
-      >>> from jaxltl.algos.feasible import make_problem
-      >>> from jaxltl import read_parametric
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
-      >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n3\\n@model\\n"
-      ...     "state 0 init\\n\\taction 0\\n\\t\\t1 : p\\n\\t\\t2 : 1-p\\n"
-      ...     "state 1 goal\\n\\taction 0\\n\\t\\t1 : 1\\nstate 2\\n\\taction 0\\n\\t\\t2 : 1\\n")
-      >>> coin = make_problem(read_parametric(path).over(0.01, 0.99), "goal", bound=">=")
-      >>> [round(x, 6) for x in enclose(coin, 0.25, 0.75)]
-      [0.25, 0.75]
     """
     low, high = _box(problem, low, high)
     model = problem.model
@@ -171,19 +179,6 @@ def prove_regions(
       ValueError: as :func:`enclose`; the threshold is NaN, or `max_boxes` below 1.
 
     Concrete arrays only, on the host; not differentiable.
-
-    Example:
-      >>> import pathlib, tempfile
-      >>> from jaxltl.algos.feasible import make_problem
-      >>> from jaxltl import read_parametric
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
-      >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n3\\n@model\\n"
-      ...     "state 0 init\\n\\taction 0\\n\\t\\t1 : p\\n\\t\\t2 : 1-p\\n"
-      ...     "state 1 goal\\n\\taction 0\\n\\t\\t1 : 1\\nstate 2\\n\\taction 0\\n\\t\\t2 : 1\\n")
-      >>> coin = make_problem(read_parametric(path).over(0.01, 0.99), "goal", bound=">=")
-      >>> found = prove_regions(coin, 0.5, max_boxes=31)
-      >>> found.share(1) > 0.45, found.share(-1) > 0.45, found.share(0) < 0.1
-      (True, True, True)
     """
     threshold, max_boxes = _limit(threshold), count("max_boxes", max_boxes, least=1)
     low, high = _box(problem, low, high)
@@ -241,19 +236,6 @@ def prove_around(
       ValueError: as :func:`prove_regions`; the point is not in the box.
 
     Concrete arrays only, on the host; not differentiable.
-
-    Example:
-      >>> import pathlib, tempfile
-      >>> from jaxltl.algos.feasible import make_problem
-      >>> from jaxltl import read_parametric
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
-      >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n3\\n@model\\n"
-      ...     "state 0 init\\n\\taction 0\\n\\t\\t1 : p\\n\\t\\t2 : 1-p\\n"
-      ...     "state 1 goal\\n\\taction 0\\n\\t\\t1 : 1\\nstate 2\\n\\taction 0\\n\\t\\t2 : 1\\n")
-      >>> coin = make_problem(read_parametric(path).over(0.01, 0.99), "goal", bound=">=")
-      >>> low, high = prove_around(coin, 0.5, [0.75])
-      >>> low.shape, 0.5 <= low.item() < 0.55 and 0.95 < high.item() <= 0.99
-      ((1,), True)
     """
     _require_problem(problem)
     threshold, num_halvings = _limit(threshold), count("num_halvings", num_halvings, most=1000)

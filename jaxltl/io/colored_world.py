@@ -1,4 +1,23 @@
-"""Coloured worlds as text files: a letter for each cell, and which kinds of cells there are."""
+"""Coloured worlds as text files: a letter for each cell, and which kinds of cells there are.
+
+Example:
+  >>> import pathlib, tempfile
+  >>> from jaxltl.io.colored_world import load_world, read_world, save_world, write_world
+  >>> world = read_world('''
+  ... rbrp
+  ... brbp
+  ... rbry
+  ... ''')
+  >>> world.shape, world.mdp.label[:, 0].tolist()
+  ((1, 2), [True, False])
+  >>> again = read_world(write_world(world))
+  >>> again.shape, bool((again.mdp.label == world.mdp.label).all())
+  ((1, 2), True)
+  >>> path = pathlib.Path(tempfile.mkdtemp()) / "world.txt"
+  >>> save_world(path, world)
+  >>> load_world(path).shape
+  (1, 2)
+"""
 
 from __future__ import annotations
 
@@ -16,9 +35,6 @@ from jaxltl.envs.temporal_gridworld import World, colored_world
 LETTERS = "rywpb"  # of the colours, in text files
 
 
-
-
-
 def write_world(world: World) -> str:
     """A world as text: its margin, slip and kinds of cells, then a letter for each colour.
 
@@ -27,16 +43,6 @@ def write_world(world: World) -> str:
 
     Returns:
       The text, of which :func:`read_world` makes the same world.
-
-    Example:
-      >>> world = read_world('''
-      ... rbrp
-      ... brbp
-      ... rbry
-      ... ''')
-      >>> again = read_world(write_world(world))
-      >>> again.shape, bool((again.mdp.label == world.mdp.label).all())
-      ((1, 2), True)
     """
     slip = 0.0
     if world.mdp.num_successors > 1:
@@ -65,15 +71,6 @@ def read_world(text: str) -> World:
 
     Raises:
       ValueError: naming the line, or the row and column of the map, and what is wrong.
-
-    Example:
-      >>> world = read_world('''
-      ... rbrp
-      ... brbp
-      ... rbry
-      ... ''')
-      >>> world.shape, world.mdp.label[:, 0].tolist()
-      ((1, 2), [True, False])
     """
     margin, slip = 1, 0.0
     kinds: dict[str, dict[str, int]] = {}
@@ -142,18 +139,6 @@ def save_world(path: str | os.PathLike[str], world: World) -> None:
 
     Raises:
       ValueError: the place cannot be written to.
-
-    Example:
-      >>> import pathlib, tempfile
-      >>> world = read_world('''
-      ... rbrp
-      ... brbp
-      ... rbry
-      ... ''')
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "world.txt"
-      >>> save_world(path, world)
-      >>> load_world(path).shape
-      (1, 2)
     """
     with atomic_write(path) as file:
         file.write(write_world(world).encode())
@@ -170,13 +155,6 @@ def load_world(path: str | os.PathLike[str]) -> World:
 
     Raises:
       ValueError: the file cannot be read, or :func:`read_world` refuses it; naming the file.
-
-    Example:
-      >>> import pathlib, tempfile
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "world.txt"
-      >>> _ = path.write_text("margin: 1\\nrbrp\\nbrbp\\nrbry\\n")
-      >>> load_world(path).shape
-      (1, 2)
     """
     try:
         return read_world(Path(path).read_text(encoding="utf-8"))

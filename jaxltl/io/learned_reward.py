@@ -1,4 +1,26 @@
-"""A learned reward network in a file, and planning with it in worlds never seen."""
+"""A learned reward network in a file, and planning with it in worlds never seen.
+
+Example:
+  >>> import pathlib, tempfile
+  >>> import jax, numpy as np
+  >>> import jaxltl as jl
+  >>> from jaxltl.io.learned_reward import LearnedReward, load_reward, plan_in, save_reward
+  >>> linear = {"kernel": np.zeros((5, 1)), "bias": np.zeros(1)}  # of seen, memory and action
+  >>> learned = LearnedReward(
+  ...     parameters={"params": linear}, hidden=(),
+  ...     memory=jl.to_automaton("F g"), label_on="exit", discount=0.9, horizon=None, radius=0,
+  ...     formula="F g", kinds=("plain", "goal"))
+  >>> learned.network.hidden, learned.hparams.discount
+  ((), 0.9)
+  >>> path = pathlib.Path(tempfile.mkdtemp()) / "reward.npz"
+  >>> save_reward(path, learned)
+  >>> again = load_reward(path)
+  >>> again.kinds, again.parameters["params"]["kernel"].shape
+  (('plain', 'goal'), (5, 1))
+  >>> world = jl.from_dense([[[0.5, 0.5]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
+  >>> jax.eval_shape(lambda seen: plan_in(again, world, seen)[1], np.eye(2)).policy.shape
+  (2, 2, 1)
+"""
 
 from __future__ import annotations
 
@@ -40,16 +62,6 @@ class LearnedReward:
       guarantee: ``"best"``: plans take the actions alone that lose nothing of the memory's task;
         a probability of it, for which as many of them are mixed in as it takes; or ``"none"``.
       over: of which initial states a probability is, their ``"mean"`` or the ``"worst"``.
-
-    Example:
-      >>> from jaxltl import from_dense, to_automaton
-      >>> linear = {"kernel": np.zeros((5, 1)), "bias": np.zeros(1)}  # of seen, memory and action
-      >>> learned = LearnedReward(
-      ...     parameters={"params": linear}, hidden=(),
-      ...     memory=to_automaton("F g"), label_on="exit", discount=0.9, horizon=None, radius=0,
-      ...     formula="F g", kinds=("plain", "goal"))
-      >>> learned.network.hidden, learned.hparams.discount
-      ((), 0.9)
     """
 
     parameters: Any
@@ -93,17 +105,6 @@ def plan_in(learned: LearnedReward, world: MDP, observation: Any) -> tuple[Produ
         have the shape that the network reads, or no policy has the probability there.
 
     Differentiable as :func:`~jaxltl.algos.todirl.plan` is, where nothing is guaranteed.
-
-    Example:
-      >>> from jaxltl import from_dense, to_automaton
-      >>> linear = {"kernel": np.zeros((5, 1)), "bias": np.zeros(1)}  # of seen, memory and action
-      >>> learned = LearnedReward(
-      ...     parameters={"params": linear}, hidden=(),
-      ...     memory=to_automaton("F g"), label_on="exit", discount=0.9, horizon=None, radius=0,
-      ...     formula="F g", kinds=("plain", "goal"))
-      >>> world = from_dense([[[0.5, 0.5]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
-      >>> jax.eval_shape(lambda seen: plan_in(learned, world, seen)[1], np.eye(2)).policy.shape
-      (2, 2, 1)
     """
     model = product(world, learned.memory, label_on=learned.label_on)
     seen = jnp.asarray(observation, model.dtype)
@@ -149,19 +150,6 @@ def save_reward(path: str | Path, learned: LearnedReward) -> None:
 
     Raises:
       ValueError: the place cannot be written to.
-
-    Example:
-      >>> import pathlib, tempfile
-      >>> from jaxltl import from_dense, to_automaton
-      >>> linear = {"kernel": np.zeros((5, 1)), "bias": np.zeros(1)}  # of seen, memory and action
-      >>> learned = LearnedReward(
-      ...     parameters={"params": linear}, hidden=(),
-      ...     memory=to_automaton("F g"), label_on="exit", discount=0.9, horizon=None, radius=0,
-      ...     formula="F g", kinds=("plain", "goal"))
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "reward.npz"
-      >>> save_reward(path, learned)
-      >>> load_reward(path).kinds
-      ('plain', 'goal')
     """
     about = {key: getattr(learned, key) for key in _ABOUT}
     text = json.dumps({**about, "memory": to_dict(learned.memory)})
@@ -181,19 +169,6 @@ def load_reward(path: str | Path) -> LearnedReward:
 
     Raises:
       ValueError: the file cannot be read, or is no such file.
-
-    Example:
-      >>> import pathlib, tempfile
-      >>> from jaxltl import from_dense, to_automaton
-      >>> linear = {"kernel": np.zeros((5, 1)), "bias": np.zeros(1)}  # of seen, memory and action
-      >>> learned = LearnedReward(
-      ...     parameters={"params": linear}, hidden=(),
-      ...     memory=to_automaton("F g"), label_on="exit", discount=0.9, horizon=None, radius=0,
-      ...     formula="F g", kinds=("plain", "goal"))
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "reward.npz"
-      >>> save_reward(path, learned)
-      >>> load_reward(path).parameters["params"]["kernel"].shape
-      (5, 1)
     """
     try:
         with open(path, "rb") as file:

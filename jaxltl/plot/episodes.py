@@ -1,4 +1,25 @@
-"""Episodes in worlds that have places: one picture, or a page that plays them."""
+"""Episodes in worlds that have places: one picture, or a page that plays them.
+
+Example:
+  >>> import jax.numpy as jnp, numpy as np
+  >>> from jaxltl import Episode, Timestep, make_box, make_environment
+  >>> def step(world, action, key):
+  ...     return Timestep({"place": world["place"] + action}, 0.0, False)
+  >>> walk = make_environment(
+  ...     lambda key: {"place": jnp.zeros(2)}, step, lambda world: world["place"],
+  ...     actions=make_box(-1, 1, (2,)), propositions=["far"],
+  ...     labels=lambda world: jnp.array([world["place"][0] > 1]))
+  >>> zeros, made = np.zeros(2), np.ones(2, bool)
+  >>> episode = Episode(  # two steps to the right, as run_episode would return them
+  ...     {"place": np.array([[0, 0], [1, 0], [2, 0.0]])}, np.zeros((2, 2)), np.zeros((2, 2)),
+  ...     zeros, zeros, np.array([[False], [False], [True]]), made, False, False, np.ones(2))
+  >>> from jaxltl.plot import draw_episode, draw_episodes, play_episode
+  >>> page = play_episode(walk, episode, title="to the right")
+  >>> page.startswith("<!doctype html>") or page.startswith("<!DOCTYPE html>")
+  True
+  >>> len(draw_episode(walk, episode).axes), len(draw_episodes(walk, [episode, episode]).axes)
+  (1, 2)
+"""
 
 from __future__ import annotations
 
@@ -65,22 +86,6 @@ def draw_episode(environment: Any, episode: Any, *, title: str | None = None) ->
 
     Raises:
       ValueError: another world, or many trajectories.
-
-    Example:
-      >>> import jax.numpy as jnp
-      >>> from jaxltl import Episode, Timestep, make_box, make_environment
-      >>> def step(world, action, key):
-      ...     return Timestep({"place": world["place"] + action}, 0.0, False)
-      >>> walk = make_environment(
-      ...     lambda key: {"place": jnp.zeros(2)}, step, lambda world: world["place"],
-      ...     actions=make_box(-1, 1, (2,)), propositions=["far"],
-      ...     labels=lambda world: jnp.array([world["place"][0] > 1]))
-      >>> zeros, made = np.zeros(2), np.ones(2, bool)
-      >>> episode = Episode(  # two steps to the right, as run_episode would return them
-      ...     {"place": np.array([[0, 0], [1, 0], [2, 0.0]])}, np.zeros((2, 2)), np.zeros((2, 2)),
-      ...     zeros, zeros, np.array([[False], [False], [True]]), made, False, False, np.ones(2))
-      >>> len(draw_episode(walk, episode).axes)
-      1
     """
     figure = Figure(figsize=(4.4, 4.9), layout="constrained", facecolor=PAPER)
     scene = scene_of(environment, episode)
@@ -94,8 +99,6 @@ def draw_episodes(
     environment: Any, episodes: Sequence[Any], *, titles: Sequence[str] | None = None
 ) -> Figure:
     """Several episodes as :func:`draw_episode` draws one, side by side.
-
-    An example is that of :func:`play_episode`.
 
     Args:
       environment: as there.
@@ -332,25 +335,6 @@ def play_episode(environment: Any, episode: Any, *, title: str | None = None) ->
 
     Raises:
       ValueError: another world, or many trajectories.
-
-    Example:
-      >>> import jax.numpy as jnp
-      >>> from jaxltl import Episode, Timestep, make_box, make_environment
-      >>> def step(world, action, key):
-      ...     return Timestep({"place": world["place"] + action}, 0.0, False)
-      >>> walk = make_environment(
-      ...     lambda key: {"place": jnp.zeros(2)}, step, lambda world: world["place"],
-      ...     actions=make_box(-1, 1, (2,)), propositions=["far"],
-      ...     labels=lambda world: jnp.array([world["place"][0] > 1]))
-      >>> zeros, made = np.zeros(2), np.ones(2, bool)
-      >>> episode = Episode(  # two steps to the right, as run_episode would return them
-      ...     {"place": np.array([[0, 0], [1, 0], [2, 0.0]])}, np.zeros((2, 2)), np.zeros((2, 2)),
-      ...     zeros, zeros, np.array([[False], [False], [True]]), made, False, False, np.ones(2))
-      >>> page = play_episode(walk, episode, title="to the right")
-      >>> page.startswith("<!doctype html>") or page.startswith("<!DOCTYPE html>")
-      True
-      >>> len(draw_episodes(walk, [episode, episode]).axes)  # the same as pictures, side by side
-      2
     """
     scene = scene_of(environment, episode)
     zoom = _PIXELS / scene.size
