@@ -52,10 +52,6 @@ class Output(NamedTuple):
         finitely many; of a box a pair of arrays of an action's shape, mean and logarithm of the
         standard deviation.
       value: ``float[]``.
-
-    Example:
-      >>> Output((), jnp.zeros(4), jnp.array(0.5)).action.shape
-      (4,)
     """
 
     memory: Any

@@ -21,10 +21,6 @@ class Best:
       parameters: of the network, a pytree.
       neg_log_likelihood: ``float[]``, held out, in nats a pair; NaN without held-out data.
       step: ``int32[]``, the number of steps after which they were reached.
-
-    Example:
-      >>> Best(jnp.zeros(3), jnp.array(0.7), jnp.int32(4)).step.item()
-      4
     """
 
     parameters: Any

@@ -78,10 +78,6 @@ class FullGaussian:
       mean: ``float[D]``.
       factor: ``float[D, D]``, lower triangular, the covariance being ``factor @ factor.T``.
         Kept instead of the covariance, which rounding could make indefinite.
-
-    Example:
-      >>> full_gaussian([0.0, 0.0], [[4.0, 0.0], [0.0, 1.0]]).factor.tolist()
-      [[2.0, 0.0], [0.0, 1.0]]
     """
 
     mean: jax.Array
@@ -96,10 +92,6 @@ class Gamma:
     Attributes:
       shape: ``float[D]``.
       rate: ``float[D]``; the mean is ``shape / rate``.
-
-    Example:
-      >>> center(gamma([2.0, 3.0], 2.0)).tolist()
-      [1.0, 1.5]
     """
 
     shape: jax.Array

@@ -143,11 +143,6 @@ class Conditions(NamedTuple):
       failing: the names of those that fail.
       conditions: all, with reasons.
       assumed: what the theorem assumes of the problem, which settings cannot show.
-
-    Example:
-      >>> from jaxltl.algos.cce import Hparams
-      >>> theorem_conditions(Hparams(weighting="literal")).conditions[0].name
-      'samples grow'
     """
 
     holds: bool | None

@@ -37,10 +37,6 @@ class LQR:
       start: ``float[n]``.
       scale: what J is divided by in the objective.
       horizon: N, the number of controls; static.
-
-    Example:
-      >>> lqr().dynamics.tolist(), lqr().control.shape
-      ([[1.0, 1.0], [0.0, 1.0]], (2, 1))
     """
 
     dynamics: chex.Array

@@ -53,14 +53,6 @@ class HoaGame(NamedTuple):
       objective: the parity objective.
       inputs: the propositions that the environment chooses.
       outputs: those that the system chooses.
-
-    Example:
-      >>> text = '''HOA: v1 States: 1 Start: 0 AP: 2 "request" "grant" controllable-AP: 1
-      ...   acc-name: parity max even 3 Acceptance: 3 Inf(2) | (Fin(1) & Inf(0))
-      ...   --BODY-- State: 0 [0 & 1] 0 {2} [0 & !1] 0 {1} [!0] 0 {0} --END--'''
-      >>> game, objective, inputs, outputs = read_hoa_game(text)
-      >>> inputs, outputs, objective.priority.shape == game.state_shape
-      (('request',), ('grant',), True)
     """
 
     game: Game

@@ -92,16 +92,6 @@ class ParametricModel:
       rewards: for each name the numbers of the functions on states, ``int32[S]``, and on choices,
         ``int32[R]``.
       names: labels, initial states and actions, as ``make_sparse`` takes them.
-
-    Example:
-      >>> import pathlib, tempfile
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
-      >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n2\\n@model\\n"
-      ...     "state 0 init\\n\\taction 0\\n\\t\\t0 : 1-p\\n\\t\\t1 : p\\n"
-      ...     "state 1\\n\\taction 0\\n\\t\\t1 : 1\\n")
-      >>> coin = read_parametric(path)
-      >>> coin.parameters, coin.successor.tolist(), coin.at({"p": 0.25}).probability.tolist()
-      (('p',), [0, 1, 1], [0.75, 0.25, 1.0])
     """
 
     parameters: tuple[str, ...]

@@ -33,14 +33,6 @@ class ParityGame(NamedTuple):
     Attributes:
       game: a Game over a :class:`~jaxltl.core.models.sparse.SparseMDP`.
       objective: the parity objective, min-even, of the fewest priorities that say the same.
-
-    Example:
-      >>> import pathlib, tempfile
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "game.pg"
-      >>> _ = path.write_text("parity 1; 0 0 0 1; 1 1 1 0;")
-      >>> found = read_pgsolver(path)
-      >>> found.game.system.tolist(), found.objective.priority.tolist()
-      ([True, False], [2, 1])
     """
 
     game: Game

@@ -37,16 +37,6 @@ class RewardMachine(NamedTuple):
       automaton: with co-safe acceptance, whose final states are those in which the machine has
         ended. Its `state_names` are the numbers in the file.
       reward: ``float64[Q, L]``, of reading letter l in state q; zero once the machine has ended.
-
-    Example:
-      >>> machine = read_reward_machine('''
-      ... 0
-      ... [1]
-      ... (0, 1, 'goal', ConstantRewardFunction(1))
-      ... (0, 0, '!goal', ConstantRewardFunction(0))
-      ... ''')
-      >>> machine.automaton.acceptance, machine.reward.tolist()
-      ('cosafe', [[0.0, 1.0], [0.0, 0.0]])
     """
 
     automaton: Automaton
