@@ -112,14 +112,14 @@ def problem_and_state() -> tuple[Any, Any, Any]:
 
 def run(directory: Path, place: Any) -> None:
     """Steps of the lanes, saved after every 50, and what comes out, printed by the first."""
-    from jaxltl.algos import learner
+    from jaxltl.algos.chunks import run_in_chunks
     from jaxltl.core.models.lanes import on_host
 
     step, states, goal = problem_and_state()
     path = directory / "run.npz"
     begun = place.sees(str(path), path.exists())
     made: list[int] = []
-    found = learner.run_in_chunks(
+    found = run_in_chunks(
         step, states, goal, 0.01, num_steps=STEPS, lanes=True, chunk=50, checkpoint=path,
         mesh=place.mesh, report=lambda done, _: made.append(done))
     state = on_host(found.state)

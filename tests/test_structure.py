@@ -29,9 +29,9 @@ STOREYS = (
 )
 # What a private helper helps is one learner; these serve several.
 SHARED_BY_LEARNERS = (
-    "action_distributions", "actor_critic", "advantages", "checkpoint", "early_stopping",
-    "exponential_family", "learner", "moments", "pac", "play", "schedules", "settings",
-    "splitmix",
+    "action_distributions", "actor_critic", "advantages", "checkpoint", "chunks",
+    "early_stopping", "exponential_family", "learner", "moments", "pac", "play", "schedules",
+    "settings", "splitmix",
 )
 NO_JAX = ("core.show", "core.logic", "core.host", "core.automata")
 

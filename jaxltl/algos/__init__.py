@@ -9,9 +9,9 @@ used, ``jaxltl.algos.ppo`` as well as ``from jaxltl.algos import ppo``. Steps an
 From demonstrations: ``mlirl``, ``todirl``, ``behavioral_cloning``. By trying, in a model:
 ``maximin_q``, ``rmax``, ``interval_learning``. By trying, in a simulated world: ``ppo``,
 ``many_tasks``, ``cce``, ``trust_region``. Parameters of a model: ``feasible``, ``regions``. For
-all of them: ``learner`` (loops, stopping, progress), ``checkpoint`` (files), ``early_stopping``,
-``schedules``; for some: ``actor_critic`` (networks), ``exponential_family`` (of ``cce``), ``pac``
-(constants and bounds of ``rmax``).
+all of them: ``learner`` (loops, stopping), ``chunks`` (progress, resuming), ``checkpoint`` (files),
+``early_stopping``, ``schedules``; for some: ``actor_critic`` (networks), ``exponential_family`` (of
+``cce``), ``pac`` (constants and bounds of ``rmax``).
 """
 
 import importlib
@@ -22,6 +22,7 @@ __all__ = [
     "behavioral_cloning",
     "cce",
     "checkpoint",
+    "chunks",
     "early_stopping",
     "exponential_family",
     "feasible",
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from jaxltl.algos import behavioral_cloning as behavioral_cloning
     from jaxltl.algos import cce as cce
     from jaxltl.algos import checkpoint as checkpoint
+    from jaxltl.algos import chunks as chunks
     from jaxltl.algos import early_stopping as early_stopping
     from jaxltl.algos import exponential_family as exponential_family
     from jaxltl.algos import feasible as feasible

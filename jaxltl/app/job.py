@@ -18,8 +18,8 @@ import numpy as np
 from jax.sharding import Mesh
 
 import jaxltl
-from jaxltl.algos import learner
 from jaxltl.algos.checkpoint import atomic_write
+from jaxltl.algos.chunks import Chunks, run_in_chunks, trace_lanes
 from jaxltl.app.drawing import Picture, drawing
 from jaxltl.app.files.task import Task
 from jaxltl.core.automata.automaton import Automaton
@@ -38,28 +38,28 @@ def settings(kind: Any, spec: Mapping[str, Any]) -> Any:
 def run_seeds(
     algorithm: Any, seeds: tuple[int, int], problem: Any, hparams: Any, report: Report | None,
     mesh: Mesh | None = None, **options: Any,
-) -> tuple[learner.Chunks, dict[str, np.ndarray]]:
+) -> tuple[Chunks, dict[str, np.ndarray]]:
     """Runs of a learner from N seeds side by side, and their figures ``[T, N]`` by name.
 
     Args:
       algorithm: the learner's module.
       seeds: the first, and how many.
       mesh: devices that several seeds are learned on; the same in every process.
-      options: for :func:`~jaxltl.algos.learner.run_in_chunks`.
+      options: for :func:`~jaxltl.algos.chunks.run_in_chunks`.
     """
     if seeds[1] == 1:
         mesh = None
     given = (algorithm.init, *seeds, problem, hparams)
     if mesh is None:
         wait = compile_beside(_first_states, *given)
-        learner.trace_lanes(algorithm.step, jax.eval_shape(_first_states, *given), problem, hparams)
+        trace_lanes(algorithm.step, jax.eval_shape(_first_states, *given), problem, hparams)
         wait()
         states = _first_states(*given)
     else:
         first = vmap_over_mesh(_first_of(algorithm.init), mesh, in_axes=(0, None, None, None))
         states = first(np.arange(seeds[1]), np.int32(seeds[0]), problem, hparams)
     by_name = report and (lambda step, metrics: report(step, vars(metrics)))
-    found = learner.run_in_chunks(
+    found = run_in_chunks(
         algorithm.step, states, problem, hparams, lanes=True, report=by_name, mesh=mesh, **options
     )
     if mesh is not None:  # what comes then is each process's own

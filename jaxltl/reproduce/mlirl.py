@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxltl.algos import learner
 from jaxltl.algos import mlirl as irl
+from jaxltl.algos.chunks import run_in_chunks
 from jaxltl.app.job import plain
 from jaxltl.core.models.lifting import lift_policy
 from jaxltl.core.models.mdp import MDP
@@ -97,7 +98,7 @@ def learn_cases(
     def begin(start: jax.Array) -> irl.State:
         return irl.init(jax.random.key(0), replace(problem, start=start), one)
 
-    learned = learner.run_in_chunks(
+    learned = run_in_chunks(
         irl.step, jax.vmap(begin)(starts), problem, hparams, num_steps=400, lanes=True,
         until=learner.gradient_vanishes(1e-6), keep="before",
     )

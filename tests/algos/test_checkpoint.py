@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.algos import behavioral_cloning, checkpoint, learner
+from jaxltl.algos import behavioral_cloning, checkpoint
+from jaxltl.algos.chunks import run_in_chunks
 from tests.algos.test_learner import assert_bitwise, start, toy_init, toy_step
 
 
@@ -66,7 +67,7 @@ def test_states_of_another_run_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"does not belong to this run: .* is missing"):
         checkpoint.load(path, start("cce"))
     with pytest.raises(ValueError, match="Delete the file to start afresh"):
-        learner.run_in_chunks(
+        run_in_chunks(
             toy_step, start("toy"), jnp.zeros(3), 0.1, num_steps=3, checkpoint=path)
 
 

@@ -34,6 +34,7 @@ from jaxltl.algos import (
     todirl,
     trust_region,
 )
+from jaxltl.algos.chunks import run_in_chunks
 from jaxltl.algos.exponential_family import diagonal_gaussian
 from jaxltl.core.models.environment import Timestep, make_box, make_environment
 from jaxltl.core.models.game import make_game
@@ -618,7 +619,7 @@ def test_a_loop_of_lanes_is_a_while_loop():
 def test_a_run_in_chunks_is_the_run():
     module, problem, hparams, _ = case("toy")
     reports = []
-    found = learner.run_in_chunks(
+    found = run_in_chunks(
         module.step, start("toy"), problem, hparams, num_steps=10, chunk=4,
         report=lambda done, row: reports.append((done, int(row.at))),
     )
@@ -627,7 +628,7 @@ def test_a_run_in_chunks_is_the_run():
     np.testing.assert_array_equal(found.metrics.x, metrics.x)
     assert found.step.tolist() == list(range(1, 11)) and not found.done
     assert reports == [(4, 3), (8, 7), (10, 9)]
-    long = learner.run_in_chunks(module.step, start("toy"), problem, hparams, num_steps=3000)
+    long = run_in_chunks(module.step, start("toy"), problem, hparams, num_steps=3000)
     assert len(long.step) == 1000, "rows do not grow with steps"
 
 
@@ -635,7 +636,7 @@ def test_runs_side_by_side_in_chunks():
     """Each with its own number and its own end."""
     module, problem, _, _ = case("toy")
     given = np.array([0.1, 0.2, 0.3])
-    chunks = partial(learner.run_in_chunks, module.step, problem=problem, num_steps=9, chunk=4)
+    chunks = partial(run_in_chunks, module.step, problem=problem, num_steps=9, chunk=4)
     found = chunks(
         starts("toy"), hparams=given, lanes=True,
         until=lambda before, after, metrics: metrics.at >= 20 * given[0] + 3 * (after.step == 4))
@@ -663,7 +664,7 @@ def test_an_interrupted_run_resumes_and_ends_bitwise_equal(name, tmp_path):
         raise KeyboardInterrupt
 
     run = partial(
-        learner.run_in_chunks, module.step, problem=problem, num_steps=6, chunk=3)
+        run_in_chunks, module.step, problem=problem, num_steps=6, chunk=3)
     with pytest.raises(KeyboardInterrupt):
         run(state=start(name), hparams=hparams, report=interrupt, checkpoint=path)
     found = run(state=start(name), hparams=hparams, checkpoint=path,

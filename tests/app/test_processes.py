@@ -123,13 +123,13 @@ def is_whole(directory):
 
 def _like(path):
     """What the run saves, and what it is told apart by."""
-    from jaxltl.algos import learner
+    from jaxltl.algos import chunks
 
     with jax.enable_x64(False):  # as the program
         step, states, goal = several.problem_and_state()
         given = {}
-        hparams = learner._spread(0.01, states)
-        now = learner._begin(step, states, goal, hparams, several.LANES)
+        hparams = chunks._spread(0.01, states)
+        now = chunks._begin(step, states, goal, hparams, several.LANES)
         rows = jax.tree.map(
             lambda x: np.zeros((0, *x.shape), x.dtype), (now.count, now.metrics))
         given = checkpoint.fingerprint(step=step, problem=goal, hparams=hparams)
