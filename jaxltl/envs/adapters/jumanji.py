@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
+from jaxltl.core.host import given
 from jaxltl.core.models.environment import (
     Box,
     Environment,
@@ -35,6 +36,7 @@ from jaxltl.envs.adapters.common import (
     some_allowed,
     timestep,
 )
+from jaxltl.envs.adapters.in_turn import in_turn as parts_in_turn
 
 # More are learned part by part, and a mask of all their combinations would fill the memory.
 _MOST_ACTIONS = 2**20
@@ -43,6 +45,7 @@ _MOST_ACTIONS = 2**20
 def from_jumanji(
     env: Any,
     *,
+    in_turn: bool = False,
     labels: Callable[..., jax.Array] | None = None,
     propositions: Sequence[str] = (),
 ) -> Environment:
@@ -58,6 +61,9 @@ def from_jumanji(
       env: as ``jumanji.make(name)`` returns it. Where an action has several parts, the actions here
         are all combinations, numbered with the last part fastest. An `action_mask` in what is
         observed is what is `allowed`; of parts, where all of them are.
+      in_turn: whether parts of an action are chosen one after the other instead, each in a step of
+        its own; the last of them moves the world, in which nothing happens before. What has been
+        chosen is seen beside the observation. For parts that have too many combinations.
       labels: ``state -> bool[P]``, of Jumanji's state.
       propositions: the names of the labels.
 
@@ -66,8 +72,8 @@ def from_jumanji(
 
     Raises:
       ValueError: no environment of Jumanji, one that starts anew by itself, or a batch; a reward
-        for each of several agents; actions that are neither finite nor in a box; labels that are
-        not ``bool[P]``.
+        for each of several agents; actions that are neither finite nor in a box, have too many
+        combinations, or no parts to be chosen in turn; labels that are not ``bool[P]``.
       ImportError: jumanji is not installed.
 
     Example:
@@ -86,13 +92,23 @@ def from_jumanji(
         raise ValueError(
             f"from_jumanji: {type(env).__name__} has rewards of shape {env.reward_spec.shape}, "
             "one for each agent; wrap it in jumanji.wrappers.MultiToSingleWrapper.")
-    held, endless, parts = Held(env), Held(_without_limit(env)), _parts(env.action_spec)
+    held, endless, parts = Held(env), Held(_without_limit(env)), _parts(env)
     limit = next((x.time_limit for x in layers(env, "_env") if "time_limit" in vars(x)), None)
+    limit = None if limit is None else int(limit)
+    if given.truth("in_turn", in_turn):
+        if not parts:
+            raise ValueError(
+                f"from_jumanji: in_turn=True, but an action of {type(env).__name__} has no parts "
+                "of finitely many values; leave it out.")
+        return parts_in_turn(
+            parts, Partial(_reset, held), Partial(_moved, held, endless), Partial(observation_of),
+            labels=labels_of_state(labels), propositions=propositions,
+            mask=None if _mask(env, parts) is None else Partial(_mask_in), horizon=limit)
     return make_environment(
         Partial(_reset, held), Partial(_step, held, endless, Held(parts)),
         Partial(observation_of), actions=_actions(env.action_spec, parts),
         labels=labels_of_state(labels), propositions=propositions,
-        allowed=_mask(env, parts), horizon=None if limit is None else int(limit))
+        allowed=_mask(env, parts), horizon=limit)
 
 
 def _without_limit(env: Any) -> Any:
@@ -106,11 +122,21 @@ def _without_limit(env: Any) -> Any:
     return endless
 
 
-def _parts(spec: Any) -> tuple[int, ...] | None:
-    """How many values each part of an action has: () for an action that is a number itself."""
-    if not hasattr(spec, "num_values"):
+def _parts(env: Any) -> tuple[int, ...] | None:
+    """How many values each part of an action has: () for an action that is a number itself.
+
+    Whole numbers within bounds are such parts too; what a mask of fewer columns leaves out is not
+    to be taken.
+    """
+    spec = env.action_spec
+    if hasattr(spec, "num_values"):
+        return tuple(np.ravel(spec.num_values).tolist()) if spec.shape else ()
+    if not (spec.shape and hasattr(spec, "minimum") and jnp.issubdtype(spec.dtype, jnp.integer)):
         return None
-    return tuple(np.ravel(spec.num_values).tolist()) if spec.shape else ()
+    low, high = (np.broadcast_to(x, spec.shape).ravel() for x in (spec.minimum, spec.maximum))
+    mask = _mask_of(env)
+    most = mask.shape[1] if mask is not None and mask.ndim == 2 else np.inf
+    return tuple(int(min(n, most)) for n in high.astype(int) - low + 1)
 
 
 def _actions(spec: Any, parts: tuple[int, ...] | None) -> Finite | Box:
@@ -119,20 +145,24 @@ def _actions(spec: Any, parts: tuple[int, ...] | None) -> Finite | Box:
         if count > _MOST_ACTIONS:
             raise ValueError(
                 f"from_jumanji: parts of {list(parts)} values make {count} actions; at most "
-                f"{_MOST_ACTIONS} are numbered. Take fewer agents or a smaller board.")
+                f"{_MOST_ACTIONS} are numbered. Choose the parts one after the other, "
+                "in_turn=True, or take fewer agents or a smaller board.")
         return Finite(count)
     if not (hasattr(spec, "minimum") and jnp.issubdtype(spec.dtype, jnp.floating)):
         raise ValueError(f"from_jumanji: actions are {spec!r}; they must be finite or in a box.")
     return make_box(spec.minimum, spec.maximum, spec.shape, spec.dtype)
 
 
+def _mask_of(env: Any) -> Any:
+    """The shape of the mask that the environment shows, if it shows one."""
+    seen = jax.eval_shape(lambda key: env.reset(key)[1].observation, jax.random.key(0))
+    return getattr(seen, "action_mask", None)
+
+
 def _mask(env: Any, parts: tuple[int, ...] | None) -> Partial | None:
     """What is allowed, if the environment shows a mask."""
-    if parts is None:
-        return None
-    seen = jax.eval_shape(lambda key: env.reset(key)[1].observation, jax.random.key(0))
-    mask = getattr(seen, "action_mask", None)
-    if mask is None:
+    mask = None if parts is None else _mask_of(env)
+    if parts is None or mask is None:
         return None
     together = tuple(mask.shape) == parts or (not parts and len(mask.shape) == 1)
     apart = len(mask.shape) == 2 and mask.shape[0] == len(parts) and mask.shape[1] >= max(parts)
@@ -141,6 +171,10 @@ def _mask(env: Any, parts: tuple[int, ...] | None) -> Partial | None:
             f"from_jumanji: action_mask has the shape {list(mask.shape)}, for actions of "
             f"{list(parts)} values.")
     return Partial(_allowed_together) if together else Partial(_allowed_apart, Held(parts))
+
+
+def _mask_in(world: Seen) -> jax.Array:
+    return world.observation.action_mask
 
 
 def _allowed_together(world: Seen) -> jax.Array:
@@ -162,9 +196,17 @@ def _reset(held: Held, key: chex.PRNGKey) -> Seen:
 def _step(
     held: Held, endless: Held, parts: Held, world: Seen, action: Any, key: chex.PRNGKey
 ) -> Timestep:
-    del key  # the state has one
     if parts.it:
-        action = jnp.stack(jnp.unravel_index(action, parts.it)).astype(held.it.action_spec.dtype)
+        action = jnp.stack(jnp.unravel_index(action, parts.it))
+    return _moved(held, endless, world, action, key)
+
+
+def _moved(held: Held, endless: Held, world: Seen, action: Any, key: chex.PRNGKey) -> Timestep:
+    """A step by the package's action, or by its parts as one vector from 0."""
+    del key  # the state has one
+    spec = held.it.action_spec
+    if spec.shape and jnp.issubdtype(spec.dtype, jnp.integer):
+        action = (action.reshape(spec.shape) + getattr(spec, "minimum", 0)).astype(spec.dtype)
     state, found = held.it.step(copied(world.state), action)
     _, further = endless.it.step(copied(world.state), action)
     terminated = further.last() & (further.discount == 0)

@@ -70,6 +70,43 @@ def test_actions_of_several_parts_are_numbered(jumanji, name, apart):
         np.testing.assert_array_equal(x, y)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Minesweeper-v0", "JobShop-v0", "MultiCVRP-v0"])
+def test_parts_in_turn_are_one_step(jumanji, name):
+    """A mask of all combinations, of ten parts each for itself, and whole numbers in bounds."""
+    own = jumanji.make(name)
+    if own.reward_spec.shape:
+        own = load("jumanji.wrappers").MultiToSingleWrapper(own)
+    env = from_jumanji(own, in_turn=True)
+    reset, step, theirs = jax.jit(env.reset), jax.jit(env.step), jax.jit(own.step)
+    allowed, observe = jax.jit(env.allowed), jax.jit(env.observe)
+    now, rng, parts = reset(jax.random.key(0)), np.random.default_rng(0), own.action_spec.shape[0]
+    assert env.horizon is None or env.horizon == parts * own.time_limit
+    for _ in range(3):
+        before, mask = now.world, np.asarray(now.world.observation.action_mask)
+        chosen = []
+        for part in range(parts):
+            seen, may = observe(now), np.asarray(allowed(now))
+            assert seen.turn.argmax() == part and seen.parts.sum() == part
+            left = mask[part] if len(mask) == parts and name != "Minesweeper-v0" else (
+                mask[tuple(chosen)] if part else mask.any(1))
+            np.testing.assert_array_equal(np.flatnonzero(may), np.flatnonzero(left))
+            chosen.append(int(rng.choice(np.flatnonzero(may))))
+            found = step(now, jnp.int32(chosen[-1]), jax.random.key(1))
+            now = found.world
+            if part < parts - 1:
+                assert found.reward == 0 and not found.terminated and not found.truncated
+        _, told = theirs(before.state, jnp.array(chosen, own.action_spec.dtype))
+        np.testing.assert_allclose(found.reward, told.reward, rtol=1e-6)
+        assert (found.terminated | found.truncated) == told.last() and now.turn == 0
+        for x, y in zip(
+                jax.tree.leaves(now.world.observation), jax.tree.leaves(told.observation),
+                strict=True):
+            np.testing.assert_allclose(x, y, rtol=1e-6)
+        if told.last():
+            now = reset(jax.random.key(2))
+
+
 def test_what_is_not_jumanjis_is_named(jumanji):
     wrappers = load("jumanji.wrappers")
     snake = jumanji.make("Snake-v1")
@@ -78,7 +115,9 @@ def test_what_is_not_jumanjis_is_named(jumanji):
             from_jumanji(wrapper(snake))
     with pytest.raises(ValueError, match=r"from_jumanji: env is a .*no environment of jumanji"):
         from_jumanji(jnp)
-    with pytest.raises(ValueError, match="make 16679880978201 actions; at most"):
+    with pytest.raises(ValueError, match=r"make 16679880978201 actions; at most .*in_turn=True"):
         from_jumanji(jumanji.make("JobShop-v0"))
+    with pytest.raises(ValueError, match="an action of Snake has no parts"):
+        from_jumanji(snake, in_turn=True)
     with pytest.raises(ValueError, match=r"one for each agent; wrap it in .*MultiToSingleWrapper"):
         from_jumanji(jumanji.make("Connector-v3"))

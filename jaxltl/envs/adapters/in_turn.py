@@ -1,0 +1,138 @@
+"""Actions of several parts, chosen one after the other.
+
+Where N parts have many values each, their combinations are too many to be numbered. A step of the
+package's world is then N steps here: each chooses one part, and the last one moves the world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.tree_util import Partial
+
+from jaxltl.core.models.environment import Environment, Timestep, make_environment
+from jaxltl.core.show import brief
+from jaxltl.envs.adapters.common import Held
+
+
+@brief
+class PartWorld(NamedTuple):
+    """A world and what has been chosen of the action that comes next.
+
+    Attributes:
+      world: the inner one.
+      parts: ``int32[N]``; 0 where it is still to be chosen.
+      turn: ``int32[]``, the part that is chosen now.
+    """
+
+    world: Any
+    parts: jax.Array
+    turn: jax.Array
+
+
+@brief
+class PartObservation(NamedTuple):
+    """What is seen of the inner world, what has been chosen, and which part comes now.
+
+    Attributes:
+      world: as it is observed.
+      parts: ``bool[N, M]``, a row for each part, with its value where it has been chosen.
+      turn: ``bool[N]``, one of them.
+    """
+
+    world: Any
+    parts: jax.Array
+    turn: jax.Array
+
+
+def in_turn(
+    counts: Sequence[int],
+    reset: Callable[..., Any],
+    step: Callable[..., Timestep],
+    observe: Callable[..., Any],
+    *,
+    labels: Partial | None,
+    propositions: Sequence[str],
+    mask: Callable[..., jax.Array] | None,
+    horizon: int | None,
+) -> Environment:
+    """The environment of N parts of so many values each, whose parts are chosen in turn.
+
+    Args:
+      counts: values of each part; the actions are the most of them, M.
+      reset, observe: of the inner world.
+      step: ``(world, int32[N], key) -> Timestep`` of the inner world.
+      labels: of the inner world, which does not change but with the last part.
+      propositions: their names.
+      mask: ``world -> bool``, of all combinations or ``bool[N, M]``; None: everything is allowed.
+      horizon: of the inner world.
+
+    Returns:
+      :class:`~jaxltl.core.models.environment.Environment`.
+    """
+    held = Held(tuple(counts))
+    return make_environment(
+        Partial(_begin, held, reset), Partial(_choose, held, step), Partial(_seen, held, observe),
+        actions=max(counts), labels=None if labels is None else Partial(_labels, labels),
+        propositions=propositions, allowed=Partial(_allowed, held, mask),
+        horizon=None if horizon is None else horizon * len(counts))
+
+
+def _nothing(counts: Held, world: Any) -> PartWorld:
+    return PartWorld(world, jnp.zeros(len(counts.it), jnp.int32), jnp.int32(0))
+
+
+def _begin(counts: Held, reset: Callable[..., Any], key: chex.PRNGKey) -> PartWorld:
+    return _nothing(counts, reset(key))
+
+
+def _choose(
+    counts: Held, step: Callable[..., Timestep], now: PartWorld, action: Any, key: chex.PRNGKey
+) -> Timestep:
+    last = now.turn == len(counts.it) - 1
+    parts = now.parts.at[now.turn].set(action)
+
+    def wait() -> Timestep:
+        return Timestep(
+            now.world, jnp.zeros((), jnp.result_type(float)), jnp.bool_(False), jnp.bool_(False),
+            jnp.zeros(()))
+
+    found = lax.cond(last, lambda: step(now.world, parts, key), wait)
+    fresh, going = _nothing(counts, found.world), PartWorld(found.world, parts, now.turn + 1)
+    return found._replace(world=jax.tree.map(lambda x, y: jnp.where(last, x, y), fresh, going))
+
+
+def _seen(counts: Held, observe: Callable[..., Any], now: PartWorld) -> PartObservation:
+    number = jnp.arange(len(counts.it))
+    chosen = jax.nn.one_hot(now.parts, max(counts.it), dtype=bool)
+    return PartObservation(
+        observe(now.world), chosen & (number < now.turn)[:, None], number == now.turn)
+
+
+def _labels(labels: Callable[..., jax.Array], now: PartWorld) -> jax.Array:
+    return labels(now.world)
+
+
+def _allowed(counts: Held, mask: Callable[..., jax.Array] | None, now: PartWorld) -> jax.Array:
+    """Values of the part whose turn it is that go with what has been chosen."""
+    most = max(counts.it)
+    inside = (jnp.arange(most) < jnp.array(counts.it)[:, None])[now.turn]
+    if mask is None:
+        return inside
+    found = mask(now.world)
+    if found.shape == counts.it:
+        for part, count in enumerate(counts.it):
+            own = jnp.arange(count) == now.parts[part]
+            shape = [count if i == part else 1 for i in range(found.ndim)]
+            found &= ((part >= now.turn) | own).reshape(shape)
+        rows = [
+            jnp.pad(found.any([i for i in range(found.ndim) if i != part]), (0, most - count))
+            for part, count in enumerate(counts.it)]
+        found = jnp.stack(rows)
+    row = found[now.turn, :most] & inside
+    return jnp.where(row.any(), row, inside)
