@@ -1,6 +1,7 @@
-"""``python -m benchmarks.flat_world [--seeds N] [--chunks N] [--episodes N]``: unseen formulas.
+"""``python -m benchmarks.flat_world [--box] [--seeds N] [--chunks N]``: unseen formulas.
 
-As :mod:`benchmarks.letter_world`, among the discs of the flat world, with its nine velocities: the
+As :mod:`benchmarks.letter_world`, among the discs of the flat world, with its nine velocities, or
+with all those of a box: the
 share of episodes that do finite reach-avoid tasks, and for infinite ones how often they are
 accepted in 1,000 steps, each with its interval. The network reads which events hold around the
 agent, a fixed function of the position, which is all that is seen. Jackermeier and Abate (2025)
@@ -20,7 +21,7 @@ import numpy as np
 from jaxltl.algos import many_tasks, ppo
 from jaxltl.algos.schedules import Linear
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.environment import Environment
+from jaxltl.core.models.environment import Environment, Finite
 from jaxltl.core.models.sequence_task import (
     proposition_sets,
     sequence_environment,
@@ -70,8 +71,11 @@ def problems(world: Environment, events: np.ndarray, depth: int = DEPTH) -> list
 
     Sets of events are what propositions mean, and single events: automata tell of both.
     """
+    actions: Any = world.actions
+    acts: dict[str, Any] = (
+        {"num_actions": actions.num} if isinstance(actions, Finite) else {"shape": actions.shape})
     network = many_tasks.SequenceNetwork(
-        num_actions=9, hidden=(128, 128), embedding=24, detailed=2, by_name=True,
+        **acts, hidden=(128, 128), embedding=24, detailed=2, by_name=True,
         events_seen=events_around(world, events))
     single = np.eye(len(events), dtype=bool)[events.any(1)]
     sets = np.unique(np.concatenate([proposition_sets(events), single]), axis=0)
@@ -84,9 +88,11 @@ def problems(world: Environment, events: np.ndarray, depth: int = DEPTH) -> list
     return found
 
 
-def learn(seed: int, chunks: int, enough: float) -> tuple[Any, many_tasks.Staged]:
+def learn(
+    seed: int, chunks: int, enough: float, discrete: bool
+) -> tuple[Any, many_tasks.Staged]:
     """The trained network of a seed, and how it was learned."""
-    world = flat_world(discrete=True)
+    world = flat_world(discrete=discrete)
     stages = problems(world, events_in(world))
 
     def told(chunk: int, stage: int, metrics: Any) -> None:
@@ -99,14 +105,17 @@ def learn(seed: int, chunks: int, enough: float) -> tuple[Any, many_tasks.Staged
     return many_tasks.trained(stages[0].network, found.state.parameters), found
 
 
-def judged(network: Any, formula: str, number: int, episodes: int) -> dict[str, Any]:
+def judged(
+    network: Any, formula: str, number: int, episodes: int, discrete: bool
+) -> dict[str, Any]:
     """Success within 500 steps of a finite task; of an infinite one its visits in 1,000."""
     finite = formula in FINITE
-    world = flat_world(discrete=True, horizon=500 if finite else 1000)
+    world = flat_world(discrete=discrete, horizon=500 if finite else 1000)
     automaton = to_automaton(formula)
     plan = many_tasks.make_plan(automaton, events_in(world), world.propositions, depth=DEPTH)
     found = evaluate(
-        jax.random.key(1000 + number), many_tasks.sequence_agent(network, plan),
+        jax.random.key(1000 + number),
+        many_tasks.sequence_agent(network, plan, actions=world.actions),
         task_environment(world, automaton), num_episodes=episodes)
     told = found.success if finite else found.visits
     assert told is not None and found.violation is not None
@@ -118,6 +127,7 @@ def judged(network: Any, formula: str, number: int, episodes: int) -> dict[str, 
 def main() -> None:
     """Trains, evaluates and prints a line for each task."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--box", action="store_true")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--chunks", type=int, default=13)
     parser.add_argument("--episodes", type=int, default=500)
@@ -126,13 +136,14 @@ def main() -> None:
     shares = []
     for seed in range(given.seeds):
         cpu = time.process_time()
-        network, run = learn(seed, given.chunks, given.enough)
+        network, run = learn(seed, given.chunks, given.enough, not given.box)
         cpu = time.process_time() - cpu
         steps = int(run.metrics[-1].transitions[-1])
         print(f"seed {seed}: {steps:,} steps in {run.seconds[-1]:.0f} s, {cpu:.0f} CPU s, "
               f"{steps / cpu:,.0f} a CPU second", flush=True)
         for number, formula in enumerate((*FINITE, *INFINITE)):
-            row = {"seed": seed, **judged(network, formula, number, given.episodes)}
+            row = {"seed": seed, **judged(
+                network, formula, number, given.episodes, not given.box)}
             print("  " + json.dumps(row), flush=True)
             shares += [row["mean"]] if row["of"] == "success" else []
     print(f"mean success {np.mean(shares):.4f}, least {np.min(shares):.4f}")
