@@ -38,7 +38,6 @@ from jaxltl.core.values.performance import infeasible_starts
 from jaxltl.core.values.soft import soft_value
 from jaxltl.envs.cell_kinds import (
     COLORS,
-    FREE,
     OBJECTS,
     OBSTACLES,
     Counts,
@@ -46,15 +45,13 @@ from jaxltl.envs.cell_kinds import (
     categories,
     check_margin,
     codes_of,
-    find_kinds,
     make_kinds,
 )
+from jaxltl.envs.cell_patches import filled, placed, plan_map, planned, stamps_of
 from jaxltl.envs.gridworld import gridworld
 
 COMPLETE = "(!o2 & !o3 & !ob) U (o1 & ((!o3 & !ob) U (o2 & (!ob U o3))))"
 INCOMPLETE = "(!o2 & !o3) U (o1 & ((!o3) U (o2 & F o3)))"
-
-_ROUNDS = 10_000
 
 
 @brief
@@ -168,23 +165,9 @@ def make_world(
     kinds = make_kinds(objects, obstacles)
     check_margin(margin)
     _check_shape(shape)
-    kind = _plan_map(plan, kinds, shape)
-    stamps, codes = _stamps(kinds), codes_of(kinds)
-    colors = np.full((shape[0] + 2, shape[1] + 2), FREE)
-    for row, column in np.argwhere(kind >= 0).tolist():
-        if not _stamp(colors, stamps[kind[row, column]], row, column):
-            raise ValueError(
-                f"the patch of {kinds[kind[row, column]][0]} in cell {(row + 1, column + 1)} "
-                "overlaps with another that wants other colours; plan them 3 cells apart."
-            )
-    found = find_kinds(colors, codes)
-    for row, column in np.argwhere(found != kind)[:1]:
-        raise ValueError(
-            f"cell {(int(row) + 1, int(column) + 1)} would be {kinds[found[row, column]][0]}, "
-            "which the plan does not say: the patches around it leave no choice. Add it, or "
-            "move them."
-        )
-    colors = _fill(np.random.default_rng(seed), colors, kind, codes, margin)
+    kind = plan_map(plan, kinds, shape)
+    colors = filled(
+        np.random.default_rng(seed), planned(kind, kinds), kind, codes_of(kinds), margin)
     return _assemble(_blank(shape, slip), colors, kind, kinds, margin)
 
 
@@ -215,85 +198,12 @@ def _check_shape(shape: Sequence[int]) -> None:
         raise ValueError(f"shape={tuple(shape)}; give (rows, columns), both at least 1.")
 
 
-def _plan_map(
-    plan: Mapping[str, Sequence[tuple[int, int]]], kinds: Kinds, shape: tuple[int, int]
-) -> NDArray[np.int32]:
-    names = [name for name, _ in kinds]
-    kind = np.full(shape, -1, np.int32)
-    for name, cells in plan.items():
-        if name not in names:
-            raise ValueError(f"plan: {name!r} is no kind of cell; there are {', '.join(names)}.")
-        for row, column in cells:
-            if not (1 <= row <= shape[0] and 1 <= column <= shape[1]):
-                raise ValueError(
-                    f"plan: {name} in cell {(row, column)} is outside the grid; rows are 1 to "
-                    f"{shape[0]}, columns 1 to {shape[1]}."
-                )
-            if kind[row - 1, column - 1] >= 0:
-                raise ValueError(f"plan: cell {(row, column)} is used twice.")
-            kind[row - 1, column - 1] = names.index(name)
-    return kind
-
-
-def _stamps(kinds: Kinds) -> list[NDArray[np.int64]]:
-    """A 3 x 3 patch for each kind."""
-    order = np.array([4, 0, 2, 6, 8, 1, 3, 5, 7])  # centre, corners, and the rest
-    stamps = []
-    for _, counts in kinds:
-        frequent = sorted(range(len(counts)), key=lambda c: -counts[c])
-        patch = np.empty(9, np.int64)
-        patch[order] = np.repeat(frequent, [counts[c] for c in frequent])
-        stamps.append(patch.reshape(3, 3))
-    return stamps
-
-
-def _stamp(colors: NDArray[Any], stamp: NDArray[np.int64], row: int, column: int) -> bool:
-    """Writes a patch around a cell, unless a cell there has another colour already."""
-    patch = colors[row : row + 3, column : column + 3]
-    if ((patch != FREE) & (patch != stamp)).any():
-        return False
-    patch[:] = stamp
-    return True
-
-
-def _fill(
-    random: np.random.Generator, colors: NDArray[Any], kind: NDArray[np.int32],
-    codes: NDArray[np.int64], margin: int,
-) -> NDArray[Any]:
-    """Random colours for free cells that make nothing that is not planned, and outer rings."""
-    free = colors == FREE
-    again = free
-    for _ in range(_ROUNDS):
-        colors[again] = random.integers(len(COLORS), size=int(again.sum()))
-        wrong = np.argwhere(find_kinds(colors, codes) != kind)
-        if not len(wrong):
-            break
-        again = np.zeros_like(free)
-        for row, column in wrong:
-            again[row : row + 3, column : column + 3] = True
-        again &= free
-    else:
-        raise ValueError(
-            f"no colours were found in {_ROUNDS} rounds that make only what is planned; plan "
-            "fewer objects and obstacles, or give them rarer colours."
-        )
-    for _ in range(margin - 1):
-        ring = random.integers(len(COLORS), size=(colors.shape[0] + 2, colors.shape[1] + 2))
-        ring[1:-1, 1:-1] = colors
-        colors = ring
-    return colors
-
-
-
-class _Generator(NamedTuple):
+class _Family(NamedTuple):
     """What all random worlds of a family share."""
 
     blank: MDP
     successor: NDArray[Any]  # [S, A, K]
     kinds: Kinds
-    num_objects: int  # which are the first kinds
-    counts: tuple[int, ...]  # how many cells of each kind
-    distance: tuple[int, ...]  # from objects, for each kind
     automaton: Automaton
     step: NDArray[np.int32]  # [P + 1, Q], the memory after leaving a cell; the last row: of no kind
 
@@ -345,19 +255,16 @@ def random_worlds(
         raise ValueError(f"num_obstacles={num_obstacles}; give 0 or more.")
     automaton, step = _on_kinds(task, kinds)
     blank = _blank(shape, slip)
-    family = _Generator(
-        blank, np.asarray(blank.successor), kinds, len(objects),
-        (1,) * len(objects) + (num_obstacles,) * len(obstacles),
-        (min_distance,) * len(objects) + (obstacle_distance,) * len(obstacles),
-        automaton, step,
-    )
-    codes, stamps = codes_of(kinds), _stamps(kinds)
+    family = _Family(blank, np.asarray(blank.successor), kinds, automaton, step)
+    counts = (1,) * len(objects) + (num_obstacles,) * len(obstacles)
+    distances = (min_distance,) * len(objects) + (obstacle_distance,) * len(obstacles)
+    codes, stamps = codes_of(kinds), stamps_of(kinds)
     worlds = []
     for seed in seeds:
         random = np.random.default_rng(seed)
         for _ in range(max_tries):
-            placed = _place(random, family, shape, stamps, codes)
-            if placed is not None and _is_feasible(family, placed[1]):
+            found = placed(random, shape, counts, distances, len(objects), stamps, codes)
+            if found is not None and _is_feasible(family, found[1]):
                 break
         else:
             raise ValueError(
@@ -365,8 +272,8 @@ def random_worlds(
                 "objects had no room, or the task could not be done from every distractor cell. "
                 "Use a larger grid or fewer obstacles, or check the task."
             )
-        colors = _fill(random, *placed, codes, margin)
-        worlds.append(_assemble(blank, colors, placed[1], kinds, margin))
+        colors = filled(random, *found, codes, margin)
+        worlds.append(_assemble(blank, colors, found[1], kinds, margin))
     return worlds
 
 
@@ -405,50 +312,7 @@ def _on_kinds(task: Task, kinds: Kinds) -> tuple[Automaton, NDArray[np.int32]]:
     return task, np.asarray(task.delta)[:, read].T
 
 
-def _place(
-    random: np.random.Generator, family: _Generator, shape: tuple[int, int],
-    stamps: list[NDArray[np.int64]], codes: NDArray[np.int64],
-) -> tuple[NDArray[Any], NDArray[np.int32]] | None:
-    """Patches in random cells and the kinds of cells, or None if there is no room."""
-    rows, columns = shape
-    colors = np.full((rows + 2, columns + 2), FREE)
-    kind = np.full(shape, -1, np.int32)
-    objects: list[tuple[int, int]] = []
-    for i, (count, distance) in enumerate(zip(family.counts, family.distance, strict=True)):
-        open_ = kind < 0
-        for row, column in objects:
-            near = slice(max(row - distance + 1, 0), row + distance)
-            open_[near, max(column - distance + 1, 0) : column + distance] = False
-        for cell in random.permutation(np.flatnonzero(open_)):
-            if not count:
-                break
-            row, column = divmod(int(cell), columns)
-            if _adds(colors, kind, i, stamps[i], codes, row, column):
-                count -= 1
-                if i < family.num_objects:
-                    objects.append((row, column))
-        if count:
-            return None
-    return colors, kind
-
-
-def _adds(colors, kind, number, stamp, codes, row: int, column: int) -> bool:
-    """Stamps a kind around a cell, unless that is impossible or makes something else too."""
-    patch = colors[row : row + 3, column : column + 3]
-    before = patch.copy()
-    if not _stamp(colors, stamp, row, column):
-        return False
-    kind[row, column] = number
-    # Only cells up to two away see the patch.
-    top, left = max(row - 2, 0), max(column - 2, 0)
-    planned = kind[top : row + 3, left : column + 3]
-    if np.array_equal(find_kinds(colors[top : row + 5, left : column + 5], codes), planned):
-        return True
-    patch[:], kind[row, column] = before, -1
-    return False
-
-
-def _is_feasible(family: _Generator, kind: NDArray[np.int32]) -> bool:
+def _is_feasible(family: _Family, kind: NDArray[np.int32]) -> bool:
     flat, task = kind.ravel(), family.automaton
     if task.acceptance != "cosafe":
         label = flat[:, None] == np.arange(len(family.kinds))
@@ -483,7 +347,6 @@ def _can_finish(
         if np.array_equal(after, can):
             return after
         can = after
-
 
 
 def patches(world: World, radius: int = 1) -> jax.Array:
