@@ -17,6 +17,7 @@ from jaxltl.core.models.sequence_task import Sequence, SequenceObservation, even
 from jaxltl.core.models.tabulate import tabulate
 from jaxltl.core.models.task_environment import stack_tasks, task_environment
 from jaxltl.core.values.optimality_gap import optimality_gap, tabulate_policy
+from jaxltl.envs.flat_world import flat_world
 from jaxltl.envs.letter_world import events_seen, letter_world
 
 NAMES = ("a", "b", "c")
@@ -201,6 +202,48 @@ def test_masks_are_kept():
         agent = many_tasks.sequence_agent(
             lambda observation: (scores, 0.0), one_state_plan(), sampled=sampled)
         assert int(agent.act(agent.memory, seen, allowed, jax.random.key(0))[0]) == 1
+
+
+def test_boxes_and_finite_actions_do_the_same():
+    """One mind in the flat world, which says which of nine velocities it takes, or the velocity."""
+    scene = (("a", -0.3, 0.0, 0.2), ("b", 0.5, 0.1, 0.2), ("c", 0.0, -0.8, 0.1))
+    velocities = np.array([(0, 1), (1, 0), (0, -1), (-1, 0)], np.float32)
+
+    def mind(observation):
+        place, (reach, _, _) = observation
+        apart = jnp.linalg.norm(jnp.array([x[1:3] for x in scene]) - place, axis=-1)
+        wanted = jnp.where(reach[0, 1:], apart, 9.0).argmin()
+        after = place + 0.08 * velocities - jnp.array([x[1:3] for x in scene])[wanted]
+        return jnp.linalg.norm(after, axis=-1).argmin(), -apart[wanted]
+
+    def finite(observation):
+        move, value = mind(observation)
+        return jnp.where(jnp.arange(9) == move, 0.0, -99.0), value
+
+    def boxed(observation):
+        move, value = mind(observation)
+        return (jnp.asarray(velocities)[move] * 5, jnp.zeros(2)), value  # clipped to the box
+
+    told = []
+    for network, discrete in ((finite, True), (boxed, False)):
+        world = flat_world(discs=scene, start=(-0.8, 0.6), discrete=discrete)
+        plan = many_tasks.make_plan("F a & F b", EVENTS, NAMES, depth=DEPTH)
+        task = task_environment(world, "F a & F b")
+        agent = many_tasks.sequence_agent(
+            network, plan, actions=world.actions, sampled=False)
+
+        def go(carry, key, task=task, agent=agent):
+            now, memory = carry
+            action, memory = agent.act(memory, task.observe(now), None, key)
+            found = task.step(now, action, key)
+            return (found.world, memory), (found.world.world[0].place, memory, found.world.verdict)
+
+        told.append(jax.jit(lambda keys, go=go, task=task, agent=agent: jax.lax.scan(
+            go, (task.reset(keys[0]), agent.memory), keys)[1])(
+                jax.random.split(jax.random.key(1), 28)))
+    for one, other in zip(*map(jax.tree.leaves, told), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
+    assert told[0][2][-1] == Verdict.SATISFIED and len(set(told[0][1].state.tolist())) >= 2
 
 
 @pytest.mark.slow
