@@ -90,6 +90,14 @@ def _first_of(init: Callable[..., Any]) -> Callable[..., Any]:
     return first
 
 
+def one_seed(learned: Any, i: int) -> Any:
+    """One of N seeds alone, of a frozen dataclass of arrays ``[N, ...]`` with a history ``[T, N]``.
+    """
+    one = {k: v[i : i + 1] for k, v in vars(learned).items() if isinstance(v, np.ndarray)}
+    history = {k: v if v.ndim == 1 else v[:, i : i + 1] for k, v in learned.history.items()}
+    return dataclasses.replace(learned, **one, history=history)
+
+
 def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
     """What the progress bar tells of the newest figures of a gradient's descent."""
     return {"loss": f"{figures['loss'].min():.4f}",

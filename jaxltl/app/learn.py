@@ -42,6 +42,7 @@ from jaxltl.app.job import (
     compile_beside,
     hyperparameters,
     memory_arrays,
+    one_seed,
     plain,
     run_seeds,
     save_arrays,
@@ -172,7 +173,7 @@ def _with_guarantee(
     # With a weight of zero it is one program for all weights.
     hparams = dataclasses.replace(hparams, mu=0.0 if hparams.mu is None else hparams.mu)
     learned = _trained(setup, names, problem, hparams, seeds, report, checkpoint, mesh)
-    free = _lane(learned, _least_loss(learned))
+    free = one_seed(learned, _least_loss(learned))
 
     def train(mu: float, before: Learned, problem: mlirl.Problem = problem) -> Learned:
         start = jnp.asarray(before.weights[0], problem.features.dtype)
@@ -207,14 +208,6 @@ def _least_loss(learned: Learned) -> int:
     """The seed that is kept: of those that converged, if any did, the one of least loss."""
     loss = np.where(np.isfinite(learned.loss), learned.loss, np.inf)
     return int(np.argmin(np.where(learned.converged, loss, loss + 1e12)))
-
-
-def _lane(learned: Learned, i: int) -> Learned:
-    """One of the seeds alone."""
-    one: dict[str, Any] = {
-        k: v[i : i + 1] for k, v in vars(learned).items() if isinstance(v, np.ndarray)}
-    history = {k: v if v.ndim == 1 else v[:, i : i + 1] for k, v in learned.history.items()}
-    return dataclasses.replace(learned, **one, history=history)
 
 
 def _policy_and_likelihood(

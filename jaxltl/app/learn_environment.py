@@ -218,8 +218,12 @@ def learn(
 
 def _agent(setup: Setup, states: Any, i: int) -> Agent:
     """What a seed learned."""
+    return _acting(setup, jax.tree.map(lambda x: x[i], states))
+
+
+def _acting(setup: Setup, state: Any) -> Agent:
     likeliest = setup.task.evaluation.get("policy") == "likeliest"
-    return setup.method.agent(jax.tree.map(lambda x: x[i], states), likeliest)
+    return setup.method.agent(state, likeliest)
 
 
 def _evaluated(key: jax.Array, agent: Agent, setup: Setup, *, threshold: bool) -> Evaluation:
@@ -427,8 +431,7 @@ def load_policy(
     kept = {name: getattr(state, name) for name in method.kept}
     leaves = [jnp.asarray(arrays[name], x.dtype) for name, x in _parts(method, state)]
     state = replace(state, **jax.tree.unflatten(jax.tree.structure(kept), leaves))
-    likeliest = setup.task.evaluation.get("policy") == "likeliest"
-    return setup.environment, method.agent(state, likeliest)
+    return setup.environment, _acting(setup, state)
 
 
 def _kept_task(policy_file: Path, arrays: Mapping[str, np.ndarray]) -> EnvironmentTask:

@@ -52,6 +52,7 @@ from jaxltl.app.job import (
     about,
     hyperparameters,
     memory_arrays,
+    one_seed,
     plain,
     run_seeds,
     save_arrays,
@@ -272,11 +273,8 @@ def _least_loss(learned: Learned) -> int:
 
 def _lane(learned: Learned, i: int) -> Learned:
     """One of the seeds alone."""
-    one: dict[str, Any] = {
-        k: v[i : i + 1] for k, v in vars(learned).items() if isinstance(v, np.ndarray)}
-    history = {k: v if v.ndim == 1 else v[:, i : i + 1] for k, v in learned.history.items()}
     return replace(
-        learned, parameters=part_of(learned.parameters, slice(i, i + 1)), history=history, **one)
+        one_seed(learned, i), parameters=part_of(learned.parameters, slice(i, i + 1)))
 
 
 def _weighed(

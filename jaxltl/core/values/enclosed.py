@@ -28,6 +28,17 @@ from jaxltl.core.types import (
 from jaxltl.core.values.bounded import finite_reward
 
 
+def status_between(
+    low: np.ndarray, high: np.ndarray, tolerance: float, *, relative: bool
+) -> Status:
+    """Whether bounds are as narrow as asked; where both are infinite they are."""
+    finite = np.isfinite(high)
+    width = np.where(finite, high, 0) - np.where(finite, low, 0)
+    scale = np.where(finite, high, 1) if relative else 1
+    narrow = (width <= tolerance * scale) & (finite | (low == high))
+    return Status.CONVERGED if narrow.all() else Status.PRECISION
+
+
 def solution_of(
     model: Any, sparse: SparseMDP, found: Enclosed, tolerance: float, *, relative: bool
 ) -> Solution:
@@ -41,11 +52,7 @@ def solution_of(
       relative: whether that is a share of the value.
     """
     low, high = found.lower, found.upper
-    finite = np.isfinite(high)
-    width = np.where(finite, high, 0) - np.where(finite, low, 0)
-    scale = np.where(finite, high, 1) if relative else 1
-    narrow = (width <= tolerance * scale) & (finite | (low == high))
-    status = Status.CONVERGED if narrow.all() else Status.PRECISION
+    status = status_between(low, high, tolerance, relative=relative)
     policy = found.row
     shape = model.state_shape
     if not is_sparse(model):

@@ -16,8 +16,9 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.operators import is_deterministic, row_weights
 from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts, row_reward
-from jaxltl.core.types import Method, Solution, Status, require_shape
+from jaxltl.core.types import Method, Solution, require_shape
 from jaxltl.core.values.bounded import states
+from jaxltl.core.values.enclosed import status_between
 
 TOLERANCE = 1e-6
 
@@ -297,11 +298,7 @@ def robust_solution(
     """What the host found, with its status."""
     size = sides.model.num_states
     value, lower, upper = (x[:size] for x in (found.value, found.lower, found.upper))
-    finite = np.isfinite(upper)
-    width = np.where(finite, upper, 0) - np.where(finite, lower, 0)
-    scale = np.where(finite, upper, 1) if relative else 1.0
-    narrow = (width <= tolerance * scale) & (finite | (lower == upper))
-    status = Status.CONVERGED if narrow.all() else Status.PRECISION
+    status = status_between(lower, upper, tolerance, relative=relative)
     row, chance = found.row, found.probability
     if sides.spread is not None:
         row = sides.spread.policy(row, chance)
