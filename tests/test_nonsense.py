@@ -151,7 +151,8 @@ ADAPTERS = {
     "navix": ("navix", lambda: {"env": imported("navix", "make", "Navix-Empty-5x5-v0")}, {}),
     "xminigrid": ("xminigrid", lambda: pair(
         imported("xminigrid", "make", "MiniGrid-Empty-5x5")), {}),
-    "jumanji": ("jumanji", lambda: {"env": imported("jumanji", "make", "Game2048-v1")}, {}),
+    "jumanji": ("jumanji", lambda: {"env": imported("jumanji", "make", "Game2048-v1")},
+                {"in_turn": False}),
     "brax": ("brax", lambda: {"env": imported("brax.envs", "get_environment", "fast")}, {}),
     "pgx": ("pgx", lambda: {"env": imported("pgx", "make", "tic_tac_toe")},
             {"opponent": lambda state, key: 0, "player": 0}),
@@ -327,7 +328,7 @@ def traced(function, **given):
 SEVERAL = {"truths": np.array([True, False]), "axis": np.ones(3), "digits": "0.5"}
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", NONSENSE | SEVERAL)
 def test_nonsense_about_simulated_worlds_is_told(kind):
     for call, given in simulated():

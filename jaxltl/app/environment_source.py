@@ -94,10 +94,12 @@ def _of_package(
         raise ValueError(
             f'needs the package {root} ({problem}); pip install "jaxltl[{root}]".') from None
     extra = {"auto_reset": False} if root == "craftax" else {}
+    adapter = getattr(adapters, f"from_{root}")
+    ours = {x: arguments[x] for x in inspect.getfullargspec(adapter).kwonlyargs if x in arguments}
     with _theirs(f"{root}:{name}"):
-        made = make(name, **extra, **arguments)
+        made = make(name, **extra, **{k: v for k, v in arguments.items() if k not in ours})
         pair = made if isinstance(made, tuple) else (made,)
-        return getattr(adapters, f"from_{root}")(*pair, labels=labels, propositions=propositions)
+        return adapter(*pair, **ours | {"labels": labels, "propositions": propositions})
 
 
 def _function(name: str, folder: Path) -> Callable[..., Any]:

@@ -1,6 +1,7 @@
 """Jumanji's environments, against jumanji."""
 
 import itertools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxltl import from_jumanji
+from jaxltl.app.environment_source import load_environment
 from jaxltl.core.models.environment import Finite
 from tests.envs.adapters.harness import (  # noqa: F401
     both_ends,
@@ -105,6 +107,15 @@ def test_parts_in_turn_are_one_step(jumanji, name):
             np.testing.assert_allclose(x, y, rtol=1e-6)
         if told.last():
             now = reset(jax.random.key(2))
+
+
+def test_a_task_file_chooses_parts_in_turn(tmp_path):
+    task = SimpleNamespace(path=tmp_path / "task.toml", world={
+        "environment": "jumanji:JobShop-v0", "arguments": {"in_turn": True}})
+    assert load_environment(task).actions == Finite(21)
+    del task.world["arguments"]
+    with pytest.raises(ValueError, match=r"'jumanji:JobShop-v0': from_jumanji: parts of .*in_turn"):
+        load_environment(task)
 
 
 def test_what_is_not_jumanjis_is_named(jumanji):
