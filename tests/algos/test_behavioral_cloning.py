@@ -127,6 +127,7 @@ def test_the_network_is_that_of_the_dissertation():
     assert shapes == sorted([(2, 2, 5, 12), (2, 2, 12, 24), (29, 100), (100, 100), (100, 4)])
 
 
+@pytest.mark.slow
 def test_memory_enters_beside_what_is_seen():
     """The sum of two parts is one dense layer on both side by side."""
     rng = np.random.default_rng(0)

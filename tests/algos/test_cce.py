@@ -211,7 +211,7 @@ def test_later_samples_are_masked():
 # --- problems solved --------------------------------------------------------------------------
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("family", [
     start(), ef.full_gaussian(jnp.zeros(2), jnp.eye(2)),
     ef.diagonal_gaussian(jnp.zeros(2, jnp.float32), 1.0),
@@ -228,6 +228,7 @@ def test_a_constrained_quadratic_is_solved(family):
     assert "feasible on 2 fresh evaluations" in solved.message
 
 
+@pytest.mark.slow
 def test_a_gamma_family_searches_positive_numbers():
     given = cce.make_problem(
         lambda x, key: (-jnp.sum(jnp.log(x / jnp.array([0.2, 3.0])) ** 2), x[1]),
@@ -404,6 +405,7 @@ def test_all_samples_without_a_number_are_an_error():
         cce.result(state, given, Hparams(population=10), jax.random.key(0))
 
 
+@pytest.mark.slow
 def test_a_batch_of_runs_is_refused_by_result_and_its_lanes_are_not():
     given, hparams = problem(), Hparams(rate=0.3)
     keys = jax.random.split(jax.random.key(0), 3)

@@ -62,6 +62,7 @@ def ruin():
     return make_parametric(walk, numbers, {"p": 0.01}, {"p": 0.99})
 
 
+@pytest.mark.slow
 def test_a_quarter_is_the_most_that_a_head_and_a_tail_have(tmp_path):
     problem = make_problem(coins(tmp_path).over(1e-3, 1 - 1e-3), "goal", bound=">=")
     found = feasible(problem, 0.2499, starts=40)
@@ -98,6 +99,7 @@ def test_at_most_and_expected_rewards(tmp_path):
     assert not feasible(problem, 1.0, starts=20).feasible.any(), "p is at least a thousandth"
 
 
+@pytest.mark.slow
 def test_walks_with_circles():
     model = ruin()
     problem = make_problem(model, "won", bound=">=")
@@ -346,6 +348,7 @@ def test_points_that_are_no_model_after_all_are_told(tmp_path, monkeypatch):
     assert found.status.tolist() == [Status.INVALID] and not found.feasible.any()
 
 
+@pytest.mark.slow
 def test_storm_finds_the_same_at_what_was_found(tmp_path):
     pytest.importorskip("stormpy")
     from tests.storm_oracle import storm_model, storm_values

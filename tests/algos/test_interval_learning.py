@@ -163,6 +163,7 @@ def test_where_a_task_is_won_only_what_may_be_done_for_ever_is_done():
     assert not learning.wins_almost_surely(problem, np.full(problem.allowed.shape, 0.5))
 
 
+@pytest.mark.slow
 def test_who_may_stay_has_the_value_of_the_best_way_out():
     """Two states in a circle, one of which has a risky way home; and values once too high."""
     world = jl.make_mdp(
@@ -348,6 +349,7 @@ def test_a_run_ends_when_values_are_known_well_enough():
     assert later.num_steps >= found.num_steps
 
 
+@pytest.mark.slow
 def test_a_successor_that_stands_twice_is_one():
     world = jl.make_mdp(
         [[[1, 2, 1]], [[1, 0, 0]], [[2, 0, 0]]],

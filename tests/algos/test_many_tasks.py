@@ -77,6 +77,7 @@ def verdicts(plans):
     return np.asarray(jax.jit(jax.vmap(run))(worlds, many_tasks.stack_plans(plans)))
 
 
+@pytest.mark.slow
 def test_who_follows_what_is_asked_for_does_formulas_that_nobody_trained(verdicts):
     assert (verdicts == Verdict.SATISFIED).mean(1).min() > 0.95
     assert not (verdicts == Verdict.VIOLATED).any()
@@ -103,6 +104,7 @@ def knowing_network():
     return jax.tree_util.Partial(knowing)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", ["finite", "box"])
 def test_names_of_events_have_gone_where_the_network_sees_them(kind):
     size = {"num_actions": 4} if kind == "finite" else {"shape": (2,)}

@@ -102,7 +102,7 @@ def exact_problem(size: int, **options: Any) -> maximin_q.Problem:
         safe.part, safe.reward, exact=exact, measured=measured, **options)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "counts"),
     [(3, {9.0: 16, 10.0: 56}), (4, {7.29: 16, 8.1: 48, 9.0: 44, 10.0: 132})],
@@ -197,6 +197,7 @@ def test_restarts_reach_states_without_predecessors():
 # --- both methods, with and without chance -------------------------------------------------------
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("per", ["move", "system_move"])
 @pytest.mark.parametrize("method", ["generalized", "maximin"])
 def test_methods_agree_on_alternating_games(method, per):
@@ -219,6 +220,7 @@ def test_methods_agree_on_alternating_games(method, per):
         assert not np.asarray(state.value)[4:].any()
 
 
+@pytest.mark.slow
 def test_maximin_is_generalized_on_the_robots():
     problem = exact_problem(3, method="maximin")
     hparams = maximin_q.Hparams(discount=0.9, num_chains=256)

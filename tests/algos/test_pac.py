@@ -521,6 +521,7 @@ def test_the_bound_is_nearly_attained(discount, share):
     assert limit / 1.2 < gap <= limit * (1 + 1e-9)
 
 
+@pytest.mark.slow
 def test_what_the_hat_strategy_costs():  # lemma 8
     rng = np.random.default_rng(13)
     game, reward = random_games(rng, TRIALS)

@@ -86,6 +86,7 @@ def collected(problem, hparams, seed=0):
     return state, jax.jit(collecting.collected)(key, state, problem, hparams)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("resets", [None, 0])
 def test_advantages_bootstrap_where_an_episode_is_cut_off_and_not_where_it_is_over(resets):
     """From the actions alone, the walk is made again and its advantages summed up."""
@@ -122,6 +123,7 @@ def test_advantages_bootstrap_where_an_episode_is_cut_off_and_not_where_it_is_ov
         [np.mean(sums), np.mean(lengths), reward.mean()], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_many_episodes_cut_off_at_once_are_all_bootstrapped():
     """Every step is the last of its episode: more than are evaluated at a time."""
     once = make_environment(
@@ -157,6 +159,7 @@ NUMBERED = make_environment(
     numbered_step, lambda world: world.start[None], actions=2)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("resets", "most"), [(None, None), (0, None), (5, 5)])
 def test_episodes_begin_in_worlds_drawn_for_them(resets, most):
     problem = ppo.make_problem(NUMBERED, network=Table(2))
@@ -366,6 +369,7 @@ def test_a_policy_that_does_not_change_has_ratios_of_one(name):
     assert state.moments["place"].count == 128
 
 
+@pytest.mark.slow
 def test_scales_are_those_of_all_that_was_seen():
     problem, hparams, state, (last, _) = two_steps("perceptron")
     seen, sums = [], []
@@ -461,6 +465,7 @@ def test_a_short_walk_is_learned():
     assert metrics.updates == 1, "the first minibatch is of the policy that acted"
 
 
+@pytest.mark.slow
 def test_what_is_not_finite_is_not_learned_from():
     def step(world, action, key):
         found = walk_step(world, action, key)

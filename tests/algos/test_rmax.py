@@ -261,6 +261,7 @@ def test_with_restarts_nearly_all_states_become_optimal():
             found.epsilon_optimal)
 
 
+@pytest.mark.slow
 def test_without_restarts_what_recurs_becomes_optimal():
     problem, hparams = example(), settings(restart=0.0)
     learned = learn(jax.random.key(0), problem, hparams, 10_000)
@@ -347,6 +348,7 @@ def test_the_constants_of_the_theorem_are_used():
 # --- lanes, traces, precision -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_lanes_of_different_settings_are_as_if_alone():
     problem, _ = random_problem(5)
     hparams = settings(

@@ -164,6 +164,7 @@ def test_the_gradient_is_that_of_the_dense_sensitivity():
     np.testing.assert_allclose(-np.asarray(found), expected, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", ["sparse", "product"])
 def test_numbered_states_lead_where_the_model_does(kind):
     rng = np.random.default_rng(0)
@@ -267,6 +268,7 @@ def test_the_expert_is_recovered_with_the_features_of_its_reward():
     np.testing.assert_allclose(learned.policy[often], expert.policy[often], atol=0.08)
 
 
+@pytest.mark.slow
 def test_learning_stops_at_the_best_held_out_likelihood():
     problem = small(held_out=0.5)
     hparams = todirl.Hparams(
@@ -388,6 +390,7 @@ def test_stacked_products_are_taken_as_they_are():
 # --- fewer actions -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_inside_a_mask_the_plan_and_the_gradient_are_those_of_worlds_without_the_rest():
     models = [lazy(0), lazy(1)]
     masks = [np.asarray(jl.optimal_actions(m).allowed) for m in models]

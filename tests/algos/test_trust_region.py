@@ -719,6 +719,7 @@ def test_one_choice_ends_at_the_limit():
     np.testing.assert_allclose(metrics.cost_multiplier[-20:][active].mean(), 2, atol=0.3)
 
 
+@pytest.mark.slow
 def test_recovery_lowers_the_cost_until_the_limit_is_kept():
     state, metrics = trust_region.train(jax.random.key(0), one_choice(-2.0), ONE, num_steps=60)
     assert metrics.case[0] == Case.RECOVERY and metrics.cost_multiplier[0] == 1

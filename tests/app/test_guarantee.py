@@ -89,6 +89,7 @@ def test_one_demonstration_is_enough(fetched):
     assert sure[start, int(outcome.setup.model.initial_memory[start])]
 
 
+@pytest.mark.slow
 def test_the_demonstrated_route_is_the_most_likely_one(fetched):
     outcome, _ = fetched
     first, second = check_demonstrated_route(outcome, np.asarray(outcome.setup.model.final))
@@ -277,6 +278,7 @@ def prepared(path):
     return job.prepare(job.read_task(path), 0)
 
 
+@pytest.mark.slow
 def test_demonstrated_steps_that_lose_are_left_out_and_named(write):  # noqa: F811
     outcome, result = learned(write(CORRIDOR, SLIPPERY, shown=ERRING))
     setup, lost = outcome.setup, result["guarantee"]["left_out"]

@@ -250,6 +250,7 @@ def test_the_reward_carries_over(learned):
         assert words in printed
 
 
+@pytest.mark.slow
 def test_learning_is_on_record(learned):
     _, _, result = learned
     history, learning = result["history"], result["learning"]

@@ -298,6 +298,7 @@ def test_synthetic_demonstrations_do_the_task(write, discount):
         assert last == 5 and 2 not in states[:n].tolist()
 
 
+@pytest.mark.slow
 def test_synthetic_demonstrations_need_a_task_that_can_be_done(write):
     synthetic = ('file = "shown.json"', "synthetic = 5\ndiscount = 0.9\nlength = 1")
     task = read_task(write(synthetic, ('initial = "!r & !y"', 'initial = "b"')))

@@ -77,6 +77,7 @@ def test_a_task_is_looked_through_and_what_comes_after_the_end_is_not_shown():
     assert "ends after 2 steps" in to_bytes(draw_episode(world, run)).decode()
 
 
+@pytest.mark.slow
 def test_discs_and_zones_stand_upright():
     flat = flat_world(start=(1.0, 1.5), horizon=8)
     scene = scene_of(flat, episode(flat, jnp.array([0.0, 1.0]), 8))

@@ -60,6 +60,7 @@ def test_whatever_is_allowed_satisfies_the_formula(formula, options):
         assert float((np.asarray(joint.initial) * value).sum()) == pytest.approx(least, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_random_walk_inside_a_shield_never_collides():
     inner = task_environment(environment_of(game()), SAFE)
     strategy = permissive_strategy(game(), SAFE)

@@ -44,6 +44,7 @@ def won(name):
              jl.winning_region(padded, SPECS[name](padded, x))) for game, padded, x in games()]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", SPECS)
 def test_regions_are_those_of_the_padded_game_and_strategies_win(name):
     some = []
@@ -59,6 +60,7 @@ def test_regions_are_those_of_the_padded_game_and_strategies_win(name):
     assert 0 < np.mean(some) < 1
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", SPECS)
 def test_the_checker_refutes_the_same_strategies_of_both(name):
     """One action is changed, of either player: the verdicts on rows and actions are the same."""
@@ -100,6 +102,7 @@ def test_what_is_no_row_of_a_state_is_refused_by_name():
             found.replace(action=action)).reason
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["parity", "gr1", "either"])
 def test_inside_jit_the_answers_are_the_hosts(name):
     compiled = jax.jit(solve)

@@ -157,6 +157,7 @@ def larger_games(rng, count, shapes=((60, 2, 2), (120, 3, 2), (300, 2, 3))):
         yield reference_games.random_game(rng, *shapes[i // 2 % len(shapes)], local=local)
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("kind", OBJECTIVES)
 def test_the_host_and_compiled_code_agree(kind, monkeypatch):
     rng = np.random.default_rng(2)

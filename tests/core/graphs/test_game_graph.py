@@ -43,6 +43,7 @@ def check_moves(model, case, found, chance):
     np.testing.assert_array_equal(again, region)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("chance", CHANCE)
 def test_rules_by_state_equal_naive_sweeps(chance):
     rng = np.random.default_rng(0)

@@ -117,7 +117,7 @@ def branches(place, action, key):
     ({"allowed": lambda place: jnp.ones(2)}, "return Booleans"),
     ({"allowed": lambda place: jnp.ones(2, bool), "actions": make_box(0, 1),
       "step": lambda place, action, key: Timestep(place, action, False)}, "clip those of a box"),
-    ({"step": remembers}, "step is not pure: it keeps"),
+    pytest.param({"step": remembers}, "step is not pure: it keeps", marks=pytest.mark.slow),
     ({"step": draws_by_itself}, "step is not pure: called twice"),
     ({"step": branches}, "step cannot be traced"),
 ])

@@ -58,6 +58,7 @@ def assert_same(found, expected):
         np.testing.assert_array_equal(x, y)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(("sizes", "axis", "number", "spec"), [
     ((1,), None, 8, P()), ((2,), "lanes", 8, P("lanes")), ((4,), None, 8, P("lanes")),
     ((4,), None, 6, P()), ((4,), None, 1, P()), ((2, 2), "more", 6, P("more")),
@@ -72,6 +73,7 @@ def test_lanes_are_those_of_vmap(sizes, axis, number, spec):
         assert x.sharding.is_equivalent_to(NamedSharding(mesh, spec), x.ndim)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("explicit", [False, True])
 @pytest.mark.parametrize("around", ["nothing", "jit", "mesh", "both"])
 def test_whatever_is_around(explicit, around):

@@ -32,6 +32,7 @@ least_successor, transition_matrix, induced_chain, action_argmax, action_max = m
 following = whole(lambda model, policy, value: operators.following(model, policy)(value))
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("kind", REPRESENTATIONS)
 @pytest.mark.parametrize("num_successors", [1, 3, 20])  # short rows are summed term by term
 def test_primitives_equal_loops(kind, num_successors):

@@ -67,6 +67,7 @@ asked = jax.jit(_asked)
 EMPTY = {"expectation": 0, "exists": False, "forall": True, "least": 2**31 - 1}
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("count", "reach", "ragged"), [
     (1, 2, True), (2, 2, True), (4, None, True), (4, 1, False),
     *(pytest.param(count, reach, ragged, marks=pytest.mark.exhaustive)

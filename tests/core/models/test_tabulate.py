@@ -100,7 +100,7 @@ def as_pairs(table):
     return list(zip(np.asarray(table.world["state"]).tolist(), over.tolist(), strict=True))
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("seed", range(6))
 def test_a_told_world_is_its_process(seed):
     p = random_process(seed)
@@ -129,6 +129,7 @@ def test_a_told_world_is_its_process(seed):
     assert table.evidence == "told" and table.num_steps is None
 
 
+@pytest.mark.slow
 def test_a_map_of_letters_is_a_torus_whose_program_reads_no_key():
     cells = np.full((4, 4), -1)
     cells[0, 1], cells[2, 3], cells[3, 0] = 0, 1, 0
@@ -149,6 +150,7 @@ def test_a_map_of_letters_is_a_torus_whose_program_reads_no_key():
     assert one.model.initial[one.start].tolist() == [1]
 
 
+@pytest.mark.slow
 def test_maps_side_by_side():
     world = letter_world(size=5, letters=3)
     drawn = jax.vmap(world.reset)(jax.random.split(jax.random.key(0), 7))
@@ -284,6 +286,7 @@ def without_one(p):
     return replace(whole, outcomes=Partial(partial(fewer, whole.outcomes)))
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(("world", "options", "said"), [
     (lambda: simulated(P, told=False), {}, "reset is random, .* make_environment"),
     (lambda: simulated(P, outcomes=None), {}, "step is random: action . in world"),

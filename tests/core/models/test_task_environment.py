@@ -190,6 +190,7 @@ def test_a_time_limit_decides_nothing():
 # --- many tasks -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_each_of_a_stack_is_as_by_itself():
     tasks = [task_environment(walk(), f) for f in FORMULAS]
     stacked = stack_tasks(tasks)

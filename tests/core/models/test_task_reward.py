@@ -217,6 +217,7 @@ def check_optimal(name, count):
     assert undone > count / 8, "most problems are decided anyway"
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", EXACT)
 def test_what_is_best_by_the_reward_is_best_by_the_formula(name):
     check_optimal(name, 60)

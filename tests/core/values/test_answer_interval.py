@@ -216,6 +216,7 @@ PLAIN = ('F "a"', '"a" U "b"', 'G "a"', '"a" W "b"', '"a" R "b"', 'X "a"', 'G F 
          '(G F "a") => (G F "b")', '"b" | X "a"')
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("seed", [
     *range(3), *(pytest.param(x, marks=pytest.mark.exhaustive) for x in range(3, 60))])
 def test_any_formula_beside_all_that_nature_may_keep_to(seed):

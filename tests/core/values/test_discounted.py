@@ -76,6 +76,7 @@ def some(usual, other):
             *(pytest.param(*x, marks=pytest.mark.exhaustive) for x in more)]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("tolerance", [None, 1e-6])
 def test_policy_values_are_enclosed(batch, exact_policy, tolerance):
     solution = jax.jit(jax.vmap(
@@ -83,6 +84,7 @@ def test_policy_values_are_enclosed(batch, exact_policy, tolerance):
     assert_certified(solution, exact_policy, tolerance)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("method", "tolerance"), some(
     "modified_policy_iteration", "value_iteration"))
 def test_optimal_values_are_enclosed(cases, batch, exact_optimal, method, tolerance):
@@ -319,6 +321,7 @@ def explicit_sensitivity(model, policy, q, value, direction, discount, constant_
     return slope, direction + discount * (model.transition @ slope)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("adjoint", ["exact", "approximate"])
 def test_sensitivities_equal_the_explicit_equations(adjoint):
     """In the reward and the probabilities; the two adjoints differ, except at zero reward."""

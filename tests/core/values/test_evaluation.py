@@ -78,7 +78,7 @@ def check_mean(estimate, x):
     assert estimate.lower <= estimate.mean <= estimate.upper
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_figures_are_those_of_the_episodes(name):
     environment, key = ENVIRONMENTS[name], jax.random.key(3)
@@ -231,7 +231,7 @@ def test_intervals_where_the_simulation_stops_cover(chance, threshold):
     assert covered >= confidence and wrong <= 1 - confidence
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("number", [200, pytest.param(10_000, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("chance", CHANCES)
 @pytest.mark.parametrize("threshold", [None, 0.9])

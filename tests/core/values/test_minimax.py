@@ -103,6 +103,7 @@ def batch(cases):
 
 
 # Of the other methods the games below ask by the system's moves.
+@pytest.mark.few(3)
 @pytest.mark.parametrize(("method", "per"), [
     *((method, "move") for method in METHODS), (METHODS[0], "system_move"),
     *(pytest.param(method, "system_move", marks=pytest.mark.exhaustive)
@@ -115,6 +116,7 @@ def test_minimax_values_are_those_of_all_strategy_pairs(batch, exact, method, pe
     assert_certified(near, exact[per], 1e-4)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("double", [True, False])
 def test_without_a_tolerance_the_enclosure_is_as_narrow_as_floats_allow(cases, exact, double):
     with jax.enable_x64(double):
@@ -139,6 +141,7 @@ def test_both_players_policies_secure_the_bounds(cases, batch, per):
             assert (sign * (secured - np.asarray(bound)) >= 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_lane_is_as_if_alone(batch, method):
     games, rewards, discounts = batch
@@ -259,6 +262,7 @@ def test_a_mask_restricts_and_getting_stuck_is_worth_minus_infinity(cases, batch
     assert 30 < num_lost < 80 * SHAPE[0] - 30
 
 
+@pytest.mark.slow
 def test_a_closed_mask_gives_the_values_of_the_restricted_game():
     game, reward, allowed = robots(3)
     inside = restrict(game, allowed=allowed)
@@ -304,7 +308,7 @@ def robots(size):
     return game, jnp.asarray(reward.reshape(flat)), available & ~lost[:, None] & ~to_lost
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "method", "states", "counts"), [
     *((3, method, 120, {10.0: 56, 9.0: 16}) for method in METHODS),
     pytest.param(4, METHODS[0], 432, {10.0: 132, 9.0: 44, 8.1: 48, 7.29: 16},
@@ -327,6 +331,7 @@ def test_robots_on_a_grid(size, method, states, counts):
 # --- values of strategies ------------------------------------------------------------------
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("method", "per"), [
     (METHODS[0], "system_move"), (METHODS[1], "move"), (METHODS[2], "system_move")])
 def test_worst_cases_of_strategies(cases, method, per):
@@ -343,6 +348,7 @@ def test_worst_cases_of_strategies(cases, method, per):
     assert mixed.policy.shape == (150, *SHAPE[:2])
 
 
+@pytest.mark.slow
 def test_a_strategy_of_single_actions_is_the_stochastic_one_that_is_sure(cases):
     for model, system, reward, discount in cases[:10]:
         game = as_game(model, system)

@@ -292,6 +292,7 @@ def test_what_is_attained_nearest_to_a_border_is_told():
     assert best.nearest.lower[1] <= 1 <= best.nearest.upper[1]
 
 
+@pytest.mark.slow
 def test_all_corners_are_found():
     model, x, y = arc(16)
     found = pareto(model, [Objective(reward="x"), Objective(reward="y")], tolerance=1e-6)

@@ -151,6 +151,7 @@ def _support(model, region):
     return jnp.where(odd.any(-1, keepdims=True), odd, model.available)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [5, pytest.param(300, marks=pytest.mark.exhaustive)])
 def test_components_by_sweeps_are_those_of_the_host(count):
     for seed in range(count):

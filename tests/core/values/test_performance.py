@@ -82,6 +82,7 @@ def test_the_probability_is_enclosed_in_every_lane(acceptance, label_on):
     assert_correct(tp.task_performances(models, policies), models, exact)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("acceptance", "label_on"), [
     ("cosafe", "exit"), ("cosafe", "entry"), ("safety", "exit"),
     pytest.param("safety", "entry", marks=pytest.mark.exhaustive)])
@@ -211,6 +212,7 @@ def three_worlds():
     return models, tp.task_performances(models, jnp.full((3, models.num_memory, 4), 0.25))
 
 
+@pytest.mark.slow
 def test_infeasible_starts_are_found():
     models, _ = three_worlds()
     found = jax.jit(jax.vmap(tp.infeasible_starts))(models)
@@ -222,7 +224,7 @@ def test_infeasible_starts_are_found():
 KINDS = ("cosafe", "safety", "buchi", "parity")
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", KINDS)
 def test_starts_from_which_nothing_does_any_task_are_found(kind):
     rng = np.random.default_rng(KINDS.index(kind))

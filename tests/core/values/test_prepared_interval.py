@@ -95,7 +95,7 @@ def _cases(seed, count):
     return successor, *map(np.array, zip(*ends, strict=True)), cost
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize(("objective", "nature"), DIRECTIONS)
 def test_all_ends_of_a_batch_are_enclosed_as_by_brute_force(seed, objective, nature):
@@ -156,7 +156,7 @@ def test_given_policies_are_evaluated():
 
 
 # Compiling derivatives takes seconds; by default each direction and each question occurs.
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("objective", "nature", "question"), [
     pytest.param(*ways, question, marks=[] if usual else pytest.mark.exhaustive)
     for i, ways in enumerate(DIRECTIONS) for usual, question in (

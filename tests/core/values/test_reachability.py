@@ -108,7 +108,7 @@ def test_the_examples_are_not_trivial(cases, exact):
     assert several > 100
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("objective", "tolerance"), [
     ("max", None), ("min", None), ("max", 1e-12),
     pytest.param("min", 1e-12, marks=pytest.mark.exhaustive)])
@@ -319,6 +319,7 @@ def test_a_world_too_large_for_elimination():
         assert_encloses(solution, np.array([1 - x if flip else x for x in exact], object))
 
 
+@pytest.mark.slow
 def test_lanes_equal_single_runs(cases):
     """Compiled alike; eagerly, a model without end components takes another way to its bounds."""
     mdps, targets, _ = batch_of(cases[:50])

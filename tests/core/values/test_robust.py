@@ -59,6 +59,7 @@ def test_points_are_the_exact_model():
             np.testing.assert_allclose(found.value, exact.value, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_wider_intervals_give_nature_more():
     """Values move apart with the width, and hold the exact ones between them."""
     rng = np.random.default_rng(1)
@@ -79,6 +80,7 @@ def test_wider_intervals_give_nature_more():
                 low, high = least.value, most.value
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("label_on", ["entry", "exit"])
 def test_products(label_on):
     """From every memory, whether letters are read on entry or on exit."""
@@ -98,6 +100,7 @@ def test_products(label_on):
                 found.value[np.arange(4), start], alone.value, atol=2e-6)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("label_on", ["entry", "exit"])
 def test_policies_of_products(label_on):
     """The best policy is worth what it is worth; points are exact models, mixtures too."""

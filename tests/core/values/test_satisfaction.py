@@ -84,7 +84,7 @@ def check_case(rng, kind, label_on, objective):
         assert agrees.all(1).any()  # it is one of them where it matters
 
 
-@pytest.mark.few(7)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("count", [1, pytest.param(20, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize(("kind", "label_on", "objective"), CASES)
 def test_no_best_policy_is_quicker(kind, label_on, objective, count):
@@ -135,6 +135,7 @@ TASKS = ("F g", "G !r", "G F g & G F y", "F G g & F y")
 
 
 # By default each task and each objective occurs.
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("task", "objective"), [
     pytest.param(task, objective, marks=[] if i % 2 == j else pytest.mark.exhaustive)
     for i, task in enumerate(TASKS) for j, objective in enumerate(("max", "min"))])

@@ -265,6 +265,7 @@ def slopes_agree(run, at, changes, step=1e-5):
             (found[i] * change).sum(), (up - down) / (2 * step), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("objective", [
     "min", pytest.param("max", marks=pytest.mark.exhaustive), "policy"])
 def test_derivatives_are_those_of_differences(objective):
