@@ -23,6 +23,7 @@ _SPREAD = 8  # how many times its mean bandwidth a larger one must have states
 _MOST = 2**28  # entries that may be filled, 12 bytes each
 _MOST_BETWEEN = 10**7  # of these, between components that are eliminated together
 _APART = 500  # states from which a component is eliminated alone, if they are not
+_LAST = 8000  # states up to which it is eliminated, however it fills, where sweeps fail
 _SAMPLED = 64  # rows in which what fills is counted where its bound is too large
 _PANEL = 2  # columns that are eliminated at once: each wants room for a full one
 _FILL = 4  # growth of the fill after which the order is sought anew
@@ -42,6 +43,7 @@ class _Block(NamedTuple):
       outer: ``float64[B, M]``, on the blocks before; None where there are none.
       factor: of SuperLU; None where it is swept.
       fill: entries of the first factors in this order.
+      sparing: whether those of least degree go first, wherever that may help.
     """
 
     order: Integers
@@ -49,6 +51,7 @@ class _Block(NamedTuple):
     outer: Any
     factor: Any
     fill: int
+    sparing: bool = False
 
 
 class Factors(NamedTuple):
@@ -94,12 +97,27 @@ class Factors(NamedTuple):
         found = []
         for block in self.blocks:
             swept = block.factor is None
-            new = _block(self.rows, self.label, block.order, chosen, swept=swept)
+            new = _block(
+                self.rows, self.label, block.order, chosen, swept=swept, sparing=block.sparing)
             if new is None:
                 return None
             if not swept and (new.factor is None or new.fill > _FILL * block.fill):
                 return factors(self.rows, self.label, chosen)
             found.append(new._replace(fill=block.fill))
+        return self._replace(blocks=tuple(found))
+
+    def eliminated(self, chosen: Integers) -> Factors | None:
+        """The same of a policy with which sweeps do not come to an end; None if too large."""
+        if not any(x.factor is None for x in self.blocks):
+            return None
+        found = []
+        for block in self.blocks:
+            if block.factor is None and block.order.size > _LAST:
+                return None
+            new = _block(self.rows, self.label, block.order, chosen, sparing=block.factor is None)
+            if new is None or new.factor is None:
+                return None
+            found.append(new)
         return self._replace(blocks=tuple(found))
 
 
@@ -181,7 +199,8 @@ def order_of(matrix: Any, label: Integers) -> Integers | None:
 
 
 def _block(
-    rows: Any, label: Integers, order: Integers, chosen: Integers, *, swept: bool = False
+    rows: Any, label: Integers, order: Integers, chosen: Integers, *, swept: bool = False,
+    sparing: bool = False,
 ) -> _Block | None:
     """Some states of a policy, factored unless that would fill too much; None if singular."""
     from scipy.sparse import linalg
@@ -206,11 +225,11 @@ def _block(
             and _bandwidth(inner) > _NARROW)
     try:
         factor = linalg.splu(
-            _minus(inner).T, permc_spec="MMD_AT_PLUS_A" if wide else "NATURAL",
+            _minus(inner).T, permc_spec="MMD_AT_PLUS_A" if sparing or wide else "NATURAL",
             diag_pivot_thresh=0, relax=1, panel_size=_PANEL, options={"SymmetricMode": True})
     except (RuntimeError, MemoryError):
         return None
-    return _Block(order, inner, outer, factor, int(factor.nnz))
+    return _Block(order, inner, outer, factor, int(factor.nnz), sparing)
 
 
 def _bandwidth(matrix: Any) -> float:

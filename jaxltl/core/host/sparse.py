@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.host.rows import Booleans, Integers, Rows
+from jaxltl.core.host.rows import Booleans, Integers, Rows, spans
 from jaxltl.core.show import brief
 
 Floats = NDArray[np.float64]
@@ -63,6 +63,17 @@ class HostMDP:
     def row(self) -> Integers:
         """The row of each entry, ``int32[T]``."""
         return np.repeat(np.arange(self.num_rows, dtype=np.int32), np.diff(self.entry_start))
+
+    @cached_property
+    def standing(self) -> NDArray[np.bool_]:
+        """Whether a row leads to its own state alone, ``bool[R]``."""
+        found: NDArray[np.bool_] = self.successor[self.entry_start[:-1]] == self.state
+        count = np.diff(self.entry_start)
+        several = np.flatnonzero(found & (count > 1))
+        entry = spans(self.entry_start[several], count[several])
+        of = several.repeat(count[several])
+        found[of[self.successor[entry] != self.state[of]]] = False
+        return found
 
     @cached_property
     def predecessors(self) -> tuple[Integers, Integers]:

@@ -229,16 +229,25 @@ def end_components(
     """The maximal end components of some states and rows (Baier and Katoen 2008, section 10.6.3).
 
     States that cannot stay are taken away first, so that components are looked for among few.
+    Rows that stand still belong to them and hold nothing together: they come last, else each state
+    at the rim of what does not stay would be taken away in a round of its own.
 
     Args:
       mdp: the model.
       states: ``bool[S]``; default all.
       rows: ``bool[R]``; default all.
     """
-    component = np.arange(mdp.num_states)
     kept = np.ones(mdp.num_rows, bool) if rows is None else rows.copy()
     if states is not None:
         kept &= states[mdp.state]
+    still = kept & mdp.standing
+    found = _moving_components(mdp, kept & ~still)
+    return found._replace(inside=found.inside | still)
+
+
+def _moving_components(mdp: HostMDP, kept: Booleans) -> Components:
+    """Those of some rows."""
+    component = np.arange(mdp.num_states)
     inside = np.zeros(mdp.num_rows, bool)
     while True:
         candidates = np.zeros(mdp.num_states, bool)

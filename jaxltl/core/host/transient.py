@@ -19,6 +19,8 @@ from jaxltl.core.host.choices import Choices, choices_of
 from jaxltl.core.host.elimination import Factors, factors, order_of
 from jaxltl.core.host.exact import LARGEST, System, exact_optimum
 from jaxltl.core.host.levels import Edges, Levels, components_in_order, peel
+from jaxltl.core.host.onward import carried_on
+from jaxltl.core.host.refined import Equations, refined
 from jaxltl.core.host.rows import LARGE, Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import searched
@@ -32,6 +34,7 @@ _SWEEPS = 12  # after each system, by which news goes on from where policies cha
 _HASTY = 12  # exact rounds after which its own improvement alone goes on, which must end
 _KEPT = 0.75  # of the extra cost: who gains less stays, and the rest is what proves the bound
 _MAX_ROUNDS = 300
+_GOOD = 0.1  # bounds so narrow that their policy is one to begin with
 
 
 class Transient(NamedTuple):
@@ -144,7 +147,7 @@ def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: b
         core = np.flatnonzero(among)
         if core.size:
             found = _solve_core(
-                system, core, bounds, unit + grown, sign, problem, tolerance, relative)
+                system, core, bounds, (unit, grown), sign, problem, tolerance, relative)
             rounds, method = found.rounds, found.method
             node = found.node
             bounds[:, node], chosen[node] = (found.near, found.far, found.value), found.chosen
@@ -404,15 +407,20 @@ def _circles(
 
 
 def _solve_core(
-    system: _System, core: Integers, bounds: Floats, unit: float, sign: int, problem: Transient,
-    tolerance: float, relative: bool,
+    system: _System, core: Integers, bounds: Floats, errors: tuple[float, float], sign: int,
+    problem: Transient, tolerance: float, relative: bool,
 ) -> _Core:
-    """Policy iteration of the problem whose every step costs a little more."""
+    """Policy iteration of the problem whose every step costs a little more.
+
+    Args:
+      errors: the shares by which a backup may err, and what is known of the states outside.
+    """
+    unit = sum(errors)
     circles, core, edges = _circles(system, core, bounds, sign)
     label = components_in_order(edges)
     proper = partial(_proper, circles, _way_out(circles, system, core, problem))
     chosen = proper(_greedy(circles, 0.0, np.zeros(core.size), _FIRST_SWEEPS))
-    solver = factors(circles.matrix, label, chosen)
+    first, solver = chosen, factors(circles.matrix, label, chosen)
     aim = (_AIM_CHAIN if circles.is_chain else _AIM) * tolerance
     extra, rounds = None, 0
     best: _Core | None = None
@@ -424,7 +432,8 @@ def _solve_core(
             extra = _extra(time, value, unit, aim, relative)
         value = solver.solve(circles.known[chosen] + sign * extra)
         if not np.isfinite(value).all():
-            break
+            solver, extra = solver.eliminated(chosen), extra if np.isfinite(extra) else None
+            continue
         image = circles.backup(value)
         gain = sign * (circles.best(image) - value) + extra
         better = gain > _KEPT * extra
@@ -432,8 +441,9 @@ def _solve_core(
             if rounds <= _HASTY:
                 chosen = proper(_greedy(circles, sign * extra, value, _SWEEPS))
             else:
-                row = circles.argbest(image, circles.best(image))
-                chosen = np.where(better, row, chosen)
+                chosen = carried_on(
+                    circles.matrix, circles.known + sign * extra, circles.owner, value, chosen,
+                    sign, _KEPT * extra)
             solver = solver.other(chosen)
             continue
         found = _prove(circles, solver, chosen, value, extra, unit)
@@ -450,10 +460,15 @@ def _solve_core(
         if extra / 2 <= other <= (2 * extra if found is None else np.inf):
             break
         extra = other
-    narrow = best is not None and _narrow(best, sign, tolerance, relative)
-    exact = None if narrow else _in_fractions(circles, core, label, chosen, unit)
-    if exact is not None:
-        best = exact._replace(rounds=rounds)
+    for other_way in (_refined, _in_fractions):
+        if best is not None and _narrow(best, sign, tolerance, relative):
+            break
+        # A policy that costs of steps led to, where little is proven, may linger nearly for ever.
+        good = best is not None and _narrow(best, sign, _GOOD, relative)
+        more = other_way(
+            circles, core, label, best.chosen if best and good else first, errors, tolerance)
+        if more is not None:
+            best = more._replace(rounds=rounds + more.rounds)
     if best is None:
         low, high = np.zeros(core.size), np.full(core.size, np.inf)
         near, far = (low, high) if sign > 0 else (high, low)
@@ -467,13 +482,33 @@ def _narrow(found: _Core, sign: int, tolerance: float, relative: bool) -> bool:
     return bool((width <= tolerance * size).all())
 
 
-def _in_fractions(
-    circles: _Circles, core: Integers, label: Integers, chosen: Integers, unit: float
+def _refined(
+    circles: _Circles, core: Integers, label: Integers, chosen: Integers,
+    errors: tuple[float, float], tolerance: float,
 ) -> _Core | None:
-    """The same of a small core that hardly ever ends: of the weights as floats give them.
+    """The same of a core that takes very long to end, by refinement beyond double precision."""
 
-    Weights that err by a share `unit` change the solution by twice that for each of its unknowns.
-    """
+    def solver_of(rows: Integers) -> Any:
+        solver = factors(circles.matrix, label, rows)
+        return None if solver is None else (solver.eliminated(rows) or solver).solve
+
+    unit, grown = errors
+    equations = Equations(circles.matrix, circles.leaving, circles.known, circles.owner, unit)
+    found = refined(equations, chosen, solver_of, circles.sign, tolerance)
+    if found is None:
+        return None
+    share = found.share + grown
+    near, far = (found.value * (1 - end * circles.sign * share) for end in (1, -1))
+    return _Core(core, near, far, found.value, found.chosen, found.rounds,
+                 "policy iteration by elimination, refined")
+
+
+def _in_fractions(
+    circles: _Circles, core: Integers, label: Integers, chosen: Integers,
+    errors: tuple[float, float], tolerance: float,
+) -> _Core | None:
+    """The same of a small core, however rarely it ends: of the weights as floats give them."""
+    del tolerance
     if core.size > LARGEST:
         return None
     order = order_of(circles.matrix[chosen], label)
@@ -484,7 +519,7 @@ def _in_fractions(
     if found is None:
         return None
     value, rows = found
-    share = 2.1 * (core.size + 2) * unit
+    share = 2.1 * (core.size + 2) * sum(errors)
     near, far = (value * (1 - end * circles.sign * share) for end in (1, -1))
     return _Core(core, near, far, value, rows, 0, "policy iteration in fractions")
 

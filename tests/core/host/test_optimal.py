@@ -6,7 +6,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from jaxltl.core.host import contract, elimination, levels
+from jaxltl.core.host import contract, elimination, levels, transient
 from jaxltl.core.host.optimal import reachability, total_reward, worst_width
 from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.models.sparse import make_sparse
@@ -114,7 +114,7 @@ def best_of(values, *, maximize):
     return [min((x for x in c if x is not None), default=None) for c in columns]
 
 
-WAYS = ["as it is", "in the core", "by sweeps", "contracted"]
+WAYS = ["as it is", "in the core", "by sweeps", "contracted", "refined"]
 
 
 @pytest.fixture(params=WAYS)
@@ -122,12 +122,14 @@ def way(request, monkeypatch):
     """Each way through the solver, which size and shape choose."""
     if request.param != "as it is":
         monkeypatch.setattr(contract, "_WORTH", 10**6)
-    if request.param in ("in the core", "by sweeps"):
+    if request.param in ("in the core", "by sweeps", "refined"):
         monkeypatch.setattr(levels, "_ROUNDS", 0)
         monkeypatch.setattr(levels, "_NODES", 10**9)
     if request.param == "by sweeps":
         monkeypatch.setattr(elimination, "_SMALL", 0)
         monkeypatch.setattr(elimination, "_SPREAD", 10**9)
+    if request.param == "refined":
+        monkeypatch.setattr(transient, "_prove", lambda *_: None)
 
 
 def cases(count, seed=0):

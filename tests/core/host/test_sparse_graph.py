@@ -19,6 +19,7 @@ from jaxltl.core.graphs.end_components import (
 )
 from jaxltl.core.graphs.graph import host_graph
 from jaxltl.core.host import rows, sparse_graph
+from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.models.convert import to_padded, to_sparse
 from tests.core.models.test_sparse import random_padded
 
@@ -88,6 +89,29 @@ def test_end_components():
         np.testing.assert_array_equal(ours.region(host), np.asarray(theirs.inside).any(-1))
         some += ours.inside.any()
     assert some > 10
+
+
+def test_what_stands_still_holds_nothing_together(monkeypatch):
+    """Along a walk that one may stop at any time, states are not taken away one round each."""
+    size, rounds = 60, []
+    entry, target = [0], []
+    for s in range(size):
+        moves = [[s]] if s in (0, size - 1) else [[s], [s - 1, s + 1]]
+        for row in moves:
+            target += row
+            entry.append(len(target))
+    row_start = np.concatenate([[0], 1 + 2 * np.arange(size - 1), [2 * size - 2]])
+    host = HostMDP(row_start, np.array(entry), np.array(target, np.int32),
+                   np.where(np.repeat(np.diff(entry), np.diff(entry)) == 1, 1.0, 0.5))
+    labels = sparse_graph._labels
+    monkeypatch.setattr(sparse_graph, "_labels", lambda *x: rounds.append(0) or labels(*x))
+    inner = np.ones(size, bool)
+    inner[[0, -1]] = False
+    found = sparse_graph.end_components(host, inner)
+    assert len(rounds) <= 1
+    np.testing.assert_array_equal(found.component, np.arange(size))
+    np.testing.assert_array_equal(
+        found.inside, inner[host.state] & (np.diff(host.entry_start) == 1))
 
 
 def test_attractors_of_rows_are_those_of_actions():
