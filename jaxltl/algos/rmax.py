@@ -63,12 +63,18 @@ from jaxltl.algos._joint_game import (
     require_start,
     shaped_reward,
 )
-from jaxltl.algos._walk import Rules, Seen, Walk, marks, move, note_last, record, walk_from
+from jaxltl.algos._optimistic_model import (
+    enough,
+    exploration,
+    solver_tolerance,
+    unknown_reward,
+    updated,
+)
+from jaxltl.algos._walk import Rules, Seen, marks, move, note_last, record, walk_from
 from jaxltl.algos.play import (
     check_distributions,
     cumulative,
     draw,
-    take,
 )
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.objective import Parity, buchi
@@ -82,7 +88,6 @@ from jaxltl.core.models.restrict import restrict
 from jaxltl.core.show import brief, history
 from jaxltl.core.types import Solution, Status, require_shape, status_code
 from jaxltl.core.values.minimax import minimax_value, strategy_value
-from jaxltl.core.values.warm_start import span_iteration
 
 UPDATES = ("every", "printed")
 
@@ -342,7 +347,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     _check(hparams)
     game, shape = problem.game, problem.game.mdp.probability.shape
     listed = game.mdp.probability > 0
-    bound = jnp.asarray(_bound(hparams), game.dtype)
+    bound = jnp.asarray(unknown_reward(hparams), game.dtype)
     gain = jnp.where(problem.allowed, bound, 0)
     value = jnp.where(problem.region, bound / (1 - hparams.discount), 0)
     word = jax.random.bits(learner.init_key(key), (), jnp.uint32)
@@ -397,7 +402,7 @@ def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
     Returns:
       :class:`Metrics`, scalars.
     """
-    solved = state.error <= _solver_tolerance(problem, hparams)
+    solved = state.error <= solver_tolerance(problem, hparams)
     status = status_code(solved & (state.moves < learner.MOST), jnp.isfinite(state.error))
     return Metrics(
         moves=state.moves,
@@ -436,7 +441,7 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
       ``float[S, A]``, rows that sum to one where the system moves inside the region.
     """
     allowed = problem.allowed & problem.game.system[:, None]
-    return pac.hat_strategy(state.best, allowed, _exploration(problem, hparams))
+    return pac.hat_strategy(state.best, allowed, exploration(problem, hparams))
 
 
 def observe(
@@ -488,7 +493,7 @@ def _observe(state, problem, hparams, action, successor, reward) -> State:
                  jnp.asarray(reward, problem.game.dtype))
     rules = _rules(state, problem, hparams)
     walk = note_last(record(walk, seen, rules, jnp.bool_(True)), problem)
-    return _updated(state, walk, problem, hparams)
+    return updated(state, walk, problem, hparams)
 
 
 def evidence(
@@ -562,7 +567,7 @@ def _rules(state: State, problem: Problem, hparams: Hparams) -> Rules:
     return Rules(
         problem, marks(state.best, state.known_at), jax.random.fold_in(key, 1),
         splitmix.streams(jax.random.fold_in(key, 0)),
-        _exploration(problem, hparams), _enough(problem, hparams),
+        exploration(problem, hparams), enough(problem, hparams),
         jnp.asarray(hparams.reward_bound, dtype), jnp.asarray(hparams.restart, dtype),
         jnp.bool_(hparams.update == "every"),
     )
@@ -573,99 +578,7 @@ def _advance(state: State, problem: Problem, hparams: Hparams, moves: jax.Array)
     rules = _rules(state, problem, hparams)
     walk = learner.while_active(
         lambda w, _: w.left > 0, move, walk_from(state, moves), rules)
-    return _updated(state, note_last(walk, problem), problem, hparams)
-
-
-# --- the model and its solution -------------------------------------------------------------
-
-def _updated(state: State, walk: Walk, problem: Problem, hparams: Hparams) -> State:
-    """The state after a walk; with something new, the model and the strategy are too."""
-    game, news = problem.game, walk.known | walk.fresh
-    place = jnp.divmod(walk.pair, game.num_actions)
-    probability, share = state.probability, take(state.probability, place)
-    if game.num_successors > 1:
-        # Every listed successor is taken to have been seen once, which keeps the graph.
-        listed = take(game.mdp.probability, place) > 0
-        row = jnp.where(listed, jnp.maximum(take(walk.counts, place), 1), 0)
-        share = jnp.where(walk.known, row / jnp.sum(row).astype(game.dtype), share)
-        probability = probability.at[place].set(share, mode="promise_in_bounds")
-    gain = jnp.sum(share * take(walk.reward, place))
-    since = jnp.where(walk.known, walk.moves, take(state.known_at, place))
-    gain = jnp.where(news, gain, take(state.gain, place))
-    state = replace(
-        state, moves=walk.moves, position=walk.position, fault=walk.fault,
-        counts=walk.counts, reward=walk.reward, probability=probability,
-        known_at=state.known_at.at[place].set(since, mode="promise_in_bounds"),
-        gain=state.gain.at[place].set(gain, mode="promise_in_bounds"),
-        num_known=state.num_known + walk.known,
-        last_update=jnp.where(news, walk.moves, state.last_update),
-        num_updates=state.num_updates + news,
-    )
-    return _solved(state, problem, hparams, news)
-
-
-def _solved(state: State, problem: Problem, hparams: Hparams, news: jax.Array) -> State:
-    """The optimistic model's value and near-optimal moves; the same state without news."""
-    given = (state.gain, state.probability, problem, hparams)
-    # A loop of one pass, which is left out where no lane has news.
-    value, error, best, _ = learner.while_active(
-        lambda now, _: now[-1], _solve, (state.value, state.error, state.best, news), given)
-    # Every allowed move then has a positive probability, unless that is too small a number.
-    least = _exploration(problem, hparams) / problem.game.num_actions
-    return replace(
-        state, value=value, error=error, best=best,
-        always_almost_sure=state.always_almost_sure & (least > 0),
-    )
-
-
-def _solve(now: Any, given: Any) -> Any:
-    value, error, best, news = now
-    gain, probability, problem, hparams = given
-    dtype = problem.game.dtype
-    discount = jnp.asarray(hparams.discount, dtype)
-    value, width, quantity = span_iteration(
-        problem.game, problem.allowed, gain, probability, value, discount,
-        enough=_solver_tolerance(problem, hparams), active=news,
-    )
-    # What is within eps_1 by these values less twice their error is within eps_1 by the true.
-    asked = pac.action_tolerance(hparams.epsilon, hparams.discount)
-    strict = jnp.maximum(asked - 2 * width, 0).astype(dtype)
-    mine = problem.allowed & problem.game.system[:, None]
-    near = pac.near_optimal(quantity, mine, strict)
-    return value, jnp.where(news, width, error), jnp.where(news, near, best), jnp.zeros_like(news)
-
-
-# --- constants ------------------------------------------------------------------------------
-
-
-def _bound(hparams: Hparams) -> jax.Array:
-    """What an unknown move is taken to pay."""
-    return jnp.asarray(hparams.reward_bound) / (1 - jnp.asarray(hparams.discount))
-
-
-def _exploration(problem: Problem, hparams: Hparams) -> jax.Array:
-    p = pac.exploration(hparams.epsilon, hparams.discount, hparams.reward_bound)
-    return jnp.asarray(p, problem.game.dtype)
-
-
-def _enough(problem: Problem, hparams: Hparams) -> jax.Array:
-    """Visits after which a pair is known."""
-    if hparams.known_after is not None:
-        return jnp.asarray(hparams.known_after, problem.game.dtype)
-    visits = pac.visits(
-        hparams.epsilon, hparams.failure, hparams.discount, hparams.reward_bound,
-        jnp.sum(problem.region), problem.game.num_actions,
-    )
-    return jnp.asarray(visits, problem.game.dtype)
-
-
-def _solver_tolerance(problem: Problem, hparams: Hparams) -> jax.Array:
-    """The error of the optimistic model's value at which a solve ends."""
-    dtype = problem.game.dtype
-    asked = pac.action_tolerance(hparams.epsilon, hparams.discount) / 4
-    left = 1 - jnp.asarray(hparams.discount, dtype)
-    rounding = 8 * jnp.finfo(dtype).eps * jnp.asarray(_bound(hparams), dtype) / left
-    return jnp.maximum(asked, rounding).astype(dtype)
+    return updated(state, note_last(walk, problem), problem, hparams)
 
 
 def _inside(problem: Problem) -> Game:

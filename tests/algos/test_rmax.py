@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.algos import pac, rmax
+from jaxltl.algos import _optimistic_model, pac, rmax
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.types import Status
 from jaxltl.core.values.minimax import minimax_value
@@ -334,8 +334,8 @@ def test_the_adversary_plays_the_minimax_answer():
 
 def test_the_constants_of_the_theorem_are_used():
     hparams = settings()
-    assert float(rmax._enough(example(), hparams)) == pytest.approx(1.4193e19, rel=1e-4)
-    explore = float(rmax._exploration(example(), hparams))
+    assert float(_optimistic_model.enough(example(), hparams)) == pytest.approx(1.4193e19, rel=1e-4)
+    explore = float(_optimistic_model.exploration(example(), hparams))
     assert explore == pytest.approx(5.33333e-7, rel=1e-5)
     state = rmax.init(jax.random.key(0), example(), hparams)
     assert float(state.value.max()) == pytest.approx(1 / 0.4**2)
