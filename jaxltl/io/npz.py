@@ -283,16 +283,6 @@ def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
 
     Raises:
       ValueError: naming the file and the array that is unknown, missing or wrong.
-
-    Example:
-      >>> import pathlib, tempfile
-      >>> from jaxltl import make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
-      ...                    label={"heads": [1]})
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.npz"
-      >>> write_npz(path, coin)
-      >>> read_npz(path).probability.tolist()
-      [0.5, 0.5, 1.0, 1.0]
     """
     name = str(path)
     try:

@@ -88,16 +88,6 @@ def read_umb(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
         another, or it holds what is not read: games with intervals, rates, observations, more
         than two players who have a choice, choices whose branches have no probabilities. The
         message names the file, the member, what was found and what was expected.
-
-    Example:
-      >>> import pathlib, tempfile
-      >>> from jaxltl import make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
-      ...                    label={"heads": [1]})
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.umb"
-      >>> write_umb(path, coin)
-      >>> read_umb(path).probability.tolist()
-      [0.5, 0.5, 1.0, 1.0]
     """
     name = str(path)
     place = f"{name!r}: "
