@@ -29,47 +29,7 @@ _MODULES = {
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names.split()}
 
-__all__ = [
-    "HoaGame",
-    "LearnedReward",
-    "ParametricModel",
-    "ParityGame",
-    "RationalFunction",
-    "RewardMachine",
-    "from_stormpy",
-    "load_reward",
-    "load_world",
-    "machine_reward",
-    "objective_of",
-    "plan_in",
-    "read_drn",
-    "read_hoa",
-    "read_hoa_game",
-    "read_hoa_stream",
-    "read_labels",
-    "read_log",
-    "read_model",
-    "read_npz",
-    "read_parametric",
-    "read_pgsolver",
-    "read_prism",
-    "read_reward_machine",
-    "read_sharded",
-    "read_umb",
-    "read_world",
-    "save_reward",
-    "save_world",
-    "to_stormpy",
-    "write_drn",
-    "write_hoa",
-    "write_hoa_game",
-    "write_model",
-    "write_npz",
-    "write_pgsolver",
-    "write_prism",
-    "write_umb",
-    "write_world",
-]
+__all__ = sorted(_MODULE_OF)
 
 if TYPE_CHECKING:
     from jaxltl.io.colored_world import load_world as load_world
