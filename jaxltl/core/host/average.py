@@ -26,11 +26,16 @@ from jaxltl.core.host.transient import Transient, optimum
 _EPS = float(np.finfo(np.float64).eps)
 _LAZY = 0.5  # the share of a step by which value iteration moves, so that no period keeps it apart
 _SWEEPS = 400  # of value iteration before policies are solved for
+_JUDGED = 32  # sweeps after which it is seen whether more would do
 _EVERY = 8  # sweeps between two looks at the bounds
 _ROUNDS = 60  # policies at most
 _LOOKS = 30  # steps after which it is asked where a policy is most often
 _REFINED = 3  # solves of one bias, each of what the last ones left
 _ELIMINATED = 300_000  # states up to which they are
+_LINGERS = 1e12  # times the largest reward: biases that far apart are of states hardly ever left
+_IDLE = 6  # policies in a row that earn more by no more than
+_IDLE_SHARE = 1e-12  # of what the ones before did
+_NEAR = 1e-3  # of their range: the best ones
 _TINY = 1e-13
 _FLOOR = 1e-6  # of the tolerance, times the largest reward: what counts where a gain is near zero
 
@@ -212,11 +217,10 @@ class _Part(NamedTuple):
         return (self.reward + np.add.reduceat(step, mdp.entry_start[:-1]),
                 self.unit * (self.magnitude + slack))
 
-    def wide(self, low: Floats, high: Floats, tolerance: float) -> Booleans:
-        """Whether bounds are wider than asked."""
+    def asked(self, low: Floats, high: Floats, tolerance: float) -> Floats:
+        """How wide bounds may be."""
         weight = np.maximum.reduceat(self.mdp.over_choices(np.maximum, self.magnitude), self.start)
-        near = np.maximum(np.minimum(np.abs(low), np.abs(high)), _FLOOR * weight)
-        return high - low > tolerance * near
+        return tolerance * np.maximum(np.minimum(np.abs(low), np.abs(high)), _FLOOR * weight)
 
     def first_best(self, quantity: Floats) -> Integers:
         """The first row of each state with the most."""
@@ -276,7 +280,8 @@ class _Gains:
 
     def wide(self, left: _Left, tolerance: float) -> Booleans:
         """Whose bounds are wider than asked."""
-        return left.part.wide(self.lower[left.which], self.upper[left.which], tolerance)
+        low, high = self.lower[left.which], self.upper[left.which]
+        return high - low > left.part.asked(low, high, tolerance)
 
 
 def _gains(whole: _Part, tolerance: float, max_steps: int) -> _Gains:
@@ -284,12 +289,15 @@ def _gains(whole: _Part, tolerance: float, max_steps: int) -> _Gains:
     count, size = whole.start.size, whole.mdp.num_states
     known = _Gains(np.full(count, -np.inf), np.full(count, np.inf), np.zeros(size, np.int64))
     left = _Left(np.arange(count), np.arange(size), whole, np.zeros(size))
-    left = _swept(known, left, tolerance, min(_SWEEPS, max_steps))
-    settled = np.zeros(left.which.size, bool)
+    left = _swept(known, left, tolerance, min(_SWEEPS, max_steps), hasty=True)
+    settled, v = np.zeros(left.which.size, bool), left.v.copy()
     for i in np.flatnonzero(left.part.size <= _ELIMINATED):
         one = np.arange(settled.size) == i
-        settled[i] = _by_policies(known, left.only(one), tolerance)
-    _swept(known, left.only(~settled), tolerance, max_steps - _SWEEPS)
+        found = _by_policies(known, left.only(one), tolerance)
+        settled[i] = found is None
+        if found is not None:
+            v[np.repeat(one, left.part.size)] = found
+    _swept(known, left._replace(v=v).only(~settled), tolerance, max_steps - _SWEEPS)
     return known
 
 
@@ -314,8 +322,14 @@ class _Left(NamedTuple):
         return _Left(self.which[kept], self.states[states], small, self.v[states])
 
 
-def _swept(known: _Gains, left: _Left, tolerance: float, num_steps: int) -> _Left:
-    """Value iteration of all components at once, until each is narrow."""
+def _swept(
+    known: _Gains, left: _Left, tolerance: float, num_steps: int, *, hasty: bool = False
+) -> _Left:
+    """Value iteration of all components at once, until each is narrow.
+
+    If `hasty`, also until it can be seen that the steps are too few for those that are left.
+    """
+    before: Floats | None = None
     done = 0
     while left.which.size and done <= num_steps:
         v = left.v
@@ -325,36 +339,61 @@ def _swept(known: _Gains, left: _Left, tolerance: float, num_steps: int) -> _Lef
         left = left._replace(v=v)
         known.note(left)
         left = left.only(known.wide(left, tolerance))
+        if hasty and done % _JUDGED == 0 and left.which.size:
+            if before is not None and (
+                    _steps_left(known, left, before, tolerance) > num_steps - done).all():
+                break
+            before = known.upper - known.lower
     known.rounds += done
     return left
+
+
+def _steps_left(known: _Gains, left: _Left, before: Floats, tolerance: float) -> Floats:
+    """How many more it takes, by how much narrower bounds became since they were judged last."""
+    low, high = known.lower[left.which], known.upper[left.which]
+    now = high - low
+    rate = np.log(np.minimum(now / before[left.which], 1 - _EPS))
+    asked = np.maximum(left.part.asked(low, high, tolerance), _EPS * now)
+    return _JUDGED * np.log(asked / now) / rate
 
 
 # --- policies of one component -------------------------------------------------------------------
 
 
-def _by_policies(known: _Gains, left: _Left, tolerance: float) -> bool:
+def _by_policies(known: _Gains, left: _Left, tolerance: float) -> Floats | None:
     """Policy iteration (Howard 1960) of one component, each policy with one recurrent class.
 
     Returns:
-      Whether it came to an end, where nothing but rounding can be better.
+      None where it came to an end, where nothing but rounding can be better; else, as policies of
+      one gain take turns whose states for ever are others, the value of one of the best.
     """
     part = left.part
-    chosen = part.first_best(part.gain(left.v)[0])
+    chosen, best, idle = part.first_best(part.gain(left.v)[0]), left.v, 0
     for _ in range(_ROUNDS):
         known.rounds += 1
-        solved = _bias(part, chosen)
+        before, solved = float(known.lower[left.which[0]]), _bias(part, chosen)
         if solved is None:
-            return False
+            return best
         v, chosen = solved
         known.note(left._replace(v=v))
         if not known.wide(left, tolerance).any():
-            return True
+            return None
+        range_, more = float(np.ptp(v)), float(known.lower[left.which[0]]) - before
+        idle = 0 if more > _IDLE_SHARE * abs(before) else idle + 1
+        if idle > _IDLE:
+            break
+        if range_ > _LINGERS * part.magnitude.max():
+            # Some states are left hardly ever: the rest goes to the best of these.
+            goal = v >= v.max() - _NEAR * range_
+            chosen = np.where(goal, chosen, towards(part.mdp, goal, np.ones(part.row.size, bool)))
+            continue
+        best = v
         gain, slack = part.gain(v)
         better = part.mdp.over_choices(np.maximum, gain - slack) > (gain + slack)[chosen]
         if not better.any():
-            return True
+            return None
         chosen = np.where(better, part.first_best(gain - slack), chosen)
-    return False
+    return best
 
 
 def _bias(part: _Part, chosen: Integers) -> tuple[Floats, Integers] | None:

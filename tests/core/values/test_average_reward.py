@@ -6,6 +6,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from jaxltl.core.host.average import average
 from jaxltl.core.host.components import strong_components
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import check
@@ -171,3 +172,18 @@ def test_storm_finds_the_same(seed):
         found = check(average_reward(model, reward, objective=objective))
         theirs = storm_values(storm, f'R{{"r"}}{objective}=? [ LRA ]')
         np.testing.assert_allclose(found.value, theirs, atol=1e-5)
+
+
+def test_sweeps_that_would_not_end_are_not_waited_for():
+    """A walk of many states mixes too slowly; that is seen after some sweeps."""
+    size = 300
+    states = np.arange(size)
+    entry, target = 2 * np.arange(size + 1), np.stack(
+        [np.maximum(states - 1, 0), np.minimum(states + 1, size - 1)], 1)
+    model = make_sparse(None, entry, target.ravel(), np.full(2 * size, 0.5))
+    reward = states / size
+    found = average(model.host, reward, reward, tolerance=1e-6, max_steps=10**6)
+    assert found.rounds < 150
+    exact = (size - 1) / size / 2
+    assert (found.lower <= exact).all() and (exact <= found.upper).all()
+    assert (found.upper - found.lower <= 1e-6).all()
