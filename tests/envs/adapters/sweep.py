@@ -13,7 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxltl as jl
-from tests.envs.adapters.harness import own_walk, walk
+from jaxltl.core.models.environment import random_action
+from jaxltl.core.models.episodes import step_or_reset
+from tests.envs.adapters.harness import keys_of, own_walk, walk
 
 LIMIT, STEPS, WALKS = 20, 50, 3  # an episode's steps, a walk's, and how many walks are one vmap
 
@@ -207,6 +209,39 @@ PACKAGES = {
 }
 
 
+def of_contacts(env, reset, step, steps=STEPS, walks=WALKS):
+    """As :func:`differences`, step by step from the adapter's own worlds, which are the package's.
+
+    Where bodies touch, what two programs round differently is soon another walk.
+    """
+    keys = jax.random.split(jax.random.key(7), walks)
+
+    def go(world, key):
+        choose, at = jax.random.split(key)
+        action = random_action(choose, env.actions)
+        after, found = step_or_reset(env, world, action, at)
+        return after, (world, action, found._replace(world=env.observe(found.world)))
+
+    def walked(key):
+        first, rest = keys_of(key, steps)
+        return jax.lax.scan(go, env.reset(first), rest)[1]
+
+    world, action, found = jax.tree.map(
+        lambda x: x.reshape(-1, *x.shape[2:]), jax.jit(jax.vmap(walked))(keys))
+    told = jax.jit(jax.vmap(lambda *pair: step(*pair, None)[1:]))(world, action)
+    pairs = {"last observations": (found.world, told[0]), "rewards": (found.reward, told[1]),
+             "ends": (found.terminated | found.truncated, told[2])}
+    pairs["first observations"] = (
+        jax.tree.map(lambda x: x[::steps], env.observe(world)),
+        jax.jit(jax.vmap(lambda key: reset(keys_of(key, steps)[0])[1]))(keys))
+    wrong = [f"{name}: {text}" for name, pair in pairs.items() if (text := unlike(*pair, 1e-3))]
+    for row in np.asarray(found.terminated | found.truncated).reshape(walks, -1):
+        if (lengths(row) > env.horizon).any():
+            wrong.append(f"an episode goes on after {env.horizon} steps")
+    return ("; ".join(wrong), int((found.terminated | found.truncated).sum()),
+            int((found.truncated & ~found.terminated).sum()))
+
+
 def differences(env, reset, step, steps=STEPS, walks=WALKS):
     """Where the walks of an adapter are not the package's own: a text, empty if they are.
 
@@ -251,14 +286,14 @@ def lengths(ended):
     return np.array(ages)
 
 
-def unlike(mine, theirs):
+def unlike(mine, theirs, most=1e-4):
     if jax.tree.structure(mine) != jax.tree.structure(theirs):
         return "another structure"
     for x, y in zip(jax.tree.leaves(mine), jax.tree.leaves(theirs), strict=True):
         x, y = np.asarray(x), np.asarray(y)
         if x.shape != y.shape:
             return f"{x.shape} for {y.shape}"
-        close = np.isclose(x, y, rtol=1e-4, atol=1e-5, equal_nan=True) if (
+        close = np.isclose(x, y, rtol=most, atol=most / 10, equal_nan=True) if (
             y.dtype.kind == "f") else x == y
         if not close.all():
             return f"{(~close).sum()} of {close.size} numbers, first at {np.argwhere(~close)[0]}"
@@ -274,7 +309,8 @@ def sweep(package, names=(), steps=STEPS, walks=WALKS):
         begin = time.process_time()
         try:
             env, *own = make()
-            wrong, ended, cut = differences(env, *own, steps=steps, walks=walks)
+            look = of_contacts if package == "brax" else differences
+            wrong, ended, cut = look(env, *own, steps=steps, walks=walks)
             said = f"{ended} ends, {cut} cut off"
         except Exception as problem:
             wrong, said = f"{type(problem).__name__}: {problem}", ""
