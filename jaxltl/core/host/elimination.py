@@ -24,6 +24,8 @@ _MOST = 2**28  # entries that may be filled, 12 bytes each
 _MOST_BETWEEN = 10**7  # of these, between components that are eliminated together
 _APART = 500  # states from which a component is eliminated alone, if they are not
 _LAST = 8000  # states up to which it is eliminated, however it fills, where sweeps fail
+_WORK = 1e11  # multiplications of a band from which Krylov steps come first,
+_MANY = 2  # if there are more successors than these in the mean
 _SAMPLED = 64  # rows in which what fills is counted where its bound is too large
 _PANEL = 2  # columns that are eliminated at once: each wants room for a full one
 _FILL = 4  # growth of the fill after which the order is sought anew
@@ -110,11 +112,13 @@ class Factors(NamedTuple):
         """The same of a policy with which sweeps do not come to an end; None if too large."""
         if not any(x.factor is None for x in self.blocks):
             return None
-        found = []
+        found, matrix = [], self.rows[chosen]
         for block in self.blocks:
-            if block.factor is None and block.order.size > _LAST:
+            nodes, swept = block.order, block.factor is None
+            if swept and nodes.size > _LAST and order_of(
+                    matrix[nodes][:, nodes], self.label[nodes]) is None:
                 return None
-            new = _block(self.rows, self.label, block.order, chosen, sparing=block.factor is None)
+            new = _block(self.rows, self.label, nodes, chosen, sparing=swept or block.sparing)
             if new is None or new.factor is None:
                 return None
             found.append(new)
@@ -134,7 +138,7 @@ def factors(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
     """
     matrix, size = rows[chosen], np.bincount(label)
     if min(_between(matrix, label, size)) <= _MOST_BETWEEN:
-        order = order_of(matrix, label)
+        order = order_of(matrix, label, _WORK)
         one = None if order is None else _block(rows, label, order, chosen)
         if order is not None and one is None:
             return None
@@ -142,7 +146,7 @@ def factors(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
             return Factors(rows, label, (one,))
     found = []
     for nodes in _parts(label, size):
-        order = order_of(matrix[nodes][:, nodes], label[nodes])
+        order = order_of(matrix[nodes][:, nodes], label[nodes], _WORK)
         kept = nodes if order is None else nodes[order]
         block = _block(rows, label, kept, chosen, swept=order is None)
         if block is None:
@@ -169,8 +173,14 @@ def _between(matrix: Any, label: Integers, size: Integers) -> tuple[int, int]:
     return int(size[target[between]].sum()), int(size[source[between]].sum())
 
 
-def order_of(matrix: Any, label: Integers) -> Integers | None:
-    """By component, and in each one after its neighbours; None where that would not help."""
+def order_of(matrix: Any, label: Integers, work: float = np.inf) -> Integers | None:
+    """By component, and in each one after its neighbours; None where that would not help.
+
+    Args:
+      matrix: ``float64[M, M]``, SciPy's.
+      label: ``int[M]``, the components.
+      work: multiplications, as bands have them, that a component may cost.
+    """
     from scipy.sparse import csgraph
 
     size = np.bincount(label)
@@ -192,7 +202,8 @@ def order_of(matrix: Any, label: Integers) -> Integers | None:
         furthest = np.zeros(label.size, np.int64)
         np.maximum.at(furthest, source, place[source] - place[both.indices])
         mean = np.bincount(label, furthest) / np.maximum(size, 1)
-        if ((size > _SMALL) & (mean * _SPREAD > size)).any():
+        fills = (size * mean**2 > work) & (within.nnz > _MANY * label.size)
+        if ((size > _SMALL) & ((mean * _SPREAD > size) | fills)).any():
             return None
     # What leads from one component to another fills, of the two, the one that stands first.
     return order[::-1] if out_of < into else order

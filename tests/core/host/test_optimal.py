@@ -114,7 +114,7 @@ def best_of(values, *, maximize):
     return [min((x for x in c if x is not None), default=None) for c in columns]
 
 
-WAYS = ["as it is", "in the core", "by sweeps", "contracted", "refined"]
+WAYS = ["as it is", "in the core", "by sweeps", "contracted", "refined", "eliminated at last"]
 
 
 @pytest.fixture(params=WAYS)
@@ -122,12 +122,14 @@ def way(request, monkeypatch):
     """Each way through the solver, which size and shape choose."""
     if request.param != "as it is":
         monkeypatch.setattr(contract, "_WORTH", 10**6)
-    if request.param in ("in the core", "by sweeps", "refined"):
+    if request.param not in ("as it is", "contracted"):
         monkeypatch.setattr(levels, "_ROUNDS", 0)
         monkeypatch.setattr(levels, "_NODES", 10**9)
-    if request.param == "by sweeps":
+    if request.param in ("by sweeps", "eliminated at last"):
         monkeypatch.setattr(elimination, "_SMALL", 0)
         monkeypatch.setattr(elimination, "_SPREAD", 10**9)
+    if request.param == "eliminated at last":
+        monkeypatch.setattr(elimination, "_swept", lambda _, b: np.full(b.size, np.nan))
     if request.param == "refined":
         monkeypatch.setattr(transient, "_prove", lambda *_: None)
 
