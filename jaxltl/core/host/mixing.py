@@ -18,11 +18,15 @@ _TINY = 1e-290
 _LARGE = 20_000  # open states from which sweeps are tried
 _MET = 4096  # states that are met
 _STEPS = 10  # within so many steps from one, where a model may mix
+_SOME = 400  # open states from which they are where half of them are met
+_FEW = 5  # within so many
 
 
 def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: bool) -> Enclosed:
-    """:func:`jaxltl.core.host.transient.optimum`, by sweeps where a large model mixes well."""
-    if np.count_nonzero(problem.open) >= _LARGE and _spreads(problem.mdp, problem.open):
+    """:func:`jaxltl.core.host.transient.optimum`, by sweeps where a model mixes well."""
+    size = int(np.count_nonzero(problem.open))
+    met, steps = (_MET, _STEPS) if size >= _LARGE else (min(_MET, size // 2), _FEW)
+    if size >= _SOME and _spreads(problem.mdp, problem.open, met, steps):
         found = by_sweeps(problem, maximize=maximize, tolerance=tolerance, relative=relative)
         if found is not None:
             return found
@@ -84,7 +88,9 @@ def _without_loops(problem: Transient) -> tuple[Floats, Booleans | None]:
     return weight, rows
 
 
-def _spreads(mdp: HostMDP, open_: Booleans) -> bool:
+def _spreads(
+    mdp: HostMDP, open_: Booleans, met: int = _MET, steps: int = _STEPS
+) -> bool:
     """Whether few steps from a state lead to many, as they do where elimination fills."""
     node, first = np.flatnonzero(open_), mdp.entry_start[mdp.row_start]
 
@@ -92,11 +98,12 @@ def _spreads(mdp: HostMDP, open_: Booleans) -> bool:
         after = mdp.successor[spans(first[states], first[states + 1] - first[states])]
         return after[open_[after]]
 
-    return spreads(follow, node[node.size // 2 : node.size // 2 + 1], open_.size)
+    return spreads(follow, node[node.size // 2 : node.size // 2 + 1], open_.size, met, steps)
 
 
 def spreads(
-    follow: Callable[[Any], Any], start: Any, num_states: int, met: int | None = None
+    follow: Callable[[Any], Any], start: Any, num_states: int, met: int | None = None,
+    steps: int = _STEPS,
 ) -> bool:
     """Whether few steps from a state lead to many others.
 
@@ -105,11 +112,12 @@ def spreads(
       start: ``int[1]``.
       num_states: S.
       met: to how many; default 4096.
+      steps: within how many.
     """
     left = (_MET if met is None else met) - 1
     seen: Any = np.zeros(num_states, bool)
     seen[start] = True
-    for _ in range(_STEPS):
+    for _ in range(steps):
         if left <= 0:
             return True
         after = follow(start)

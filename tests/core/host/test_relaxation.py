@@ -99,6 +99,25 @@ def test_only_what_spreads_is_swept():
         assert mixing._spreads(host, np.ones(size, bool)) == spreads
 
 
+def test_small_models_of_wide_rows_are_swept_too():
+    """Elimination would fill all of them; what is found is the same."""
+    rng = np.random.default_rng(5)
+    size, width = 500, 60
+    target = np.sort(np.stack([rng.permutation(size)[:width] for _ in range(size)]), -1)
+    host = make_sparse(
+        None, width * np.arange(size + 1), target.ravel(), np.full(target.size, 1 / width)).host
+    goal = np.arange(size) < 50
+    ours = optimal.total_reward(host, np.ones(size), goal, maximize=False)
+    assert ours.method == "sweeps in place"
+    nodes = np.flatnonzero(~goal)
+    inner = np.zeros((size, size))
+    np.add.at(inner, (np.repeat(np.arange(size), width), target.ravel()), 1 / width)
+    exact = np.linalg.solve(np.eye(nodes.size) - inner[nodes][:, nodes], np.ones(nodes.size))
+    assert (ours.lower[nodes] <= exact * (1 + 1e-12)).all()
+    assert (exact <= ours.upper[nodes] * (1 + 1e-12)).all()
+    assert (ours.upper - ours.lower <= 1e-6 * ours.upper).all()
+
+
 def test_what_mixes_slowly_is_left_to_others():
     """A walk on a long line: sweeps would take as long as it does."""
     size = 300
