@@ -11,12 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.host.choices import Choices, choices_of
-from jaxltl.core.host.rows import Booleans, Integers, spans
+from jaxltl.core.host.rows import Booleans, Integers, distinct, spans
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import reaching
 
 UNDERFLOW = 1e-300  # more than all that is lost where numbers are too small
 _HUGE = 1e150
+_MANY = 32  # steps from which it pays to leave out the states that these do not lead to the target
 
 
 class Steps(NamedTuple):
@@ -146,6 +147,8 @@ def until(
       by_step: whether the choices of all steps are asked for.
     """
     open_ = stay & ~target
+    if num_steps >= _MANY:
+        open_ &= _near(mdp, target, open_, num_steps)
     backup = backup_on(mdp, np.flatnonzero(open_), operation)
     cost = backup.taken @ target.astype(np.float64)
     every: list[Integers] | None = [] if by_step else None
@@ -165,6 +168,20 @@ def until(
     if every is not None:
         return Steps(value, error, _policies(mdp, backup, every, num_steps), done)
     return Steps(value, error, _policy(mdp, backup, row), done)
+
+
+def _near(mdp: HostMDP, target: Booleans, open_: Booleans, num_steps: int) -> Booleans:
+    """The states that some choices may lead to a target in so many steps."""
+    start, pred = mdp.predecessors
+    seen, frontier = target.copy(), np.flatnonzero(target)
+    for _ in range(num_steps):
+        state = mdp.state[pred[spans(start[frontier], start[frontier + 1] - start[frontier])]]
+        state = distinct(state, mdp.num_states)
+        frontier = state[open_[state] & ~seen[state]]
+        if not frontier.size:
+            break
+        seen[frontier] = True
+    return seen
 
 
 def _within(

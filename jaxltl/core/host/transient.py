@@ -410,12 +410,8 @@ def _solve_core(
     system: _System, core: Integers, bounds: Floats, errors: tuple[float, float], sign: int,
     problem: Transient, tolerance: float, relative: bool,
 ) -> _Core:
-    """Policy iteration of the problem whose every step costs a little more.
-
-    Args:
-      errors: the shares by which a backup may err, and what is known of the states outside.
-    """
-    unit = sum(errors)
+    """Policy iteration of the problem whose every step costs a little more."""
+    unit = sum(errors)  # the shares by which a backup may err, and what is known outside
     circles, core, edges = _circles(system, core, bounds, sign)
     label = components_in_order(edges)
     proper = partial(_proper, circles, _way_out(circles, system, core, problem))
@@ -438,12 +434,15 @@ def _solve_core(
         gain = sign * (circles.best(image) - value) + extra
         better = gain > _KEPT * extra
         if better.any():
-            if rounds <= _HASTY:
+            before = chosen
+            if rounds <= _HASTY and not circles.is_chain:
                 chosen = proper(_greedy(circles, sign * extra, value, _SWEEPS))
             else:
                 chosen = carried_on(
                     circles.matrix, circles.known + sign * extra, circles.owner, value, chosen,
                     sign, _KEPT * extra)
+                if (chosen == before).all():
+                    break  # what gains is rounding
             solver = solver.other(chosen)
             continue
         found = _prove(circles, solver, chosen, value, extra, unit)
