@@ -349,6 +349,7 @@ def test_a_lucky_sample_is_not_presented_as_a_solution():
     assert "no sample was" not in solved.message, "one was seen"
 
 
+@pytest.mark.slow
 def test_noise_and_its_margin():
     given = problem(noisy)
     hparams = Hparams(rate=0.3, margin=0.8)

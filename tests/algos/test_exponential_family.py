@@ -169,6 +169,7 @@ def test_single_precision_keeps_concentrated_gammas():
         whole.standard_deviation(moved), np.float64(samples).std(), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_many_single_precision_steps_stay_positive():
     @jax.jit
     def run(family):

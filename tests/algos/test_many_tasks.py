@@ -83,6 +83,7 @@ def test_who_follows_what_is_asked_for_does_formulas_that_nobody_trained(verdict
     assert not (verdicts == Verdict.VIOLATED).any()
 
 
+@pytest.mark.slow
 def test_a_lane_of_stacked_plans_is_the_plan(plans, verdicts):
     agent = many_tasks.sequence_agent(knowing, plans[1], sampled=False)
     alone = jax.jit(lambda keys: episodes(task_environment(WORLD, TASKS[1]), agent, keys))(

@@ -85,6 +85,7 @@ def test_polynomials_of_degree_one_have_exact_ranges():
     assert found.upper[0] == pytest.approx(0.2 + 0.9 - 0.36)
 
 
+@pytest.mark.slow
 def test_bounds_hold_in_the_whole_box(twice):
     rng = np.random.default_rng(1)
     chance = make_problem(twice, "goal", bound=">=")

@@ -370,6 +370,7 @@ def test_lanes_of_different_settings_are_as_if_alone():
             np.testing.assert_allclose(here.value, alone.state.value, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_new_numbers_do_not_retrace():
     problem, _ = random_problem(5)
     learn(jax.random.key(0), problem, settings(known_after=3), 50)

@@ -77,6 +77,7 @@ def parameters(problem, seed=0):
 # --- the gradient ------------------------------------------------------------------------------
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("setting", [
     pytest.param({}, id="exit"),
     pytest.param({"worlds": (0, 1), "weight": [1.0, 0.5]}, id="two-worlds",

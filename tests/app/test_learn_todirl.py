@@ -261,6 +261,7 @@ def test_learning_is_on_record(learned):
     assert learning["solver"] == "CONVERGED" and result["network"]["hidden"] == [12]
 
 
+@pytest.mark.slow
 def test_what_is_written(learned):
     place, _, result = learned
     names = {path.name for path in (place / "out").iterdir()}
@@ -275,6 +276,7 @@ def test_what_is_written(learned):
     assert "http" not in page and "Test worlds" in page
 
 
+@pytest.mark.slow
 def test_the_written_network_plans_the_written_policy(learned):
     place, _, result = learned
     found = load_reward(place / "out" / "network.npz")
@@ -291,6 +293,7 @@ def test_the_written_network_plans_the_written_policy(learned):
         plan_in(found, WORLD.mdp, seen[:, :9])
 
 
+@pytest.mark.slow
 def test_a_file_that_is_no_network(tmp_path, learned):
     with pytest.raises(ValueError, match="No such file"):
         load_reward(tmp_path / "none.npz")
@@ -300,6 +303,7 @@ def test_a_file_that_is_no_network(tmp_path, learned):
             load_reward(path)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch):
     place, _, _ = learned
     interrupt_soon(monkeypatch)
@@ -317,6 +321,7 @@ def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch):
             assert all(a[key].tobytes() == b[key].tobytes() for key in b.files)
 
 
+@pytest.mark.slow
 def test_what_must_be_known_before_trusting_the_figures(learned):
     result = json.loads(json.dumps(learned[2]))
     assert report_todirl.warnings(result) == []
@@ -403,6 +408,7 @@ def test_the_example_is_sound():
 # --- the guarantee -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_best_is_attained_in_every_world_also_in_new_ones(learned):
     place, printed, result = learned
     assert result["guarantee"]["asked"] == "best" and "By construction" in printed

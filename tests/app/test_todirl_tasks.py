@@ -312,6 +312,7 @@ def test_a_task_without_end_has_its_probability_by_moves_that_lose_nothing(write
         assert (world["share"], world["attained"]) == (1, 1)
 
 
+@pytest.mark.slow
 def test_what_no_policy_has_in_a_world_is_refused_with_what_is_possible(write, tmp_path):
     (tmp_path / "shown.json").write_text(json.dumps(CARELESS))
     best = jl.optimal_satisfaction(own(prepared(write(text=RISKY)), 2))

@@ -273,6 +273,7 @@ def test_rewards_on_entry_are_expected_over_slips():
     np.testing.assert_allclose(reward[0], [0.1, 0.1, -1.0, 7.8], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_demonstrations_end_where_the_task_is_decided():
     world = tg.training_world()
     model = exit_product(world)

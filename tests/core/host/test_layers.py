@@ -75,6 +75,7 @@ def check(model, target, objective, monkeypatch, tolerance):
     return True
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("single", [False, True])
 @pytest.mark.parametrize("objective", ["max", "min"])
 @pytest.mark.parametrize("count", [20, pytest.param(5000, marks=pytest.mark.exhaustive)])

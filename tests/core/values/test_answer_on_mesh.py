@@ -54,7 +54,7 @@ def asked(sharded, text, steps=1000):
         bounds, times = (found.lower, found.upper), times + 1
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("text", PROPERTIES)
 def test_the_answers_are_those_of_the_host(model, sharded, text):
     there, _ = asked(sharded, text)
@@ -65,6 +65,7 @@ def test_the_answers_are_those_of_the_host(model, sharded, text):
     assert there.status == here.status == Status.CONVERGED and there.holds == here.holds
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("text", ['Pmax=? [ F "win" ]', 'Pmax=? [ G !"lose" ]'])
 def test_bounds_are_gone_on_from(model, sharded, text):
     """Also of a task that is the opposite of what is reached."""

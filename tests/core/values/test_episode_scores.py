@@ -49,6 +49,7 @@ def above(totals):
     return totals.length > 5
 
 
+@pytest.mark.slow
 def test_scores_are_means_over_episodes():
     every = ("failure", "violation", "undecided", "visits", "cost", "length", "discounted_visits",
              "discounted_reward", above)

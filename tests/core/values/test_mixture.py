@@ -32,7 +32,7 @@ def reached(model, policy, over):
     return float(each @ weight if over == "mean" else each[weight > 0].min())
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("kind", "over"), [
     ("cosafe", "mean"), ("safety", "worst"), ("buchi", "mean"), ("parity", "worst"),
     *(pytest.param(*setting, marks=pytest.mark.exhaustive) for setting in (

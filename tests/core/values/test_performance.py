@@ -70,7 +70,7 @@ def assert_correct(found, models, exact):
     assert float(jnp.max(found.upper - found.lower)) < 1e-10
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("acceptance", "label_on"),
     [("cosafe", "exit"), ("cosafe", "entry"), ("safety", "exit"),

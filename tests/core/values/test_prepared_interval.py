@@ -140,6 +140,7 @@ def test_policy_and_nature_attain_what_they_are_shown_for(objective, nature):
     np.testing.assert_allclose(side.value, host.value, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_given_policies_are_evaluated():
     successor, lower, upper, cost = _cases(4, 1)
     model = _model(successor, lower[0], upper[0])
@@ -203,6 +204,7 @@ def test_derivatives_in_the_ends_are_differences(objective, nature, question):
     np.testing.assert_allclose(small.lower @ way[0] + small.upper @ way[1], change, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_other_graphs_are_refused_inside_jit():
     successor, lower, upper, _ = _cases(6, 1)
     model = _model(successor, lower[0], upper[0])

@@ -70,7 +70,7 @@ def solve(model, goal, policy, objective):
 traced = jax.jit(solve, static_argnames="objective")
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("objective", ["max", "min", "policy"])
 @pytest.mark.parametrize("dense_limit", [host.DENSE_LIMIT, 0])
 def test_both_engines_give_the_same_bounds_and_regions(objective, dense_limit, monkeypatch):

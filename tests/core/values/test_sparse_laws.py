@@ -349,7 +349,7 @@ def test_where_the_boltzmann_operator_contracts_is_known_inside_jit():
             jax.jit(boltzmann_expansion)(jnp.int32(count)), expected, rtol=1e-12)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("label_on", ["entry", "exit"])
 def test_products_are_solved_without_padding(label_on):
     model, _, _, _ = example()

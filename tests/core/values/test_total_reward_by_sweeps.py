@@ -300,6 +300,7 @@ def test_derivatives_over_a_mesh():
         lambda r: sum_of_finite(world, r, goal, objective="min"), [put(reward)], [put(change)])
 
 
+@pytest.mark.slow
 def test_lanes_are_what_they_are_alone():
     parts, reward, target, _ = some_problem(4)
     model = made(parts)

@@ -35,7 +35,7 @@ def exact(game, allowed, probability, gain, discount):
     return np.asarray(minimax_value(game, gain, discount, tolerance=1e-10).value)[:-1]
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("shape", [SHAPE, (6, 2, 1), (8, 2, 20)])
 @pytest.mark.parametrize("enough", [1e-2, 1e-9])
 def test_the_error_holds_what_it_says(shape, enough):
@@ -80,6 +80,7 @@ def test_lanes_are_as_if_alone_however_they_are_nested():
     assert flat[1][2] == np.inf
 
 
+@pytest.mark.slow
 def test_the_last_of_many_lanes_end_as_they_do_among_few():
     """Most begin with their value and end at once, which leaves few that go on by themselves."""
     game, allowed, probability, gain, guess = models(3, 64)
