@@ -173,7 +173,8 @@ def until(
 def _near(mdp: HostMDP, target: Booleans, open_: Booleans, num_steps: int) -> Booleans:
     """The states that some choices may lead to a target in so many steps."""
     start, pred = mdp.predecessors
-    seen, frontier = target.copy(), np.flatnonzero(target)
+    seen = target.copy()
+    frontier: Integers = np.flatnonzero(target)
     for _ in range(num_steps):
         state = mdp.state[pred[spans(start[frontier], start[frontier + 1] - start[frontier])]]
         state = distinct(state, mdp.num_states)
