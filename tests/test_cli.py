@@ -277,8 +277,8 @@ def test_an_interrupt_waits_for_what_is_imported(tmp_path, monkeypatch):
 
 def test_an_interrupted_command_says_so_in_a_line():
     program = """
-import os, signal, jaxltl.cli
-jaxltl.cli.main = lambda **_: os.kill(os.getpid(), signal.SIGINT)
+import signal, jaxltl.cli
+jaxltl.cli.main = lambda **_: signal.raise_signal(signal.SIGINT)
 from jaxltl.__main__ import run
 run()
 """

@@ -109,7 +109,7 @@ def test_parts_in_turn_are_one_step(jumanji, name):
             now = reset(jax.random.key(2))
 
 
-def test_a_task_file_chooses_parts_in_turn(tmp_path):
+def test_a_task_file_chooses_parts_in_turn(jumanji, tmp_path):
     task = SimpleNamespace(path=tmp_path / "task.toml", world={
         "environment": "jumanji:JobShop-v0", "arguments": {"in_turn": True}})
     assert load_environment(task).actions == Finite(21)
