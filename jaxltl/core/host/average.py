@@ -28,10 +28,11 @@ _LAZY = 0.5  # the share of a step by which value iteration moves, so that no pe
 _SWEEPS = 400  # of value iteration before policies are solved for
 _JUDGED = 32  # sweeps after which it is seen whether more would do
 _EVERY = 8  # sweeps between two looks at the bounds
+_TURNS = 4  # of policies and of as many sweeps, before sweeps alone go on
 _ROUNDS = 60  # policies at most
 _LOOKS = 30  # steps after which it is asked where a policy is most often
 _REFINED = 3  # solves of one bias, each of what the last ones left
-_ELIMINATED = 300_000  # states up to which they are
+_ELIMINATED = 2_000_000  # states up to which they are
 _LINGERS = 1e12  # times the largest reward: biases that far apart are of states hardly ever left
 _IDLE = 6  # policies in a row that earn more by no more than
 _IDLE_SHARE = 1e-12  # of what the ones before did
@@ -290,14 +291,20 @@ def _gains(whole: _Part, tolerance: float, max_steps: int) -> _Gains:
     known = _Gains(np.full(count, -np.inf), np.full(count, np.inf), np.zeros(size, np.int64))
     left = _Left(np.arange(count), np.arange(size), whole, np.zeros(size))
     left = _swept(known, left, tolerance, min(_SWEEPS, max_steps), hasty=True)
-    settled, v = np.zeros(left.which.size, bool), left.v.copy()
-    for i in np.flatnonzero(left.part.size <= _ELIMINATED):
-        one = np.arange(settled.size) == i
-        found = _by_policies(known, left.only(one), tolerance)
-        settled[i] = found is None
-        if found is not None:
-            v[np.repeat(one, left.part.size)] = found
-    _swept(known, left._replace(v=v).only(~settled), tolerance, max_steps - _SWEEPS)
+    for turn in range(_TURNS):
+        settled, v = np.zeros(left.which.size, bool), left.v.copy()
+        for i in np.flatnonzero(left.part.size <= _ELIMINATED):
+            one = np.arange(settled.size) == i
+            found = _by_policies(known, left.only(one), tolerance)
+            settled[i] = found is None
+            if found is not None:
+                v[np.repeat(one, left.part.size)] = found
+        # Value iteration goes on where it was, and later from what policies found.
+        left = (left._replace(v=v) if turn else left).only(~settled)
+        if not left.which.size or max_steps <= _SWEEPS:
+            break
+        left = _swept(known, left, tolerance, _SWEEPS)
+    _swept(known, left, tolerance, max_steps - (_TURNS + 1) * _SWEEPS)
     return known
 
 
