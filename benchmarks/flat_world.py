@@ -129,12 +129,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--box", action="store_true")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--chunks", type=int, default=13)
     parser.add_argument("--episodes", type=int, default=500)
     parser.add_argument("--enough", type=float, default=0.8)
     given = parser.parse_args()
     shares = []
-    for seed in range(given.seeds):
+    for seed in range(given.first, given.first + given.seeds):
         cpu = time.process_time()
         network, run = learn(seed, given.chunks, given.enough, not given.box)
         cpu = time.process_time() - cpu

@@ -234,7 +234,8 @@ def of_contacts(env, reset, step, steps=STEPS, walks=WALKS):
     pairs["first observations"] = (
         jax.tree.map(lambda x: x[::steps], env.observe(world)),
         jax.jit(jax.vmap(lambda key: reset(keys_of(key, steps)[0])[1]))(keys))
-    wrong = [f"{name}: {text}" for name, pair in pairs.items() if (text := unlike(*pair, 1e-3))]
+    wrong = [f"{name}: {text}" for name, pair in pairs.items()
+             if (text := unlike(*pair, 1e-3, scaled=True))]
     for row in np.asarray(found.terminated | found.truncated).reshape(walks, -1):
         if (lengths(row) > env.horizon).any():
             wrong.append(f"an episode goes on after {env.horizon} steps")
@@ -286,14 +287,16 @@ def lengths(ended):
     return np.array(ages)
 
 
-def unlike(mine, theirs, most=1e-4):
+def unlike(mine, theirs, most=1e-4, scaled=False):
+    """Where two trees differ; of vectors of forces and places, as parts of the largest number."""
     if jax.tree.structure(mine) != jax.tree.structure(theirs):
         return "another structure"
     for x, y in zip(jax.tree.leaves(mine), jax.tree.leaves(theirs), strict=True):
         x, y = np.asarray(x), np.asarray(y)
         if x.shape != y.shape:
             return f"{x.shape} for {y.shape}"
-        close = np.isclose(x, y, rtol=most, atol=most / 10, equal_nan=True) if (
+        size = np.abs(y).max(-1, keepdims=True, initial=0.1) if scaled and y.ndim > 1 else 0.1
+        close = np.isclose(x, y, rtol=most, atol=most * size, equal_nan=True) if (
             y.dtype.kind == "f") else x == y
         if not close.all():
             return f"{(~close).sum()} of {close.size} numbers, first at {np.argwhere(~close)[0]}"
