@@ -42,6 +42,7 @@ from jaxltl.core.values.total_reward import total_reward
 TOLERANCE = 1e-6
 FINER = (1.0, 1e-3, 1e-6)  # parts of the tolerance by which a threshold is tried
 TINY = 1e-12  # width of an interval of rewards that is narrow enough whatever they are
+_AVERAGE = "averages of end components"
 _OTHER = {"max": "min", "min": "max"}
 
 
@@ -305,7 +306,7 @@ def _solver(
         known = _without_intervals(model, prop, "averages in the long run")
         share = states_satisfying(graph, path, prop.text).astype(np.float64)
         return lambda tolerance: _plain(states, average_reward(
-            known, share, objective=aim.policy, tolerance=tolerance))
+            known, share, objective=aim.policy, tolerance=tolerance))._replace(method=_AVERAGE)
     reward: Any = np.ones(model.num_rows) if prop.operator == "T" else prop.reward
     if isinstance(path, Formula):
         target: Any = states_satisfying(graph, path.operands[0], prop.text)
@@ -315,10 +316,12 @@ def _solver(
     if path.steps is not None:
         return _steps_solver(model, path.kind == "cumulative", reward, path.steps, aim, states)
     what = "rewards for ever (C)" if path.kind == "total" else "averages in the long run"
-    known, solve = _without_intervals(model, prop, what), (
-        total_reward if path.kind == "total" else average_reward)
-    return lambda tolerance: _plain(states, solve(
-        known, reward, objective=aim.policy, tolerance=tolerance))
+    known = _without_intervals(model, prop, what)
+    if path.kind == "total":
+        return lambda tolerance: _plain(states, total_reward(
+            known, reward, objective=aim.policy, tolerance=tolerance))
+    return lambda tolerance: _plain(states, average_reward(
+        known, reward, objective=aim.policy, tolerance=tolerance))._replace(method=_AVERAGE)
 
 
 def _steps_solver(

@@ -191,3 +191,12 @@ def test_mistakes_are_named(text, message):
 ])
 def test_bounds_decide_thresholds(relation, lower, upper, verdict):
     assert meets(relation, Fraction(1, 2), lower, upper) is verdict
+
+
+@pytest.mark.parametrize("text", [
+    'LRAmax=? [ "a" ]', "Rmax=? [ LRA ]", "Rmin=? [ C ]", "Rmax=? [ C<=3 ]", 'Pmax=? [ F "a" ]'])
+def test_it_is_told_how(text):
+    model = make_sparse(
+        [0, 2, 3], [0, 2, 3, 4], [0, 1, 0, 1], [0.75, 0.25, 1, 1], initial=[1, 0],
+        label={"a": [1]}, rewards={"r": Rewards(state=np.array([1.0, 0]))})
+    assert solve_property(model, text).method
