@@ -16,6 +16,7 @@ from jaxltl.envs.adapters.common import (
     Held,
     arrays,
     copied,
+    own_errors,
     package,
     refuse_wrappers,
     require_environment,
@@ -64,10 +65,12 @@ def from_brax(
         make)
     held, size = Held(env), int(env.action_size)
     length, repeat = getattr(env, "episode_length", None), getattr(env, "action_repeat", 1)
-    return make_environment(
-        Partial(_reset, held), Partial(_step, held), Partial(_observe),
-        actions=make_box(-1.0, 1.0, (size,), np.float32), labels=labels, propositions=propositions,
-        horizon=None if length is None else -(-int(length) // int(repeat)))
+    with own_errors("brax", env):
+        return make_environment(
+            Partial(_reset, held), Partial(_step, held), Partial(_observe),
+            actions=make_box(-1.0, 1.0, (size,), np.float32), labels=labels,
+            propositions=propositions,
+            horizon=None if length is None else -(-int(length) // int(repeat)))
 
 
 def _reset(held: Held, key: chex.PRNGKey) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import warnings
 from collections.abc import Callable, Iterator
@@ -83,6 +84,21 @@ def params_of(root: str, params: Any, own: Any) -> Any:
             f"from_{root}: params is {given.shown(params)}; give a {type(own).__qualname__}, such "
             "as the environment's own with params.replace(...), or None for its own.")
     return params
+
+
+@contextlib.contextmanager
+def own_errors(root: str, env: Any) -> Iterator[None]:
+    """What a package's own functions raise when they are traced, told as its own."""
+    try:
+        yield
+    except ValueError:
+        raise
+    except Exception as problem:
+        first = (str(problem).strip().splitlines() or [""])[0].rstrip(".")
+        raise ValueError(
+            f"from_{root}: {type(env).__name__} cannot be traced with JAX {jax.__version__}: "
+            f"{type(problem).__name__}: {first}. Take another version of {root} or of "
+            "JAX, or mend its labels.") from problem
 
 
 def refuse_wrappers(root: str, env: Any, attribute: str, kinds: Any, remedy: str) -> None:

@@ -70,5 +70,13 @@ def test_what_is_not_braxs_is_named(envs):
         wrapped = envs.training.EpisodeWrapper(kind(own), 10, 1)
         with pytest.raises(ValueError, match=f"wrapped in {kind.__name__}; give brax.envs.get_env"):
             from_brax(wrapped)
+    class Old(type(own)):
+        """One that this JAX does not have a function for."""
+
+        def step(self, state, action):
+            return jnp.clip(state, a_minimum=0)
+
+    with pytest.raises(ValueError, match=r"Old cannot be traced .*: TypeError: .*a_minimum"):
+        from_brax(Old())
     with pytest.raises(ValueError, match="no environment of brax"):
         from_brax(envs)
