@@ -278,6 +278,7 @@ def test_an_interrupt_waits_for_what_is_imported(tmp_path, monkeypatch):
 def test_an_interrupted_command_says_so_in_a_line():
     program = """
 import signal, jaxltl.cli
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which shells turn off behind an "&"
 jaxltl.cli.main = lambda **_: signal.raise_signal(signal.SIGINT)
 from jaxltl.__main__ import run
 run()

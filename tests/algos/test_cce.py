@@ -187,6 +187,7 @@ def test_a_step_is_4_14(share):
     np.testing.assert_allclose(metrics.cost, [cost.mean()])
 
 
+@pytest.mark.slow
 def test_later_samples_are_masked():
     """n_l = 5 l of 20, k_l = ceil(.3 n_l)."""
     hparams = Hparams(num_samples=Polynomial(5.0, 1.0), population=20, rho=0.3)

@@ -116,6 +116,7 @@ def test_walks_with_circles():
     assert not feasible(longest, 9.001, starts=20).feasible.any()
 
 
+@pytest.mark.slow
 def test_what_may_be_passed_before(tmp_path):
     """Not through state 1, so by the other way: of probability (1 - p) p, not 1 - p^2."""
     model = drn(tmp_path, "p", [

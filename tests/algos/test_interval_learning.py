@@ -272,7 +272,7 @@ def test_frequencies_that_are_rounded_beyond_one_make_no_nan():
 # --- values -------------------------------------------------------------------------------------
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_settled_values_are_the_robust_values_of_the_intervals(task):
     """By another solver, from all states; from values of other intervals, 40 steps on end."""

@@ -346,7 +346,7 @@ def masked(reward=mlirl.linear_reward, **options):
         lazy, features, demonstrations, allowed=allowed, **options)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "mu"), [
     ("boltzmann", None), ("soft", 0.5),
     pytest.param("boltzmann", 0.5, marks=pytest.mark.exhaustive),

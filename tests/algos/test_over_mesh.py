@@ -96,6 +96,7 @@ def cases():
             yield pytest.param(name, number, marks=() if quick else pytest.mark.exhaustive)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("name", "number"), list(cases()))
 def test_eight_lanes_on_several_devices_are_those_on_one(name, number):
     mesh = mesh_of(number)

@@ -356,7 +356,7 @@ def two_steps(name):
     return problem, hparams, state, ppo.run(state, problem, hparams, num_steps=2)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DRIFTERS)
 def test_a_policy_that_does_not_change_has_ratios_of_one(name):
     """Scales and memories are in the update what they were when actions were drawn."""

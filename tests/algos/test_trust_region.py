@@ -673,6 +673,7 @@ def test_values_of_what_is_cut_off_are_those_of_what_goes_on(time_limit, horizon
 # --- numbers that are not finite ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_trajectories_that_are_not_finite_are_counted_and_left_out():
     problem = counted(poison=0.3)
     start = trust_region.init(jax.random.key(0), problem, SMALL)

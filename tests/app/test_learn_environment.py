@@ -133,6 +133,7 @@ def learned(tmp_path_factory):
     return path, folder / "out", told
 
 
+@pytest.mark.slow
 def test_learn_says_and_writes_what_it_found(learned):
     _, out, told = learned
     assert told.stderr.startswith("jaxltl")

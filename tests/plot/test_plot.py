@@ -63,6 +63,7 @@ def marks(figure):
             for x in sorted(found, key=lambda x: (-x.center[1], x.center[0]))]
 
 
+@pytest.mark.few(7)
 @pytest.mark.parametrize("formula", GOOD)
 def test_an_automaton_is_drawn(formula):
     table = to_automaton(formula)

@@ -115,6 +115,7 @@ def test_negation_is_complement(count):
     assert count / 25 < both < count / 2
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("letters", "stem", "tail", "largest"), [(["", "a"], 4, 3, 5), (["", "a", "b"], 3, 2, 4)]
 )
@@ -589,6 +590,7 @@ def test_thirteen_propositions_in_all_of_the_logic():
         to_automaton(text, [])
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("seed", [1000, 1001, 1003, 1006, 1008, 1011, 1014, 1017, 1020, 1025])
 def test_large_formulas(seed):
     rng = random.Random(seed)

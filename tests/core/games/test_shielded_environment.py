@@ -45,7 +45,7 @@ def episodes(keys, environment, num_steps):
     return jax.vmap(lambda key: run_episode(key, environment, agent, num_steps=num_steps))(keys)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("formula", "options"), [
     (SAFE, {"method": "stay"}), (OFTEN, {"method": "rank"}),
     (OFTEN, {"method": "counter", "bound": 9}),

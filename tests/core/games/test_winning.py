@@ -104,6 +104,7 @@ PARITY_LIKE = ("safety", "reach", "buchi", "cobuchi", "parity")
 SHAPES = [(7, 2, 2), (5, 3, 2), (4, 2, 3), (1, 2, 1)]
 
 
+@pytest.mark.few(3)
 @counts(60, 200)
 @pytest.mark.parametrize("kind", PARITY_LIKE)
 def test_regions_equal_all_pairs_of_strategies(kind, count):
@@ -393,6 +394,7 @@ def test_formulas_equal_the_explicit_product(formula):
         assert bool(found.realizable) == expected[np.ravel(explicit.initial) > 0].all()
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("formula", "objective"),
     [

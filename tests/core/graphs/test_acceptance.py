@@ -79,7 +79,7 @@ def all_values(model):
     return np.stack([satisfied(model, np.eye(A)[list(c)].reshape(S, Q, A)) for c in choices])
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("label_on", ["entry", "exit"])
 @pytest.mark.parametrize("seed", [
     pytest.param(seed, marks=[] if seed < 5 else pytest.mark.exhaustive) for seed in range(12)])
@@ -135,6 +135,7 @@ def test_the_gradient_is_that_of_finite_differences():
         np.testing.assert_allclose([forward[i], reverse[i]], difference, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_inside_jit_and_vmap():
     models = [random_case(seed, "entry") for seed in range(3)]
     plain = [

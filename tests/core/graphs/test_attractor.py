@@ -42,6 +42,7 @@ def check_progress(model, goal, allowed, found):
     assert reaches[region].all()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("rule", ["exists", "forall"])
 def test_attractors_equal_naive_sweeps(cases, mdps, rule):
     for mdp, (model, goal, allowed, _) in zip(mdps, cases, strict=True):

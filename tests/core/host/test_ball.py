@@ -170,6 +170,7 @@ def test_probabilities_and_rewards(count):
             within_ball(model, found.probability)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", COUNTS)
 def test_parity(count):
     rng = np.random.default_rng(3)

@@ -50,6 +50,7 @@ def tiny_model(rng, kind):
     return interval_rows(row_start, entry_start, successor, lower, upper, **ball).host
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("kind", ["firm", "loose", "ball"])
 def test_bounds_are_those_of_the_numbers_as_they_are(kind, count):

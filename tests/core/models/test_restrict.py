@@ -56,7 +56,7 @@ def questions(model, region, value, reward, policy, *, compiled=True):
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("kind", [
-    *REPRESENTATIONS, pytest.param("product on exit", marks=pytest.mark.exhaustive)])
+    *sorted(REPRESENTATIONS), pytest.param("product on exit", marks=pytest.mark.exhaustive)])
 def test_a_narrowed_model_has_no_other_actions(kind):
     options = {"label_on": "exit"} if "exit" in kind else {}
     if "product" not in kind:

@@ -32,6 +32,7 @@ def drawn(rng, model, size):
         for i, j in zip(model.entry_start[:-1], model.entry_start[1:], strict=True)])
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("count", [20, pytest.param(2000, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("method", METHODS)
 def test_guarantees_hold(method, count):

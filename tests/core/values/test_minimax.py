@@ -421,6 +421,7 @@ def test_where_nobody_can_move_is_worth_minus_infinity_and_what_leads_there_too(
 # --- representations, derivatives, laws ----------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("label_on", "method"), [
     pytest.param("entry", "policy_iteration", marks=pytest.mark.exhaustive),
     ("exit", "strategy_iteration"),

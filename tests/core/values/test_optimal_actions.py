@@ -172,7 +172,7 @@ def check_case(rng, kind, label_on, objective):
     return (best * (1 - best) > 1e-9).any(), left_out.any(), several, (left_out & conserving).any()
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("kind", "label_on", "objective"), CASES)
 @pytest.mark.parametrize(
     "count", [18, pytest.param(313, marks=pytest.mark.exhaustive)])

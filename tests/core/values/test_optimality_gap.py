@@ -91,7 +91,7 @@ def on_table(table, policy):
     return policy[np.asarray(table.world)]
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("kind", ["stochastic", "deterministic"])
 def test_bounds_enclose_the_recursion(seed, kind):

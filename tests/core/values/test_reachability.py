@@ -175,7 +175,7 @@ def exact_satisfaction(lazy, explicit, policy):
     return value if cosafe else 1 - value
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("acceptance", "label_on", "count"),
     [
