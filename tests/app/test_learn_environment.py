@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from jaxltl.algos import learner
+from jaxltl.algos import chunks
 from jaxltl.app import learn_environment as job
 from jaxltl.app.environment_source import load_environment
 from jaxltl.app.files.task_environment import is_environment_task, read_task
@@ -208,7 +208,7 @@ def test_what_is_done_is_not_done_again(learned, monkeypatch):
 @pytest.mark.slow
 def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch, tmp_path):
     path, out, _ = learned
-    save, count = learner.files.save, []
+    save, count = chunks.files.save, []
 
     def saved(*arguments):
         save(*arguments)
@@ -216,7 +216,7 @@ def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch, tmp_path):
         if len(count) == 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(learner.files, "save", saved)
+    monkeypatch.setattr(chunks.files, "save", saved)
     stopped = run("learn", path, "--seeds", 2, "--out", tmp_path)
     assert stopped.exit_code == 130 and "goes on from the last checkpoint" in stopped.stderr
     assert len(list(tmp_path.glob("checkpoint*"))) == 1
