@@ -61,7 +61,7 @@ def test_a_penalty_changes_what_is_learned():
     assert "penalised TRPO" in cce.table(result)
 
 
-@pytest.mark.few(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("task", nav.TASKS)
 def test_steps_add_up_to_the_scores(task):
     """The rewards and costs of steps are those of whole trajectories, from the same robot."""

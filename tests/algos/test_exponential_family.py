@@ -84,6 +84,7 @@ def test_log_densities_are_scipys(name):
     np.testing.assert_allclose(whole.log_density(family, samples), expected, rtol=1e-10)
 
 
+@pytest.mark.few(2)
 @by_family
 def test_the_mean_map_is_the_mean_of_the_statistics_and_has_its_inverse(name):
     family = MEMBERS[name]()

@@ -140,6 +140,7 @@ def test_steps_are_measured_by_the_odds():
         np.testing.assert_allclose(metrics.gradient_norm, 3 * 0.98 / (p * (1 - p)), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_keys_and_starts_decide():
     problem = make_problem(ruin(), "won", bound=">=")
     one, same, other = (feasible(problem, 0.9, starts=20, key=jax.random.key(k)) for k in (1, 1, 2))

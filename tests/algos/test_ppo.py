@@ -221,6 +221,7 @@ def test_what_is_forbidden_is_never_done():
         assert (episode.reward == episode.valid).all() and episode.valid.sum() > 1
 
 
+@pytest.mark.slow
 def test_where_nothing_is_allowed_nothing_is_learned_and_it_is_said():
     stuck = make_environment(
         walk_reset, walk_step, walk_observe, actions=2,

@@ -107,7 +107,7 @@ def test_bounds_hold_in_the_whole_box(twice):
             assert of.lower[0] <= bounds[1]
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("bound", [">=", "<="])
 def test_boxes_cover_and_are_decided_right(twice, bound):
     problem = make_problem(twice, "goal", bound=bound)

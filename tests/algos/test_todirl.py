@@ -130,6 +130,7 @@ def check_weighed(worlds, weight):
     assert float(found.score) == pytest.approx(float(found.held_out) - gain / float(pairs))
 
 
+@pytest.mark.slow
 def test_a_weight_is_of_the_probability_of_the_task():
     check_weighed((0,), None)
     with pytest.raises(ValueError, match="leave horizon out"):

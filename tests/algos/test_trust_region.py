@@ -686,6 +686,7 @@ def test_trajectories_that_are_not_finite_are_counted_and_left_out():
     assert (metrics.scale > 0).any()
 
 
+@pytest.mark.slow
 def test_a_policy_stays_if_nothing_is_finite():
     problem = counted(poison=2.0)
     start = trust_region.init(jax.random.key(0), problem, SMALL)

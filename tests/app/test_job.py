@@ -49,6 +49,7 @@ def test_a_seed_alone_uses_one_device(seeds):
     same(alone(mesh=mesh_of(2))[0], alone()[0])
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_on_other_devices(seeds, tmp_path):
     module, problem, hparams, _ = case("toy")
 

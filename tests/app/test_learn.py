@@ -13,7 +13,7 @@ from jaxltl.app.reports.learn import remarks
 from tests.app.test_task import write  # noqa: F401
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("optimizer", ["lbfgs", "adam"])
 def test_the_policy_is_that_of_the_weights(write, optimizer):  # noqa: F811
     """Whether or not the last evaluation was at them, before the first step too."""

@@ -152,6 +152,7 @@ def test_learn_says_and_writes_what_it_found(learned):
     assert not list(out.glob("checkpoint*"))
 
 
+@pytest.mark.slow
 def test_the_written_policy_does_what_the_result_says(learned):
     path, out, _ = learned
     result = json.loads((out / "result.json").read_text())
@@ -165,6 +166,7 @@ def test_the_written_policy_does_what_the_result_says(learned):
         job.load_policy(out / "other.npz", task_file=path)
 
 
+@pytest.mark.slow
 def test_a_written_policy_is_used_without_its_task_file(learned, tmp_path):
     path, out, _ = learned
     world = load_environment(read_task(path))
@@ -199,6 +201,7 @@ def test_a_written_policy_is_used_without_its_task_file(learned, tmp_path):
         job.load_policy(tmp_path / "none.npz")
 
 
+@pytest.mark.slow
 def test_what_is_done_is_not_done_again(learned, monkeypatch):
     path, out, _ = learned
     monkeypatch.setattr(job, "learn", None)
@@ -228,6 +231,7 @@ def test_an_interrupted_run_goes_on_bitwise(learned, monkeypatch, tmp_path):
         np.testing.assert_array_equal(one[name], other[name])
 
 
+@pytest.mark.slow
 def test_interrupted_before_it_learns(learned, monkeypatch, tmp_path):
     def interrupt(*given):
         raise KeyboardInterrupt

@@ -42,7 +42,7 @@ class Left(Exception):
     """In place of a death."""
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("other", [2, 4])
 def test_bounds_are_gone_on_from_there_and_elsewhere(often, tmp_path, monkeypatch, other):
     whole = solved(2, None).answer

@@ -166,6 +166,7 @@ def test_the_task_can_be_done_from_everywhere(model):
     assert jl.verify(whole)
 
 
+@pytest.mark.slow
 def test_optimal_values(model, optimal):
     value = np.asarray(optimal.value)[np.asarray(model.game.system)]
     values, counts = np.unique(value.round(6), return_counts=True)

@@ -50,6 +50,7 @@ def test_damage_is_named(tmp_path, pack):
         read_bytes(path)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("pack", [gzip.compress, lzma.compress])
 def test_a_bomb_is_refused_before_it_grows(tmp_path, pack, monkeypatch):
     monkeypatch.setattr(_files, "ALWAYS_ALLOWED", 2**20)

@@ -94,6 +94,7 @@ def test_parity_condition():
             assert holds(parity_condition(count), mask) == (least % 2 == 0)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("seed", range(4))
 def test_parity_automaton_keeps_the_language(seed):
     rng = random.Random(seed)

@@ -193,6 +193,7 @@ def test_parity(count):
         np.testing.assert_allclose(best.value, found.value, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_discounted_and_steps():
     """Values satisfy their equation over all vertices."""
     rng = np.random.default_rng(4)

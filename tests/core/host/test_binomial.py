@@ -87,7 +87,7 @@ def test_clopper_and_pearson_of_many(k, n):
         assert upper == min(np.nextafter(1 - other, 2), 1)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("failure", [0.3, 0.01])
 def test_intervals_hold_with_their_chance(name, failure):

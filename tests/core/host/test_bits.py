@@ -37,6 +37,7 @@ def models(num_memory, count):
         yield model, rng.random(model.state_shape) < 0.1
 
 
+@pytest.mark.few(9)
 @pytest.mark.parametrize("block", [3, 2**15])
 @pytest.mark.parametrize("num_memory", [1, 5, 8, 9, 20, 40, 64])
 def test_sets(num_memory, block, monkeypatch):

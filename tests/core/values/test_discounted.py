@@ -376,6 +376,7 @@ def test_sensitivities_equal_the_explicit_equations(adjoint):
                 np.testing.assert_allclose(other, slope, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_soft_newton_passes_linear_systems_that_single_precision_does_not_solve():
     """In this world the linear solver gets nowhere in the second step; a sweep leads on."""
     model = stack_products([grid.random_world(9).mdp], grid.COMPLETE)

@@ -116,7 +116,7 @@ def test_minimax_values_are_those_of_all_strategy_pairs(batch, exact, method, pe
     assert_certified(near, exact[per], 1e-4)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("double", [True, False])
 def test_without_a_tolerance_the_enclosure_is_as_narrow_as_floats_allow(cases, exact, double):
     with jax.enable_x64(double):
@@ -488,6 +488,7 @@ def test_lost_states_have_no_derivative_and_spoil_none():
     np.testing.assert_allclose(slope, [[2.0, 0], [0, 0], [2.0, 0]], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_new_values_do_not_trace_again(cases):
     model, system, reward, _ = cases[0]
     game, strategy = as_game(model, system), jnp.asarray(model.available.argmax(-1))

@@ -125,6 +125,7 @@ def test_rewards_of_both_signs_and_probabilities(seed):
     check_front(found.front, model, events, rewards, sweeps=300)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("seed", range(8))
 def test_one_objective_is_what_its_own_solver_finds(seed):
     rng = np.random.default_rng(seed)

@@ -205,6 +205,7 @@ def test_a_network_is_what_it_does_in_its_tasks_environment():
     assert found.evidence == table.evidence == "told"
 
 
+@pytest.mark.slow
 def test_without_a_limit():
     world, *arrays = process(1, np.zeros(S, int))
     table = tabulate(world)

@@ -252,6 +252,7 @@ def walk():
     return model, np.arange(5) == 4
 
 
+@pytest.mark.slow
 def test_other_numbers_are_judged(walk):
     model, target = walk
     prepared = prepare(model, target)

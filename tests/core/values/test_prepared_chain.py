@@ -36,7 +36,7 @@ def case(seed, kind, trap=-1):
     return rng, model, target, rng.random(SIZE) * (rng.random(SIZE) < 0.8)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", ["circles", "loops"])
 @pytest.mark.parametrize("asks_reward", [False, True])
 def test_values_are_those_of_the_host_engine(kind, asks_reward):

@@ -82,6 +82,7 @@ FORMULAS = ("G F a & G F b", "F G a | G F b", "F (a & X F b)", "G (a -> X b)", "
             "G F a -> G F b", "a U (b & X a)")
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("formula", FORMULAS)
 def test_formulas(formula):
     for _, sparse, padded, _ in cases(8, FORMULAS.index(formula)):

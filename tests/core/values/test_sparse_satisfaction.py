@@ -50,6 +50,7 @@ def chain_of(model: SparseMDP, found: Satisfaction) -> SparseMDP:
         label=np.asarray(model.label)[found.product.base_state], propositions=model.propositions)
 
 
+@pytest.mark.few(9)
 @pytest.mark.parametrize("formula", FORMULAS)
 def test_values_are_those_of_the_padded_product(formula):
     for seed in range(3):
@@ -69,6 +70,7 @@ def test_values_are_those_of_the_padded_product(formula):
                 np.testing.assert_allclose(solution.value, np.asarray(wanted.value)[at], atol=1e-5)
 
 
+@pytest.mark.few(9)
 @pytest.mark.parametrize("formula", FORMULAS)
 def test_strategies_attain_what_they_are_said_to(formula):
     for seed in range(3, 6):

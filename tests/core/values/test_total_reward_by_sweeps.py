@@ -207,6 +207,7 @@ def walk(num_states, *forward):
     return jl.make_mdp(np.repeat(successor[:, None], len(forward), 1), p), s == num_states - 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("devices", [1, pytest.param(4, marks=pytest.mark.exhaustive)])
 def test_slow_walks_are_solved(devices):
     model, target = walk(80, 0.5, 0.6)
@@ -265,7 +266,7 @@ def slopes_agree(run, at, changes, step=1e-5):
             (found[i] * change).sum(), (up - down) / (2 * step), rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", [
     "min", pytest.param("max", marks=pytest.mark.exhaustive), "policy"])
 def test_derivatives_are_those_of_differences(objective):
