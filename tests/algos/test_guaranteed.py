@@ -315,7 +315,7 @@ def check_todirl(rng, kind, label_on, num_worlds):
     check_policies(models[-1], found[-1], other)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind, _, _ in USUAL])
 def test_todirl_inside_the_mask_attains_the_optimum_in_worlds_never_seen_too(kind):
     """Of all kinds with the label that one program reads; the others below."""

@@ -463,6 +463,7 @@ def test_visits_are_counted_up_to_a_limit():
                        hparams.replace(num_chains=2**16, moves_per_step=2**15))
 
 
+@pytest.mark.slow
 def test_single_precision_learns_too():
     with jax.enable_x64(False):
         game, reward = random_game(1, alternating=True)

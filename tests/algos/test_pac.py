@@ -500,6 +500,7 @@ def one_loop(paid):
     return Game(from_dense(transition), jnp.ones(2, bool)), jnp.asarray(reward)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("discount", [0.05, 0.6, 0.99])
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_the_bound_is_nearly_attained(discount, share):

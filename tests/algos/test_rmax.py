@@ -316,6 +316,7 @@ def test_a_formula_on_a_markov_decision_process():
     np.testing.assert_allclose(found.worst.value, found.met.value, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_adversary_plays_the_minimax_answer():
     found = patrol()
     problem = rmax.make_problem(

@@ -45,6 +45,7 @@ def test_steps_and_colours_are_the_slow_worlds():
     assert np.asarray(discs_of(world).color).sum(axis=0).tolist() == [1, 1, 2, 1, 1, 2, 1]
 
 
+@pytest.mark.slow
 def test_episodes_begin_anywhere_outside_of_the_discs():
     world = flat_world()
     places = np.asarray(jax.vmap(world.reset)(jax.random.split(jax.random.key(3), 4000))[0].place)

@@ -44,7 +44,7 @@ def clipped_linear(gain, offset):
     return jnp.array([a, a, b, b, offset + 0.2, offset - 0.2, 1.0, -1.0, -0.2])
 
 
-@pytest.mark.few(3)
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", [*NETWORKS, "3-4-2"])
 def test_runs_against_a_plain_simulation(spec):
     world = other_world() if spec == "3-4-2" else lqr()
@@ -248,7 +248,7 @@ def test_networks_that_do_not_fit_are_refused():
         evaluator(lqr(), "2-2-1")(jnp.zeros(8), None)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("world", [lqr(), other_world()])
 def test_the_environment_is_the_run(world):
     """Episodes of a network add up to what the evaluation of its run says."""

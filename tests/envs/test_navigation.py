@@ -177,7 +177,7 @@ def test_starts_are_uniform():
     assert np.abs(correlation - np.eye(3)).max() < 0.03
 
 
-@pytest.mark.few(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("task", nav.TASKS)
 def test_tasks_against_table_4(task):
     world = crowded()
@@ -212,6 +212,7 @@ def test_staying_in_the_goal_is_worth_the_horizon():
     assert evaluator(world, 3, network, absorbing=True)(parameters, jax.random.key(0))[1] == -30
 
 
+@pytest.mark.slow
 def test_batches_are_single_evaluations():
     evaluate = evaluator(WORLD, 2, num_trajectories=3)
     parameters = random_policy(NETWORK, (2, 3))
@@ -263,6 +264,7 @@ def test_a_users_task_with_several_constraints():
     np.testing.assert_allclose(cost, both.mean(0), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_evaluations_are_differentiable_in_the_parameters():
     world = crowded()  # where some first states are in the obstacle
     network = policy_network(world, (4,))

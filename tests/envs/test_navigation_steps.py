@@ -20,7 +20,7 @@ NETWORK = nav.policy_network(WORLD, (4,))
 PARAMETERS = 0.7 * jax.random.normal(jax.random.key(5), (3, NETWORK.num_parameters))
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("task", nav.TASKS)
 def test_episodes_are_trajectories(task):
     """The same places, J and Z as of the run that starts alike."""

@@ -81,6 +81,7 @@ def test_what_is_observed_is_what_is_left(episodes):
     assert not np.asarray(remaining(drawn, drawn.length).reach).any()
 
 
+@pytest.mark.slow
 def test_what_is_drawn_has_the_weights_asked_for():
     drawn = jax.vmap(draw_sequence, (0, None))(jax.random.split(jax.random.key(1), 3000), SAMPLER)
     reach, avoid, length = map(np.asarray, drawn)
@@ -94,6 +95,7 @@ def test_what_is_drawn_has_the_weights_asked_for():
     assert not (avoid[:, 1:] & reach[:, :-1]).any()  # what has just happened is not avoided
 
 
+@pytest.mark.slow
 def test_sets_of_events_are_drawn_whole():
     events = events_of(NAMES, 2)
     sampler = sequence_sampler([1, 1], [1, 1], [0, 1], proposition_sets(events))

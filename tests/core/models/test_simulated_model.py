@@ -99,6 +99,7 @@ def test_tabulated_it_is_the_model_again():
         assert float(found) == pytest.approx(float(expected), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_success_by_simulation_is_the_probability_by_the_solver():
     """For a task that is decided soon, within four standard deviations."""
     formula, count = "!b U (a & X !b)", 4000

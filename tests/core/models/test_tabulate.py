@@ -216,6 +216,7 @@ def test_what_tells_worlds_apart():
         tabulate(world, max_states=50)
 
 
+@pytest.mark.slow
 def test_what_distinct_leaves_out_is_idle_or_the_callers_word():
     def drawn(world, action, key):
         place, carried = world

@@ -73,6 +73,7 @@ def test_rollouts_are_runs_of_the_model(kind):
     assert (explicit.transition[s, a, t] > 0).all()
 
 
+@pytest.mark.slow
 def test_rollouts_visit_as_the_occupancy_says():
     rng = np.random.default_rng(1)
     model = reference.random_model(rng, 4, 2, 2, 0.0)
