@@ -1,19 +1,16 @@
 """Optimal sums in fractions, for small systems that hardly ever end, beyond what floats can tell.
 
-Each equation is written as ``sum_j w_j (x_i - x_j) = c_i``, over all that a row leads to, those who
-end it among them: then a solution is a quotient of sums of products of the weights and costs
-(the matrix-tree theorem), so that weights which err by a share of themselves make it err by no more
-than twice as many times that share as there are unknowns, however long a run may take
-(O'Cinneide 1993).
+What the floats of the weights leave open is told by :mod:`jaxltl.core.host.matrix_tree`.
 """
 
 from __future__ import annotations
 
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from jaxltl.core.host.matrix_tree import System
 from jaxltl.core.host.rows import Integers
 from jaxltl.core.host.sparse import Floats
 
@@ -21,22 +18,6 @@ LARGEST = 1000  # unknowns
 _OPERATIONS = 150_000  # on fractions, in one elimination
 _BITS = 1024  # of numbers, from which an operation counts as more
 _ROUNDS = 50
-
-
-class System(NamedTuple):
-    """Rows of an optimality equation.
-
-    Attributes:
-      matrix: ``float64[R, M]``, SciPy's, without self-loops.
-      leaving: ``float64[R]``, the weight of what ends a run.
-      known: ``float64[R]``, at least 0.
-      owner: ``int[R]``.
-    """
-
-    matrix: Any
-    leaving: Floats
-    known: Floats
-    owner: Integers
 
 
 def exact_optimum(

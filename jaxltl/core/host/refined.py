@@ -1,23 +1,23 @@
 """Optimal sums of systems that take very long to end, by refinement beyond double precision.
 
-Each equation is written as ``sum_j w_j (x_i - x_j) + l_i x_i = c_i``, without subtracting weights,
-for a solution in two floats, of which differences are right in all their digits. What comes in,
+Of equations ``sum_j w_j (x_i - x_j) + l_i x_i = c_i``, in which no weights are subtracted, and a
+solution in two floats, of which differences are right in all their digits, what comes in,
 ``U = c + sum_{x_j > x_i} w_j (x_j - x_i)``, and what goes out, ``D``, then are sums of positive
 terms. Where a policy's rows have ``|U - D| <= e (U + D)``, and no row has more than that on the
-better side, the numbers are the exact optimum of weights that differ by a share e at most. The
-matrix-tree theorem bounds what that means, however long runs may take: each of the n unknowns
-counts for twice that share (O'Cinneide 1993). Such numbers are found by iterative refinement
+better side, the numbers are the exact optimum of weights that differ by a share e at most, and the
+matrix-tree theorem bounds what that means. Such numbers are found by iterative refinement
 (Wilkinson 1963), and by policy iteration on these differences.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxltl.core.host.levels import Edges
+from jaxltl.core.host.matrix_tree import System, share_of_values
 from jaxltl.core.host.rows import Integers
 from jaxltl.core.host.sparse import Floats
 from jaxltl.core.host.sparse_graph import searched
@@ -32,24 +32,6 @@ _MOST = 1e-3  # share up to which its powers are what is written for them
 Solver = Callable[[Floats], Floats]
 
 
-class Equations(NamedTuple):
-    """Rows of an optimality equation.
-
-    Attributes:
-      matrix: ``float64[R, M]``, SciPy's, without self-loops.
-      leaving: ``float64[R]``, the weight of what ends a run.
-      known: ``float64[R]``, at least 0.
-      owner: ``int[R]``.
-      unit: the share by which the numbers may err.
-    """
-
-    matrix: Any
-    leaving: Floats
-    known: Floats
-    owner: Integers
-    unit: float
-
-
 class Refined(NamedTuple):
     """Values ``float64[M]``, the share by which they may err, and the rows that attain them."""
 
@@ -60,13 +42,14 @@ class Refined(NamedTuple):
 
 
 def refined(
-    equations: Equations, chosen: Integers, solver_of: Callable[[Integers], Solver | None],
-    sign: int, tolerance: float,
+    system: System, unit: float, chosen: Integers,
+    solver_of: Callable[[Integers], Solver | None], sign: int, tolerance: float,
 ) -> Refined | None:
     """The optimum of a system that every policy that counts leaves.
 
     Args:
-      equations: the system.
+      system: the equations.
+      unit: the share by which their numbers, and the sums of a row, may err.
       chosen: ``int[M]``, a policy that surely ends.
       solver_of: what solves ``(I - P) x = b`` for a policy's rows P, roughly; None where it fails.
       sign: 1 for the largest, -1 for the smallest.
@@ -75,7 +58,7 @@ def refined(
     Returns:
       It, or None if it was not found.
     """
-    rows = _Rows(equations)
+    rows = _Rows(system)
     for round_ in range(1, _ROUNDS + 1):
         solve = solver_of(chosen)
         pair = None if solve is None else _solution(rows, chosen, solve)
@@ -87,19 +70,19 @@ def refined(
             gap, scale = rows.balance(high, low)
             left = float(_share(gap[chosen], scale[chosen]))
             # What a row has more on the better side than rounding explains.
-            ahead = sign * gap - max(2 * equations.unit, _NOISE * left) * scale
+            ahead = sign * gap - max(2 * unit, _NOISE * left) * scale
             ahead[chosen] = 0
             if (ahead > 0).any():
                 better = (ahead, sign * gap) if left <= _LOOSE or better is None else better
                 continue
-            found = _proven(equations, high, chosen, gap, scale, sign, round_)
+            found = _proven(system, unit, high, chosen, gap, scale, sign, round_)
             if found is not None and (best is None or found.share < best.share):
                 best = found
                 if found.share <= tolerance / 4:
                     break
         if best is not None or better is None:
             return best
-        chosen = _switched(equations.owner, chosen, *better)
+        chosen = _switched(system.owner, chosen, *better)
     return None
 
 
@@ -117,17 +100,16 @@ def _share(gap: Floats, scale: Floats) -> float:
 
 
 def _proven(
-    equations: Equations, value: Floats, chosen: Integers, gap: Floats, scale: Floats, sign: int,
-    rounds: int,
+    system: System, unit: float, value: Floats, chosen: Integers, gap: Floats, scale: Floats,
+    sign: int, rounds: int,
 ) -> Refined | None:
     """What the differences prove of a policy that surely ends."""
     over = np.maximum(sign * gap, 0)
     over[chosen] = np.abs(gap[chosen])
-    share = _share(over, scale) + 2 * equations.unit
-    share *= 2.1 * (chosen.size + 2)
-    own = equations.matrix[chosen]
+    share = share_of_values(_share(over, scale) + 2 * unit, chosen.size)
+    own = system.matrix[chosen]
     back = Edges(own.indptr, own.indices).reverse()
-    leaves = searched(back.start, back.target, equations.leaving[chosen] > 0)
+    leaves = searched(back.start, back.target, system.leaving[chosen] > 0)
     if not share <= _MOST or not (value >= 0).all() or not leaves.all():
         return None
     return Refined(value, share, chosen, rounds)
@@ -136,16 +118,16 @@ def _proven(
 class _Rows:
     """The entries of the rows, and how what comes in differs from what goes out."""
 
-    def __init__(self, equations: Equations):
-        matrix = equations.matrix
-        self.known, self.leaving, self.owner = equations.known, equations.leaving, equations.owner
+    def __init__(self, system: System):
+        matrix = system.matrix
+        self.known, self.leaving, self.owner = system.known, system.leaving, system.owner
         self.row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
         self.of, self.target, self.weight = self.owner[self.row], matrix.indices, matrix.data
 
     def balance(self, high: Floats, low: Floats) -> tuple[Floats, Floats]:
         """``U - D`` and ``U + D`` of each row, from a value in two floats.
 
-        Their rounding is a share of ``U + D`` that the unit of the equations covers: differences
+        Their rounding is a share of ``U + D`` that the unit covers: differences
         are right to two roundings, and a row has as many sums as terms.
         """
         difference = _difference(

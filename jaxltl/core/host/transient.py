@@ -17,10 +17,11 @@ import numpy as np
 
 from jaxltl.core.host.choices import Choices, choices_of
 from jaxltl.core.host.elimination import Factors, factors, order_of
-from jaxltl.core.host.exact import LARGEST, System, exact_optimum
+from jaxltl.core.host.exact import LARGEST, exact_optimum
 from jaxltl.core.host.levels import Edges, Levels, components_in_order, peel
+from jaxltl.core.host.matrix_tree import System, share_of_values
 from jaxltl.core.host.onward import carried_on
-from jaxltl.core.host.refined import Equations, refined
+from jaxltl.core.host.refined import refined
 from jaxltl.core.host.rows import LARGE, Booleans, Integers, spans, starts_of
 from jaxltl.core.host.sparse import Floats, HostMDP
 from jaxltl.core.host.sparse_graph import searched
@@ -483,6 +484,10 @@ def _narrow(found: _Core, sign: int, tolerance: float, relative: bool) -> bool:
     return bool((width <= tolerance * size).all())
 
 
+def _system_of(circles: _Circles) -> System:
+    return System(circles.matrix, circles.leaving, circles.known, circles.owner)
+
+
 def _refined(
     circles: _Circles, core: Integers, label: Integers, chosen: Integers,
     errors: tuple[float, float], tolerance: float,
@@ -494,8 +499,7 @@ def _refined(
         return None if solver is None else (solver.eliminated(rows) or solver).solve
 
     unit, grown = errors
-    equations = Equations(circles.matrix, circles.leaving, circles.known, circles.owner, unit)
-    found = refined(equations, chosen, solver_of, circles.sign, tolerance)
+    found = refined(_system_of(circles), unit, chosen, solver_of, circles.sign, tolerance)
     if found is None:
         return None
     share = found.share + grown
@@ -515,12 +519,11 @@ def _in_fractions(
     order = order_of(circles.matrix[chosen], label)
     if order is None:
         return None
-    system = System(circles.matrix, circles.leaving, circles.known, circles.owner)
-    found = exact_optimum(system, chosen, order, circles.sign)
+    found = exact_optimum(_system_of(circles), chosen, order, circles.sign)
     if found is None:
         return None
     value, rows = found
-    share = 2.1 * (core.size + 2) * sum(errors)
+    share = share_of_values(sum(errors), core.size)
     near, far = (value * (1 - end * circles.sign * share) for end in (1, -1))
     return _Core(core, near, far, value, rows, 0, "policy iteration in fractions")
 
