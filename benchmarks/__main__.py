@@ -33,14 +33,20 @@ def _search() -> list[dict[str, Any]]:
 def main() -> None:
     """Measures the chosen parts, prints a row each and at the end all as one JSON line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("parts", nargs="*", default=list("abcdefghikl"),
-                        help="a to l; j takes minutes and is left out unless it is named")
+    parser.add_argument(
+        "parts",
+        nargs="*",
+        default=list("abcdefghikl"),
+        help="a to l; j takes minutes and is left out unless it is named",
+    )
     parser.add_argument("--states", type=int, default=1_000_000)
     parser.add_argument("--json", action="store_true", help="only the JSON line")
     chosen = parser.parse_args()
     rows: list[dict[str, Any]] = []
-    header = (f"{'what':<50} {'peer':<34} {'compile s':>10} {'run s':>10} {'peer s':>10} "
-              f"{'ratio':>8} {'target':>9}")
+    header = (
+        f"{'what':<50} {'peer':<34} {'compile s':>10} {'run s':>10} {'peer s':>10} "
+        f"{'ratio':>8} {'target':>9}"
+    )
     if not chosen.json:
         print(f"jax {jax.__version__} on {platform.machine()}, {os.cpu_count()} cores\n{header}")
     for part in chosen.parts:

@@ -46,10 +46,16 @@ except ValueError as error:  # a task that cannot be done is an answer too
 print(json.dumps({"seconds": time.perf_counter() - begin, "programs": count[0]}))
 """
 _TARGETS = {
-    "optimal_satisfaction, co-safe": 0.8, "optimal_satisfaction, parity": 0.8,
-    "satisfaction_probability": 0.8, "winning_region": 0.1, "verify": 0.1,
-    "permissive_strategy": 0.1, "end_components": 0.1, "minimax_value": 0.8,
-    "optimal_value": None, "soft_value": None,
+    "optimal_satisfaction, co-safe": 0.8,
+    "optimal_satisfaction, parity": 0.8,
+    "satisfaction_probability": 0.8,
+    "winning_region": 0.1,
+    "verify": 0.1,
+    "permissive_strategy": 0.1,
+    "end_components": 0.1,
+    "minimax_value": 0.8,
+    "optimal_value": None,
+    "soft_value": None,
 }
 
 
@@ -59,10 +65,19 @@ def run() -> list[dict[str, Any]]:
     for name, target in _TARGETS.items():
         for cells in (25, 400):
             done = subprocess.run(
-                [sys.executable, "-c", _PROGRAM, name, str(cells)], capture_output=True,
-                text=True, check=True)
+                [sys.executable, "-c", _PROGRAM, name, str(cells)],
+                capture_output=True,
+                text=True,
+                check=True,
+            )
             found = json.loads(done.stdout.splitlines()[-1])
-            rows.append({
-                "name": f"{name}, {cells} cells", "peer": f"{found['programs']} programs",
-                "ratio": found["seconds"], "target": target, **found})
+            rows.append(
+                {
+                    "name": f"{name}, {cells} cells",
+                    "peer": f"{found['programs']} programs",
+                    "ratio": found["seconds"],
+                    "target": target,
+                    **found,
+                }
+            )
     return rows

@@ -53,8 +53,15 @@ CHUNK = 10  # steps of the learner
 def hparams(chunks: int) -> ppo.Hparams:
     """Of PPO, whose learning rate falls to a tenth."""
     return ppo.Hparams(
-        discount=0.98, learning_rate=Linear(1e-3, 1e-4, CHUNK * chunks), entropy_weight=0.003,
-        num_envs=256, num_steps=64, num_epochs=3, num_minibatches=8, num_resets=2048)
+        discount=0.98,
+        learning_rate=Linear(1e-3, 1e-4, CHUNK * chunks),
+        entropy_weight=0.003,
+        num_envs=256,
+        num_steps=64,
+        num_epochs=3,
+        num_minibatches=8,
+        num_resets=2048,
+    )
 
 
 def events_in(environment: Environment, cells: int = 400) -> np.ndarray:
@@ -73,35 +80,51 @@ def problems(world: Environment, events: np.ndarray, depth: int = DEPTH) -> list
     """
     actions: Any = world.actions
     acts: dict[str, Any] = (
-        {"num_actions": actions.num} if isinstance(actions, Finite) else {"shape": actions.shape})
+        {"num_actions": actions.num} if isinstance(actions, Finite) else {"shape": actions.shape}
+    )
     network = many_tasks.SequenceNetwork(
-        **acts, hidden=(128, 128), embedding=24, detailed=2, by_name=True,
-        events_seen=events_around(world, events))
+        **acts,
+        hidden=(128, 128),
+        embedding=24,
+        detailed=2,
+        by_name=True,
+        events_seen=events_around(world, events),
+    )
     single = np.eye(len(events), dtype=bool)[events.any(1)]
     sets = np.unique(np.concatenate([proposition_sets(events), single]), axis=0)
     found = []
     for longest in range(1, depth + 1):
         length = (np.arange(depth) < longest).astype(float)
         sampler = sequence_sampler(length, [0.75, 0.25], [0.3, 0.3, 0.25, 0.15], sets)
-        found.append(ppo.make_problem(
-            sequence_environment(world, events, sampler), network=network))
+        found.append(
+            ppo.make_problem(sequence_environment(world, events, sampler), network=network)
+        )
     return found
 
 
-def learn(
-    seed: int, chunks: int, enough: float, discrete: bool
-) -> tuple[Any, many_tasks.Staged]:
+def learn(seed: int, chunks: int, enough: float, discrete: bool) -> tuple[Any, many_tasks.Staged]:
     """The trained network of a seed, and how it was learned."""
     world = flat_world(discrete=discrete)
     stages = problems(world, events_in(world))
 
     def told(chunk: int, stage: int, metrics: Any) -> None:
-        print(f"  seed {seed}: {int(metrics.transitions[-1]):>10,} steps, stage {stage}, "
-              f"mean return {np.nanmean(metrics.episode_return):.3f}", flush=True)
+        print(
+            f"  seed {seed}: {int(metrics.transitions[-1]):>10,} steps, stage {stage}, "
+            f"mean return {np.nanmean(metrics.episode_return):.3f}",
+            flush=True,
+        )
 
     found = many_tasks.train_in_stages(
-        jax.random.key(seed), stages, hparams(chunks), init=ppo.init, run=ppo.run,
-        num_chunks=chunks, num_steps=CHUNK, enough=enough, report=told)
+        jax.random.key(seed),
+        stages,
+        hparams(chunks),
+        init=ppo.init,
+        run=ppo.run,
+        num_chunks=chunks,
+        num_steps=CHUNK,
+        enough=enough,
+        report=told,
+    )
     return many_tasks.trained(stages[0].network, found.state.parameters), found
 
 
@@ -116,12 +139,19 @@ def judged(
     found = evaluate(
         jax.random.key(1000 + number),
         many_tasks.sequence_agent(network, plan, actions=world.actions),
-        task_environment(world, automaton), num_episodes=episodes)
+        task_environment(world, automaton),
+        num_episodes=episodes,
+    )
     told = found.success if finite else found.visits
     assert told is not None and found.violation is not None
-    return {"task": formula, "of": "success" if finite else "visits", "mean": told.mean,
-            "interval": [told.lower, told.upper], "violation": found.violation.mean,
-            "steps": found.length.mean}
+    return {
+        "task": formula,
+        "of": "success" if finite else "visits",
+        "mean": told.mean,
+        "interval": [told.lower, told.upper],
+        "violation": found.violation.mean,
+        "steps": found.length.mean,
+    }
 
 
 def main() -> None:
@@ -140,11 +170,13 @@ def main() -> None:
         network, run = learn(seed, given.chunks, given.enough, not given.box)
         cpu = time.process_time() - cpu
         steps = int(run.metrics[-1].transitions[-1])
-        print(f"seed {seed}: {steps:,} steps in {run.seconds[-1]:.0f} s, {cpu:.0f} CPU s, "
-              f"{steps / cpu:,.0f} a CPU second", flush=True)
+        print(
+            f"seed {seed}: {steps:,} steps in {run.seconds[-1]:.0f} s, {cpu:.0f} CPU s, "
+            f"{steps / cpu:,.0f} a CPU second",
+            flush=True,
+        )
         for number, formula in enumerate((*FINITE, *INFINITE)):
-            row = {"seed": seed, **judged(
-                network, formula, number, given.episodes, not given.box)}
+            row = {"seed": seed, **judged(network, formula, number, given.episodes, not given.box)}
             print("  " + json.dumps(row), flush=True)
             shares += [row["mean"]] if row["of"] == "success" else []
     print(f"mean success {np.mean(shares):.4f}, least {np.min(shares):.4f}")

@@ -45,8 +45,13 @@ def _row(name: str, target: float, repeats: int, job: Callable[[], Any]) -> dict
     first, _ = once(job)
     seconds = statistics.median(once(job)[0] for _ in range(repeats))
     return {
-        "name": name, "peer": "seconds asked for", "compile_seconds": max(first - seconds, 0.0),
-        "seconds": seconds, "peer_seconds": target, "ratio": seconds / target, "target": 1.0,
+        "name": name,
+        "peer": "seconds asked for",
+        "compile_seconds": max(first - seconds, 0.0),
+        "seconds": seconds,
+        "peer_seconds": target,
+        "ratio": seconds / target,
+        "target": 1.0,
     }
 
 
@@ -59,14 +64,22 @@ def run(states: int = 1_000_000) -> list[dict[str, Any]]:
     with jax.enable_x64(True):  # single precision certifies 1e-4 at values of 10
         large = synthesize(30).model
         reward = diagonal_reward(large)
-        rows.append(_row(
-            "robots, N = 30: exact value to 1e-6", 30.0, 3,
-            lambda: check(minimax_value(large, reward, 0.9, per="system_move", tolerance=1e-6)),
-        ))
+        rows.append(
+            _row(
+                "robots, N = 30: exact value to 1e-6",
+                30.0,
+                3,
+                lambda: check(minimax_value(large, reward, 0.9, per="system_move", tolerance=1e-6)),
+            )
+        )
     game = random_game(states)
     accepting = jnp.asarray(np.random.default_rng(1).random(states) < 0.01)
-    rows.append(_row(
-        f"random stochastic Buchi game, {states} states", 10.0, 3,
-        lambda: winning_region(game, buchi(game, accepting)),
-    ))
+    rows.append(
+        _row(
+            f"random stochastic Buchi game, {states} states",
+            10.0,
+            3,
+            lambda: winning_region(game, buchi(game, accepting)),
+        )
+    )
     return rows

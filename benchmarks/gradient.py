@@ -81,25 +81,36 @@ def run() -> list[dict[str, Any]]:
             exact = exact_gradient(weights, given, hparams)
             scale = jnp.max(jnp.abs(exact))
             for num_steps in (25, 50, 75, 100, 150, 200, 300, 400, 600, 800, 1200):
-                peer = partial(unrolled_gradient, weights, given, hparams,
-                               num_steps=num_steps, damping=damping)
+                peer = partial(
+                    unrolled_gradient, weights, given, hparams, num_steps=num_steps, damping=damping
+                )
                 error = float(jnp.max(jnp.abs(peer() - exact)) / scale)
                 if error < 1e-9:
                     break
             nearby = mlirl.solve(weights * 1.01, given, hparams).value
             for start, initial in (("cold", None), ("as in training", nearby)):
                 ours = partial(exact_gradient, weights, given, hparams, initial)
-                rows.append({
-                    "name": f"likelihood gradient, discount {discount}, {start}",
-                    "states": given.model.num_states,
-                    "peer": f"unrolled, {num_steps} steps", "error": error,
-                    "target": 1 / 5, **compare(ours, peer, repeats=21),
-                    "temporary_bytes": _temporary_bytes(
-                        exact_gradient, weights, given, hparams, initial),
-                    "peer_temporary_bytes": _temporary_bytes(
-                        unrolled_gradient, weights, given, hparams,
-                        num_steps=num_steps, damping=damping),
-                })
+                rows.append(
+                    {
+                        "name": f"likelihood gradient, discount {discount}, {start}",
+                        "states": given.model.num_states,
+                        "peer": f"unrolled, {num_steps} steps",
+                        "error": error,
+                        "target": 1 / 5,
+                        **compare(ours, peer, repeats=21),
+                        "temporary_bytes": _temporary_bytes(
+                            exact_gradient, weights, given, hparams, initial
+                        ),
+                        "peer_temporary_bytes": _temporary_bytes(
+                            unrolled_gradient,
+                            weights,
+                            given,
+                            hparams,
+                            num_steps=num_steps,
+                            damping=damping,
+                        ),
+                    }
+                )
         rows.append(_network_row(given, weights))
     return rows
 
@@ -118,7 +129,9 @@ def _network_row(given: mlirl.Problem, weights) -> dict[str, Any]:
     once(lambda: forward(start))
     return {
         "name": f"likelihood gradient, network of {count} weights",
-        "states": given.model.num_states, "peer": "five features", "target": 1.5,
+        "states": given.model.num_states,
+        "peer": "five features",
+        "target": 1.5,
         "network_alone_seconds": min(once(lambda: forward(start))[0] for _ in range(11)),
         **compare(ours, peer, repeats=21),
     }

@@ -28,14 +28,14 @@ REPEATS = 2
 LANES = 1000
 
 
-def _intervals(
-    rng: Any, probability: Any, entry_start: Any, share: float
-) -> tuple[Any, Any]:
+def _intervals(rng: Any, probability: Any, entry_start: Any, share: float) -> tuple[Any, Any]:
     """Intervals around distributions, up to a share of each probability wide on either side."""
     below, above = share * rng.random((2, probability.size))
     sure = np.repeat(np.diff(entry_start) == 1, np.diff(entry_start))
-    return (np.where(sure, 1, probability * (1 - below)),
-            np.where(sure, 1, np.minimum(probability * (1 + above), 1)))
+    return (
+        np.where(sure, 1, probability * (1 - below)),
+        np.where(sure, 1, np.minimum(probability * (1 + above), 1)),
+    )
 
 
 def _model(
@@ -49,8 +49,14 @@ def _model(
     probability = np.array([p for row in flat for _, p in row])
     lower, upper = _intervals(rng, probability, entry_start, share)
     return interval_rows(
-        row_start, entry_start, successor, lower, upper,
-        initial=np.arange(len(rows)) == 0, label={"goal": np.flatnonzero(goal)})
+        row_start,
+        entry_start,
+        successor,
+        lower,
+        upper,
+        initial=np.arange(len(rows)) == 0,
+        label={"goal": np.flatnonzero(goal)},
+    )
 
 
 def _joined(row: list[tuple[int, float]]) -> list[tuple[int, float]]:
@@ -76,9 +82,14 @@ def grid(size: int, rng: Any) -> IntervalMDP:
             if trap[i, j] or i == j == n - 1:
                 rows.append([[(i * n + j, 1.0)]])
                 continue
-            rows.append([
-                _joined([(to[a], 0.798), (to[a - 1], 0.1), (to[(a + 1) % 4], 0.1), (n * n, 0.002)])
-                for a in range(4)])
+            rows.append(
+                [
+                    _joined(
+                        [(to[a], 0.798), (to[a - 1], 0.1), (to[(a + 1) % 4], 0.1), (n * n, 0.002)]
+                    )
+                    for a in range(4)
+                ]
+            )
     rows.append([[(n * n, 1.0)]])
     return _model(rng, rows, np.arange(n * n + 1) == n * n - 1)
 
@@ -115,18 +126,31 @@ def random_graph(size: int, rng: Any) -> IntervalMDP:
         if end[s]:
             rows.append([[(s, 1.0)]])
             continue
-        rows.append([
-            _joined([(int(rng.choice(ends)), 0.02), *zip(
-                rng.integers(size, size=4).tolist(),
-                (0.98 * rng.dirichlet(np.ones(4))).tolist(), strict=True)])
-            for _ in range(2)])
+        rows.append(
+            [
+                _joined(
+                    [
+                        (int(rng.choice(ends)), 0.02),
+                        *zip(
+                            rng.integers(size, size=4).tolist(),
+                            (0.98 * rng.dirichlet(np.ones(4))).tolist(),
+                            strict=True,
+                        ),
+                    ]
+                )
+                for _ in range(2)
+            ]
+        )
     goal = end & (rng.random(size) < 0.5)
     goal[-1] = True
     return _model(rng, rows, goal)
 
 
 FAMILIES: dict[str, Callable[[int, Any], IntervalMDP]] = {
-    "grid": grid, "queues": queues, "random graph": random_graph}
+    "grid": grid,
+    "queues": queues,
+    "random graph": random_graph,
+}
 
 
 def storm(model: Any, text: str, cooperative: bool) -> tuple[float, float]:
@@ -137,8 +161,11 @@ def storm(model: Any, text: str, cooperative: bool) -> tuple[float, float]:
     mode = stormpy.UncertaintyResolutionMode
     begin = time.process_time()
     result = stormpy.model_checking(
-        model, prop, only_initial_states=True,
-        uncertainty_resolution_mode=mode.COOPERATIVE if cooperative else mode.ROBUST)
+        model,
+        prop,
+        only_initial_states=True,
+        uncertainty_resolution_mode=mode.COOPERATIVE if cooperative else mode.ROBUST,
+    )
     seconds = time.process_time() - begin
     return float(result.get_value(next(iter(model.initial_states)))), seconds
 
@@ -164,11 +191,20 @@ def measure(name: str, size: int, folder: Path, objectives: tuple[str, ...] = ("
                 value, seconds = storm(peer, f'P{objective}=? [F "goal"]', objective == nature)
                 theirs.append(seconds)
             yield {
-                "model": name, "states": model.num_states, "transitions": model.num_transitions,
-                "policy": objective, "nature": nature, "ours": min(ours), "storm": min(theirs),
-                "status": Status(int(found.status)).name, "lower": float(found.lower[0]),
-                "upper": float(found.upper[0]), "peer": value, "rounds": int(found.num_steps),
-                "method": str(found.method)}
+                "model": name,
+                "states": model.num_states,
+                "transitions": model.num_transitions,
+                "policy": objective,
+                "nature": nature,
+                "ours": min(ours),
+                "storm": min(theirs),
+                "status": Status(int(found.status)).name,
+                "lower": float(found.lower[0]),
+                "upper": float(found.upper[0]),
+                "peer": value,
+                "rounds": int(found.num_steps),
+                "method": str(found.method),
+            }
 
 
 def prepared() -> None:
@@ -181,8 +217,10 @@ def prepared() -> None:
     rng = np.random.default_rng(0)
     model = random_graph(100, rng)
     chance, start = np.asarray(model.nominal.probability), np.asarray(model.nominal.entry_start)
-    lower, upper = (np.stack(x) for x in zip(
-        *(_intervals(rng, chance, start, 0.3) for _ in range(LANES)), strict=True))
+    lower, upper = (
+        np.stack(x)
+        for x in zip(*(_intervals(rng, chance, start, 0.3) for _ in range(LANES)), strict=True)
+    )
     target = model.states_where("goal")
     for nature in ("min", "max"):
         question = prepare_interval(model, target, nature=nature)
@@ -200,8 +238,10 @@ def prepared() -> None:
             robust_reachability(model.replace(lower=a, upper=b), target, nature=nature)
         clock.append(time.process_time())
         batch, loop, host = np.diff(clock)
-        print(f"nature {nature}: one call {batch:.2f} s, a loop over it {loop:.2f} s, a loop over "
-              f"the host's engine {host * LANES / few:.1f} s, statuses {np.bincount(found.status)}")
+        print(
+            f"nature {nature}: one call {batch:.2f} s, a loop over it {loop:.2f} s, a loop over "
+            f"the host's engine {host * LANES / few:.1f} s, statuses {np.bincount(found.status)}"
+        )
 
 
 def main() -> None:
@@ -215,19 +255,24 @@ def main() -> None:
     if chosen.prepared:
         prepared()
         return
-    print(f"{'model':<14}{'states':>8}{'policy':>7}{'nature':>7}{'ours s':>9}{'storm s':>9}"
-          f"{'ratio':>7}  status [lower, upper] storm")
+    print(
+        f"{'model':<14}{'states':>8}{'policy':>7}{'nature':>7}{'ours s':>9}{'storm s':>9}"
+        f"{'ratio':>7}  status [lower, upper] storm"
+    )
     with TemporaryDirectory() as folder:
         for name in FAMILIES:
             if chosen.only not in name:
                 continue
             for size in chosen.sizes:
                 for row in measure(name, size, Path(folder), tuple(chosen.objectives)):
-                    print(f"{row['model']:<14}{row['states']:>8}{row['policy']:>7}"
-                          f"{row['nature']:>7}{row['ours']:9.3f}{row['storm']:9.3f}"
-                          f"{row['ours'] / row['storm']:7.2f}  {row['status']} "
-                          f"[{row['lower']:.7g}, {row['upper']:.7g}] {row['peer']:.7g} "
-                          f"{row['rounds']} {row['method']}", flush=True)
+                    print(
+                        f"{row['model']:<14}{row['states']:>8}{row['policy']:>7}"
+                        f"{row['nature']:>7}{row['ours']:9.3f}{row['storm']:9.3f}"
+                        f"{row['ours'] / row['storm']:7.2f}  {row['status']} "
+                        f"[{row['lower']:.7g}, {row['upper']:.7g}] {row['peer']:.7g} "
+                        f"{row['rounds']} {row['method']}",
+                        flush=True,
+                    )
 
 
 if __name__ == "__main__":

@@ -49,37 +49,56 @@ def _solver_cases(model: Any, name: str) -> Iterator[Case]:
     policy = jax.nn.softmax(reward, axis=-1)
     for discount in (0.9, 0.99):
         at = f"{name}, discount {discount}"
-        yield Case(f"policy_value, {at}", lambda x, d=discount: jl.policy_value(
-            model, x[1], x[0], d), (reward, policy), 0.5)
-        yield Case(f"optimal_value, {at}", lambda x, d=discount: jl.optimal_value(
-            model, x, d), reward, 0.5)
+        yield Case(
+            f"policy_value, {at}",
+            lambda x, d=discount: jl.policy_value(model, x[1], x[0], d),
+            (reward, policy),
+            0.5,
+        )
+        yield Case(
+            f"optimal_value, {at}", lambda x, d=discount: jl.optimal_value(model, x, d), reward, 0.5
+        )
         for method in ("newton", "value_iteration"):
-            yield Case(f"soft_value, {method}, {at}", lambda x, d=discount, m=method: jl.soft_value(
-                model, x, d, method=m), reward, 0.5)
-        yield Case(f"boltzmann_value, {at}", lambda x, d=discount: jl.boltzmann_value(
-            model, x, d), reward)
-        yield Case(f"occupancy_measure, {at}", lambda x, d=discount: jl.occupancy_measure(
-            model, x, d), policy)
-        yield Case(f"minimax_value, {at}", lambda x, d=discount: jl.minimax_value(
-            model, x, d), reward)
+            yield Case(
+                f"soft_value, {method}, {at}",
+                lambda x, d=discount, m=method: jl.soft_value(model, x, d, method=m),
+                reward,
+                0.5,
+            )
+        yield Case(
+            f"boltzmann_value, {at}", lambda x, d=discount: jl.boltzmann_value(model, x, d), reward
+        )
+        yield Case(
+            f"occupancy_measure, {at}",
+            lambda x, d=discount: jl.occupancy_measure(model, x, d),
+            policy,
+        )
+        yield Case(
+            f"minimax_value, {at}", lambda x, d=discount: jl.minimax_value(model, x, d), reward
+        )
     target = jnp.arange(model.num_states).reshape(model.state_shape) % 97 == 5
-    yield Case(f"reachability of a policy, {name}", lambda x: jl.reachability_probability(
-        model, target, policy=x), policy)
+    yield Case(
+        f"reachability of a policy, {name}",
+        lambda x: jl.reachability_probability(model, target, policy=x),
+        policy,
+    )
 
 
 def _task_cases(model: Any, name: str) -> Iterator[Case]:
     rng = np.random.default_rng(1)
     shape = (*model.state_shape, model.num_actions)
     policy = jax.nn.softmax(3 * rng.normal(size=(_LANES, *shape)), axis=-1)
-    yield Case(f"satisfaction_probability, {name}", lambda x: jl.satisfaction_probability(
-        model, x), policy)
+    yield Case(
+        f"satisfaction_probability, {name}", lambda x: jl.satisfaction_probability(model, x), policy
+    )
     yield Case(f"task_performance, {name}", lambda x: jl.task_performance(model, x), policy)
     slip = jnp.linspace(0.02, 0.3, _LANES)
     probability = model.mdp.probability
 
     def slippery(slip):
         mixed = (1 - slip) * probability + slip * jnp.where(
-            probability > 0, 1 / jnp.sum(probability > 0, -1, keepdims=True), 0)
+            probability > 0, 1 / jnp.sum(probability > 0, -1, keepdims=True), 0
+        )
         world = model.mdp.replace(probability=mixed)
         return jl.optimal_satisfaction(model.replace(mdp=world))
 
@@ -99,7 +118,8 @@ def mlirl_case(model: Any, num_steps: int = 10) -> Case:
 
     def train(lane):
         return mlirl.train(
-            lane[0], problem, mlirl.Hparams(discount=0.9, mu=lane[1]), num_steps=num_steps)
+            lane[0], problem, mlirl.Hparams(discount=0.9, mu=lane[1]), num_steps=num_steps
+        )
 
     return Case(f"mlirl.train, {num_steps} steps, mu", train, lanes)
 
@@ -116,11 +136,16 @@ def measure(case: Case, repeats: int = 5) -> dict[str, Any]:
     end = time.perf_counter()
     lanes = [jax.tree.map(lambda x, i=i: x[i], case.lanes) for i in range(_LANES)]
     row = compare(
-        partial(many, case.lanes), lambda: [jax.block_until_ready(one(x)) for x in lanes],
-        repeats=repeats)
+        partial(many, case.lanes),
+        lambda: [jax.block_until_ready(one(x)) for x in lanes],
+        repeats=repeats,
+    )
     row["compile_seconds"] = end - middle
     return {
-        "name": case.name, "peer": "loop of 8", "target": case.target, **row,
+        "name": case.name,
+        "peer": "loop of 8",
+        "target": case.target,
+        **row,
         "compile_ratio": (end - middle) / (middle - begin),
         "peer_compile_seconds": middle - begin,
     }

@@ -41,7 +41,8 @@ INFINITE = (  # the first two are theirs
 )
 DEPTH = 6
 HPARAMS = ppo.Hparams(
-    discount=0.94, learning_rate=5e-4, num_envs=256, num_steps=64, num_epochs=3, num_minibatches=8)
+    discount=0.94, learning_rate=5e-4, num_envs=256, num_steps=64, num_epochs=3, num_minibatches=8
+)
 CHUNK = 10  # steps of the learner
 
 
@@ -54,9 +55,11 @@ def problems(depth: int = DEPTH) -> list[ppo.Problem]:
     for longest in (1, 2, 3, 4, depth):
         length = (np.arange(depth) < longest).astype(float)
         sampler = sequence_sampler(
-            length, [0.7, 0.2, 0.05, 0.05], [0.3, 0.25, 0.25, 0.1, 0.1], events.any(1))
-        found.append(ppo.make_problem(
-            sequence_environment(world, events, sampler), network=network))
+            length, [0.7, 0.2, 0.05, 0.05], [0.3, 0.25, 0.25, 0.1, 0.1], events.any(1)
+        )
+        found.append(
+            ppo.make_problem(sequence_environment(world, events, sampler), network=network)
+        )
     return found
 
 
@@ -65,12 +68,22 @@ def learn(seed: int, chunks: int) -> tuple[Any, many_tasks.Staged]:
     stages = problems()
 
     def told(chunk: int, stage: int, metrics: Any) -> None:
-        print(f"  seed {seed}: {int(metrics.transitions[-1]):>9,} steps, stage {stage}, "
-              f"mean return {np.nanmean(metrics.episode_return):.3f}", flush=True)
+        print(
+            f"  seed {seed}: {int(metrics.transitions[-1]):>9,} steps, stage {stage}, "
+            f"mean return {np.nanmean(metrics.episode_return):.3f}",
+            flush=True,
+        )
 
     found = many_tasks.train_in_stages(
-        jax.random.key(seed), stages, HPARAMS, init=ppo.init, run=ppo.run, num_chunks=chunks,
-        num_steps=CHUNK, report=told)
+        jax.random.key(seed),
+        stages,
+        HPARAMS,
+        init=ppo.init,
+        run=ppo.run,
+        num_chunks=chunks,
+        num_steps=CHUNK,
+        report=told,
+    )
     return many_tasks.trained(stages[0].network, found.state.parameters), found
 
 
@@ -89,27 +102,39 @@ def gaps(network: Any, automaton: Any, table: Any) -> dict[str, float]:
     """The certified optimum and the agent's gap to it, over maps and all their beginnings."""
     world = letter_world()
     plan = many_tasks.make_plan(
-        automaton, events_of(world.propositions), world.propositions, depth=DEPTH)
+        automaton, events_of(world.propositions), world.propositions, depth=DEPTH
+    )
     policy = Partial(many_tasks.sequence_policy, network, plan)
     acts = tabulate_policy(policy, world, table, len(automaton.delta))
     found = optimality_gap(table, automaton, acts)
-    return {"optimum": found.mean_optimum[0], "gap": found.mean[1],
-            "largest gap": float(found.upper.max()),
-            "width": found.mean[1] - found.mean[0], "beginnings": len(found.start)}
+    return {
+        "optimum": found.mean_optimum[0],
+        "gap": found.mean[1],
+        "largest gap": float(found.upper.max()),
+        "width": found.mean[1] - found.mean[0],
+        "beginnings": len(found.start),
+    }
 
 
 def visited(network: Any, formula: str, number: int, episodes: int) -> dict[str, Any]:
     """How often an infinite task is accepted within 1,000 steps."""
     world, automaton = letter_world(horizon=1000), to_automaton(formula)
     plan = many_tasks.make_plan(
-        automaton, events_of(world.propositions), world.propositions, depth=DEPTH)
+        automaton, events_of(world.propositions), world.propositions, depth=DEPTH
+    )
     found = evaluate(
-        jax.random.key(2000 + number), many_tasks.sequence_agent(network, plan),
-        task_environment(world, automaton), num_episodes=episodes)
+        jax.random.key(2000 + number),
+        many_tasks.sequence_agent(network, plan),
+        task_environment(world, automaton),
+        num_episodes=episodes,
+    )
     assert found.visits is not None and found.violation is not None
-    return {"task": formula, "visits": found.visits.mean,
-            "interval": [found.visits.lower, found.visits.upper],
-            "violation": [found.violation.lower, found.violation.mean, found.violation.upper]}
+    return {
+        "task": formula,
+        "visits": found.visits.mean,
+        "interval": [found.visits.lower, found.visits.upper],
+        "violation": [found.violation.lower, found.violation.mean, found.violation.upper],
+    }
 
 
 def main() -> None:
@@ -131,17 +156,28 @@ def main() -> None:
         network, run = learn(seed, given.chunks)
         cpu = time.process_time() - cpu
         steps = int(run.metrics[-1].transitions[-1])
-        print(f"seed {seed}: {steps:,} steps in {run.seconds[-1]:.0f} s, {cpu:.0f} CPU s, "
-              f"{steps / cpu:,.0f} a CPU second", flush=True)
+        print(
+            f"seed {seed}: {steps:,} steps in {run.seconds[-1]:.0f} s, {cpu:.0f} CPU s, "
+            f"{steps / cpu:,.0f} a CPU second",
+            flush=True,
+        )
         for number, formula in enumerate(TASKS):
             automaton = to_automaton(formula)
             plan = many_tasks.make_plan(automaton, events, world.propositions, depth=DEPTH)
             found = evaluate(
-                jax.random.key(1000 + number), many_tasks.sequence_agent(network, plan),
-                task_environment(world, automaton), num_episodes=given.episodes)
-            row = {"seed": seed, "task": formula, "success": found.success.mean,
-                   "interval": [found.success.lower, found.success.upper],
-                   "violation": found.violation.mean, "steps": found.length.mean}
+                jax.random.key(1000 + number),
+                many_tasks.sequence_agent(network, plan),
+                task_environment(world, automaton),
+                num_episodes=given.episodes,
+            )
+            row = {
+                "seed": seed,
+                "task": formula,
+                "success": found.success.mean,
+                "interval": [found.success.lower, found.success.upper],
+                "violation": found.violation.mean,
+                "steps": found.length.mean,
+            }
             if given.layouts:
                 begin = time.perf_counter()
                 row |= gaps(network, automaton, table)

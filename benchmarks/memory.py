@@ -51,8 +51,14 @@ def large_product(num_states: int) -> Product:
     kinds = np.random.default_rng(2).integers(0, 64, num_states)
     names = tuple(f"g{i}" for i in range(8))
     label = kinds[:, None] == np.arange(8)
-    world = MDP(world.successor, world.probability, world.available, world.initial,
-                jnp.asarray(label), names)
+    world = MDP(
+        world.successor,
+        world.probability,
+        world.available,
+        world.initial,
+        jnp.asarray(label),
+        names,
+    )
     formula = "F (g0 & F (g1 & F (g2 & F (g3 & F (g4 & F (g5 & F (g6 & F g7)))))))"
     task = to_automaton(f"X {formula}", letters=letters_of(world))
     return product(world, task)
@@ -80,8 +86,12 @@ def child(case: str, num_states: int) -> dict[str, Any]:
     arrays = _bytes(model) + (0 if reward is None else _bytes(reward))
     # What the solver added at its peak, plus the arrays that it was given.
     peak = max(_peak() - before, 0) + arrays
-    result = {"peak_bytes": peak, "model_bytes": arrays, "status": int(solution.status),
-              "value_bytes": int(solution.value.nbytes)}
+    result = {
+        "peak_bytes": peak,
+        "model_bytes": arrays,
+        "status": int(solution.status),
+        "value_bytes": int(solution.value.nbytes),
+    }
     if case == "product":
         begin = time.perf_counter()
         jax.block_until_ready(solve())
@@ -102,10 +112,16 @@ def run(num_states: int) -> list[dict[str, Any]]:
         done = subprocess.run(command, check=True, capture_output=True, text=True)
         result = json.loads(done.stdout.splitlines()[-1])
         ratio = result["peak_bytes"] / result["model_bytes"]
-        rows.append({
-            "name": f"peak memory, {case}", "states": num_states, "peer": "the model's arrays",
-            "ratio": ratio, "target": 3.0 if case != "product" else None, **result,
-        })
+        rows.append(
+            {
+                "name": f"peak memory, {case}",
+                "states": num_states,
+                "peer": "the model's arrays",
+                "ratio": ratio,
+                "target": 3.0 if case != "product" else None,
+                **result,
+            }
+        )
     return rows
 
 

@@ -36,6 +36,7 @@ def strip(columns: int, num_states: int) -> Callable[[int, int], jl.ModelPart]:
 
     A state's number alone says what it is, so that any part can be made anywhere.
     """
+
     def part(start: int, stop: int) -> jl.ModelPart:
         state = np.arange(start, stop, dtype=np.int64)
         noise = _mixed(state)
@@ -45,15 +46,20 @@ def strip(columns: int, num_states: int) -> Callable[[int, int], jl.ModelPart]:
         ahead = (state[:, None] + moves) % num_states
         ahead[still] = state[still, None]
         share = 0.1 + (_mixed(state + num_states) % 1000) / 2000  # 0.1 to 0.6
-        first = np.stack([share, 0.8 - share, *[np.full(state.size, x) for x in (0.1, 0.05, 0.05)]],
-                         1)
+        first = np.stack(
+            [share, 0.8 - share, *[np.full(state.size, x) for x in (0.1, 0.05, 0.05)]], 1
+        )
         probability = np.stack([first, first[:, [2, 3, 0, 1, 4]]], 1)
         successor = np.broadcast_to(ahead[:, None], probability.shape)
         earned = (noise // 20 % 1000) / 1000
         return jl.ModelPart(
-            np.arange(0, successor.size + 1, _WIDTH), successor.ravel(), probability.ravel(),
-            np.arange(0, _ACTIONS * state.size + 1, _ACTIONS), label=(kind == 0)[:, None],
-            rewards={"earned": np.repeat(earned, _ACTIONS)})
+            np.arange(0, successor.size + 1, _WIDTH),
+            successor.ravel(),
+            probability.ravel(),
+            np.arange(0, _ACTIONS * state.size + 1, _ACTIONS),
+            label=(kind == 0)[:, None],
+            rewards={"earned": np.repeat(earned, _ACTIONS)},
+        )
 
     return part
 
@@ -69,8 +75,13 @@ def scattered(num_states: int) -> Callable[[int, int], jl.ModelPart]:
         own = np.repeat(np.arange(start, stop), _ACTIONS * _WIDTH)
         stays = _mixed(own) % 20 <= 2
         return jl.ModelPart(
-            found.entry_start, np.where(stays, own, anywhere), found.probability, found.row_start,
-            label=found.label, rewards=found.rewards)
+            found.entry_start,
+            np.where(stays, own, anywhere),
+            found.probability,
+            found.row_start,
+            label=found.label,
+            rewards=found.rewards,
+        )
 
     return part
 
@@ -87,7 +98,8 @@ def questions(model: Any, reward: Any, goal: Any) -> dict[str, Callable[[], Any]
     """Certified solves; each returns a solution."""
     return {
         "discounted": lambda: jl.optimal_value(
-            model, reward, 0.95, method="value_iteration", tolerance=5e-3),
+            model, reward, 0.95, method="value_iteration", tolerance=5e-3
+        ),
         "reachability": lambda: jl.reachability_probability(model, goal, tolerance=5e-3),
     }
 
@@ -108,9 +120,13 @@ def measure(part: Any, num_states: int, num_devices: int, repeats: int = 3) -> d
         first, solution = once(ask)
         seconds = min(once(ask)[0] for _ in range(repeats))
         found[name] = {
-            "seconds": seconds, "first": first, "steps": int(solution.num_steps),
-            "a_step": seconds / int(solution.num_steps), "status": int(solution.status),
-            "width": float(jnp.max(solution.upper - solution.lower))}
+            "seconds": seconds,
+            "first": first,
+            "steps": int(solution.num_steps),
+            "a_step": seconds / int(solution.num_steps),
+            "status": int(solution.status),
+            "width": float(jnp.max(solution.upper - solution.lower)),
+        }
     if num_devices:
         found["exchanged"] = given[0].num_exchanged
     return found
@@ -120,8 +136,11 @@ def _padded(part: Any, num_states: int) -> tuple[Any, Any, Any]:
     whole = part(0, num_states)
     shape = (num_states, _ACTIONS, _WIDTH)
     model = jl.make_mdp(
-        whole.successor.reshape(shape), whole.probability.reshape(shape), label=whole.label,
-        propositions=("goal",))
+        whole.successor.reshape(shape),
+        whole.probability.reshape(shape),
+        label=whole.label,
+        propositions=("goal",),
+    )
     reward = whole.rewards["earned"].reshape(shape[:2]).astype(np.float32)
     return model, jax.device_put(reward), model.label[:, 0]
 
@@ -146,21 +165,25 @@ def _of_process(num_states: int, place: str) -> None:
     jax.distributed.initialize(f"127.0.0.1:{port}", processes, process)
     mesh = jax.make_mesh((jax.device_count(),), ("states",))
     begin = time.perf_counter()
-    model = jl.model_from_parts(
-        strip(1000, num_states), num_states, mesh, propositions=("goal",))
+    model = jl.model_from_parts(strip(1000, num_states), num_states, mesh, propositions=("goal",))
     told: dict[str, Any] = {
-        "process": process, "transitions": num_states * _ACTIONS * _WIDTH,
+        "process": process,
+        "transitions": num_states * _ACTIONS * _WIDTH,
         "made_seconds": time.perf_counter() - begin,
-        "bytes_a_device": sum(piece.data.nbytes for x in jax.tree.leaves(model)
-                              for piece in x.addressable_shards),
-        "exchanged": model.num_exchanged}
+        "bytes_a_device": sum(
+            piece.data.nbytes for x in jax.tree.leaves(model) for piece in x.addressable_shards
+        ),
+        "exchanged": model.num_exchanged,
+    }
     for name, ask in questions(*_asked_of(model)).items():
         seconds, solution = once(ask)
         told[name] = {
-            "seconds": seconds, "steps": int(on_host(solution.num_steps)),
+            "seconds": seconds,
+            "steps": int(on_host(solution.num_steps)),
             "status": int(on_host(solution.status)),
             "width": float(on_host(jax.jit(lambda s: jnp.max(s.upper - s.lower))(solution))),
-            "mean": float(on_host(jax.jit(jnp.mean)(solution.value)))}
+            "mean": float(on_host(jax.jit(jnp.mean)(solution.value))),
+        }
     told["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(json.dumps(told), flush=True)
     jax.distributed.shutdown()
@@ -185,12 +208,20 @@ def main() -> None:
     print(f"jax {jax.__version__}, {os.cpu_count()} cores, load {load}")
     for name, part in (("strip", strip(400, asked.states)), ("random", scattered(asked.states))):
         for devices in (0, *_DEVICES):
-            print(json.dumps({"model": name, "states": asked.states,
-                              **measure(part, asked.states, devices)}), flush=True)
+            print(
+                json.dumps(
+                    {"model": name, "states": asked.states, **measure(part, asked.states, devices)}
+                ),
+                flush=True,
+            )
     for devices in _DEVICES[1:]:  # weak scaling: as many states a device
         size = asked.states * devices
-        print(json.dumps({"model": "strip, weak", "states": size,
-                          **measure(strip(400, size), size, devices)}), flush=True)
+        print(
+            json.dumps(
+                {"model": "strip, weak", "states": size, **measure(strip(400, size), size, devices)}
+            ),
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

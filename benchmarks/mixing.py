@@ -55,8 +55,11 @@ def measure(name: str, solve: Callable[[], Any], *, relative: bool = False) -> A
     cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     lower, upper = np.asarray(found.lower), np.asarray(found.upper)
     width = (upper - lower) / np.maximum(upper if relative else 1, 1e-300)
-    print(f"{name:<44} {cpu:8.2f} {wall:8.2f} {int(found.num_steps):6d} {width.max():9.1e} "
-          f"{int(found.status)}", flush=True)
+    print(
+        f"{name:<44} {cpu:8.2f} {wall:8.2f} {int(found.num_steps):6d} {width.max():9.1e} "
+        f"{int(found.status)}",
+        flush=True,
+    )
     return found
 
 
@@ -69,16 +72,23 @@ def main() -> None:
     with jax.enable_x64(True):
         model, goal, ends = random_sparse(size)
         measure("sparse: largest probability", lambda: reachability_probability(model, goal))
-        measure("sparse: least expected steps", lambda: total_reward(
-            model, np.ones(model.num_rows), ends, objective="min"), relative=True)
+        measure(
+            "sparse: least expected steps",
+            lambda: total_reward(model, np.ones(model.num_rows), ends, objective="min"),
+            relative=True,
+        )
         padded, target = to_padded(model), jnp.asarray(goal)
         for name in ("with compilation", "padded"):
-            measure(f"{name}: largest probability", lambda: reachability_probability(
-                padded, target, tolerance=5e-7))
+            measure(
+                f"{name}: largest probability",
+                lambda: reachability_probability(padded, target, tolerance=5e-7),
+            )
     product = large_product(size)
     for objective in ("max", "min"):
-        measure(f"product, {objective}", lambda o=objective: optimal_satisfaction(
-            product, objective=o, tolerance=1e-4))
+        measure(
+            f"product, {objective}",
+            lambda o=objective: optimal_satisfaction(product, objective=o, tolerance=1e-4),
+        )
 
 
 if __name__ == "__main__":

@@ -74,7 +74,8 @@ def make_peer(world: navigation.Navigation, network: Any):
                         px = x + (c * offset[i, 0] - s * offset[i, 1])
                         py = y + (s * offset[i, 0] + c * offset[i, 1])
                         seen[i] = np.float32(inside(goal, px, py)) - np.float32(
-                            inside(obstacle, px, py))
+                            inside(obstacle, px, py)
+                        )
                     tx, ty = middle_x - x, middle_y - y
                     length = np.sqrt(tx * tx + ty * ty)
                     scale = np.float32(1) / length if length > 0 else np.float32(0)
@@ -113,29 +114,38 @@ def run(populations: tuple[int, ...] = (100, 500)) -> list[dict[str, Any]]:
     rows = []
     for size in populations:
         parameters = _SPREAD * jax.random.normal(
-            jax.random.key(0), (size, network.num_parameters), "float32")
+            jax.random.key(0), (size, network.num_parameters), "float32"
+        )
         keys = jax.random.split(jax.random.key(1), size)
-        states = jax.vmap(
-            lambda k: navigation.start_states(world, k, (_TRAJECTORIES,), "float32"))(keys)
+        states = jax.vmap(lambda k: navigation.start_states(world, k, (_TRAJECTORIES,), "float32"))(
+            keys
+        )
         starts = np.stack([np.asarray(x) for x in states], axis=-1)
         lists = jax.vmap(lambda p: layers(network, p))(parameters)
         weights = jax.tree.map(np.asarray, lists)
         steps = size * _TRAJECTORIES * world.horizon
         timed = compare(
-            partial(population, evaluate, parameters, keys), partial(peer, starts, weights),
+            partial(population, evaluate, parameters, keys),
+            partial(peer, starts, weights),
             repeats=15,
         )
         objective, cost = population(evaluate, parameters, keys)
         theirs = peer(starts, weights)
         # Where a sensor's point is on an edge, rounding may decide what a robot does.
         same = np.isclose(np.stack([objective, cost], -1), theirs, atol=1e-2).all(-1)
-        rows.append({
-            "name": f"navigation, {size} policies, {_TRAJECTORIES} trajectories each",
-            "peer": "numba, one thread", "states": size * _TRAJECTORIES, "steps": steps,
-            "steps_per_second": steps / timed["seconds"],
-            "peer_steps_per_second": steps / timed["peer_seconds"],
-            "agreeing": float(same.mean()), "target": 0.25, **timed,
-        })
+        rows.append(
+            {
+                "name": f"navigation, {size} policies, {_TRAJECTORIES} trajectories each",
+                "peer": "numba, one thread",
+                "states": size * _TRAJECTORIES,
+                "steps": steps,
+                "steps_per_second": steps / timed["seconds"],
+                "peer_steps_per_second": steps / timed["peer_seconds"],
+                "agreeing": float(same.mean()),
+                "target": 0.25,
+                **timed,
+            }
+        )
     return rows
 
 
@@ -144,10 +154,16 @@ def main() -> None:
     begin = time.perf_counter()
     rows = run()
     for row in rows:
-        print(f"{row['name']:<50} {row['steps_per_second'] / 1e6:8.2f} M/s "
-              f"{row['peer_steps_per_second'] / 1e6:8.2f} M/s {row['ratio']:7.3f}")
-    machine = {"cores": os.cpu_count(), "machine": platform.machine(), "jax": jax.__version__,
-               "total_seconds": time.perf_counter() - begin}
+        print(
+            f"{row['name']:<50} {row['steps_per_second'] / 1e6:8.2f} M/s "
+            f"{row['peer_steps_per_second'] / 1e6:8.2f} M/s {row['ratio']:7.3f}"
+        )
+    machine = {
+        "cores": os.cpu_count(),
+        "machine": platform.machine(),
+        "jax": jax.__version__,
+        "total_seconds": time.perf_counter() - begin,
+    }
     print(json.dumps({"machine": machine, "rows": rows}))
 
 

@@ -48,11 +48,25 @@ def write_layered(path: Path, layers: int, width: int, num_parameters: int) -> N
     """
     rng = np.random.default_rng(0)
     names = [f"p{d}" for d in range(num_parameters)]
-    lines = ["@type: DTMC", "@parameters", " ".join(names), "@reward_models", "dropped_packets",
-             "@nr_states", str(layers * width + 1), "@model", "state 0 [0] goal", "\taction 0",
-             "\t\t0 : 1"]
-    shares = {1: ["1"], 2: ["1/4", "3/4"], 3: ["1/4", "1/4", "1/2"],
-              4: ["2/25", "3/25", "8/25", "12/25"]}
+    lines = [
+        "@type: DTMC",
+        "@parameters",
+        " ".join(names),
+        "@reward_models",
+        "dropped_packets",
+        "@nr_states",
+        str(layers * width + 1),
+        "@model",
+        "state 0 [0] goal",
+        "\taction 0",
+        "\t\t0 : 1",
+    ]
+    shares = {
+        1: ["1"],
+        2: ["1/4", "3/4"],
+        3: ["1/4", "1/4", "1/2"],
+        4: ["2/25", "3/25", "8/25", "12/25"],
+    }
     for number in range(layers * width):
         layer, p = number // width, names[rng.integers(num_parameters)]
         kind = int(rng.integers(3))
@@ -78,19 +92,28 @@ def ours(path: Path, threshold: float, chosen: Any) -> tuple[dict[str, Any], Any
     problem = make_problem(model, "goal", reward=chosen.reward, bound="<=")
 
     def search(key: int, enough: int | None = None) -> Any:
-        return feasible(problem, threshold, starts=chosen.starts, key=jax.random.key(key),
-                        num_steps=chosen.steps, enough=enough)
+        return feasible(
+            problem,
+            threshold,
+            starts=chosen.starts,
+            key=jax.random.key(key),
+            num_steps=chosen.steps,
+            enough=enough,
+        )
 
     first, found = seconds(lambda: search(0))
     again = [seconds(lambda k=k: search(k)) for k in range(1, REPEATS + 1)]
     whole = min(x for x, _ in again)
     one = min(seconds(lambda k=k: search(k, 1))[0] for k in range(1, REPEATS + 1))
     return {
-        "states": model.model.num_states, "parameters": len(model.parameters),
+        "states": model.model.num_states,
+        "parameters": len(model.parameters),
         "proven": int(found.feasible.sum()),
         "least_proven": min(int(x.feasible.sum()) for _, x in again),
         "steps": [float(np.median(found.num_steps)), int(found.num_steps.max())],
-        "compile": first - whole, "all": whole, "one": one,
+        "compile": first - whole,
+        "all": whole,
+        "one": one,
     }, found
 
 
@@ -104,7 +127,8 @@ def storms(path: Path, threshold: float, chosen: Any) -> dict[str, Any]:
 
     def run() -> Any:
         return pars.check_feasibility(
-            model, asked, region_bound=chosen.margin, method=pars.FeasibilityMethod.GD)
+            model, asked, region_bound=chosen.margin, method=pars.FeasibilityMethod.GD
+        )
 
     begin, times = time.process_time(), [seconds(run)]
     while len(times) < REPEATS and time.process_time() - begin < PATIENCE:
@@ -127,7 +151,9 @@ def agreement(path: Path, found: Any, chosen: Any) -> int:
     for i in np.flatnonzero(found.feasible)[: chosen.checks]:
         point = {
             variables[name]: stormpy.numbers.RationalFunctionCoefficient(str(Fraction(x)))
-            for name, x in found.valuation(i).items() if name in variables}
+            for name, x in found.valuation(i).items()
+            if name in variables
+        }
         chain = exact.instantiate(point)
         result = stormpy.model_checking(chain, asked, only_initial_states=True)
         value = Fraction(str(result.get_value(chain.initial_states[0])))
@@ -157,8 +183,10 @@ def main() -> None:
         chosen.names = [name]
     jax.config.update("jax_enable_x64", True)
     rows = []
-    print(f"{'model':<20}{'states':>8}{'D':>5}{'at most':>9}{'proven':>9}{'steps':>11}"
-          f"{'compile':>9}{'all':>9}{'each':>9}{'one':>9}{'storm':>9}{'agree':>7}")
+    print(
+        f"{'model':<20}{'states':>8}{'D':>5}{'at most':>9}{'proven':>9}{'steps':>11}"
+        f"{'compile':>9}{'all':>9}{'each':>9}{'one':>9}{'storm':>9}{'agree':>7}"
+    )
     for path in sorted(chosen.folder.glob("*.drn")):
         if chosen.names and not any(x in path.stem for x in chosen.names):
             continue
@@ -169,11 +197,14 @@ def main() -> None:
             row["agree"] = agreement(path, found, chosen)
         rows.append({"model": path.stem, "threshold": threshold, **row})
         each = row["all"] / max(row["proven"], 1)
-        print(f"{path.stem:<20}{row['states']:>8}{row['parameters']:>5}{threshold:>9.4g}"
-              f"{row['proven']:>5}/{chosen.starts:<3}"
-              f"{row['steps'][0]:>6.4g} {row['steps'][1]:>4}{row['compile']:>9.2f}"
-              f"{row['all']:>9.4f}{each:>9.5f}{row['one']:>9.5f}"
-              f"{row.get('storm', np.nan):>9.5f}{row.get('agree', ''):>7}", flush=True)
+        print(
+            f"{path.stem:<20}{row['states']:>8}{row['parameters']:>5}{threshold:>9.4g}"
+            f"{row['proven']:>5}/{chosen.starts:<3}"
+            f"{row['steps'][0]:>6.4g} {row['steps'][1]:>4}{row['compile']:>9.2f}"
+            f"{row['all']:>9.4f}{each:>9.5f}{row['one']:>9.5f}"
+            f"{row.get('storm', np.nan):>9.5f}{row.get('agree', ''):>7}",
+            flush=True,
+        )
     if chosen.json:
         print(json.dumps(rows))
 

@@ -87,8 +87,14 @@ def peer(task: Task) -> Callable[[jax.Array], Any]:
     batch = task.num_envs * task.num_steps
     optimizer = optax.chain(
         optax.clip_by_global_norm(_NORM),
-        optax.adam(lambda n: task.learning_rate * (
-            1 - (n // (task.num_minibatches * task.num_epochs)) / task.num_updates), eps=1e-5))
+        optax.adam(
+            lambda n: (
+                task.learning_rate
+                * (1 - (n // (task.num_minibatches * task.num_epochs)) / task.num_updates)
+            ),
+            eps=1e-5,
+        ),
+    )
 
     def density(logits: jax.Array, action: jax.Array) -> jax.Array:
         return jnp.take_along_axis(jax.nn.log_softmax(logits), action[..., None], -1)[..., 0]
@@ -102,8 +108,8 @@ def peer(task: Task) -> Callable[[jax.Array], Any]:
         logits, value = network.apply(parameters, seen)
         action = jax.random.categorical(act_key, logits)
         after, world, reward, terminated, truncated, _ = jax.vmap(
-            environment.step, (0, 0, 0, None))(
-                jax.random.split(step_key, task.num_envs), world, action, settings)
+            environment.step, (0, 0, 0, None)
+        )(jax.random.split(step_key, task.num_envs), world, action, settings)
         done, total = terminated | truncated, total + reward
         row = seen, action, density(logits, action), value, reward, done, total
         return (parameters, world, flat(after), jnp.where(done, 0, total), key), row
@@ -128,40 +134,53 @@ def peer(task: Task) -> Callable[[jax.Array], Any]:
     def update(carry: Any, _: Any) -> Any:
         parameters, memory, world, seen, total, key = carry
         (_, world, seen, total, key), path = lax.scan(
-            move, (parameters, world, seen, total, key), None, task.num_steps)
+            move, (parameters, world, seen, total, key), None, task.num_steps
+        )
         observed, action, old, value, reward, done, ended = path
         last = network.apply(parameters, seen)[1]
 
         def back(carry: Any, row: Any) -> Any:
             advantage, following = carry
             value, reward, done = row
-            advantage = (reward + _DISCOUNT * following * (1 - done) - value
-                         + _DISCOUNT * _LAMBDA * (1 - done) * advantage)
+            advantage = (
+                reward
+                + _DISCOUNT * following * (1 - done)
+                - value
+                + _DISCOUNT * _LAMBDA * (1 - done) * advantage
+            )
             return (advantage, value), advantage
 
         _, advantage = lax.scan(
-            back, (jnp.zeros_like(last), last), (value, reward, done), reverse=True, unroll=16)
+            back, (jnp.zeros_like(last), last), (value, reward, done), reverse=True, unroll=16
+        )
         rows = jax.tree.map(
-            lambda x: x.reshape(batch, *x.shape[2:]), (observed, action, old, value, advantage))
+            lambda x: x.reshape(batch, *x.shape[2:]), (observed, action, old, value, advantage)
+        )
 
         def epoch(carry: Any, _: Any) -> Any:
             *going, key = carry
             key, order_key = jax.random.split(key)
             order = jax.random.permutation(order_key, batch)
-            parts = jax.tree.map(lambda x: jnp.take(x, order, axis=0).reshape(
-                task.num_minibatches, -1, *x.shape[1:]), rows)
+            parts = jax.tree.map(
+                lambda x: jnp.take(x, order, axis=0).reshape(
+                    task.num_minibatches, -1, *x.shape[1:]
+                ),
+                rows,
+            )
             going, _ = lax.scan(descend, tuple(going), parts)
             return (*going, key), None
 
         (parameters, memory, key), _ = lax.scan(
-            epoch, (parameters, memory, key), None, task.num_epochs)
+            epoch, (parameters, memory, key), None, task.num_epochs
+        )
         mean = jnp.sum(ended * done) / jnp.where(done.sum() > 0, done.sum(), jnp.nan)
         return (parameters, memory, world, seen, total, key), mean
 
     def train(key: jax.Array) -> jax.Array:
         key, net_key, reset_key = jax.random.split(key, 3)
         seen, world = jax.vmap(environment.reset, (0, None))(
-            jax.random.split(reset_key, task.num_envs), settings)
+            jax.random.split(reset_key, task.num_envs), settings
+        )
         seen = flat(seen)
         parameters = network.init(net_key, seen[0])
         begin = (parameters, optimizer.init(parameters), world, seen, jnp.zeros(task.num_envs), key)
@@ -181,15 +200,24 @@ def ours(task: Task) -> Callable[[jax.Array], Any]:
     network = ppo.ActorCritic(environment.actions.num, activation=task.activation)
     problem = ppo.make_problem(environment, network=network)
     hparams = ppo.Hparams(
-        discount=_DISCOUNT, gae_lambda=_LAMBDA,
+        discount=_DISCOUNT,
+        gae_lambda=_LAMBDA,
         learning_rate=Linear(task.learning_rate, 0.0, task.num_updates),
-        clip=_CLIP, value_clip=_CLIP, value_weight=_VALUE, entropy_weight=_ENTROPY,
-        max_gradient_norm=_NORM, num_envs=task.num_envs, num_steps=task.num_steps,
-        num_epochs=task.num_epochs, num_minibatches=task.num_minibatches)
+        clip=_CLIP,
+        value_clip=_CLIP,
+        value_weight=_VALUE,
+        entropy_weight=_ENTROPY,
+        max_gradient_norm=_NORM,
+        num_envs=task.num_envs,
+        num_steps=task.num_steps,
+        num_epochs=task.num_epochs,
+        num_minibatches=task.num_minibatches,
+    )
 
     def train(key: jax.Array) -> jax.Array:
         _, metrics = ppo.train(
-            key, problem, hparams, num_steps=task.num_updates, max_rows=task.num_updates)
+            key, problem, hparams, num_steps=task.num_updates, max_rows=task.num_updates
+        )
         return metrics.episode_return
 
     return train
@@ -200,7 +228,7 @@ def ours(task: Task) -> Callable[[jax.Array], Any]:
 
 def _last_returns(returns: np.ndarray) -> np.ndarray:
     """Each seed's mean return over the last tenth of its updates."""
-    return np.nanmean(returns[:, -max(returns.shape[1] // 10, 1):], axis=1)
+    return np.nanmean(returns[:, -max(returns.shape[1] // 10, 1) :], axis=1)
 
 
 def compare_returns(task: Task, seeds: int) -> dict[str, Any]:
@@ -209,8 +237,11 @@ def compare_returns(task: Task, seeds: int) -> dict[str, Any]:
     for name, make, first in (("ours", ours, 0), ("peer", peer, 1000)):
         keys = jax.vmap(jax.random.key)(jnp.arange(first, first + seeds))
         last = _last_returns(np.asarray(jax.jit(jax.vmap(make(task)))(keys)))
-        found[name] = {"mean": float(last.mean()), "deviation": float(last.std(ddof=1)),
-                       "seeds": [round(float(x), 1) for x in last]}
+        found[name] = {
+            "mean": float(last.mean()),
+            "deviation": float(last.std(ddof=1)),
+            "seeds": [round(float(x), 1) for x in last],
+        }
     return {"task": task.name, "steps": task.total, **found}
 
 
@@ -238,7 +269,8 @@ def compare_speed(task: Task, num_updates: int, lanes: int | None, repeats: int)
         row[name] = {
             "steps_per_cpu_second": round(steps / statistics.median(used)),
             "steps_per_second": round(steps / statistics.median(passed)),
-            "compile_seconds": round(compiling, 1)}
+            "compile_seconds": round(compiling, 1),
+        }
     ratios = [b / a for a, b in zip(runs["ours"][2], runs["peer"][2], strict=True)]
     row["ratio"] = round(statistics.median(ratios), 3)
     walls = [b / a for a, b in zip(runs["ours"][3], runs["peer"][3], strict=True)]

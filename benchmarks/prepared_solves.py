@@ -64,8 +64,12 @@ def with_deadline(model: SparseMDP, target: Any, deadline: int) -> tuple[SparseM
     initial[0] = 1
     return make_sparse(
         None if len(entry_start) == len(row_start) and host.is_chain else np.asarray(row_start),
-        np.asarray(entry_start), np.asarray(successor), np.asarray(probability), initial=initial,
-        label={"goal_0": np.flatnonzero(region)}), region
+        np.asarray(entry_start),
+        np.asarray(successor),
+        np.asarray(probability),
+        initial=initial,
+        label={"goal_0": np.flatnonzero(region)},
+    ), region
 
 
 def least_seconds(run: Any) -> float:
@@ -78,13 +82,17 @@ def least_seconds(run: Any) -> float:
     return min(times)
 
 
-def measure(model: SparseMDP, peer: Any, text: str, objective: str, target: Any, stay: Any,
-            reward: Any) -> dict[str, Any]:
+def measure(
+    model: SparseMDP, peer: Any, text: str, objective: str, target: Any, stay: Any, reward: Any
+) -> dict[str, Any]:
     """Times of one property."""
     begin = time.perf_counter()
     prepared = prepare(model, target, stay=stay, reward=reward, objective=objective)
-    row: dict[str, Any] = {"states": model.num_states, "property": text,
-                           "prepare": time.perf_counter() - begin}
+    row: dict[str, Any] = {
+        "states": model.num_states,
+        "property": text,
+        "prepare": time.perf_counter() - begin,
+    }
     numbers = {"probability": prepared.probability}
     if reward is not None:
         numbers["reward"] = prepared.reward
@@ -99,11 +107,11 @@ def measure(model: SparseMDP, peer: Any, text: str, objective: str, target: Any,
     row["anew"] = least_seconds(lambda: jax.block_until_ready(anew(prepared, numbers)))
     jax.block_until_ready(anew(prepared, {}))
     row["same"] = least_seconds(lambda: jax.block_until_ready(anew(prepared, {})))
-    slope = jax.jit(jax.grad(lambda x, p: solve_prepared(
-        prepared=p, probability=x).value[0]))
+    slope = jax.jit(jax.grad(lambda x, p: solve_prepared(prepared=p, probability=x).value[0]))
     jax.block_until_ready(slope(prepared.probability, prepared))
     row["gradient"] = least_seconds(
-        lambda: jax.block_until_ready(slope(prepared.probability, prepared)))
+        lambda: jax.block_until_ready(slope(prepared.probability, prepared))
+    )
     times = []
     for _ in range(REPEATS):
         low, high, _ = storm(peer, text)
@@ -113,11 +121,16 @@ def measure(model: SparseMDP, peer: Any, text: str, objective: str, target: Any,
     row["storm"] = min(times)
     start = int(np.argmax(np.asarray(model.initial)))
     row |= {
-        "cyclic": prepared.cyclic, "places": prepared.size,
+        "cyclic": prepared.cyclic,
+        "places": prepared.size,
         "shape": [list(x.target.shape) for x in prepared.segments if x.target.size],
-        "steps": int(found.num_steps), "status": int(found.status),
-        "lower": float(found.lower[start]), "upper": float(found.upper[start]),
-        "peer": (low, high), "ratio": row["anew"] / row["storm"]}
+        "steps": int(found.num_steps),
+        "status": int(found.status),
+        "lower": float(found.lower[start]),
+        "upper": float(found.upper[start]),
+        "peer": (low, high),
+        "ratio": row["anew"] / row["storm"],
+    }
     return row
 
 
@@ -133,8 +146,10 @@ def main() -> None:
     import stormpy
 
     expected = json.loads((chosen.folder / "expected.json").read_text())
-    print(f"{'model':<34}{'property':<14}{'states':>8}{'prepare':>9}{'compile':>9}{'storm ms':>9}"
-          f"{'anew ms':>9}{'same ms':>9}{'grad ms':>9}{'ratio':>7}  steps shape")
+    print(
+        f"{'model':<34}{'property':<14}{'states':>8}{'prepare':>9}{'compile':>9}{'storm ms':>9}"
+        f"{'anew ms':>9}{'same ms':>9}{'grad ms':>9}{'ratio':>7}  steps shape"
+    )
     for path in sorted(chosen.folder.glob("*.umb")):
         if chosen.names and not any(x in path.stem for x in chosen.names):
             continue
@@ -161,10 +176,12 @@ def main() -> None:
                 text = f'P{sign}=? [ F "goal_0" ]'
             row = measure(used, peer, text, objective, target, stay, reward)
             ms = "".join(f"{1e3 * row[x]:9.3f}" for x in ("storm", "anew", "same", "gradient"))
-            print(f"{path.stem:<34}{name[:13]:<14}{row['states']:>8}{row['prepare']:9.2f}"
-                  f"{row['compile']:9.2f}{ms}{row['ratio']:7.2f}  {row['steps']} {row['shape']} "
-                  f"{row['status']} [{row['lower']:.6g}, {row['upper']:.6g}] {row['peer']}",
-                  flush=True)
+            print(
+                f"{path.stem:<34}{name[:13]:<14}{row['states']:>8}{row['prepare']:9.2f}"
+                f"{row['compile']:9.2f}{ms}{row['ratio']:7.2f}  {row['steps']} {row['shape']} "
+                f"{row['status']} [{row['lower']:.6g}, {row['upper']:.6g}] {row['peer']}",
+                flush=True,
+            )
             if chosen.first:
                 break
 

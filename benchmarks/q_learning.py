@@ -82,8 +82,18 @@ def make_peer(game: Game, reward: np.ndarray):
     place = [np.int64(np.argmax(system)), np.uint64(88172645463325252)]
 
     def play(num_moves: int) -> np.ndarray:
-        place[:] = loop(q, reward, successor, choice, count, system, np.float32(_DISCOUNT),
-                        place[0], np.uint64(place[1]), num_moves)
+        place[:] = loop(
+            q,
+            reward,
+            successor,
+            choice,
+            count,
+            system,
+            np.float32(_DISCOUNT),
+            place[0],
+            np.uint64(place[1]),
+            num_moves,
+        )
         return q
 
     return play
@@ -107,21 +117,24 @@ def run(size: int = 10, num_chains: tuple[int, ...] = (1024, 4096, 16384)) -> li
     rows = []
     for chains in num_chains:
         for name, step_size in (("alpha 1", None), ("any alpha", 0.5)):
-            hparams = maximin_q.Hparams(
-                discount=_DISCOUNT, num_chains=chains, step_size=step_size)
+            hparams = maximin_q.Hparams(discount=_DISCOUNT, num_chains=chains, step_size=step_size)
             start = maximin_q.init(jax.random.key(0), problem, hparams)
             num_steps = _MOVES // (chains * hparams.moves_per_step)
             ours = partial(maximin_q.run, start, problem, hparams, num_steps=num_steps)
             timed = compare(ours, partial(play, _MOVES), repeats=9)
-            rows.append({
-                "name": f"Q-learning, robots {size}, {chains} chains, {name}",
-                "states": game.num_states, "peer": "numba, one chain, alpha 1",
-                "moves": _MOVES, "moves_per_second": _MOVES / timed["seconds"],
-                "peer_moves_per_second": _MOVES / timed["peer_seconds"],
-                # Steps of other sizes are for games with chance; the peer makes none.
-                "target": 1.0 if step_size is None and chains == max(num_chains) else None,
-                **timed,
-            })
+            rows.append(
+                {
+                    "name": f"Q-learning, robots {size}, {chains} chains, {name}",
+                    "states": game.num_states,
+                    "peer": "numba, one chain, alpha 1",
+                    "moves": _MOVES,
+                    "moves_per_second": _MOVES / timed["seconds"],
+                    "peer_moves_per_second": _MOVES / timed["peer_seconds"],
+                    # Steps of other sizes are for games with chance; the peer makes none.
+                    "target": 1.0 if step_size is None and chains == max(num_chains) else None,
+                    **timed,
+                }
+            )
     rows.append(_learned_row(problem, game, reward, exact, max(num_chains)))
     return [{k: v for k, v in row.items() if v is not None} for row in rows]
 
@@ -143,9 +156,13 @@ def _learned_row(problem, game, reward, exact, num_chains: int) -> dict[str, Any
     peer()
     return {
         "name": f"Q-learning, robots to error 1e-3, {num_chains} chains",
-        "states": game.num_states, "peer": "numba, one chain, alpha 1", "target": 1.0,
-        "moves": float(metrics.moves[-1]), "peer_moves": needed + chunk,
-        "error": float(metrics.error[-1]), "violations": int(state.violations),
+        "states": game.num_states,
+        "peer": "numba, one chain, alpha 1",
+        "target": 1.0,
+        "moves": float(metrics.moves[-1]),
+        "peer_moves": needed + chunk,
+        "error": float(metrics.error[-1]),
+        "violations": int(state.violations),
         **compare(ours, peer, repeats=5),
     }
 
@@ -155,10 +172,16 @@ def main() -> None:
     begin = time.perf_counter()
     rows = run()
     for row in rows:
-        print(f"{row['name']:<50} {row['compile_seconds']:8.2f} {row['seconds']:8.3f} "
-              f"{row['peer_seconds']:8.3f} {row['ratio']:7.3f}")
-    machine = {"cores": os.cpu_count(), "machine": platform.machine(), "jax": jax.__version__,
-               "total_seconds": time.perf_counter() - begin}
+        print(
+            f"{row['name']:<50} {row['compile_seconds']:8.2f} {row['seconds']:8.3f} "
+            f"{row['peer_seconds']:8.3f} {row['ratio']:7.3f}"
+        )
+    machine = {
+        "cores": os.cpu_count(),
+        "machine": platform.machine(),
+        "jax": jax.__version__,
+        "total_seconds": time.perf_counter() - begin,
+    }
     print(json.dumps({"machine": machine, "rows": rows}))
 
 

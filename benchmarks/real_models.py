@@ -24,7 +24,10 @@ from jaxltl.core.values.answer import solve_property
 from jaxltl.io.model_files import read_model
 
 LTL = (  # of a label a and another one b: recurrence, persistence, with safety, response
-    'G F "{a}"', 'F G !"{a}"', '(F G "{a}") & (G (!"{b}" | F "{a}"))', '(F "{b}") & (G F !"{a}")',
+    'G F "{a}"',
+    'F G !"{a}"',
+    '(F G "{a}") & (G (!"{b}" | F "{a}"))',
+    '(F "{b}") & (G F !"{a}")',
 )
 WIDTH, WRONG = 1e-6, 2e-6
 
@@ -57,8 +60,7 @@ def storm(model: Any, text: str) -> tuple[float, float, float]:
     (prop,) = stormpy.parse_properties(text)
     environment = environments.sound()
     begin = time.process_time()
-    result = stormpy.model_checking(
-        model, prop, only_initial_states=True, environment=environment)
+    result = stormpy.model_checking(model, prop, only_initial_states=True, environment=environment)
     seconds = time.process_time() - begin
     (state,) = model.initial_states
     value = result.get_value(state)
@@ -86,7 +88,11 @@ def measure(folder: Path, ltl: bool = False, only: str = "", with_storm: bool = 
             peer_load = time.process_time() - begin
         for text, value in questions(path, expected, list(model.propositions), ltl):
             row: dict[str, Any] = {
-                "model": path.stem, "states": model.num_states, "property": text, "load": load}
+                "model": path.stem,
+                "states": model.num_states,
+                "property": text,
+                "load": load,
+            }
             begin = time.process_time()
             found = solve_property(model, text)
             row["seconds"] = time.process_time() - begin
@@ -96,15 +102,19 @@ def measure(folder: Path, ltl: bool = False, only: str = "", with_storm: bool = 
                 row["storm_load"] = peer_load
                 value = (low + high) / 2 if value is None else value
             size = max(abs(upper), 1e-300) if text.startswith("R") else 1.0
-            row |= {"value": float(found.value[0]), "width": 0.0 if lower == upper else
-                    (upper - lower) / size, "status": Status(found.status).name,
-                    "method": found.method}
+            row |= {
+                "value": float(found.value[0]),
+                "width": 0.0 if lower == upper else (upper - lower) / size,
+                "status": Status(found.status).name,
+                "method": found.method,
+            }
             row["verdict"] = _verdict(row, lower, upper, value, size)
             yield row
 
 
-def _verdict(row: dict[str, Any], lower: float, upper: float, value: float | None,
-             size: float) -> str:
+def _verdict(
+    row: dict[str, Any], lower: float, upper: float, value: float | None, size: float
+) -> str:
     """Whether bounds hold what is expected, up to the digits to which that is known."""
     if value is None:
         return "alone"
@@ -127,16 +137,25 @@ def main() -> None:
     for row in measure(chosen.folder, chosen.ltl, chosen.only, not chosen.alone):
         rows.append(row)
         peer = f"{row['storm']:8.4f} {row['seconds'] / row['storm']:7.2f}" if "storm" in row else ""
-        print(f"{row['model']:<40} {row['states']:>8} {row['property']:<48} {row['value']:<12.6g} "
-              f"{row['width']:8.1e} {row['seconds']:8.4f} {peer} {row['verdict']:<6} "
-              f"{row['method']}", flush=True)
+        print(
+            f"{row['model']:<40} {row['states']:>8} {row['property']:<48} {row['value']:<12.6g} "
+            f"{row['width']:8.1e} {row['seconds']:8.4f} {peer} {row['verdict']:<6} "
+            f"{row['method']}",
+            flush=True,
+        )
     verdicts = [row["verdict"] for row in rows]
-    print(f"\n{len(rows)} properties:", *(f"{verdicts.count(x)} {x}" for x in sorted(
-        set(verdicts))), f"- seconds {sum(r['seconds'] for r in rows):.2f}", end=" ")
+    print(
+        f"\n{len(rows)} properties:",
+        *(f"{verdicts.count(x)} {x}" for x in sorted(set(verdicts))),
+        f"- seconds {sum(r['seconds'] for r in rows):.2f}",
+        end=" ",
+    )
     if rows and "storm" in rows[0]:
-        print(f"Storm {sum(r['storm'] for r in rows):.2f}, ratio "
-              f"{np.divide(sum(r['seconds'] for r in rows), sum(r['storm'] for r in rows)):.2f}; "
-              f"missed: {sum(map(_missed, rows))}")
+        print(
+            f"Storm {sum(r['storm'] for r in rows):.2f}, ratio "
+            f"{np.divide(sum(r['seconds'] for r in rows), sum(r['storm'] for r in rows)):.2f}; "
+            f"missed: {sum(map(_missed, rows))}"
+        )
     if chosen.json:
         print(json.dumps(rows))
 

@@ -39,8 +39,9 @@ _DISCOUNT = 0.95
 def _seen(cells: int, state: jax.Array) -> jax.Array:
     """Both places and whose turn it is, one-hot."""
     other, own, turn = jnp.unravel_index(state, (cells, cells, 2))
-    return jnp.concatenate([
-        jax.nn.one_hot(other, cells), jax.nn.one_hot(own, cells), turn[None].astype(float)])
+    return jnp.concatenate(
+        [jax.nn.one_hot(other, cells), jax.nn.one_hot(own, cells), turn[None].astype(float)]
+    )
 
 
 def _counted(step: Any, meeting: jax.Array, world: Any, action: jax.Array, key: jax.Array) -> Any:
@@ -68,14 +69,17 @@ def worlds(size: int) -> dict[str, Any]:
     strategy = jl.permissive_strategy(game, _SAFE)
     seconds = time.perf_counter() - begin
     world = jl.environment_of(
-        game, observe=Partial(partial(_seen, size**2)), opponent=chaser(game, size))
-    task = jl.task_environment(
-        world, f"{_SAFE} & {_PATROL}", reward="eventual", discount=_DISCOUNT)
+        game, observe=Partial(partial(_seen, size**2)), opponent=chaser(game, size)
+    )
+    task = jl.task_environment(world, f"{_SAFE} & {_PATROL}", reward="eventual", discount=_DISCOUNT)
     meeting = np.asarray(game.mdp.label)[:, game.mdp.propositions.index("collision")]
     task = task.replace(step=Partial(_counted, task.step, meeting))
     shielded = jl.shield_environment(task, strategy, Partial(_state))
-    return {"unshielded": with_time_limit(task, _EPISODE),
-            "shielded": with_time_limit(shielded, _EPISODE), "shield_seconds": seconds}
+    return {
+        "unshielded": with_time_limit(task, _EPISODE),
+        "shielded": with_time_limit(shielded, _EPISODE),
+        "shield_seconds": seconds,
+    }
 
 
 def measure(size: int, steps: int, seed: int = 0) -> Iterator[dict[str, Any]]:
@@ -84,22 +88,33 @@ def measure(size: int, steps: int, seed: int = 0) -> Iterator[dict[str, Any]]:
     for name in ("shielded", "unshielded"):
         problem, updates = ppo.make_problem(found[name]), -(-steps // (64 * 128))
         hparams = ppo.Hparams(
-            discount=1.0, num_envs=64, num_steps=128, num_minibatches=8, normalize_reward=True,
-            learning_rate=Linear(1e-3, 0.0, updates))
+            discount=1.0,
+            num_envs=64,
+            num_steps=128,
+            num_minibatches=8,
+            normalize_reward=True,
+            learning_rate=Linear(1e-3, 0.0, updates),
+        )
         begin, used = time.perf_counter(), time.process_time()
-        _, metrics = jax.block_until_ready(ppo.train(
-            jax.random.key(seed), problem, hparams, num_steps=updates, max_rows=updates))
+        _, metrics = jax.block_until_ready(
+            ppo.train(jax.random.key(seed), problem, hparams, num_steps=updates, max_rows=updates)
+        )
         meetings = np.rint(np.asarray(metrics.cost, float) * 64 * 128).astype(int)
         tenth = max(updates // 10, 1)
         yield {
-            "run": name, "size": size, "steps": updates * 64 * 128,
-            "meetings": int(meetings.sum()), "meetings_in_last_tenth": int(meetings[-tenth:].sum()),
+            "run": name,
+            "size": size,
+            "steps": updates * 64 * 128,
+            "meetings": int(meetings.sum()),
+            "meetings_in_last_tenth": int(meetings[-tenth:].sum()),
             "episodes": int(metrics.episodes.sum()),
             "episode_return": round(float(jnp.nanmean(metrics.episode_return[-tenth:])), 4),
             "first_episode_return": round(float(jnp.nanmean(metrics.episode_return[:tenth])), 4),
-            "status": int(metrics.status.max()), "seconds": round(time.perf_counter() - begin, 1),
+            "status": int(metrics.status.max()),
+            "seconds": round(time.perf_counter() - begin, 1),
             "cpu_seconds": round(time.process_time() - used, 1),
-            "shield_seconds": round(found["shield_seconds"], 2)}
+            "shield_seconds": round(found["shield_seconds"], 2),
+        }
 
 
 def main() -> None:

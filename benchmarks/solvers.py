@@ -35,9 +35,13 @@ def discounted(name: str, model, target: float) -> dict[str, Any]:
         lambda: storm.check(peer, 'R{"r"}max=? [Cdiscount=0.95]', "value_iteration", 1e-6)
     )
     return {
-        "name": f"discounted value, {name}", "states": model.num_states,
-        "peer": "Storm value iteration", **row, "peer_seconds": seconds,
-        "ratio": row["seconds"] / seconds, "target": target,
+        "name": f"discounted value, {name}",
+        "states": model.num_states,
+        "peer": "Storm value iteration",
+        **row,
+        "peer_seconds": seconds,
+        "ratio": row["seconds"] / seconds,
+        "target": target,
         "half_width": float(jnp.max(solution.upper - solution.lower) / 2),
         "error": float(jnp.max(jnp.abs(solution.value - exact))),
         "peer_error": float(np.abs(values - np.asarray(exact)).max()),
@@ -56,15 +60,20 @@ def reachability(num_states: int) -> list[dict[str, Any]]:
     rows = []
     for method in storm.METHODS:
         seconds, values = once(lambda m=method: storm.check(peer, 'Pmax=? [F "goal"]', m, 1e-6))
-        rows.append({
-            "name": "maximal reachability", "states": num_states,
-            "peer": f"Storm {method.replace('_', ' ')}", **row, "peer_seconds": seconds,
-            "ratio": row["seconds"] / seconds,
-            "target": None if method == "value_iteration" else 1.0,
-            "half_width": float(jnp.max(solution.upper - solution.lower) / 2),
-            "error": float(np.abs(np.asarray(solution.value) - exact).max()),
-            "peer_error": float(np.abs(values - exact).max()),
-        })
+        rows.append(
+            {
+                "name": "maximal reachability",
+                "states": num_states,
+                "peer": f"Storm {method.replace('_', ' ')}",
+                **row,
+                "peer_seconds": seconds,
+                "ratio": row["seconds"] / seconds,
+                "target": None if method == "value_iteration" else 1.0,
+                "half_width": float(jnp.max(solution.upper - solution.lower) / 2),
+                "error": float(np.abs(np.asarray(solution.value) - exact).max()),
+                "peer_error": float(np.abs(values - exact).max()),
+            }
+        )
     return rows
 
 

@@ -25,8 +25,12 @@ def build(mdp: MDP, reward: np.ndarray, labels: dict[str, np.ndarray]):
     weights = np.take_along_axis(np.asarray(mdp.probability, np.float64), order, 2)
     weights = weights.reshape(-1, width).tolist()
     builder = datastructures.SparseMatrixBuilder(
-        rows=num_states * num_actions, columns=num_states, entries=0,
-        force_dimensions=False, has_custom_row_grouping=True, row_groups=0,
+        rows=num_states * num_actions,
+        columns=num_states,
+        entries=0,
+        force_dimensions=False,
+        has_custom_row_grouping=True,
+        row_groups=0,
     )
     for row, (targets, values) in enumerate(zip(rows, weights, strict=True)):
         if row % num_actions == 0:
@@ -48,7 +52,8 @@ def build(mdp: MDP, reward: np.ndarray, labels: dict[str, np.ndarray]):
     )
     return models.SparseMdp(
         models.SparseModelComponents(
-            transition_matrix=builder.build(), state_labeling=labeling,
+            transition_matrix=builder.build(),
+            state_labeling=labeling,
             reward_models={"r": rewards},
         )
     )

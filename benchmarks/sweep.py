@@ -49,12 +49,21 @@ def run(num_states: int) -> list[dict[str, Any]]:
     def peer():
         buffers[0][:] = start
         for i in range(_SWEEPS):
-            _numba_sweep(successor, probability, reward, discount, buffers[i % 2],
-                         buffers[1 - i % 2])
+            _numba_sweep(
+                successor, probability, reward, discount, buffers[i % 2], buffers[1 - i % 2]
+            )
         return buffers[_SWEEPS % 2]
 
     arguments = (model, jnp.asarray(reward), discount, jnp.asarray(start))
     error = np.abs(np.asarray(_sweeps(*arguments)) - peer()).max()
     row = compare(lambda: _sweeps(*arguments), peer, repeats=11)
-    return [{"name": "optimality sweep x10", "states": num_states, "peer": "numba, parallel",
-             "target": 1.6, "error": float(error), **row}]
+    return [
+        {
+            "name": "optimality sweep x10",
+            "states": num_states,
+            "peer": "numba, parallel",
+            "target": 1.6,
+            "error": float(error),
+            **row,
+        }
+    ]

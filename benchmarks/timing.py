@@ -17,9 +17,7 @@ def once(function: Callable[[], Any]) -> tuple[float, Any]:
     return time.perf_counter() - begin, result
 
 
-def compare(
-    ours: Callable[[], Any], peer: Callable[[], Any], *, repeats: int
-) -> dict[str, float]:
+def compare(ours: Callable[[], Any], peer: Callable[[], Any], *, repeats: int) -> dict[str, float]:
     """Median seconds of both, called in turn, the median ratio, and our first call's excess."""
     first, _ = once(ours)
     once(peer)

@@ -33,8 +33,7 @@ _SWEEPS = (*range(40, 200, 5), 250, 300, 400, 600, 800)
 
 def _task(formula: str, objects: grid.Counts) -> Automaton:
     """Over the letters of our worlds: no cell is of two kinds."""
-    return to_automaton(
-        formula, letters=[frozenset(), *(frozenset([p]) for p in (*objects, "ob"))])
+    return to_automaton(formula, letters=[frozenset(), *(frozenset([p]) for p in (*objects, "ob"))])
 
 
 def problem() -> todirl.Problem:
@@ -60,9 +59,7 @@ def exact_gradient(parameters, given: todirl.Problem, hparams, initial=None):
 
 
 @partial(jax.jit, static_argnames="num_steps")
-def unrolled_gradient(
-    parameters, given: todirl.Problem, hparams, initial=None, *, num_steps: int
-):
+def unrolled_gradient(parameters, given: todirl.Problem, hparams, initial=None, *, num_steps: int):
     """Reverse mode through a fixed number of soft backups."""
     model, seen, counts = _lane((given.model, given.observation, given.counts))
 
@@ -102,8 +99,13 @@ def dense_gradient(
         one = jax.vmap(one, [0 if i == axis else None for i in range(3)])
     slope = one(seen, jnp.eye(model.num_memory), jnp.eye(model.num_actions))  # [S, Q, A, N]
     rewards = todirl.reward(given.network, parameters, model, seen)
-    policy = soft_value(model, rewards, hparams.discount, initial=None if initial is None
-                        else initial[0], method="value_iteration").policy
+    policy = soft_value(
+        model,
+        rewards,
+        hparams.discount,
+        initial=None if initial is None else initial[0],
+        method="value_iteration",
+    ).policy
 
     mean = jnp.einsum("sqa,sqan->sqn", policy, slope).reshape(model.num_states, -1)
     after = hparams.discount * transition_matrix(model, policy).reshape(2 * [model.num_states])
@@ -121,8 +123,10 @@ def dense_gradient(
 
 def _distance(one: Any, other: Any) -> float:
     """Largest difference relative to the largest entry of the other, in double precision."""
-    pairs = [(np.asarray(x, float).ravel(), np.asarray(y, float).ravel())
-             for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)]
+    pairs = [
+        (np.asarray(x, float).ravel(), np.asarray(y, float).ravel())
+        for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    ]
     x, y = (np.concatenate(z) for z in zip(*pairs, strict=True))
     return float(np.abs(x - y).max() / np.abs(y).max())
 
@@ -151,22 +155,33 @@ def gradient_rows(given: todirl.Problem, hparams, parameters, last) -> list[dict
         error = _distance(ours(), true)
         for num_steps in _SWEEPS:
             peer = partial(
-                unrolled_gradient, parameters, given, hparams, initial, num_steps=num_steps)
+                unrolled_gradient, parameters, given, hparams, initial, num_steps=num_steps
+            )
             other = _distance(peer(), true)
             if other <= error:
                 break
-        rows.append({
-            "name": f"todirl gradient, {given.model.num_states} states, {start}",
-            "peer": f"unrolled, {num_steps} sweeps", "error": error, "peer_error": other,
-            "target": 1 / 3, **compare(ours, peer, repeats=41),
-        })
+        rows.append(
+            {
+                "name": f"todirl gradient, {given.model.num_states} states, {start}",
+                "peer": f"unrolled, {num_steps} sweeps",
+                "error": error,
+                "peer_error": other,
+                "target": 1 / 3,
+                **compare(ours, peer, repeats=41),
+            }
+        )
     for kind, steps in (("solved", None), (f"{num_steps} sweeps", num_steps)):
         peer = partial(dense_gradient, parameters, given, hparams, last, num_steps=steps)
-        rows.append({
-            "name": f"todirl gradient, {given.model.num_states} states, as in training",
-            "peer": f"(3.6), dense, {kind}", "error": error, "peer_error": _distance(peer(), true),
-            "target": 1 / 50, **compare(ours, peer, repeats=3),
-        })
+        rows.append(
+            {
+                "name": f"todirl gradient, {given.model.num_states} states, as in training",
+                "peer": f"(3.6), dense, {kind}",
+                "error": error,
+                "peer_error": _distance(peer(), true),
+                "target": 1 / 50,
+                **compare(ours, peer, repeats=3),
+            }
+        )
     return rows
 
 
@@ -176,14 +191,19 @@ def gradient_rows(given: todirl.Problem, hparams, parameters, last) -> list[dict
 def seeds_row(given: todirl.Problem, hparams, num_steps: int = 50) -> dict[str, Any]:
     """Learning with ten seeds side by side against one."""
     train = jax.jit(partial(todirl.train, num_steps=num_steps, max_rows=1))
-    together = jax.jit(jax.vmap(partial(todirl.train, num_steps=num_steps, max_rows=1),
-                                (0, None, None)))
+    together = jax.jit(
+        jax.vmap(partial(todirl.train, num_steps=num_steps, max_rows=1), (0, None, None))
+    )
     keys = jax.random.split(jax.random.key(1), _SEEDS)
     timed = compare(
-        partial(together, keys, given, hparams), partial(train, keys[0], given, hparams),
-        repeats=7)
-    return {"name": f"todirl, {_SEEDS} seeds, {num_steps} steps", "peer": "one seed",
-            "target": 4.0, **timed}
+        partial(together, keys, given, hparams), partial(train, keys[0], given, hparams), repeats=7
+    )
+    return {
+        "name": f"todirl, {_SEEDS} seeds, {num_steps} steps",
+        "peer": "one seed",
+        "target": 4.0,
+        **timed,
+    }
 
 
 def worlds_row(given: todirl.Problem, hparams, parameters, num: int = 1000) -> dict[str, Any]:
@@ -204,11 +224,16 @@ def worlds_row(given: todirl.Problem, hparams, parameters, num: int = 1000) -> d
     first, _ = once(evaluate)
     seconds, found = min((once(evaluate) for _ in range(3)), key=lambda x: x[0])
     return {
-        "name": f"todirl, {num} test worlds planned and judged", "peer": "seconds asked for",
-        "compile_seconds": max(first - seconds, 0.0), "seconds": seconds, "peer_seconds": 10.0,
-        "ratio": seconds / 10, "target": 1.0, "plan_seconds": once(
-            lambda: plan(parameters, models, seen))[0],
-        "mean": float(found.mean.mean()), "worst": float(found.mean.min()),
+        "name": f"todirl, {num} test worlds planned and judged",
+        "peer": "seconds asked for",
+        "compile_seconds": max(first - seconds, 0.0),
+        "seconds": seconds,
+        "peer_seconds": 10.0,
+        "ratio": seconds / 10,
+        "target": 1.0,
+        "plan_seconds": once(lambda: plan(parameters, models, seen))[0],
+        "mean": float(found.mean.mean()),
+        "worst": float(found.mean.min()),
         "worst_lower": float(found.lower.min()),
         "half_width": float(jnp.max(found.upper - found.lower)) / 2,
         "not_certified": int(np.sum(np.asarray(found.status) != 0)),
@@ -247,7 +272,8 @@ def large(num_steps: int = 300, num_new: int = 4, discount: float = 0.995) -> di
     objects = many_objects(5)
     automaton = _task(ordered(5, (4, 3, 2)), objects)
     worlds = grid.random_worlds(
-        range(1 + num_new), automaton, shape=(64, 64), objects=objects, num_obstacles=60)
+        range(1 + num_new), automaton, shape=(64, 64), objects=objects, num_obstacles=60
+    )
     models = stack_products([w.mdp for w in worlds], automaton, label_on="exit")
     seen = jnp.stack([grid.observations(w) for w in worlds])
     own: Product = _lane(models)
@@ -266,21 +292,31 @@ def large(num_steps: int = 300, num_new: int = 4, discount: float = 0.995) -> di
 
     def judge():
         policies = [
-            todirl.plan(given.network, state.best.parameters, _lane(models, w), seen[w],
-                        hparams).policy for w in range(len(worlds))]
+            todirl.plan(
+                given.network, state.best.parameters, _lane(models, w), seen[w], hparams
+            ).policy
+            for w in range(len(worlds))
+        ]
         return task_performances(models, jnp.stack(policies), batch=1)
 
     judged_first, _ = once(judge)
     judged, found = once(judge)
     return {
-        "states": own.num_states, "memory": own.num_memory, "steps": made,
-        "best_step": int(state.best.step), "step_seconds": each,
+        "states": own.num_states,
+        "memory": own.num_memory,
+        "steps": made,
+        "best_step": int(state.best.step),
+        "step_seconds": each,
         "compile_seconds": max(first - chunk * each, 0) + max(judged_first - judged, 0),
-        "learn_seconds": seconds, "judge_seconds": judged,
+        "learn_seconds": seconds,
+        "judge_seconds": judged,
         "demonstrated_steps": float(jnp.mean(shown.length)),
-        "train": float(found.mean[0]), "train_lower": float(found.lower[0]),
-        "new": found.mean[1:].tolist(), "new_lower": found.lower[1:].tolist(),
-        "new_upper": found.upper[1:].tolist(), "worst_start": float(found.worst[1:].min()),
+        "train": float(found.mean[0]),
+        "train_lower": float(found.lower[0]),
+        "new": found.mean[1:].tolist(),
+        "new_lower": found.lower[1:].tolist(),
+        "new_upper": found.upper[1:].tolist(),
+        "worst_start": float(found.worst[1:].min()),
         "status": np.asarray(found.status).tolist(),
         "solver_error": float(metrics.error[-1]),
         "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
@@ -290,13 +326,19 @@ def large(num_steps: int = 300, num_new: int = 4, discount: float = 0.995) -> di
 def run_large() -> list[dict[str, Any]]:
     """In a process of its own, whose peak memory is measured."""
     done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.todirl"], check=True, stdout=subprocess.PIPE, text=True)
+        [sys.executable, "-m", "benchmarks.todirl"], check=True, stdout=subprocess.PIPE, text=True
+    )
     found = json.loads(done.stdout.splitlines()[-1])
-    return [{
-        "name": f"todirl, {found['states']} product states: 1 - L_phi",
-        "peer": "a tenth, in the worst new world", "ratio": (1 - min(found["new_lower"])) / 0.1,
-        "target": 1.0, "seconds": found["learn_seconds"], **found,
-    }]
+    return [
+        {
+            "name": f"todirl, {found['states']} product states: 1 - L_phi",
+            "peer": "a tenth, in the worst new world",
+            "ratio": (1 - min(found["new_lower"])) / 0.1,
+            "target": 1.0,
+            "seconds": found["learn_seconds"],
+            **found,
+        }
+    ]
 
 
 if __name__ == "__main__":

@@ -40,5 +40,11 @@ def make(wind: float = 0.01, horizon: int = 80) -> Environment:
         return jnp.append(near, out)
 
     return make_environment(
-        reset, step, observe, actions=make_box(-1.0, 1.0, (2,)), labels=labels,
-        propositions=[*FIELDS, "out"], horizon=horizon)
+        reset,
+        step,
+        observe,
+        actions=make_box(-1.0, 1.0, (2,)),
+        labels=labels,
+        propositions=[*FIELDS, "out"],
+        horizon=horizon,
+    )

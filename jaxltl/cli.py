@@ -76,8 +76,11 @@ def _compiling(*, soon: bool) -> Callable[[Callable[..., None]], Callable[..., N
     """For commands that compile, with little effort if the work is short: the option --no-cache."""
 
     def wrap(command: Callable[..., None]) -> Callable[..., None]:
-        @click.option("--no-cache", is_flag=True,
-                      help="Compile anew, and keep no compiled programs for the next time.")
+        @click.option(
+            "--no-cache",
+            is_flag=True,
+            help="Compile anew, and keep no compiled programs for the next time.",
+        )
         @functools.wraps(command)
         def run(*args: Any, no_cache: bool, **options: Any) -> None:
             programs.keep_programs(not no_cache)
@@ -103,27 +106,46 @@ class _Devices(click.ParamType):
             return 0
         if value.isascii() and value.isdigit() and 0 < int(value) < 2**31:
             return int(value)
-        raise _Failure(f"--mesh {value}: give a number of devices, or all; what is not for --mesh "
-                       "comes before it.")
+        raise _Failure(
+            f"--mesh {value}: give a number of devices, or all; what is not for --mesh "
+            "comes before it."
+        )
 
 
 def _over_devices(command: Callable[..., None]) -> Callable[..., None]:
     """For commands that can use several devices and processes: which, as one argument."""
 
-    @click.option("--mesh", is_flag=False, flag_value="all", type=_Devices(),
-                  help="Use several devices: so many, or all. With srun or mpirun, those of all "
-                  "processes.")
-    @click.option("--coordinator", metavar="HOST:PORT",
-                  help="Without such a launcher: where process 0 is met.")
+    @click.option(
+        "--mesh",
+        is_flag=False,
+        flag_value="all",
+        type=_Devices(),
+        help="Use several devices: so many, or all. With srun or mpirun, those of all processes.",
+    )
+    @click.option(
+        "--coordinator",
+        metavar="HOST:PORT",
+        help="Without such a launcher: where process 0 is met.",
+    )
     @click.option("--process", type=click.IntRange(0), metavar="I", help="Which process this is.")
     @click.option("--processes", type=click.IntRange(1), metavar="N", help="Of how many.")
-    @click.option("--wait", default=several.WAIT, show_default=True, metavar="SECONDS",
-                  type=click.FloatRange(1, 86400),
-                  help="How long another process may be silent, at the start and later.")
+    @click.option(
+        "--wait",
+        default=several.WAIT,
+        show_default=True,
+        metavar="SECONDS",
+        type=click.FloatRange(1, 86400),
+        help="How long another process may be silent, at the start and later.",
+    )
     @functools.wraps(command)
     def run(
-        *args: Any, mesh: int | None, coordinator: str | None, process: int | None,
-        processes: int | None, wait: float, **options: Any,
+        *args: Any,
+        mesh: int | None,
+        coordinator: str | None,
+        process: int | None,
+        processes: int | None,
+        wait: float,
+        **options: Any,
     ) -> None:
         asked = several.Asked(mesh, coordinator, process, processes, wait)
         command(*args, asked=asked, **options)
@@ -162,18 +184,29 @@ def main() -> None:
 
 @main.command()
 @click.argument("task_file", metavar="TASK.toml", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="Directory for the results.  "
-              "[default: out/NAME]")
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="Directory for the results.  [default: out/NAME]"
+)
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0, 2**31 - 1))
-@click.option("--seeds", default=1, show_default=True, type=click.IntRange(1),
-              help="Learn with this many seeds side by side and keep the best.")
+@click.option(
+    "--seeds",
+    default=1,
+    show_default=True,
+    type=click.IntRange(1),
+    help="Learn with this many seeds side by side and keep the best.",
+)
 @click.option("--again", is_flag=True, help="Do it again where it is done already.")
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
 @_over_devices
 @_compiling(soon=True)
 @_plain_errors
 def learn(
-    task_file: Path, out: Path | None, seed: int, seeds: int, again: bool, as_json: bool,
+    task_file: Path,
+    out: Path | None,
+    seed: int,
+    seeds: int,
+    again: bool,
+    as_json: bool,
     asked: several.Asked,
 ) -> None:
     """Learn a policy for a task, and say how well it does it.
@@ -198,17 +231,27 @@ def learn(
         out = _place(out, task.name)
         with _precision(job):
             mark = job.fingerprint(task, seed, seeds)
-            place.agree({"--out": out, "--seed": seed, "--seeds": seeds, "--again": again,
-                         "as job the task and versions": mark})
+            place.agree(
+                {
+                    "--out": out,
+                    "--seed": seed,
+                    "--seeds": seeds,
+                    "--again": again,
+                    "as job the task and versions": mark,
+                }
+            )
             result = None if again else run_job.finished(out, mark)
             done = place.sees(f"{out}/result.json", result is not None)
             result = result or run_job.run_job(
-                job, task, out, (seed, seeds), mark, begin, say, place)
+                job, task, out, (seed, seeds), mark, begin, say, place
+            )
     if not place.is_first or result is None:
         return
     click.echo(run_job.report_of(result).table(result))
-    click.echo(f"\n{'done before: see' if done else 'wrote'} {out}/report.html and the files "
-               f"beside it{'; --again does it again' if done else ''}")
+    click.echo(
+        f"\n{'done before: see' if done else 'wrote'} {out}/report.html and the files "
+        f"beside it{'; --again does it again' if done else ''}"
+    )
     if as_json:
         _print_json(result)
 
@@ -243,11 +286,17 @@ def check(task_file: Path) -> None:
 
 @main.command()
 @click.argument("game_file", metavar="GAME.toml", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="Directory for the results.  "
-              "[default: out/NAME]")
-@click.option("--environment", nargs=2, type=int, metavar="ROW COLUMN",
-              help="The cell of the environment's robot in moves.svg, from 1.  "
-              "[default: where the strategy forbids most]")
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="Directory for the results.  [default: out/NAME]"
+)
+@click.option(
+    "--environment",
+    nargs=2,
+    type=int,
+    metavar="ROW COLUMN",
+    help="The cell of the environment's robot in moves.svg, from 1.  "
+    "[default: where the strategy forbids most]",
+)
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
 @_compiling(soon=True)
 @_plain_errors
@@ -286,8 +335,10 @@ def synthesize(
     if as_json:
         _print_json(written)
     if not report.is_confirmed(written):
-        raise _Failure("the independent check refutes the result, which is a mistake of jaxltl; "
-                       "please report it with the game file.")
+        raise _Failure(
+            "the independent check refutes the result, which is a mistake of jaxltl; "
+            "please report it with the game file."
+        )
     synthesis.demand(found)
 
 
@@ -334,16 +385,32 @@ def _write_synthesis(found: Any, out: Path, place: int | None, begin: float) -> 
 
 @main.command()
 @click.argument("formulas", metavar="FORMULA...", nargs=-1)
-@click.option("-F", "--file", "source", metavar="FILE",
-              help="Read one formula a line from a file; - is standard input.")
-@click.option("--to", "form", default="text", show_default=True,
-              type=click.Choice(["text", "dot", "svg", "json", "hoa"]))
-@click.option("--acceptance", default="auto", show_default=True,
-              type=click.Choice(["auto", "dfa", "buchi", "parity"]),
-              help="What an automaton accepts by: auto takes the simplest that the language has.")
+@click.option(
+    "-F",
+    "--file",
+    "source",
+    metavar="FILE",
+    help="Read one formula a line from a file; - is standard input.",
+)
+@click.option(
+    "--to",
+    "form",
+    default="text",
+    show_default=True,
+    type=click.Choice(["text", "dot", "svg", "json", "hoa"]),
+)
+@click.option(
+    "--acceptance",
+    default="auto",
+    show_default=True,
+    type=click.Choice(["auto", "dfa", "buchi", "parity"]),
+    help="What an automaton accepts by: auto takes the simplest that the language has.",
+)
 @_plain_errors
 def automaton(
-    formulas: tuple[str, ...], source: str | None, form: str,
+    formulas: tuple[str, ...],
+    source: str | None,
+    form: str,
     acceptance: Literal["auto", "dfa", "buchi", "parity"],
 ) -> None:
     """Translate formulas to small deterministic automata, in order.
@@ -410,19 +477,36 @@ def _render(result: Automaton, form: str, formula: str) -> str:
 @main.command()
 @click.argument("model_file", metavar="MODEL", type=click.Path(path_type=Path))
 @click.argument("properties", metavar="PROPERTY...", nargs=-1, required=True)
-@click.option("--strategy", type=click.Path(path_type=Path), metavar="FILE",
-              help="Write the strategies that attain the values to this file, as JSON.")
-@click.option("--tolerance", default=1e-6, show_default=True,
-              type=click.FloatRange(0, 1, min_open=True),
-              help="The width of the bounds: absolute of probabilities, else relative.")
+@click.option(
+    "--strategy",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write the strategies that attain the values to this file, as JSON.",
+)
+@click.option(
+    "--tolerance",
+    default=1e-6,
+    show_default=True,
+    type=click.FloatRange(0, 1, min_open=True),
+    help="The width of the bounds: absolute of probabilities, else relative.",
+)
 @click.option("--json", "as_json", is_flag=True, help="End with the results as one JSON line.")
-@click.option("--checkpoint", type=click.Path(path_type=Path), metavar="DIRECTORY",
-              help="With --mesh: keep the bounds of long solves here, and go on from them.")
+@click.option(
+    "--checkpoint",
+    type=click.Path(path_type=Path),
+    metavar="DIRECTORY",
+    help="With --mesh: keep the bounds of long solves here, and go on from them.",
+)
 @_over_devices
 @_plain_errors
 def solve(
-    model_file: Path, properties: tuple[str, ...], strategy: Path | None, tolerance: float,
-    as_json: bool, checkpoint: Path | None, asked: several.Asked,
+    model_file: Path,
+    properties: tuple[str, ...],
+    strategy: Path | None,
+    tolerance: float,
+    as_json: bool,
+    checkpoint: Path | None,
+    asked: several.Asked,
 ) -> None:
     """Solve properties of a Markov chain or decision process, with certified bounds.
 
@@ -440,7 +524,9 @@ def solve(
     say = _first_says(launch)
     say(_first_line(f"solving {model_file}"))
     for option, given, with_mesh in (
-            ("--strategy", strategy, False), ("--checkpoint", checkpoint, True)):
+        ("--strategy", strategy, False),
+        ("--checkpoint", checkpoint, True),
+    ):
         if given is not None and (asked.mesh is not None) != with_mesh:
             raise ValueError(f"{option} goes {'with' if with_mesh else 'without'} --mesh alone.")
     if asked.mesh is not None:
@@ -466,10 +552,13 @@ def solve(
 
             spread, known, entry = solve_on_mesh.read(model_file, questions, place)
             found = solve_on_mesh.solve_in(
-                place, spread, known, questions, tolerance, checkpoint, list(properties))
+                place, spread, known, questions, tolerance, checkpoint, list(properties)
+            )
         if place.is_first:
-            click.echo("{kind} of {states} states, {choices} choices, {transitions} transitions, "
-                       "read in {seconds:.3f} s".format(**entry))
+            click.echo(
+                "{kind} of {states} states, {choices} choices, {transitions} transitions, "
+                "read in {seconds:.3f} s".format(**entry)
+            )
         results = []
         for result in found:
             results.append(result)
@@ -493,19 +582,38 @@ def solve(
 @click.option("--terminal", multiple=True, metavar="STATE", help="Where they stay.")
 @click.option("--labels", type=click.Path(path_type=Path), help="A table of states and labels.")
 @click.option("--model", type=click.Path(path_type=Path), help="A model file that has the graph.")
-@click.option("--graph", type=click.Choice(["seen", "complete"]), default="seen",
-              show_default=True, help="Whether other transitions than those seen are possible.")
-@click.option("--method", default="anytime", show_default=True,
-              type=click.Choice(["anytime", "clopper-pearson", "hoeffding", "weissman"]))
+@click.option(
+    "--graph",
+    type=click.Choice(["seen", "complete"]),
+    default="seen",
+    show_default=True,
+    help="Whether other transitions than those seen are possible.",
+)
+@click.option(
+    "--method",
+    default="anytime",
+    show_default=True,
+    type=click.Choice(["anytime", "clopper-pearson", "hoeffding", "weissman"]),
+)
 @click.option("--min", "smallest", is_flag=True, help="Make the probability small.")
 @click.option("--policy", type=click.Path(path_type=Path), help="Write the policy, as JSON.")
-@click.option("--curve", type=click.Path(path_type=Path),
-              help="Draw the bound over the number of samples (.svg, .png or .pdf).")
+@click.option(
+    "--curve",
+    type=click.Path(path_type=Path),
+    help="Draw the bound over the number of samples (.svg, .png or .pdf).",
+)
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
 @_plain_errors
 def certify(
-    log: Path, formula: str, confidence: float, method: str, smallest: bool, policy: Path | None,
-    curve: Path | None, as_json: bool, **world: Any,
+    log: Path,
+    formula: str,
+    confidence: float,
+    method: str,
+    smallest: bool,
+    policy: Path | None,
+    curve: Path | None,
+    as_json: bool,
+    **world: Any,
 ) -> None:
     """A policy for a formula from logged transitions, and what is guaranteed of it.
 
@@ -531,11 +639,17 @@ _EXPERIMENTS = {
 
 @main.command(epilog="\n\n".join(f"{k}: {v}." for k, v in _EXPERIMENTS.items()))
 @click.argument("what", type=click.Choice(list(_EXPERIMENTS)))
-@click.option("--out", type=click.Path(path_type=Path),
-              help="Directory for the pictures, if there are any.  [default: out/reproduce]")
-@click.option("--seeds", type=click.IntRange(1),
-              help="How often learning is repeated, in todirl, pac and cce.  [default: 10; in cce "
-                   "50 for the regulator, 5 for the robot]")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="Directory for the pictures, if there are any.  [default: out/reproduce]",
+)
+@click.option(
+    "--seeds",
+    type=click.IntRange(1),
+    help="How often learning is repeated, in todirl, pac and cce.  [default: 10; in cce "
+    "50 for the regulator, 5 for the robot]",
+)
 @click.option("--json", "as_json", is_flag=True, help="End with the figures as one JSON line.")
 @_compiling(soon=False)
 @_plain_errors
@@ -547,8 +661,7 @@ def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> 
     if seeds is not None and "seeds" not in inspect.signature(experiment.figures).parameters:
         raise ValueError(f"reproduce {what} does not learn with several seeds; leave --seeds out.")
     with _float64():
-        result = experiment.figures(
-            progress=_say, **options)
+        result = experiment.figures(progress=_say, **options)
         pictures = experiment.pictures(result) if hasattr(experiment, "pictures") else []
     click.echo(experiment.table(result))
     if pictures:

@@ -29,7 +29,8 @@ from PIL import Image
 HERE = Path(__file__).parent
 MOST_BYTES = 500_000  # of a notebook with its outputs
 _NUMBER = re.compile(
-    r"(?<![\w.])[-+]?(?:\d{1,3}(?:,\d{3})+(?!\d)|\d+)?(?:(?<=\d)\.?|\.(?=\d))\d*(?:e[-+]?\d+)?\b")
+    r"(?<![\w.])[-+]?(?:\d{1,3}(?:,\d{3})+(?!\d)|\d+)?(?:(?<=\d)\.?|\.(?=\d))\d*(?:e[-+]?\d+)?\b"
+)
 _UNWANTED = {
     "a path of one machine": r"(?<![\w.:])/(?:home|root|tmp|usr|var|work|Users|opt)/",
     "an address in memory": r"\b0x[0-9a-f]{6,}",
@@ -40,8 +41,11 @@ _UNWANTED = {
 
 def paths(names: list[str]) -> list[Path]:
     """The notebooks whose names begin with one of these; all, if there is none."""
-    return [path for path in sorted(HERE.glob("*.ipynb"))
-            if not names or path.stem.startswith(tuple(names))]
+    return [
+        path
+        for path in sorted(HERE.glob("*.ipynb"))
+        if not names or path.stem.startswith(tuple(names))
+    ]
 
 
 def packages(notebook: NotebookNode) -> list[str]:
@@ -58,7 +62,10 @@ def execute(notebook: NotebookNode) -> NotebookNode:
     fresh = copy.deepcopy(notebook)
     with tempfile.TemporaryDirectory() as folder:
         NotebookClient(
-            fresh, timeout=900, record_timing=False, store_widget_state=False,
+            fresh,
+            timeout=900,
+            record_timing=False,
+            store_widget_state=False,
             resources={"metadata": {"path": folder}},
         ).execute(env={**os.environ, "XLA_FLAGS": ""})
     for cell in fresh.cells:
@@ -66,9 +73,15 @@ def execute(notebook: NotebookNode) -> NotebookNode:
             cell.outputs = _tidied(cell.outputs)
             _tell_the_cell(cell)
     fresh.metadata["kernelspec"] = {
-        "display_name": "Python 3", "language": "python", "name": "python3"}
+        "display_name": "Python 3",
+        "language": "python",
+        "name": "python3",
+    }
     fresh.metadata["language_info"] = {
-        "file_extension": ".py", "mimetype": "text/x-python", "name": "python"}
+        "file_extension": ".py",
+        "mimetype": "text/x-python",
+        "name": "python",
+    }
     fresh.metadata["outputs_of"] = sources(fresh)
     return fresh
 
@@ -84,11 +97,17 @@ def open_with_picture(notebook: NotebookNode, name: str) -> bytes:
     Raises:
       ValueError: there is not one such cell with one picture.
     """
-    found = [output for cell in notebook.cells if "opening" in cell.metadata.get("tags", ())
-             for output in cell.outputs if "image/png" in output.get("data", {})]
+    found = [
+        output
+        for cell in notebook.cells
+        if "opening" in cell.metadata.get("tags", ())
+        for output in cell.outputs
+        if "image/png" in output.get("data", {})
+    ]
     if len(found) != 1:
-        raise ValueError(f"{name}: {len(found)} pictures open it; tag one cell that shows one "
-                         'as "opening".')
+        raise ValueError(
+            f'{name}: {len(found)} pictures open it; tag one cell that shows one as "opening".'
+        )
     title, _, rest = notebook.cells[0].source.partition("\n\n")
     rest = re.sub(r"\A!\[[^\]]*\]\([^)]*\)\n\n", "", rest)
     alt = found[0].metadata["image/png"]["alt"]
@@ -145,12 +164,14 @@ def differences(saved: NotebookNode, fresh: NotebookNode) -> list[str]:
 def difference(old: str, new: str, tolerance: float) -> str:
     """How a text differs from one that was saved, in words; empty if it does not."""
     if [re.sub(r"\s", "", x) for x in _NUMBER.split(old)] != [
-            re.sub(r"\s", "", x) for x in _NUMBER.split(new)]:
+        re.sub(r"\s", "", x) for x in _NUMBER.split(new)
+    ]:
         return f"it was {old.strip()!r} and is {new.strip()!r}"
     for a, b in zip(_NUMBER.findall(old), _NUMBER.findall(new), strict=True):
         x, y = (float(n.replace(",", "")) for n in (a, b))
         if abs(x - y) > 1.01 * max(_last_place(a), _last_place(b)) and (
-                abs(x - y) > tolerance * max(1.0, abs(x))):
+            abs(x - y) > tolerance * max(1.0, abs(x))
+        ):
             line = next((n for n in new.splitlines() if b in n), new).strip()
             return f"{a} was saved, it is {b}, in {line!r}"
     return ""
@@ -164,14 +185,21 @@ def _tidied(outputs: list[NotebookNode]) -> list[NotebookNode]:
     """Streams as one text each, whenever they were flushed; what moves as its picture."""
     kept: list[NotebookNode] = []
     for output in outputs:
-        if kept and output.output_type == kept[-1].output_type == "stream" and (
-                output.name == kept[-1].name):
+        if (
+            kept
+            and output.output_type == kept[-1].output_type == "stream"
+            and (output.name == kept[-1].name)
+        ):
             kept[-1].text += output.text
             continue
         if _pictures(output):
-            output.data = NotebookNode({
-                kind: _smaller(x) if kind == "image/png" else x for kind, x in output.data.items()
-                if kind == "text/plain" or kind.startswith("image/")})
+            output.data = NotebookNode(
+                {
+                    kind: _smaller(x) if kind == "image/png" else x
+                    for kind, x in output.data.items()
+                    if kind == "text/plain" or kind.startswith("image/")
+                }
+            )
         kept.append(output)
     return kept
 
@@ -181,7 +209,8 @@ def _smaller(png: str) -> str:
     buffer = io.BytesIO()
     with Image.open(io.BytesIO(base64.b64decode(png))) as image:
         image.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(
-            buffer, format="png", optimize=True)
+            buffer, format="png", optimize=True
+        )
     return base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
@@ -215,17 +244,24 @@ def _faults_of(output: NotebookNode) -> list[str]:
     found = ["a picture without a text alternative" for x in _pictures(output) if not x.get("alt")]
     data = output.get("data", {})
     if any(kind.startswith("application/") for kind in data) or (
-            "text/html" in data and "<script" in data["text/html"]):
+        "text/html" in data and "<script" in data["text/html"]
+    ):
         found.append("it moves, and no picture stands in its place")
     text = "\n".join([*_texts([output]), str(data.get("text/html", ""))])
-    found += [f"{what}: {match[0]!r}" for what, pattern in _UNWANTED.items()
-              if (match := re.search(pattern, text))]
+    found += [
+        f"{what}: {match[0]!r}"
+        for what, pattern in _UNWANTED.items()
+        if (match := re.search(pattern, text))
+    ]
     return found
 
 
 def _texts(outputs: list[NotebookNode]) -> list[str]:
-    return [output["text"] if output.output_type == "stream" else output.data.get("text/plain", "")
-            for output in outputs if output.output_type != "error"]
+    return [
+        output["text"] if output.output_type == "stream" else output.data.get("text/plain", "")
+        for output in outputs
+        if output.output_type != "error"
+    ]
 
 
 def _last_place(number: str) -> float:
@@ -237,8 +273,11 @@ def _last_place(number: str) -> float:
 
 def main() -> int:
     """Executes what the command line names."""
-    parser = argparse.ArgumentParser(description=__doc__, prog="python -m notebooks.execute",
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__,
+        prog="python -m notebooks.execute",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("names", nargs="*", metavar="NAME")
     parser.add_argument("--check", action="store_true", help="save nothing, compare")
     arguments = parser.parse_args()

@@ -267,8 +267,12 @@ def exact_optimal_reachability(model: Model, target: np.ndarray, objective: str)
 
 
 def iterate_values(
-    transition: np.ndarray, available: np.ndarray, reward: np.ndarray, discount: float,
-    operator: str, num_steps: int,
+    transition: np.ndarray,
+    available: np.ndarray,
+    reward: np.ndarray,
+    discount: float,
+    operator: str,
+    num_steps: int,
 ) -> np.ndarray:
     """Damped iteration of the soft or the Boltzmann operator from zero, on a batch of models."""
     transition, reward = transition.astype(np.longdouble), reward.astype(np.longdouble)
@@ -290,7 +294,10 @@ def soft_maximum(q: np.ndarray, available: np.ndarray, operator: str) -> np.ndar
 
 
 def likelihood_gradient(
-    transition: np.ndarray, policy: np.ndarray, slope: np.ndarray, counts: np.ndarray,
+    transition: np.ndarray,
+    policy: np.ndarray,
+    slope: np.ndarray,
+    counts: np.ndarray,
     discount: float,
 ) -> np.ndarray:
     """(3.6) and (3.7): every parameter's sensitivity of Q by a dense solve, then of log pi.

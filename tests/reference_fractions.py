@@ -26,19 +26,23 @@ def ball(lower, upper, center, most):
         return {(Fraction(1),)}
     k, limits = len(lower), []
     for i in range(k):
-        limits += [([int(j == i) for j in range(k)], upper[i]),
-                   ([-int(j == i) for j in range(k)], -lower[i])]
+        limits += [
+            ([int(j == i) for j in range(k)], upper[i]),
+            ([-int(j == i) for j in range(k)], -lower[i]),
+        ]
     for some in itertools.product((0, 1), repeat=k):
         if any(some):
-            limits.append((list(some), most + sum(c for c, s in zip(center, some, strict=True)
-                                                  if s)))
+            limits.append(
+                (list(some), most + sum(c for c, s in zip(center, some, strict=True) if s))
+            )
     # The last entry is what the others leave.
     short = [([x - a[-1] for x in a[:-1]], b - a[-1]) for a, b in limits]
     found = set()
     for binding in itertools.combinations(short, k - 1):
         p = solve([a for a, _ in binding], [b for _, b in binding])
         if p is not None and all(
-                sum(x * y for x, y in zip(a, p, strict=True)) <= b for a, b in short):
+            sum(x * y for x, y in zip(a, p, strict=True)) <= b for a, b in short
+        ):
             found.add((*p, 1 - sum(p)))
     return found
 
@@ -69,11 +73,18 @@ def actions(host):
             if host.ball is None:
                 every = box(*ends)
             else:
-                every = ball(*ends, [Fraction(float(x)) for x in host.ball.center[of]],
-                             Fraction(float(host.ball.most[r])))
+                every = ball(
+                    *ends,
+                    [Fraction(float(x)) for x in host.ball.center[of]],
+                    Fraction(float(host.ball.most[r])),
+                )
             assert every
-            found[-1].append([{int(t): x for t, x in zip(mdp.successor[of], p, strict=True) if x}
-                              for p in sorted(every)])
+            found[-1].append(
+                [
+                    {int(t): x for t, x in zip(mdp.successor[of], p, strict=True) if x}
+                    for p in sorted(every)
+                ]
+            )
     return found
 
 
@@ -115,13 +126,17 @@ def optimum(choices, goal, cost, maximize):
     while True:
         index = {s: i for i, s in enumerate(open_)}
         matrix = [[int(s == t) - pick[s][1].get(t, 0) for t in open_] for s in open_]
-        right = [_cost(cost, pick[s]) + sum(
-            p * value[t] for t, p in pick[s][1].items() if t not in index) for s in open_]
+        right = [
+            _cost(cost, pick[s])
+            + sum(p * value[t] for t, p in pick[s][1].items() if t not in index)
+            for s in open_
+        ]
         value |= dict(zip(open_, solve(matrix, right), strict=True))
         better = {}
         for s in open_:
-            worth = [_cost(cost, a) + sum(p * value[t] for t, p in a[1].items())
-                     for a in choices[s]]
+            worth = [
+                _cost(cost, a) + sum(p * value[t] for t, p in a[1].items()) for a in choices[s]
+            ]
             best = max(worth) if maximize else min(worth)
             if best != value[s]:
                 better[s] = choices[s][worth.index(best)]
@@ -137,8 +152,9 @@ def _cost(cost, action):
 def _led(choices, goal, open_, some):
     """The states of which some (all) distributions lead to a goal with positive probability."""
     found = set(goal)
-    while new := {s for s in open_ if s not in found and some(
-            bool(set(a[1]) & found) for a in choices[s])}:
+    while new := {
+        s for s in open_ if s not in found and some(bool(set(a[1]) & found) for a in choices[s])
+    }:
         found |= new
     return found
 
@@ -159,15 +175,23 @@ def values(host, goal, ends, cost, *, maximize, large):
     """The probability of a goal, or the cost until an end, of policy and nature, by brute force."""
     worth = {int(s): Fraction(int(goal[s] and cost is None)) for s in np.flatnonzero(ends)}
     rows, start = actions(host), host.mdp.row_start
-    every = [[(start[s] + i, p) for i, row in enumerate(rows[s]) for p in row]
-             for s in range(len(rows))]
+    every = [
+        [(start[s] + i, p) for i, row in enumerate(rows[s]) for p in row] for s in range(len(rows))
+    ]
     if maximize == large:
         return optimum(every, worth, cost, maximize)
     best = None
     for policy in itertools.product(*(range(len(row)) for row in rows)):
-        found = optimum([[(r, p) for r, p in every[s] if r == start[s] + policy[s]]
-                         for s in range(len(rows))], worth, cost, large)
+        found = optimum(
+            [[(r, p) for r, p in every[s] if r == start[s] + policy[s]] for s in range(len(rows))],
+            worth,
+            cost,
+            large,
+        )
         found = [np.inf if x is None else x for x in found]
-        best = found if best is None else [
-            (max if maximize else min)(x, y) for x, y in zip(best, found, strict=True)]
+        best = (
+            found
+            if best is None
+            else [(max if maximize else min)(x, y) for x, y in zip(best, found, strict=True)]
+        )
     return [None if x == np.inf else x for x in best]

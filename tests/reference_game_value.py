@@ -96,7 +96,7 @@ def cycle_mean(successor, reward, start: int) -> Fraction:
         seen[state] = len(paid)
         paid.append(Fraction(reward[state]))
         state = int(successor[state])
-    cycle = paid[seen[state]:]
+    cycle = paid[seen[state] :]
     return sum(cycle, Fraction(0)) / len(cycle)
 
 

@@ -130,6 +130,7 @@ def reach(game: Play, goal: np.ndarray, safe: np.ndarray) -> np.ndarray:
 
 def buchi(game: Play, accepting: np.ndarray, safe: np.ndarray) -> np.ndarray:
     """No class of recurrent states misses the set, and no unsafe state is entered."""
+
     def judge(reach, recurrent):
         return ever(reach, ~safe | (recurrent & ~ever(reach, accepting)))
 
@@ -143,6 +144,7 @@ def cobuchi(game: Play, persistent: np.ndarray, safe: np.ndarray) -> np.ndarray:
 
 def parity(game: Play, priority: np.ndarray, safe: np.ndarray) -> np.ndarray:
     """The least priority of each recurrent class is even, and no unsafe state is entered."""
+
     def judge(reach, recurrent):
         least = np.where(reach, priority, priority.max() + 1).min(-1)
         return ever(reach, ~safe | (recurrent & (least % 2 == 1)))
@@ -187,10 +189,11 @@ def claims(
     system = wins(game.system, action, region & ~won, won)
     environment = wins(~game.system, counter, ~region & ~lost, won | region)
     return (
-        system is not None and not (region & lost).any() and system[1]
+        system is not None
+        and not (region & lost).any()
+        and system[1]
         and bool(system[0][region].all()),
-        environment is not None and bool(region[won].all())
-        and not environment[0][~region].any(),
+        environment is not None and bool(region[won].all()) and not environment[0][~region].any(),
     )
 
 
@@ -203,7 +206,11 @@ def positive_reach(game: Play, goal: np.ndarray) -> np.ndarray:
 
 
 def attractor(
-    model: Model, goal: np.ndarray, allowed: np.ndarray, exists: np.ndarray, chance: str,
+    model: Model,
+    goal: np.ndarray,
+    allowed: np.ndarray,
+    exists: np.ndarray,
+    chance: str,
     among: np.ndarray,
 ) -> np.ndarray:
     """The least set around the goal that is closed under the rule of each state."""

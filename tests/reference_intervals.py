@@ -49,8 +49,14 @@ def with_ball(rng, model, unit=8):
     radius = rng.choice([0.0, 0.25, 0.5, 0.75, 1.0, 2.0], model.mdp.num_rows)
     mdp = model.mdp
     return interval_rows(
-        mdp.row_start, mdp.entry_start, mdp.successor, model.lower, model.upper,
-        center=center, radius=radius).host
+        mdp.row_start,
+        mdp.entry_start,
+        mdp.successor,
+        model.lower,
+        model.upper,
+        center=center,
+        radius=radius,
+    ).host
 
 
 def random_model(rng, num_states=4, most_rows=2, width=3, unit=8):
@@ -76,7 +82,8 @@ def random_model(rng, num_states=4, most_rows=2, width=3, unit=8):
     model = HostInterval(mdp, np.array(lower), np.array(upper))
     chance = model.within(np.ones(len(successor), bool))
     return HostInterval(
-        HostMDP(mdp.row_start, mdp.entry_start, mdp.successor, chance), model.lower, model.upper)
+        HostMDP(mdp.row_start, mdp.entry_start, mdp.successor, chance), model.lower, model.upper
+    )
 
 
 def chains(model, goal):
@@ -88,17 +95,24 @@ def chains(model, goal):
         rows = np.zeros((0, mdp.num_states))
         ends = model.lower[of], model.upper[of]
         ball = model.ball
-        for p in vertices(*ends) if ball is None else ball_vertices(
-                *ends, ball.center[of], 2 * ball.most[r]):
+        for p in (
+            vertices(*ends)
+            if ball is None
+            else ball_vertices(*ends, ball.center[of], 2 * ball.most[r])
+        ):
             row = np.zeros((1, mdp.num_states))
             row[0, mdp.successor[of]] = p
             rows = np.concatenate([rows, row])
         corner.append(rows)
-    choices = [[mdp.row_start[s]] if goal[s] else range(mdp.row_start[s], mdp.row_start[s + 1])
-               for s in range(mdp.num_states)]
+    choices = [
+        [mdp.row_start[s]] if goal[s] else range(mdp.row_start[s], mdp.row_start[s + 1])
+        for s in range(mdp.num_states)
+    ]
     for policy in itertools.product(*choices):
-        options = [np.eye(mdp.num_states)[[s]] if goal[s] else corner[policy[s]]
-                   for s in range(mdp.num_states)]
+        options = [
+            np.eye(mdp.num_states)[[s]] if goal[s] else corner[policy[s]]
+            for s in range(mdp.num_states)
+        ]
         yield policy, np.array([np.stack(c) for c in itertools.product(*options)])
 
 
@@ -140,5 +154,9 @@ def parity(matrix, priority):
 def optima(answers):
     """Of arrays ``[natures, S]``, one a policy: by (policy large, nature large)."""
     large, small = (np.array([op(x, 0) for x in answers]) for op in (np.max, np.min))
-    return {(True, True): large.max(0), (True, False): small.max(0),
-            (False, True): large.min(0), (False, False): small.min(0)}
+    return {
+        (True, True): large.max(0),
+        (True, False): small.max(0),
+        (False, True): large.min(0),
+        (False, False): small.min(0),
+    }

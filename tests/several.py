@@ -49,10 +49,17 @@ def start(number: int, *command: str, places: bool = True) -> list[subprocess.Po
         names = ("--coordinator", "--process", "--processes")
         values = (address, str(i), str(number))
         more = values if places else [x for pair in zip(names, values, strict=True) for x in pair]
-        found.append(subprocess.Popen(
-            [sys.executable, *command, *more], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            text=True, cwd=ROOT, start_new_session=True,
-            env={**os.environ, "PYTHONPATH": str(ROOT)}))
+        found.append(
+            subprocess.Popen(
+                [sys.executable, *command, *more],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                cwd=ROOT,
+                start_new_session=True,
+                env={**os.environ, "PYTHONPATH": str(ROOT)},
+            )
+        )
     return found
 
 
@@ -63,8 +70,10 @@ def start_run(number: int, directory: Path, what: str = "learn") -> list[subproc
 def ended(processes: list[subprocess.Popen], seconds: float) -> list[Ended]:
     """When all have ended; whatever happens, nothing of them stays behind."""
     try:
-        return [Ended(p.returncode, *texts) for p, texts in
-                [(p, p.communicate(timeout=seconds)) for p in processes]]
+        return [
+            Ended(p.returncode, *texts)
+            for p, texts in [(p, p.communicate(timeout=seconds)) for p in processes]
+        ]
     finally:
         for process in processes:
             with contextlib.suppress(ProcessLookupError):
@@ -102,8 +111,7 @@ def problem_and_state() -> tuple[Any, Any, Any]:
     def step(state: State, goal: Any, rate: Any) -> tuple[State, Metrics]:
         noise = jax.random.normal(jax.random.fold_in(state.key, state.step), goal.shape)
         position = state.position + rate * (goal - state.position) + 0.01 * noise
-        return (State(position, state.step + 1, state.key),
-                Metrics(jnp.abs(goal - position).max()))
+        return (State(position, state.step + 1, state.key), Metrics(jnp.abs(goal - position).max()))
 
     keys = jax.random.split(jax.random.key(0), LANES)
     states = State(jnp.zeros((LANES, 3)), jnp.zeros(LANES, jnp.int32), keys)
@@ -120,8 +128,17 @@ def run(directory: Path, place: Any) -> None:
     begun = place.sees(str(path), path.exists())
     made: list[int] = []
     found = run_in_chunks(
-        step, states, goal, 0.01, num_steps=STEPS, lanes=True, chunk=50, checkpoint=path,
-        mesh=place.mesh, report=lambda done, _: made.append(done))
+        step,
+        states,
+        goal,
+        0.01,
+        num_steps=STEPS,
+        lanes=True,
+        chunk=50,
+        checkpoint=path,
+        mesh=place.mesh,
+        report=lambda done, _: made.append(done),
+    )
     state = on_host(found.state)
     if place.is_first:
         print(f"went on: {begun and (not made or made[0] > 50)}")
@@ -135,9 +152,13 @@ def walk(size: int = 11) -> Any:
 
     ends = [[s] if s in (0, size - 1) else [s - 1, s + 1] for s in range(size)]
     return make_sparse(
-        None, np.cumsum([0] + [len(x) for x in ends]), [t for x in ends for t in x],
-        [1 / len(x) for x in ends for _ in x], initial=np.eye(size)[2 * (size // 5)],
-        label={"win": [size - 1]})
+        None,
+        np.cumsum([0] + [len(x) for x in ends]),
+        [t for x in ends for t in x],
+        [1 / len(x) for x in ends for _ in x],
+        initial=np.eye(size)[2 * (size // 5)],
+        label={"win": [size - 1]},
+    )
 
 
 def solve(directory: Path, place: Any) -> None:
@@ -159,13 +180,21 @@ def solve(directory: Path, place: Any) -> None:
     text = 'Pmax=? [ F "win" ]'
     with jax.enable_x64(True):
         (found,) = solve_on_mesh.solve_in(
-            place, solve_on_mesh.on_mesh(walk(), place), {}, asked_for([text]), 1e-6, directory,
-            [text])
+            place,
+            solve_on_mesh.on_mesh(walk(), place),
+            {},
+            asked_for([text]),
+            1e-6,
+            directory,
+            [text],
+        )
     if place.is_first:
         print(f"went on: {bool(made) and made[0] > 16}")
         print(f"saved: {len(made)}")
-        print(f"ended: {found.answer.lower.tobytes().hex()}, {found.answer.upper.tobytes().hex()}, "
-              f"{found.answer.status.name}, {found.answer.value[0]!r}")
+        print(
+            f"ended: {found.answer.lower.tobytes().hex()}, {found.answer.upper.tobytes().hex()}, "
+            f"{found.answer.status.name}, {found.answer.value[0]!r}"
+        )
 
 
 def laws(directory: Path, place: Any) -> None:
@@ -185,17 +214,25 @@ def laws(directory: Path, place: Any) -> None:
         for text in PROPERTIES:
             question = question_on_mesh(model, parse_property(text))
             found = question.advance(
-                first_bounds(model, question), question.tolerance(1e-6), 10_000)
+                first_bounds(model, question), question.tolerance(1e-6), 10_000
+            )
             there = question.answer(found, 1e-6)
-            told = {"property": text, "lower": there.lower.tolist(),
-                    "upper": there.upper.tolist(), "holds": there.holds,
-                    "status": there.status.name}
+            told = {
+                "property": text,
+                "lower": there.lower.tolist(),
+                "upper": there.upper.tolist(),
+                "holds": there.holds,
+                "status": there.status.name,
+            }
             if place.is_first:
                 print(json.dumps(told), flush=True)
         for name, solve in (("optimal", optimal_value), ("soft", soft_value)):
             found = jax.jit(lambda x, solve=solve: solve(x, x.rewards["games"], 0.9))(model)
-            told = {"property": name, "value": from_mesh(model, found.value).tolist(),
-                    "status": int(on_host(found.status))}
+            told = {
+                "property": name,
+                "value": from_mesh(model, found.value).tolist(),
+                "status": int(on_host(found.status)),
+            }
             if place.is_first:
                 print(json.dumps(told), flush=True)
 

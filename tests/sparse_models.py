@@ -17,8 +17,10 @@ def random_sparse(rng, num_states, *, chain=False, most=3, width=3, fractions=No
     successor = np.concatenate([rng.choice(num_states, w, replace=False) for w in widths])
     probability = rng.random(start[-1]) + 0.05
     if fractions:
-        probability = np.concatenate([
-            rng.multinomial(fractions - w, np.ones(w) / w) + 1 for w in widths]) / fractions
+        probability = (
+            np.concatenate([rng.multinomial(fractions - w, np.ones(w) / w) + 1 for w in widths])
+            / fractions
+        )
     else:
         probability /= np.repeat(np.add.reduceat(probability, start[:-1]), widths)
     row_start = None if chain else np.concatenate([[0], count.cumsum()])
@@ -54,8 +56,13 @@ def storm_model(model: SparseMDP, labels=None, rewards=None):
     from stormpy import datastructures, models
 
     builder = datastructures.SparseMatrixBuilder(
-        rows=model.num_rows, columns=model.num_states, entries=0, force_dimensions=False,
-        has_custom_row_grouping=not model.is_chain, row_groups=0)
+        rows=model.num_rows,
+        columns=model.num_states,
+        entries=0,
+        force_dimensions=False,
+        has_custom_row_grouping=not model.is_chain,
+        row_groups=0,
+    )
     for s in range(model.num_states):
         if not model.is_chain:
             builder.new_row_group(int(model.row_start[s]))
@@ -67,18 +74,23 @@ def storm_model(model: SparseMDP, labels=None, rewards=None):
         labeling.add_label(name)
         chosen = [int(s) for s in np.flatnonzero(region)]
         labeling.set_states(name, datastructures.BitVector(model.num_states, chosen))
-    parts = {"transition_matrix": builder.build(), "state_labeling": labeling,
-             "reward_models": {name: _storm_reward(models, x)
-                               for name, x in (rewards or {}).items()}}
+    parts = {
+        "transition_matrix": builder.build(),
+        "state_labeling": labeling,
+        "reward_models": {name: _storm_reward(models, x) for name, x in (rewards or {}).items()},
+    }
     kind = models.SparseDtmc if model.is_chain else models.SparseMdp
     return kind(models.SparseModelComponents(**parts))
 
 
 def _storm_reward(models, reward: Rewards):
-    parts = {"optional_state_reward_vector": reward.state,
-             "optional_state_action_reward_vector": reward.choice}
+    parts = {
+        "optional_state_reward_vector": reward.state,
+        "optional_state_action_reward_vector": reward.choice,
+    }
     return models.SparseRewardModel(
-        **{name: np.asarray(x).tolist() for name, x in parts.items() if x is not None})
+        **{name: np.asarray(x).tolist() for name, x in parts.items() if x is not None}
+    )
 
 
 def storm_values(storm, text: str, environment=None) -> np.ndarray:

@@ -22,14 +22,16 @@ REPRESENTATIONS = ("sparse", "dense", "product")
 
 def counts(few: int, many: int) -> pytest.MarkDecorator:
     """A law of random cases, given as ``count``: few by default, many with the exhaustive ones."""
-    return pytest.mark.parametrize(
-        "count", [few, pytest.param(many, marks=pytest.mark.exhaustive)])
+    return pytest.mark.parametrize("count", [few, pytest.param(many, marks=pytest.mark.exhaustive)])
 
 
 def as_mdp(model: reference.Model, **labels: Any) -> MDP:
     """The library's model of a reference model."""
     return make_mdp(
-        model.successor, model.probability, available=model.available, initial=model.initial,
+        model.successor,
+        model.probability,
+        available=model.available,
+        initial=model.initial,
         **labels,
     )
 
@@ -86,7 +88,8 @@ def random_product(
         delta, start, bit_labels(np.arange(4), 2), names, final=final, acceptance=acceptance
     )
     lazy = product(
-        as_mdp(world, label=bit_labels(letter, 2), propositions=names), automaton,
+        as_mdp(world, label=bit_labels(letter, 2), propositions=names),
+        automaton,
         label_on=label_on,
     )
     return lazy, reference.explicit_product(world, delta, start, letter, label_on)
@@ -119,8 +122,11 @@ def assert_solutions_agree(one: Any, other: Any, tolerance: float = 1e-11) -> No
     np.testing.assert_array_equal(one.status, other.status)
     for field in ("value", "lower", "upper"):
         np.testing.assert_allclose(
-            np.ravel(getattr(one, field)), np.ravel(getattr(other, field)),
-            rtol=tolerance, atol=tolerance, err_msg=field,
+            np.ravel(getattr(one, field)),
+            np.ravel(getattr(other, field)),
+            rtol=tolerance,
+            atol=tolerance,
+            err_msg=field,
         )
 
 

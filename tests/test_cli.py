@@ -24,8 +24,11 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.io.hoa import read_hoa_stream
 from tests.app.test_task import SHOWN, TASK, write  # noqa: F401
 
-QUICK = ("discount = 0.9", 'discount = 0.9\nsteps = 40\ntolerance = 1e-6\n'
-         'optimizer = "adam"\nlearning_rate = 0.3\navoid = ["r"]')
+QUICK = (
+    "discount = 0.9",
+    "discount = 0.9\nsteps = 40\ntolerance = 1e-6\n"
+    'optimizer = "adam"\nlearning_rate = 0.3\navoid = ["r"]',
+)
 
 
 def run(*arguments, input=None):
@@ -65,24 +68,28 @@ def test_forms_of_an_automaton(form, sign, monkeypatch):
 
 
 def test_a_stream_of_automata():
-    formulas = ["F a", "G F a & G F b", "F G \"odd \\\" name\""]
+    formulas = ["F a", "G F a & G F b", 'F G "odd \\" name"']
     result = run("automaton", *formulas, "--to", "hoa")
     assert result.output.endswith("--END--\n")
     names = [line for line in result.output.splitlines() if line.startswith("name:")]
-    assert names == ['name: "F a"', 'name: "G F a & G F b"',
-                     r'name: "F G \"odd \\\" name\""']
+    assert names == ['name: "F a"', 'name: "G F a & G F b"', r'name: "F G \"odd \\\" name\""']
     read = read_hoa_stream(result.output)
     assert [x.acceptance for x in read] == ["cosafe", "buchi", "parity"]
     assert all(is_equivalent(x, to_automaton(f)) for x, f in zip(read, formulas, strict=True))
 
 
 def test_the_acceptance_that_is_asked_for():
-    for acceptance, found in (("auto", "cosafe"), ("dfa", "cosafe"), ("buchi", "buchi"),
-                              ("parity", "parity")):
+    for acceptance, found in (
+        ("auto", "cosafe"),
+        ("dfa", "cosafe"),
+        ("buchi", "buchi"),
+        ("parity", "parity"),
+    ):
         result = run("automaton", "F a", "--acceptance", acceptance)
         assert result.output.startswith(f"{found} automaton: 2 states")
     assert "has no deterministic Buchi automaton" in failure(
-        "automaton", "F G a", "--acceptance", "buchi")
+        "automaton", "F G a", "--acceptance", "buchi"
+    )
     message = failure("automaton", "-F", "-", "--acceptance", "dfa", input="F a\nG F a\n")
     assert message.startswith("error: standard input, line 2: ")
     assert "G F a has no finite acceptance" in message
@@ -122,8 +129,13 @@ def learned(tmp_path_factory):
 
 def test_learn_prints_evidence(learned):
     _, result = learned
-    for words in ("probability of doing the task", "certified", "best achievable", "weights",
-                  "over 2 seeds"):
+    for words in (
+        "probability of doing the task",
+        "certified",
+        "best achievable",
+        "weights",
+        "over 2 seeds",
+    ):
         assert words in result.stdout
     last = json.loads(result.stdout.splitlines()[-1])
     learned_mean, best = last["satisfaction"]["mean"], last["best_achievable"]["mean"]
@@ -143,8 +155,16 @@ def test_learn_says_that_it_did_not_converge(learned):
 def test_learn_writes_its_results(learned):
     place, result = learned
     names = {path.name for path in (place / "out").iterdir()}
-    assert names == {"policy.npz", "result.json", "report.html", "task.toml", "automaton.svg",
-                     "values.svg", "policy.svg", "learning.svg"}
+    assert names == {
+        "policy.npz",
+        "result.json",
+        "report.html",
+        "task.toml",
+        "automaton.svg",
+        "values.svg",
+        "policy.svg",
+        "learning.svg",
+    }
     written = json.loads((place / "out" / "result.json").read_text())
     assert written == json.loads(result.stdout.splitlines()[-1])
     page = (place / "out" / "report.html").read_text()
@@ -165,8 +185,9 @@ def test_what_is_done_is_told_and_not_done_again(learned, monkeypatch):
     assert result.exit_code == 0, result.output
     assert f"done before: see {out}/report.html" in result.stdout
     assert "--again does it again" in result.stdout and "compiling" not in result.stderr
-    told, shown = (x.stdout.partition("\nwrote ")[0].partition("\ndone before")[0]
-                   for x in (first, result))
+    told, shown = (
+        x.stdout.partition("\nwrote ")[0].partition("\ndone before")[0] for x in (first, result)
+    )
     assert told == shown
     assert json.loads(result.stdout.splitlines()[-1]) == json.loads(first.stdout.splitlines()[-1])
     for more in (["--again"], ["--seed", 1], ["--out", place / "empty"]):
@@ -179,8 +200,14 @@ def test_what_is_done_is_told_and_not_done_again(learned, monkeypatch):
 
 @pytest.mark.slow
 def test_what_falls_short_is_told_in_red_with_what_helps(write, tmp_path):  # noqa: F811
-    path = write(("[task]", '[task]\nguarantee = "none"'), shown={"demonstrations": [
-        {"cells": [[2, 1], [2, 2], [1, 2]], "actions": ["right", "up", "right"]}]})
+    path = write(
+        ("[task]", '[task]\nguarantee = "none"'),
+        shown={
+            "demonstrations": [
+                {"cells": [[2, 1], [2, 2], [1, 2]], "actions": ["right", "up", "right"]}
+            ]
+        },
+    )
     arguments = ["learn", str(path), "--out", str(tmp_path / "out"), "--json"]
     result = CliRunner().invoke(main, arguments, color=True)
     assert result.exit_code == 0, result.output
@@ -189,7 +216,8 @@ def test_what_falls_short_is_told_in_red_with_what_helps(write, tmp_path):  # no
     assert value < 0.5 and found["guarantee"]["remedy"] == 1
     warning = (
         f"warning: The policy does the task with probability {value:.4f} where 1.0000 is possible."
-        ' With guarantee = "best" in [task] it is certified to be at least 1.0000: tried.')
+        ' With guarantee = "best" in [task] it is certified to be at least 1.0000: tried.'
+    )
     assert f"\033[31m{warning}\033[0m" in result.stdout
     assert "By the graph" not in result.stdout and "By construction" not in result.stdout
     page = (tmp_path / "out" / "report.html").read_text()
@@ -210,8 +238,12 @@ def test_the_written_policy_runs_alone(learned):
             chances = policy["policy"][state, memory]
             action = policy["actions"][rng.choice(4, p=chances / chances.sum())]
             row, column = divmod(state, 3)
-            off = (row == 0 and action == "up") or (row == 1 and action == "down") or (
-                column == 0 and action == "left") or (column == 2 and action == "right")
+            off = (
+                (row == 0 and action == "up")
+                or (row == 1 and action == "down")
+                or (column == 0 and action == "left")
+                or (column == 2 and action == "right")
+            )
             state = state if off or state == 5 else state + moves[str(action)]
             memory = policy["next_memory"][state, memory]
         done += state == 5
@@ -268,6 +300,7 @@ def test_an_interrupt_waits_for_what_is_imported(tmp_path, monkeypatch):
     try:
         with pytest.raises(KeyboardInterrupt):
             import imported_slowly  # noqa: F401
+
             assert "imported_slowly" in sys.modules
             time.sleep(5)
     finally:
@@ -305,27 +338,35 @@ def test_another_task_does_not_go_on_from_a_checkpoint(learned, monkeypatch):
 def test_a_task_that_cannot_be_done_from_some_start(write, tmp_path):  # noqa: F811
     # Shapes and seeds are those of the run above, so nothing is compiled anew.
     path = write(
-        (". . r\nb . y", "b # .\nr # y"), QUICK,
+        (". . r\nb . y", "b # .\nr # y"),
+        QUICK,
         shown={"demonstrations": [{"cells": [[1, 3]], "actions": ["down"]}]},
     )
     result = run("learn", path, "--out", tmp_path / "out", "--seeds", 2)
     assert result.exit_code == 0, result.output
-    assert ("warning: No policy can do the task from 1 of 2 initial states: "
-            "row 1, column 1.") in result.stdout
+    assert (
+        "warning: No policy can do the task from 1 of 2 initial states: row 1, column 1."
+    ) in result.stdout
     written = json.loads((tmp_path / "out" / "result.json").read_text())
     assert written["impossible_starts"] == [{"state": 0, "row": 1, "column": 1}]
     assert written["best_achievable"]["minimum"]["value"] == 0
 
 
-@pytest.mark.parametrize(("replacement", "message"), [
-    (("discount = 0.9", "discount = "), "line 18"),
-    (("!r U y", "!r U U y"), "column 6"),
-    (("!r U y", "!red U y"), "the task mentions the proposition 'red'"),
-    (("!r U y", "!r & r"), "[task] formula: nothing satisfies it"),
-    (("discount = 0.9", "discount = 0.9\nstart = [1, 2]"), "start has 2 numbers; there are 5"),
-    (("discount = 0.9", 'discount = 0.9\navoid = ["q"]'), "[learner] avoid: 'q' is not a propos"),
-    (("discount = 0.9", "discount = 0.9\nprogress = [9]"), "automaton state 9 does not exist"),
-])
+@pytest.mark.parametrize(
+    ("replacement", "message"),
+    [
+        (("discount = 0.9", "discount = "), "line 18"),
+        (("!r U y", "!r U U y"), "column 6"),
+        (("!r U y", "!red U y"), "the task mentions the proposition 'red'"),
+        (("!r U y", "!r & r"), "[task] formula: nothing satisfies it"),
+        (("discount = 0.9", "discount = 0.9\nstart = [1, 2]"), "start has 2 numbers; there are 5"),
+        (
+            ("discount = 0.9", 'discount = 0.9\navoid = ["q"]'),
+            "[learner] avoid: 'q' is not a propos",
+        ),
+        (("discount = 0.9", "discount = 0.9\nprogress = [9]"), "automaton state 9 does not exist"),
+    ],
+)
 def test_mistakes_come_as_one_line(write, tmp_path, replacement, message):  # noqa: F811
     assert message in failure("learn", write(replacement), "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -343,20 +384,30 @@ def test_check(write):  # noqa: F811
     result = run("check", write())
     assert result.stdout == "ok: 6 states, 3 memory states, 1 demonstration of 2 pairs\n"
     assert "demonstration 1, step 1" in failure(
-        "check", write(shown={"demonstrations": [{"cells": [[9, 9]], "actions": ["up"]}]}))
+        "check", write(shown={"demonstrations": [{"cells": [[9, 9]], "actions": ["up"]}]})
+    )
 
 
-@pytest.mark.parametrize("name", [
-    "two_goals", "log_patrol",
-    *(pytest.param(name, marks=pytest.mark.slow) for name in (
-        "slippery_delivery", "one_demonstration", "patrol_two", "patrol_anywhere"))])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "two_goals",
+        "log_patrol",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("slippery_delivery", "one_demonstration", "patrol_two", "patrol_anywhere")
+        ),
+    ],
+)
 def test_the_examples_are_sound(name):
     assert run("check", f"examples/{name}.toml").stdout.startswith("ok: ")
 
 
 def test_check_reads_games_too(tmp_path):
-    sizes = {"robots": "512 states, 1024 with the task's memory",
-             "patrol": "512 states, 512 with the task's memory"}
+    sizes = {
+        "robots": "512 states, 1024 with the task's memory",
+        "patrol": "512 states, 512 with the task's memory",
+    }
     for name, size in sizes.items():
         assert run("check", f"examples/{name}.toml").stdout == f"ok: {size}\n"
     text = Path("examples/robots.toml").read_text()
@@ -369,7 +420,10 @@ def alone(code, tmp_path, **environment):
     """What a fresh process prints, that has imported nothing yet."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XDG_", "TF_"))}
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True,
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
         env={**kept, "XDG_CACHE_HOME": str(tmp_path), **environment},
     )
     return done.stdout.strip()
@@ -397,8 +451,12 @@ main(["learn", "task.toml"])"""
 
 @pytest.mark.slow
 def test_the_command_keeps_compiled_programs_and_the_library_does_not(tmp_path):
-    names = ("ENABLE_COMPILATION_CACHE", "COMPILATION_CACHE_DIR",
-             "PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES")
+    names = (
+        "ENABLE_COMPILATION_CACHE",
+        "COMPILATION_CACHE_DIR",
+        "PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
+        "PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES",
+    )
     # What JAX reads of it takes a second to import, so two processes ask JAX itself.
     told = f"print(*(os.environ.get('JAX_' + name) for name in {names}))"
     read = f"import jax; print(*(getattr(jax.config, 'jax_' + n.lower()) for n in {names}))"
@@ -467,11 +525,17 @@ print(os.environ.get("OPENBLAS_NUM_THREADS"))"""
     assert alone(code, tmp_path, OPENBLAS_NUM_THREADS="3").split() == ["3", "None"]
 
 
-@pytest.mark.parametrize(("platform", "environment", "place"), [
-    ("linux", {}, ".cache"), ("linux", {"XDG_CACHE_HOME": "relative"}, ".cache"),
-    ("linux", {"XDG_CACHE_HOME": "/caches"}, "/caches"), ("darwin", {}, "Library/Caches"),
-    ("win32", {}, "AppData/Local"), ("win32", {"LOCALAPPDATA": "/local"}, "/local"),
-])
+@pytest.mark.parametrize(
+    ("platform", "environment", "place"),
+    [
+        ("linux", {}, ".cache"),
+        ("linux", {"XDG_CACHE_HOME": "relative"}, ".cache"),
+        ("linux", {"XDG_CACHE_HOME": "/caches"}, "/caches"),
+        ("darwin", {}, "Library/Caches"),
+        ("win32", {}, "AppData/Local"),
+        ("win32", {"LOCALAPPDATA": "/local"}, "/local"),
+    ],
+)
 def test_where_programs_are_kept(monkeypatch, platform, environment, place):
     for name in ("XDG_CACHE_HOME", "LOCALAPPDATA"):
         monkeypatch.delenv(name, raising=False)
@@ -526,11 +590,25 @@ def patrolled(tmp_path_factory):
 @pytest.mark.slow
 def test_the_game_of_section_6_7(patrolled):
     found, _, _ = patrolled
-    sizes = [found[k] for k in ("states", "system_states", "system_transitions", "transitions",
-                                "reachable_system_states", "almost_sure_states")]
+    sizes = [
+        found[k]
+        for k in (
+            "states",
+            "system_states",
+            "system_transitions",
+            "transitions",
+            "reachable_system_states",
+            "almost_sure_states",
+        )
+    ]
     assert sizes == [144, 72, 192, 336, 54, 144]
-    assert found["values"] == {"0.545417": 8, "1.196350": 8, "1.430686": 16, "1.515047": 24,
-                               "1.545417": 16}
+    assert found["values"] == {
+        "0.545417": 8,
+        "1.196350": 8,
+        "1.430686": 16,
+        "1.515047": 24,
+        "1.545417": 16,
+    }
     initial = [found["initial_strategy"][k] for k in ("min", "max", "mean")]
     np.testing.assert_allclose(initial, [0.175092, 0.675092, 0.507881], atol=1e-6)
     assert found["winning_strategy"]["min"] >= 0
@@ -574,19 +652,29 @@ def test_the_best_moves_by_the_reward_alone(patrolled):
 @pytest.mark.slow
 def test_the_table_and_the_pictures_of_section_6_7(patrolled):
     found, printed, out = patrolled
-    for words in ("published", "measured", "58.05", "29.77", "1.545417: 16",
-                  "4 of 4 runs won almost surely"):
+    for words in (
+        "published",
+        "measured",
+        "58.05",
+        "29.77",
+        "1.545417: 16",
+        "4 of 4 runs won almost surely",
+    ):
         assert words in printed
     row = found["learned"][1]
     assert re.search(rf"^ +1 +{row['last_update_step']} +{row['updates']} ", printed, re.MULTILINE)
     pictures = sorted(path.name for path in out.iterdir())
     assert pictures == [
-        "figure_17_automaton.svg", "figure_17_best_moves.svg", "figure_18_values.svg",
-        "figure_19_initial.svg", "figure_19_learned.svg",
+        "figure_17_automaton.svg",
+        "figure_17_best_moves.svg",
+        "figure_18_values.svg",
+        "figure_19_initial.svg",
+        "figure_19_learned.svg",
     ]
     assert all((out / name).read_bytes().rstrip().endswith(b"</svg>") for name in pictures)
 
 
 def test_seeds_are_for_experiments_that_repeat_themselves():
     assert "reproduce mlirl does not learn with several seeds" in failure(
-        "reproduce", "mlirl", "--seeds", 2)
+        "reproduce", "mlirl", "--seeds", 2
+    )

@@ -9,7 +9,8 @@ from jaxltl.app.programs import known_flags
 
 # As users get their programs; other tests are compiled in haste.
 DEFAULT = {
-    "xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False,
+    "xla_backend_optimization_level": 3,
+    "xla_llvm_disable_expensive_passes": False,
     "xla_cpu_use_fusion_emitters": True,
 }
 DEFAULT = {name: value for name, value in DEFAULT.items() if known_flags({name: "1"})}

@@ -35,8 +35,14 @@ RUN = ("python", "sh", "pycon", "console")
 # Of a page that says nothing of how it is tested: what is slow in it, by a text.
 SLOW = {"README.md": ("ppo.train(", "jaxltl learn", "mlirl.train(")}
 ALL_SLOW = (
-    "docs/data.md", "docs/devices.md", "docs/gallery.md", "docs/guides/", "docs/models.md",
-    "docs/parameters.md", "docs/prepared.md", "docs/tasks-in-environments.md",
+    "docs/data.md",
+    "docs/devices.md",
+    "docs/gallery.md",
+    "docs/guides/",
+    "docs/models.md",
+    "docs/parameters.md",
+    "docs/prepared.md",
+    "docs/tasks-in-environments.md",
     "docs/worlds-of-the-literature.md",
 )
 INSTALLED = re.compile(r"(pip install|pytest|python -m build|git clone|cd )\b")
@@ -60,9 +66,7 @@ def chapters() -> list[Any]:
             if any(runs(b) for b in quick):
                 found.append(pytest.param(name, quick, id=place))
             if slow:
-                found.append(
-                    pytest.param(name, part, id=f"{place}-whole", marks=pytest.mark.slow)
-                )
+                found.append(pytest.param(name, part, id=f"{place}-whole", marks=pytest.mark.slow))
     return found
 
 

@@ -42,18 +42,33 @@ def test_the_outputs_of_a_notebook_are_current(path):
     assert not differences(notebook, fresh)
 
 
-@pytest.mark.parametrize(("old", "new", "tolerance"), [
-    ("P >= 0.9385", "P >= 0.9386", 0), ("[ 0.1  2. ]", "[0.1 2.]", 0), ("3 of 5", "4 of 5", 0.4),
-    ("1,234 steps", "1,240 steps", 0.01), ("2.3e-06", "2.2e-06", 0), ("-1.5", "-1.6", 0),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "tolerance"),
+    [
+        ("P >= 0.9385", "P >= 0.9386", 0),
+        ("[ 0.1  2. ]", "[0.1 2.]", 0),
+        ("3 of 5", "4 of 5", 0.4),
+        ("1,234 steps", "1,240 steps", 0.01),
+        ("2.3e-06", "2.2e-06", 0),
+        ("-1.5", "-1.6", 0),
+    ],
+)
 def test_numbers_may_differ_a_little(old, new, tolerance):
     assert not difference(old, new, tolerance)
 
 
-@pytest.mark.parametrize(("old", "new", "tolerance"), [
-    ("P >= 0.9385", "P >= 0.9387", 0), ("3 of 5", "4 of 5", 0), ("won from g1", "won from g2", 9),
-    ("-1.5", "1.5", 0), ("2.3e-06", "2.3e-05", 0), ("True", "False", 1), ("1 2", "1", 1),
-    ("1,234 steps", "1,250 steps", 0.01),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "tolerance"),
+    [
+        ("P >= 0.9385", "P >= 0.9387", 0),
+        ("3 of 5", "4 of 5", 0),
+        ("won from g1", "won from g2", 9),
+        ("-1.5", "1.5", 0),
+        ("2.3e-06", "2.3e-05", 0),
+        ("True", "False", 1),
+        ("1 2", "1", 1),
+        ("1,234 steps", "1,250 steps", 0.01),
+    ],
+)
 def test_more_is_a_difference(old, new, tolerance):
     assert difference(old, new, tolerance)

@@ -27,8 +27,20 @@ def test_types_are_promised_and_there():
 def test_what_tests_read_is_in_the_sdist():
     given = {x.strip("/") for x in PROJECT["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]}
     assert all((ROOT / name).exists() for name in given)
-    read = {"jaxltl", "tests", "examples", "benchmarks", "docs", "notebooks", "README.md",
-            "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "conftest.py"}
+    read = {
+        "jaxltl",
+        "tests",
+        "examples",
+        "benchmarks",
+        "docs",
+        "notebooks",
+        "README.md",
+        "CHANGELOG.md",
+        "CITATION.cff",
+        "CONTRIBUTING.md",
+        "LICENSE",
+        "conftest.py",
+    }
     assert given >= read
 
 
@@ -44,12 +56,17 @@ def test_the_readme_leads_nowhere_that_an_index_has_not():
     assert not re.findall(r"\]\((?!https?:|#)[^)]*\)|<img\b|<picture", text)
 
 
-@pytest.mark.parametrize(("text", "shown"), [
-    ("![a map](docs/a.svg)\n\nText", "Text"), ('<img src="a.svg" alt="x">\nText', "Text"),
-    ("see [the\npage](docs/a.md).", "see the\npage."), ("[up](#up)", "[up](#up)"),
-    ("[site](https://a.b/c)", "[site](https://a.b/c)"),
-    ('<picture>\n<source srcset="b.svg"><img src="a.svg"></picture>\nText', "Text"),
-])
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("![a map](docs/a.svg)\n\nText", "Text"),
+        ('<img src="a.svg" alt="x">\nText', "Text"),
+        ("see [the\npage](docs/a.md).", "see the\npage."),
+        ("[up](#up)", "[up](#up)"),
+        ("[site](https://a.b/c)", "[site](https://a.b/c)"),
+        ('<picture>\n<source srcset="b.svg"><img src="a.svg"></picture>\nText', "Text"),
+    ],
+)
 def test_pictures_and_links_to_files_are_left_out(text, shown):
     assert alone(text) == shown
 

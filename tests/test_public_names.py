@@ -22,8 +22,12 @@ from jaxltl import _public
 PUBLIC = {name: getattr(jaxltl, name) for name in jaxltl.__all__}
 # Types inside of public ones that nobody has to name, in modules whose text tells of them.
 DOCUMENTED = (
-    "jaxltl.core.host.product", "jaxltl.core.host.sparse", "jaxltl.core.logic.bounded",
-    "jaxltl.core.models.product", "jaxltl.core.models.sharded", "jaxltl.core.values.sweeps",
+    "jaxltl.core.host.product",
+    "jaxltl.core.host.sparse",
+    "jaxltl.core.logic.bounded",
+    "jaxltl.core.models.product",
+    "jaxltl.core.models.sharded",
+    "jaxltl.core.values.sweeps",
 )
 
 
@@ -54,7 +58,8 @@ jaxltl.algos.schedules.Linear, jaxltl.io.read_hoa
 assert "optax" not in sys.modules and "jaxltl.io.storm" not in sys.modules
 """
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False)
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -74,8 +79,11 @@ def annotated(thing):
     """What has the annotations of a public thing: functions, and the fields of a class."""
     if not isinstance(thing, type):
         return [thing]
-    methods = [getattr(part, "fget", part) for name, part in vars(thing).items()
-               if not name.startswith("_")]
+    methods = [
+        getattr(part, "fget", part)
+        for name, part in vars(thing).items()
+        if not name.startswith("_")
+    ]
     return [thing, *(part for part in methods if inspect.isfunction(part))]
 
 
@@ -164,13 +172,21 @@ def examples_in(text):
 @functools.cache
 def source_and_makers(module):
     """All that the examples of a module say, and its functions with the types that they return."""
-    beside = [(path.rpartition(".")[2], thing) for path, thing in EVERYTHING.items()
-              if path.startswith(f"{module}.")]
+    beside = [
+        (path.rpartition(".")[2], thing)
+        for path, thing in EVERYTHING.items()
+        if path.startswith(f"{module}.")
+    ]
     source = "".join(
-        x.source for thing in [sys.modules[module], *(thing for _, thing in beside)]
-        for x in examples_in(inspect.getdoc(thing) or ""))
-    return source, {name: str(inspect.signature(thing).return_annotation)
-                    for name, thing in beside if inspect.isfunction(inspect.unwrap(thing))}
+        x.source
+        for thing in [sys.modules[module], *(thing for _, thing in beside)]
+        for x in examples_in(inspect.getdoc(thing) or "")
+    )
+    return source, {
+        name: str(inspect.signature(thing).return_annotation)
+        for name, thing in beside
+        if inspect.isfunction(inspect.unwrap(thing))
+    }
 
 
 def shown_in_module(path):
@@ -200,11 +216,15 @@ def lacking_in_function(function, text, short):
     if returned is inspect.Signature.empty:
         lacks.append("the type that it returns")
     elif returned not in (None, "None", "NoReturn") and not (
-            {"Returns", "Yields"} & {*sections}
-            or (short and text.startswith(("``", "Whether", "A ", "An ", "The ")))):
+        {"Returns", "Yields"} & {*sections}
+        or (short and text.startswith(("``", "Whether", "A ", "An ", "The ")))
+    ):
         lacks.append("Returns")
-    if not short and re.search(r"jax\.Array|Solution", str(returned)) and not re.search(
-            "ifferentiable|derivative|gradient", text):
+    if (
+        not short
+        and re.search(r"jax\.Array|Solution", str(returned))
+        and not re.search("ifferentiable|derivative|gradient", text)
+    ):
         lacks.append("what it is differentiable in")
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     if "Raises" not in sections and any(isinstance(node, ast.Raise) for node in ast.walk(tree)):
@@ -239,7 +259,8 @@ def lacking(path):
     """What the text of a public thing lacks, in words."""
     thing, name = EVERYTHING[path], path.rpartition(".")[2]
     if isinstance(thing, functools.partial) or not (
-            inspect.isfunction(inspect.unwrap(thing)) or isinstance(thing, type)):
+        inspect.isfunction(inspect.unwrap(thing)) or isinstance(thing, type)
+    ):
         text = inspect.getdoc(thing) or ""
         return [] if len(text) > 20 else ["a text"]
     text = inspect.getdoc(thing) or ""

@@ -15,8 +15,14 @@ from jaxltl.reproduce import cce
 
 def figures(*methods):
     plan = cce.Plan(
-        networks=("2-2-1",), tasks=(4,), methods=methods, feasible_starts=(), lqr_steps=30, steps=4,
-        trust_steps=2, fresh=100,
+        networks=("2-2-1",),
+        tasks=(4,),
+        methods=methods,
+        feasible_starts=(),
+        lqr_steps=30,
+        steps=4,
+        trust_steps=2,
+        fresh=100,
     )
     return cce.figures(seeds=2, plan=plan)
 
@@ -47,7 +53,10 @@ def test_section_4_5_in_little():
     assert found["seconds"] > 0
     assert "3.7510604123" in cce.table(result)
     assert [name for name, _ in cce.pictures(result)] == [
-        "figure_8_regulator.svg", "figure_10_robot.svg", "maps.svg"]
+        "figure_8_regulator.svg",
+        "figure_10_robot.svg",
+        "maps.svg",
+    ]
 
 
 @pytest.mark.exhaustive
@@ -92,8 +101,13 @@ def test_steps_fit_the_trust_region_learner_and_its_precision():
     problem = tr.make_problem(as_environment(nav.navigation(), 3, dtype=jnp.float32), limit=-5.0)
     batch = jax.eval_shape(
         lambda key: tr.rollout(
-            key, tr.init(key, problem, tr.Hparams(discount=0.9)), problem,
-            tr.Hparams(discount=0.9), num_trajectories=3),
-        jax.random.key(0))
+            key,
+            tr.init(key, problem, tr.Hparams(discount=0.9)),
+            problem,
+            tr.Hparams(discount=0.9),
+            num_trajectories=3,
+        ),
+        jax.random.key(0),
+    )
     assert batch.observation.shape == (30, 3, 62)
     assert batch.reward.dtype == batch.observation.dtype == jnp.float32

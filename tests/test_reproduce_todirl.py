@@ -10,19 +10,24 @@ from jaxltl.reproduce import todirl
 
 def check(methods):
     plan = todirl.Plan(
-        methods=methods, demonstrations=(6,), curves=6, steps=20, cloning_steps=20, points=2,
+        methods=methods,
+        demonstrations=(6,),
+        curves=6,
+        steps=20,
+        cloning_steps=20,
+        points=2,
         test_worlds=2,
     )
     result = todirl.figures(seeds=2, plan=plan)
     found = json.loads(json.dumps(result, allow_nan=False))
     assert [(x["demonstrations"], x["method"]) for x in found["by_demonstrations"]] == [
-        (6, method) for method in methods]
+        (6, method) for method in methods
+    ]
     for x in found["by_demonstrations"]:
         assert x["seeds"] == 2 == len(x["test_of_each_seed"])
         assert 0 <= x["test_worst"] <= x["test_mean"] <= 1 and 0 <= x["train_mean"] <= 1
         np.testing.assert_allclose(np.mean(x["test_of_each_seed"]), x["test_mean"], atol=1e-4)
-        np.testing.assert_allclose(
-            np.min(x["test_worst_of_each_seed"]), x["test_worst"], atol=1e-4)
+        np.testing.assert_allclose(np.min(x["test_worst_of_each_seed"]), x["test_worst"], atol=1e-4)
         assert 0 <= x["half_width"] < 1e-3
     expert, chance = found["reference"]
     assert expert["test_worst"] > 0.999 and chance["test_mean"] < 0.1
@@ -31,8 +36,12 @@ def check(methods):
     text = todirl.table(result)
     assert all(method in text for method in methods)
     assert [name for name, _ in todirl.pictures(result)] == [
-        "figure_7_demonstrations.svg", "figure_6_learning.svg", "training_world.svg",
-        "test_world.svg", "another_test_world.svg"]
+        "figure_7_demonstrations.svg",
+        "figure_6_learning.svg",
+        "training_world.svg",
+        "test_world.svg",
+        "another_test_world.svg",
+    ]
     return {x["method"]: x for x in found["by_demonstrations"]}
 
 

@@ -19,19 +19,43 @@ import jaxltl
 ROOT = Path(jaxltl.__file__).parent
 MODULES = {
     ".".join(path.relative_to(ROOT.parent).with_suffix("").parts): path
-    for path in sorted(ROOT.rglob("*.py")) if path.name != "__init__.py"
+    for path in sorted(ROOT.rglob("*.py"))
+    if path.name != "__init__.py"
 }
 # The storeys, lowest first: a module imports from its own folder and from those before it.
 STOREYS = (
-    "core.show", "core.types", "core.logic", "core.host", "core.automata", "core.models",
-    "core.graphs", ("core.values", "core.games"), "algos", "envs", "io", "plot", "app", "reproduce",
+    "core.show",
+    "core.types",
+    "core.logic",
+    "core.host",
+    "core.automata",
+    "core.models",
+    "core.graphs",
+    ("core.values", "core.games"),
+    "algos",
+    "envs",
+    "io",
+    "plot",
+    "app",
+    "reproduce",
     "cli",
 )
 # What a private helper helps is one learner; these serve several.
 SHARED_BY_LEARNERS = (
-    "action_distributions", "actor_critic", "advantages", "checkpoint", "chunks",
-    "early_stopping", "exponential_family", "learner", "moments", "pac", "play", "schedules",
-    "settings", "splitmix",
+    "action_distributions",
+    "actor_critic",
+    "advantages",
+    "checkpoint",
+    "chunks",
+    "early_stopping",
+    "exponential_family",
+    "learner",
+    "moments",
+    "pac",
+    "play",
+    "schedules",
+    "settings",
+    "splitmix",
 )
 NO_JAX = ("core.show", "core.logic", "core.host", "core.automata")
 
@@ -52,7 +76,8 @@ def imports(name: str) -> frozenset[str]:
 
 def imports_any(name: str, roots: tuple[str, ...]) -> list[str]:
     return sorted(
-        found for found in imports(name)
+        found
+        for found in imports(name)
         if any(found == root or found.startswith(f"{root}.") for root in roots)
     )
 
@@ -105,7 +130,8 @@ def test_the_core_stands_alone(name):
 
 
 @pytest.mark.parametrize(
-    "name", [n for n in MODULES if f"{n}.".startswith(tuple(f"jaxltl.{x}." for x in NO_JAX))])
+    "name", [n for n in MODULES if f"{n}.".startswith(tuple(f"jaxltl.{x}." for x in NO_JAX))]
+)
 def test_logic_automata_and_host_never_import_jax(name):
     assert not imports_any(name, ("jax", "jaxlib", "flax", "chex"))
 
@@ -113,8 +139,10 @@ def test_logic_automata_and_host_never_import_jax(name):
 @pytest.mark.parametrize("name", [n for n in MODULES if n.startswith("jaxltl.algos.")])
 def test_learners_never_import_one_another(name):
     others = [
-        found for found in imports_any(name, ("jaxltl.algos",))
-        if found != "jaxltl.algos" and found.split(".")[2] not in SHARED_BY_LEARNERS
+        found
+        for found in imports_any(name, ("jaxltl.algos",))
+        if found != "jaxltl.algos"
+        and found.split(".")[2] not in SHARED_BY_LEARNERS
         and not found.split(".")[2].startswith("_")
     ]
     assert not others
@@ -132,29 +160,40 @@ def test_a_private_helper_has_one_learner(name):
 
 @pytest.mark.parametrize("name", [n for n in MODULES if n.startswith("jaxltl.envs.")])
 def test_worlds_import_the_core_alone(name):
-    outside = [n for n in imports_any(name, ("jaxltl",))
-               if not n.startswith(("jaxltl.core", "jaxltl.envs"))]
+    outside = [
+        n
+        for n in imports_any(name, ("jaxltl",))
+        if not n.startswith(("jaxltl.core", "jaxltl.envs"))
+    ]
     assert not outside
 
 
 LEARNER_MODULES = [
-    n for n in MODULES if n.startswith("jaxltl.algos.") and not n.startswith("jaxltl.algos._")]
+    n for n in MODULES if n.startswith("jaxltl.algos.") and not n.startswith("jaxltl.algos._")
+]
 
 
 def public_callables(module):
     """By name: what a module defines, and what it has built, such as partial functions."""
     for name, found in vars(module).items():
         is_ours = str(getattr(found, "__module__", "")).startswith("jaxltl.")
-        if not name.startswith("_") and callable(found) and typing.get_origin(found) is None and (
-                is_ours or not isinstance(found, type | types.FunctionType)):
+        if (
+            not name.startswith("_")
+            and callable(found)
+            and typing.get_origin(found) is None
+            and (is_ours or not isinstance(found, type | types.FunctionType))
+        ):
             yield name, found
 
 
 @pytest.mark.parametrize("name", ["jaxltl._public", *LEARNER_MODULES])
 def test_what_is_called_has_help_of_its_own(name):
     lent = {inspect.getdoc(functools.partial), inspect.getdoc(Partial), None, ""}
-    bare = [called for called, found in public_callables(importlib.import_module(name))
-            if inspect.getdoc(found) in lent or inspect.getdoc(found).startswith(f"{called}(")]
+    bare = [
+        called
+        for called, found in public_callables(importlib.import_module(name))
+        if inspect.getdoc(found) in lent or inspect.getdoc(found).startswith(f"{called}(")
+    ]
     assert not bare
 
 
@@ -171,7 +210,10 @@ after = {{name: jax.config.values[name] for name in before}}  # flax may registe
 assert after == before, "a setting of JAX was changed"
 {show}"""
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False,
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        check=False,
         cwd=ROOT.parent,
     )
     assert done.returncode == 0, done.stderr

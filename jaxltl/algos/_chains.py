@@ -45,8 +45,6 @@ def alias_table(rows: np.ndarray) -> np.ndarray:
     return (threshold << 8 | alias).astype(np.uint32)
 
 
-
-
 class Table(NamedTuple):
     """What a move changes: flat tables, and the chains."""
 
@@ -65,8 +63,7 @@ def move(problem, hparams, epsilons, stream, key, table: Table, i: jax.Array) ->
     source, system = table.position, table.system
     action = _choose(problem, epsilons, stream, table, i)
     pair = source * num_actions + action
-    violations = table.violations + jnp.sum(
-        ~take(problem.allowed.ravel(), pair), dtype=jnp.int32)
+    violations = table.violations + jnp.sum(~take(problem.allowed.ravel(), pair), dtype=jnp.int32)
     target = _sample(game, jax.random.fold_in(key, i), source, action)
     reward = observed_reward(game, problem.reward, source, action, target)
     discount = jnp.asarray(hparams.discount, table.q.dtype)

@@ -59,19 +59,31 @@ def write(path: Path, arrays: Mapping[str, Any], create: Write) -> dict[str, Sto
     token = np.frombuffer(secrets.token_bytes(8), np.uint32)
     mine = {
         _name(array, shard.index): np.asarray(shard.data)
-        for array, x in enumerate(arrays.values()) for shard in x.addressable_shards
-        if shard.replica_id == 0}
+        for array, x in enumerate(arrays.values())
+        for shard in x.addressable_shards
+        if shard.replica_id == 0
+    }
     if mine:
         with create(_part(path, jax.process_index(), token)) as file:
             np.savez(file, allow_pickle=False, **mine)
     tokens = np.asarray(process_allgather(token))  # when it is back all have written
     names = [_part(path, process, x).name for process, x in enumerate(tokens)]
     return {
-        name: Stored(list(x.shape), str(x.dtype), [
-            (*_ends(shard.index, x.shape), names[shard.device.process_index],
-             _name(array, shard.index))
-            for shard in x.global_shards if shard.replica_id == 0])
-        for array, (name, x) in enumerate(arrays.items())}
+        name: Stored(
+            list(x.shape),
+            str(x.dtype),
+            [
+                (
+                    *_ends(shard.index, x.shape),
+                    names[shard.device.process_index],
+                    _name(array, shard.index),
+                )
+                for shard in x.global_shards
+                if shard.replica_id == 0
+            ],
+        )
+        for array, (name, x) in enumerate(arrays.items())
+    }
 
 
 def _part(path: Path, process: int, token: np.ndarray) -> Path:

@@ -96,9 +96,11 @@ def cpo_weights(
 
 
 def _floats(*numbers: chex.Numeric) -> tuple[jax.Array, ...]:
-    dtype = jnp.result_type(float, *numbers) if not any(
-        isinstance(x, jax.Array) for x in numbers
-    ) else jnp.result_type(*numbers)
+    dtype = (
+        jnp.result_type(float, *numbers)
+        if not any(isinstance(x, jax.Array) for x in numbers)
+        else jnp.result_type(*numbers)
+    )
     return tuple(jnp.asarray(x, dtype) for x in numbers)
 
 
@@ -114,17 +116,16 @@ def _plane(
 
     The third is the distance to the limit, infinite if `b` is zero.
     """
-    distance = jnp.where(s > 0, c / jnp.sqrt(jnp.where(s > 0, s, 1)),
-                         jnp.where(c == 0, 0, jnp.sign(c) * jnp.inf))
+    distance = jnp.where(
+        s > 0, c / jnp.sqrt(jnp.where(s > 0, s, 1)), jnp.where(c == 0, 0, jnp.sign(c) * jnp.inf)
+    )
     rest = q - ratio(r, jnp.sqrt(s)) ** 2
     # What rounding leaves of parallel gradients has no direction.
     rest = jnp.where(rest > 16 * jnp.finfo(q.dtype).eps * q, rest, 0)
     return 2 * delta - distance**2, rest, distance
 
 
-def _case(
-    q: jax.Array, r: jax.Array, s: jax.Array, c: jax.Array, delta: jax.Array
-) -> jax.Array:
+def _case(q: jax.Array, r: jax.Array, s: jax.Array, c: jax.Array, delta: jax.Array) -> jax.Array:
     room, rest, _ = _plane(q, r, s, c, delta)
     # Opposite gradients never break a limit that can be kept; their sum may, by rounding.
     opposite = (rest == 0) & (r < 0)

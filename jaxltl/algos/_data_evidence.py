@@ -35,8 +35,15 @@ class DataEvidence:
 
 
 def data_evidence(
-    game: Game, allowed: Any, region: Any, reward: Any, counts: Any, play: Any, discount: float,
-    confidence: float, method: Method = "anytime",
+    game: Game,
+    allowed: Any,
+    region: Any,
+    reward: Any,
+    counts: Any,
+    play: Any,
+    discount: float,
+    confidence: float,
+    method: Method = "anytime",
 ) -> DataEvidence:
     """Bounds of a strategy's and of the best discounted value, of what was counted alone.
 
@@ -64,9 +71,15 @@ def data_evidence(
     count = np.asarray(counts)[used]
     sets = intervals_from_counts(count, confidence, method=method, entry_start=start)
     model = interval_rows(
-        starts_of(moves.sum(-1)[state]), start, number[np.asarray(mdp.successor)[used]],
-        sets.lower, sets.upper, center=None if sets.radius is None else sets.center,
-        radius=sets.radius, rewards={"reward": Rewards(transition=earned[used])})
+        starts_of(moves.sum(-1)[state]),
+        start,
+        number[np.asarray(mdp.successor)[used]],
+        sets.lower,
+        sets.upper,
+        center=None if sets.radius is None else sets.center,
+        radius=sets.radius,
+        rewards={"reward": Rewards(transition=earned[used])},
+    )
     system: Any = np.asarray(game.system)[state]
     within = Game(model, system)
     weight = np.asarray(play, np.float64)[s, a]

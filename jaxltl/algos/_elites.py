@@ -49,8 +49,6 @@ def num_elites(rho: float, num_samples: int) -> int:
     return math.ceil(rho * num_samples - SLACK)
 
 
-
-
 @brief
 @struct.dataclass
 class Elites:
@@ -159,7 +157,11 @@ def rows_of(pool: Pool, index: jax.Array) -> Pool:
 
 
 def better(
-    old: Sample, fresh: Pool, excess: jax.Array, among: jax.Array, score: jax.Array,
+    old: Sample,
+    fresh: Pool,
+    excess: jax.Array,
+    among: jax.Array,
+    score: jax.Array,
     record: jax.Array,
 ) -> Sample:
     """The old sample, or that of the highest score if it beats the record."""

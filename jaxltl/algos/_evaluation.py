@@ -58,9 +58,7 @@ def evaluate_all(
     return lanes.whole(found, hparams.sharding)
 
 
-def scores(
-    problem: Any, parameters: jax.Array, key: chex.PRNGKey
-) -> tuple[jax.Array, jax.Array]:
+def scores(problem: Any, parameters: jax.Array, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:
     """Objective and costs ``[C]`` of one rollout under some parameters."""
     objective, cost = split(problem.evaluate(parameters, key))
     require_shape("the cost that evaluate returned", cost, problem.limit.shape)

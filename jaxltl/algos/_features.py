@@ -27,9 +27,7 @@ from jaxltl.core.values.reachability import action_matrices
 from jaxltl.core.values.satisfaction import as_reachability, visiting
 
 
-def pair_counts(
-    model: Any, trajectories: Trajectories, kept: Any = None
-) -> jax.Array:
+def pair_counts(model: Any, trajectories: Trajectories, kept: Any = None) -> jax.Array:
     """How often each state-action pair occurs in trajectories of a model: ``float[S, A]``.
 
     In those steps that are `kept`, ``bool[N, T]``; default all.
@@ -120,7 +118,8 @@ def task_features(
 
 _TOO_LONG = (
     "The feature nearer is left out: the best policy's way takes more steps on average than double "
-    "precision can tell, so that nothing is known of which action shortens it.")
+    "precision can tell, so that nothing is known of which action shortens it."
+)
 
 
 def _nearer(model: Product, best: Solution) -> np.ndarray | None:
@@ -144,13 +143,17 @@ def _nearer(model: Product, best: Solution) -> np.ndarray | None:
     inside = np.where(reached, far, 0)
     # Whoever leaves the component has all of a way before him.
     ahead = np.where(reached, 0, np.where(lost, ahead.max(initial=0), ahead)) + inside.max(
-        initial=0)
+        initial=0
+    )
     way = np.where(reached, inside, ahead)
     entered = np.where(reached, inside.max(initial=0), ahead)
-    found = np.stack([
-        np.where(reached, way - visit @ way, way - row @ entered)
-        for row, visit in zip(rows, visits, strict=True)
-    ], -1)
+    found = np.stack(
+        [
+            np.where(reached, way - visit @ way, way - row @ entered)
+            for row, visit in zip(rows, visits, strict=True)
+        ],
+        -1,
+    )
     available = np.asarray(model.available)
     return np.where(available, found.reshape(available.shape), 0).astype(model.dtype)
 
@@ -163,8 +166,12 @@ def _steps(rows: list[Any], policy: Any, ended: np.ndarray) -> np.ndarray | None
 
 @partial(jax.jit, static_argnames=("avoid", "progress"))
 def _task_values(
-    model: Product, counts: jax.Array, nearer: jax.Array | None, *,
-    avoid: tuple[str, ...], progress: tuple[int, ...],
+    model: Product,
+    counts: jax.Array,
+    nearer: jax.Array | None,
+    *,
+    avoid: tuple[str, ...],
+    progress: tuple[int, ...],
 ) -> jax.Array:
     kind, num_memory = model.automaton.acceptance, model.num_memory
     columns = [(counts > 0).astype(model.dtype)]
@@ -175,7 +182,7 @@ def _task_values(
         regions += [model.final, *(target & (every != q) for q in every)]
     entered = _chances(model, regions)
     if kind == "cosafe":
-        goal, *entering = entered[-1 - num_memory:]
+        goal, *entering = entered[-1 - num_memory :]
         columns += [goal, jnp.stack([x[:, q] for q, x in enumerate(entering)], axis=1)]
     elif kind != "safety":
         priority = jnp.asarray(model.automaton.priority)
@@ -226,8 +233,12 @@ def world_features(
 
 @partial(jax.jit, static_argnames=("goal", "progress", "avoid"))
 def _world_values(
-    world: MDP | DenseMDP, counts: jax.Array, *, goal: tuple[str, ...],
-    progress: tuple[str, ...], avoid: tuple[str, ...],
+    world: MDP | DenseMDP,
+    counts: jax.Array,
+    *,
+    goal: tuple[str, ...],
+    progress: tuple[str, ...],
+    avoid: tuple[str, ...],
 ) -> jax.Array:
     columns = [
         (counts > 0).astype(world.dtype),

@@ -100,19 +100,38 @@ def step(evaluate: Callable[[Any, Point], Point], search: Search) -> tuple[Searc
         size = jnp.where(jnp.isfinite(high), (low + high) / 2, 2 * low)
         better = good | (new.loss < k.best.loss)
         later = k._replace(
-            best=learner.either(better, new, k.best), moved=k.moved | better, size=size, low=low,
-            high=high, done=good | (k.n + 1 >= _MOST), n=k.n + 1)
+            best=learner.either(better, new, k.best),
+            moved=k.moved | better,
+            size=size,
+            low=low,
+            high=high,
+            done=good | (k.n + 1 >= _MOST),
+            n=k.n + 1,
+        )
         # The very first evaluation is of the start, and gives the first direction.
         scale = -jnp.minimum(1, 1 / optax.tree.norm(new.gradient))
         first = k._replace(
-            base=new, best=new, known=jnp.bool_(True),
-            direction=optax.tree.scale(scale, new.gradient), size=jnp.ones_like(size))
+            base=new,
+            best=new,
+            known=jnp.bool_(True),
+            direction=optax.tree.scale(scale, new.gradient),
+            size=jnp.ones_like(size),
+        )
         return learner.either(k.known, later, first)
 
     one = jnp.ones((), search.point.loss.dtype)
     begin = _Trial(
-        search.point, search.direction, search.known, search.point, jnp.bool_(False),
-        jnp.where(search.known, one, 0), 0 * one, jnp.inf * one, jnp.bool_(False), jnp.int32(0))
+        search.point,
+        search.direction,
+        search.known,
+        search.point,
+        jnp.bool_(False),
+        jnp.where(search.known, one, 0),
+        0 * one,
+        jnp.inf * one,
+        jnp.bool_(False),
+        jnp.int32(0),
+    )
     found = lax.while_loop(lambda k: ~k.done, trial, begin)
     new = found.best
     moved, memory = _directions().update(new.gradient, search.memory, new.parameters)
@@ -120,11 +139,11 @@ def step(evaluate: Callable[[Any, Point], Point], search: Search) -> tuple[Searc
     fresh = ~(optax.tree.vdot(moved, new.gradient) > 0) | ~found.moved
     scale = jnp.minimum(1, 1 / optax.tree.norm(new.gradient))
     moved = learner.either(fresh, optax.tree.scale(scale, new.gradient), moved)
-    memory = learner.either(fresh & ~jnp.isnan(new.loss), learner.strong(
-        _directions().init(new.parameters)), memory)
+    memory = learner.either(
+        fresh & ~jnp.isnan(new.loss), learner.strong(_directions().init(new.parameters)), memory
+    )
     return Search(new, optax.tree.scale(-1, moved), memory, jnp.bool_(True)), found.base
 
 
 def _ahead(base: Point, direction: Any, size: jax.Array) -> Any:
     return jax.tree.map(lambda x, d: x + size.astype(x.dtype) * d, base.parameters, direction)
-

@@ -32,8 +32,13 @@ def updated(state: Any, walk: Walk, problem: Any, hparams: Any) -> Any:
     since = jnp.where(walk.known, walk.moves, take(state.known_at, place))
     gain = jnp.where(news, gain, take(state.gain, place))
     state = replace(
-        state, moves=walk.moves, position=walk.position, fault=walk.fault,
-        counts=walk.counts, reward=walk.reward, probability=probability,
+        state,
+        moves=walk.moves,
+        position=walk.position,
+        fault=walk.fault,
+        counts=walk.counts,
+        reward=walk.reward,
+        probability=probability,
         known_at=state.known_at.at[place].set(since, mode="promise_in_bounds"),
         gain=state.gain.at[place].set(gain, mode="promise_in_bounds"),
         num_known=state.num_known + walk.known,
@@ -48,11 +53,15 @@ def _solved(state: Any, problem: Any, hparams: Any, news: jax.Array) -> Any:
     given = (state.gain, state.probability, problem, hparams)
     # A loop of one pass, which is left out where no lane has news.
     value, error, best, _ = learner.while_active(
-        lambda now, _: now[-1], _solve, (state.value, state.error, state.best, news), given)
+        lambda now, _: now[-1], _solve, (state.value, state.error, state.best, news), given
+    )
     # Every allowed move then has a positive probability, unless that is too small a number.
     least = exploration(problem, hparams) / problem.game.num_actions
     return replace(
-        state, value=value, error=error, best=best,
+        state,
+        value=value,
+        error=error,
+        best=best,
         always_almost_sure=state.always_almost_sure & (least > 0),
     )
 
@@ -63,8 +72,14 @@ def _solve(now: Any, given: Any) -> Any:
     dtype = problem.game.dtype
     discount = jnp.asarray(hparams.discount, dtype)
     value, width, quantity = span_iteration(
-        problem.game, problem.allowed, gain, probability, value, discount,
-        enough=solver_tolerance(problem, hparams), active=news,
+        problem.game,
+        problem.allowed,
+        gain,
+        probability,
+        value,
+        discount,
+        enough=solver_tolerance(problem, hparams),
+        active=news,
     )
     # What is within eps_1 by these values less twice their error is within eps_1 by the true.
     asked = pac.action_tolerance(hparams.epsilon, hparams.discount)
@@ -90,8 +105,12 @@ def enough(problem: Any, hparams: Any) -> jax.Array:
     if hparams.known_after is not None:
         return jnp.asarray(hparams.known_after, problem.game.dtype)
     visits = pac.visits(
-        hparams.epsilon, hparams.failure, hparams.discount, hparams.reward_bound,
-        jnp.sum(problem.region), problem.game.num_actions,
+        hparams.epsilon,
+        hparams.failure,
+        hparams.discount,
+        hparams.reward_bound,
+        jnp.sum(problem.region),
+        problem.game.num_actions,
     )
     return jnp.asarray(visits, problem.game.dtype)
 

@@ -41,9 +41,7 @@ def value_network(hparams: Any, dtype: Any) -> Network:
     return Network(hparams.value_hidden, 1, 0.1, dtype)
 
 
-def gaussian(
-    parameters: Any, hparams: Any, inputs: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def gaussian(parameters: Any, hparams: Any, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Mean and standard deviation of the actions at some inputs."""
     log_deviation = parameters["log_deviation"]
     network = mean_network(hparams, log_deviation.shape[0], log_deviation.dtype)
@@ -83,8 +81,6 @@ def inputs_at(inputs: jax.Array, time: jax.Array, horizon: int) -> jax.Array:
     """
     times = jnp.linspace(-1, 1, horizon, dtype=inputs.dtype)
     return jnp.concatenate([inputs, times[jnp.minimum(time, horizon - 1)][:, None]], -1)
-
-
 
 
 def normalized(moments: Moments, hparams: Any, observation: jax.Array) -> jax.Array:

@@ -112,13 +112,15 @@ def collected(
     every = _evaluated_all(problem, state.parameters, path.memory, seen, 2)
     end = jax.vmap(problem.environment.observe)(walkers.world)
     final = _evaluated_all(
-        problem, state.parameters, walkers.memory, normalized(state.moments, end), 1)
+        problem, state.parameters, walkers.memory, normalized(state.moments, end), 1
+    )
     value, last = every.value.astype(dtype), final.value.astype(dtype)
     following = jnp.concatenate([value[1:], last[None]])
     cut = path.truncated & ~path.terminated
     at_ends = lanes.apart(_at_ends, hparams.sharding, (1, 1, 1, None), 1)
     following = at_ends(
-        cut, following, (every.memory, path.last), (problem, state.parameters, state.moments))
+        cut, following, (every.memory, path.last), (problem, state.parameters, state.moments)
+    )
     following = jnp.where(path.terminated, 0, following)
     discount = jnp.asarray(hparams.discount, dtype) * path.discount.astype(dtype)
     reward, ended = path.reward.astype(dtype), path.terminated | path.truncated
@@ -128,24 +130,25 @@ def collected(
         returns = _unless_nonfinite(returns, sums)
         reward = jnp.clip(reward / scale_of(returns), -10, 10)
     if moments is not None:
-        moments = jax.tree.map(
-            lambda x, m: _unless_nonfinite(m, x), path.observation, moments)
-    found = generalized_advantages(
-        reward, value, following, discount, hparams.gae_lambda, ended)
+        moments = jax.tree.map(lambda x, m: _unless_nonfinite(m, x), path.observation, moments)
+    found = generalized_advantages(reward, value, following, discount, hparams.gae_lambda, ended)
     rows = Rows(seen, path.start, path.allowed, path.raw, path.log_density, value, found)
     number = ended.sum()
     mean_of = jnp.where(number > 0, 1 / jnp.maximum(number, 1), jnp.nan).astype(dtype)
     target = found + value
     spread = jnp.var(target)
     told = Told(
-        reward=path.reward.astype(dtype).mean(), cost=path.cost.astype(dtype).mean(),
+        reward=path.reward.astype(dtype).mean(),
+        cost=path.cost.astype(dtype).mean(),
         episodes=number.astype(jnp.int32),
         episode_return=jnp.sum(jnp.where(ended, path.episode_return, 0)) * mean_of,
         episode_length=jnp.sum(jnp.where(ended, path.episode_length, 0)) * mean_of,
         explained_variance=jnp.where(
-            spread > 0, 1 - jnp.var(found) / jnp.where(spread > 0, spread, 1), jnp.nan),
+            spread > 0, 1 - jnp.var(found) / jnp.where(spread > 0, spread, 1), jnp.nan
+        ),
         permitted=jnp.bool_(True) if path.allowed is None else path.allowed.any(-1).all(),
-        finite=jnp.all(jnp.isfinite(found)))
+        finite=jnp.all(jnp.isfinite(found)),
+    )
     after = replace(state, walkers=walkers, moments=moments, return_moments=returns)
     return after, state.walkers.memory, rows, told
 
@@ -154,6 +157,7 @@ def _discounted_sums(
     walkers: Walkers, reward: jax.Array, discount: jax.Array, ended: jax.Array
 ) -> tuple[jax.Array, Walkers]:
     """``float[T, N]``, rewards of each episode so far, and the walkers who keep the last."""
+
     def on(before: jax.Array, row: Any) -> tuple[jax.Array, jax.Array]:
         reward, discount, ended = row
         now = before + reward
@@ -173,14 +177,20 @@ def _walked(key: chex.PRNGKey, state: Any, problem: Any, hparams: Any) -> tuple[
     begin, pool = _starts(reset_key, environment, hparams)
     step = (state.parameters, state.moments, problem, hparams, pool)
     walk = lanes.apart(
-        partial(_walk, sharding=hparams.sharding), hparams.sharding, (0, 0, 1, 1, 1, None), (0, 1))
-    walkers, path = walk(
-        lanes.ranks(hparams.sharding), state.walkers, begin, noise, keys, step)
+        partial(_walk, sharding=hparams.sharding), hparams.sharding, (0, 0, 1, 1, 1, None), (0, 1)
+    )
+    walkers, path = walk(lanes.ranks(hparams.sharding), state.walkers, begin, noise, keys, step)
     return learner.strong(walkers), path
 
 
 def _walk(
-    rank: jax.Array, walkers: Walkers, begin: Any, noise: Any, keys: jax.Array, given: Any, *,
+    rank: jax.Array,
+    walkers: Walkers,
+    begin: Any,
+    noise: Any,
+    keys: jax.Array,
+    given: Any,
+    *,
     sharding: Any,
 ) -> tuple[Walkers, _Path]:
     """Steps of all environments, or of those of one device."""
@@ -196,24 +206,41 @@ def _walk(
         density = actions_of.log_density(environment.actions, said.action, allowed, raw)
         action = actions_of.as_action(environment.actions, raw, hparams.squash)
         found = Timestep(*environment.step(walker.world, action, key))
-        terminated, truncated = (
-            jnp.asarray(x, bool) for x in (found.terminated, found.truncated))
+        terminated, truncated = (jnp.asarray(x, bool) for x in (found.terminated, found.truncated))
         total = walker.episode_return + found.reward
         length = walker.episode_length + 1
         row = _Path(
-            observation, walker.memory, walker.episode_length == 0, allowed, raw, density,
-            jnp.asarray(found.reward), jnp.asarray(found.cost), jnp.asarray(found.discount),
-            terminated, truncated, environment.observe(found.world), total, length)
+            observation,
+            walker.memory,
+            walker.episode_length == 0,
+            allowed,
+            raw,
+            density,
+            jnp.asarray(found.reward),
+            jnp.asarray(found.cost),
+            jnp.asarray(found.discount),
+            terminated,
+            truncated,
+            environment.observe(found.world),
+            total,
+            length,
+        )
         return replace(walker, world=found.world, memory=said.memory), row
 
     def restarted(walker: Walkers, fresh: Any, row: _Path) -> Walkers:
         ended = row.terminated | row.truncated
         world, memory = jax.tree.map(
-            lambda x, y: jnp.where(ended, x, y), (fresh, problem.memory),
-            (walker.world, walker.memory))
+            lambda x, y: jnp.where(ended, x, y),
+            (fresh, problem.memory),
+            (walker.world, walker.memory),
+        )
         return Walkers(
-            world, memory, jnp.where(ended, 0, row.episode_return),
-            jnp.where(ended, 0, row.episode_length), walker.discounted)
+            world,
+            memory,
+            jnp.where(ended, 0, row.episode_return),
+            jnp.where(ended, 0, row.episode_length),
+            walker.discounted,
+        )
 
     def move(carry: Any, given: Any) -> Any:
         walkers, used = carry
@@ -222,8 +249,7 @@ def _walk(
         ended = row.terminated | row.truncated
         if pool is not None:
             number, last = lanes.running_sum(ended, rank, sharding)
-            start = jax.tree.map(
-                lambda x: x[(used + number - 1) % hparams.num_resets], pool)
+            start = jax.tree.map(lambda x: x[(used + number - 1) % hparams.num_resets], pool)
             used = (used + last) % hparams.num_resets
         elif hparams.num_resets == 0:
             start = jax.vmap(environment.reset)(start)

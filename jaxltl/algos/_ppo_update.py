@@ -61,10 +61,10 @@ def loss(
     actions = problem.environment.actions
     said = _said(parameters, rows, begun, problem)
     batched = jax.vmap if rows.value.ndim == 1 else lambda f: jax.vmap(jax.vmap(f))
-    density = batched(partial(actions_of.log_density, actions))(
-        said.action, rows.allowed, rows.raw)
+    density = batched(partial(actions_of.log_density, actions))(said.action, rows.allowed, rows.raw)
     entropy = batched(partial(actions_of.entropy, actions, squash=hparams.squash))(
-        said.action, rows.allowed).mean()
+        said.action, rows.allowed
+    ).mean()
     change = density - rows.log_density
     ratio, advantage = jnp.exp(change), rows.advantage
     target = advantage + rows.value
@@ -80,10 +80,13 @@ def loss(
     error = error.mean() / 2
     total = -gain + hparams.value_weight * error - hparams.entropy_weight * entropy
     return total, Figures(
-        policy_loss=-gain, value_loss=error, entropy=entropy,
+        policy_loss=-gain,
+        value_loss=error,
+        entropy=entropy,
         kl=jnp.mean(ratio - 1 - change),
         clipped=jnp.mean(jnp.abs(ratio - 1) > limits.clip, dtype=ratio.dtype),
-        gradient_norm=jnp.zeros_like(gain))
+        gradient_norm=jnp.zeros_like(gain),
+    )
 
 
 def _said(parameters: Any, rows: Rows, begun: Any, problem: Any) -> Output:
@@ -132,7 +135,8 @@ def improved(
         memory = jax.tree.map(lambda x: x[chosen], begun) if recurrent else ()
         some, memory = lanes.split(some, over, int(recurrent)), lanes.split(memory, over)
         (_, told), slope = jax.value_and_grad(loss, has_aux=True)(
-            going.parameters, some, memory, problem, hparams, limits)
+            going.parameters, some, memory, problem, hparams, limits
+        )
         slope, told = lanes.whole((slope, told), over)
         norm = jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(slope)))
         told = told._replace(gradient_norm=norm)
@@ -145,7 +149,8 @@ def improved(
             slope = jax.tree.map(lambda x: x * shorter.astype(x.dtype), slope)
         change, optimizer = descent(hparams).update(slope, going.optimizer)
         parameters = jax.tree.map(
-            lambda x, u: x - (rate * u).astype(x.dtype), going.parameters, change)
+            lambda x, u: x - (rate * u).astype(x.dtype), going.parameters, change
+        )
         made = finite & ~stopped
         new = learner.choose(made, (parameters, optimizer), (going.parameters, going.optimizer))
         return _Going(new[0], new[1], stopped), (told, made, ~finite & ~stopped)
@@ -155,13 +160,21 @@ def improved(
         return lax.scan(update, going, order.reshape(count, -1))
 
     going, (told, made, lost) = lax.scan(
-        epoch, _Going(state.parameters, state.optimizer, jnp.bool_(False)),
-        jax.random.split(key, hparams.num_epochs))
+        epoch,
+        _Going(state.parameters, state.optimizer, jnp.bool_(False)),
+        jax.random.split(key, hparams.num_epochs),
+    )
     number = made.sum()
     mean = jax.tree.map(
-        lambda x: jnp.sum(jnp.where(made, x, 0)) / jnp.where(number > 0, number, jnp.nan), told)
-    return (going.parameters, going.optimizer, mean, number.astype(jnp.int32),
-            lost.sum().astype(jnp.int32))
+        lambda x: jnp.sum(jnp.where(made, x, 0)) / jnp.where(number > 0, number, jnp.nan), told
+    )
+    return (
+        going.parameters,
+        going.optimizer,
+        mean,
+        number.astype(jnp.int32),
+        lost.sum().astype(jnp.int32),
+    )
 
 
 def _at(schedule: Any, step: jax.Array) -> Any:

@@ -52,7 +52,8 @@ def advantages(
     goes_on = jnp.concatenate([valid[1:], jnp.zeros_like(valid[:1])])
     following = jnp.where(valid, jnp.where(goes_on, following, after), 0)
     return generalized_advantages(
-        jnp.where(valid, signal, 0), value, following, discount, gae_lambda)
+        jnp.where(valid, signal, 0), value, following, discount, gae_lambda
+    )
 
 
 def fitted(

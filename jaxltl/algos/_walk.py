@@ -78,8 +78,16 @@ def walk_from(state: Any, moves: jax.Array) -> Walk:
     """A walk that starts where the learner stands."""
     zero, false = jnp.int32(0), jnp.bool_(False)
     return Walk(
-        state.moves, moves, state.position, state.counts, state.reward,
-        zero, jnp.zeros((), state.reward.dtype), false, false, state.fault,
+        state.moves,
+        moves,
+        state.position,
+        state.counts,
+        state.reward,
+        zero,
+        jnp.zeros((), state.reward.dtype),
+        false,
+        false,
+        state.fault,
     )
 
 
@@ -93,7 +101,8 @@ def move(walk: Walk, rules: Rules) -> Walk:
     s = jnp.where(anew, draw(rules.problem.start_table, words[1]), walk.position)
     mine = jnp.where(
         splitmix.uniform(words[2], dtype) < rules.explore,
-        take(rules.problem.allowed, s), (take(rules.marks, s) & _BEST) > 0,
+        take(rules.problem.allowed, s),
+        (take(rules.marks, s) & _BEST) > 0,
     )
     weight = jnp.where(take(game.system, s), mine, take(rules.problem.environment, s))
     action = _draw_action(weight, splitmix.uniform(words[3], dtype))
@@ -143,7 +152,8 @@ def record(walk: Walk, seen: Seen, rules: Rules, active: jax.Array) -> Walk:
         reward=reward,
         pair=jnp.where(active, pair, walk.pair),
         seen=jnp.where(active, seen.reward, walk.seen),
-        known=known | (~active & walk.known), fresh=fresh | (~active & walk.fresh),
+        known=known | (~active & walk.known),
+        fresh=fresh | (~active & walk.fresh),
         fault=jnp.where(wrong & (walk.fault < 0), pair, walk.fault),
     )
 

@@ -52,7 +52,12 @@ def as_action(actions: Actions, raw: jax.Array, squash: str) -> jax.Array:
 
 
 def chosen(
-    key: chex.PRNGKey, actions: Actions, parameters: Any, allowed: Any, *, sampled: bool,
+    key: chex.PRNGKey,
+    actions: Actions,
+    parameters: Any,
+    allowed: Any,
+    *,
+    sampled: bool,
     squash: str,
 ) -> jax.Array:
     """The action that an agent takes by what its network says: drawn, or the most likely one."""

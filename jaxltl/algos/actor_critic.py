@@ -77,6 +77,7 @@ def orthogonal(scale: float) -> Any:
       >>> shape.shape
       (3, 2)
     """
+
     def start(key: Any, shape: Any, dtype: Any = None) -> jax.Array:
         rows, columns = shape
         most, least = max(rows, columns), min(rows, columns)
@@ -110,7 +111,8 @@ def dense(width: int, scale: float, name: str) -> nn.Dense:
       4
     """
     return nn.Dense(
-        width, kernel_init=orthogonal(scale), param_dtype=jnp.result_type(float), name=name)
+        width, kernel_init=orthogonal(scale), param_dtype=jnp.result_type(float), name=name
+    )
 
 
 class _Layers(nn.Module):
@@ -137,8 +139,7 @@ def _heads(module: Any, x: jax.Array) -> tuple[Any, jax.Array]:
     if module.num_actions:
         return scores, value
     start = nn.initializers.constant(np.log(module.initial_deviation))
-    spread = module.param(
-        "log_deviation", start, tuple(module.shape), jnp.result_type(float))
+    spread = module.param("log_deviation", start, tuple(module.shape), jnp.result_type(float))
     return (scores.reshape(module.shape), spread), value
 
 
@@ -192,8 +193,11 @@ class RecurrentActorCritic(nn.Module):
         x = dense(self.memory, np.sqrt(2), "input")(flat_observation(observation))
         x = getattr(nn, self.activation)(x)
         cell = nn.GRUCell(
-            self.memory, recurrent_kernel_init=orthogonal(1.0),
-            param_dtype=jnp.result_type(float), name="cell")
+            self.memory,
+            recurrent_kernel_init=orthogonal(1.0),
+            param_dtype=jnp.result_type(float),
+            name="cell",
+        )
         memory, x = cell(memory, x)
         return memory, _heads(self, x)
 
@@ -233,12 +237,14 @@ def initial_memory(network: nn.Module, memory: Any = None) -> Any:
         found = jax.tree.map(jnp.asarray, memory)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(
-            f"memory is {given.shown(memory)}; give a tree of arrays of numbers.") from None
+            f"memory is {given.shown(memory)}; give a tree of arrays of numbers."
+        ) from None
     own = begin() if hasattr(network, "initial_memory") else found
     if jax.tree.map(jnp.shape, found) != jax.tree.map(jnp.shape, own):
         raise ValueError(
             f"memory has the shapes {jax.tree.map(jnp.shape, found)}, and that of the network "
-            f"{jax.tree.map(jnp.shape, own)}; give one of those shapes, or none.")
+            f"{jax.tree.map(jnp.shape, own)}; give one of those shapes, or none."
+        )
     return found
 
 
@@ -325,16 +331,19 @@ def require_network(network: Any, memory: Any, observation: Any, space: Any, fin
     form = f"(memory, ({wanted}, value))" if recurrent else f"({wanted}, value)"
     try:
         found, variables = jax.eval_shape(
-            lambda *x: network.init_with_output(jax.random.key(0), *x), *read)
+            lambda *x: network.init_with_output(jax.random.key(0), *x), *read
+        )
     except TypeError as problem:  # what a function says that is called with other arguments
         remembers = "; for one that remembers, give memory, or let initial_memory() return it"
         raise ValueError(
             f"network cannot be called as network({'memory, ' * recurrent}observation): {problem}. "
-            f"Let it return {form}{'' if recurrent else remembers}.") from problem
+            f"Let it return {form}{'' if recurrent else remembers}."
+        ) from problem
     if set(variables) - {"params"}:
         raise ValueError(
             f"network keeps {sorted(set(variables) - {'params'})} beside its parameters; leave out "
-            "what is not learned by gradients.")
+            "what is not learned by gradients."
+        )
 
     def shapes(tree: Any) -> Any:
         return jax.tree.map(lambda x: x.shape, tree)
@@ -346,4 +355,5 @@ def require_network(network: Any, memory: Any, observation: Any, space: Any, fin
     if shapes(found) != expected:
         raise ValueError(
             f"network returns shapes {shapes(found)} for one observation; expected {expected}, "
-            f"{form}. It reads a single observation: many are a vmap.")
+            f"{form}. It reads a single observation: many are a vmap."
+        )

@@ -249,7 +249,9 @@ def make_problem(
     observation = stack_observations(models, observation)
     counts, other = training_counts(models, demonstrations, held_out)
     problem = Problem(
-        observation=observation, available=jnp.asarray(models.mdp.available), counts=counts,
+        observation=observation,
+        available=jnp.asarray(models.mdp.available),
+        counts=counts,
         held_out=other,
         network=ConvolutionalPolicy(num_actions=models.num_actions) if network is None else network,
     )
@@ -314,14 +316,12 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     """
     del hparams
     scores = _scores(state.best.parameters, problem)
-    return jax.nn.softmax(
-        jnp.where(problem.available[:, :, None], scores, -jnp.inf), axis=-1)
+    return jax.nn.softmax(jnp.where(problem.available[:, :, None], scores, -jnp.inf), axis=-1)
 
 
 def _scores(parameters: Any, problem: Problem) -> jax.Array:
     memory = jnp.eye(problem.counts.shape[2], dtype=problem.observation.dtype)[None, None]
-    return jnp.asarray(
-        problem.network.apply(parameters, problem.observation[:, :, None], memory))
+    return jnp.asarray(problem.network.apply(parameters, problem.observation[:, :, None], memory))
 
 
 # --- learning -------------------------------------------------------------------------------------
@@ -362,7 +362,9 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     drawn = problem.network.init(learner.init_key(key), *_inputs(problem))
     parameters = jax.tree.map(lambda x: jnp.asarray(x, dtype), drawn)
     return State(
-        key=key, step=jnp.int32(0), parameters=parameters,
+        key=key,
+        step=jnp.int32(0),
+        parameters=parameters,
         optimizer=jax.tree.map(
             lambda x: jnp.asarray(x, jnp.result_type(x)), _optimizer(hparams).init(parameters)
         ),
@@ -400,16 +402,23 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     parameters = optax.apply_updates(state.parameters, updates)
     held_out = neg_log_likelihood(state.parameters, problem, problem.held_out)
     best, stopped = stop_early(
-        state, parameters, held_out, jnp.any(problem.held_out > 0), hparams.patience)
+        state, parameters, held_out, jnp.any(problem.held_out > 0), hparams.patience
+    )
     parameters, optimizer = learner.choose(
-        stopped, (state.parameters, state.optimizer), (parameters, optimizer))
+        stopped, (state.parameters, state.optimizer), (parameters, optimizer)
+    )
     norm = optax.tree.norm(gradient)
     finite = jnp.isfinite(loss) & jnp.isfinite(norm)
     metrics = Metrics(
-        loss=loss, held_out=held_out, gradient_norm=norm, status=status_code(finite, finite))
+        loss=loss, held_out=held_out, gradient_norm=norm, status=status_code(finite, finite)
+    )
     return State(
-        key=state.key, step=state.step + 1, parameters=parameters, optimizer=optimizer,
-        best=best, stopped=stopped,
+        key=state.key,
+        step=state.step + 1,
+        parameters=parameters,
+        optimizer=optimizer,
+        best=best,
+        stopped=stopped,
     ), metrics
 
 

@@ -50,7 +50,6 @@ many settings, by ``vmap`` over the numbers of ``Hparams``. Policies
 of environments are searched with :func:`~jaxltl.core.values.episode_scores.episode_evaluator`.
 """
 
-
 from __future__ import annotations
 
 import math
@@ -314,22 +313,34 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
 
     def sample(objective: float, excess: float) -> Sample:
         return Sample(
-            jnp.zeros_like(point), jnp.asarray(objective, dtype),
-            jnp.full_like(problem.limit, jnp.nan), jnp.asarray(excess, dtype), jnp.bool_(False),
+            jnp.zeros_like(point),
+            jnp.asarray(objective, dtype),
+            jnp.full_like(problem.limit, jnp.nan),
+            jnp.asarray(excess, dtype),
+            jnp.bool_(False),
         )
 
     elites = None
     if hparams.elite_reuse:
         num = num_elites(hparams.rho, hparams.population)
         elites = Pool(
-            jnp.zeros((num, *point.shape), dtype), jnp.zeros(num, dtype),
-            jnp.zeros((num, *problem.limit.shape), dtype), jnp.zeros(num, bool),
+            jnp.zeros((num, *point.shape), dtype),
+            jnp.zeros(num, dtype),
+            jnp.zeros((num, *problem.limit.shape), dtype),
+            jnp.zeros(num, bool),
         )
     zero = jnp.int32(0)
     return State(
-        key=key, step=zero, family=problem.family, best=sample(-jnp.inf, jnp.inf),
-        least=sample(jnp.nan, jnp.inf), elites=elites, num_evaluated=zero, num_invalid=zero,
-        num_restarts=zero, status=jnp.int32(Status.CONVERGED),
+        key=key,
+        step=zero,
+        family=problem.family,
+        best=sample(-jnp.inf, jnp.inf),
+        least=sample(jnp.nan, jnp.inf),
+        elites=elites,
+        num_evaluated=zero,
+        num_invalid=zero,
+        num_restarts=zero,
+        status=jnp.int32(Status.CONVERGED),
     )
 
 
@@ -356,8 +367,13 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
         pool = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), fresh, state.elites)
     limit = problem.limit - hparams.margin
     chosen = select(
-        pool.objective, pool.cost, limit, num=num_elites(hparams.rho, hparams.population),
-        count=count, scale=problem.scale, active=pool.active,
+        pool.objective,
+        pool.cost,
+        limit,
+        num=num_elites(hparams.rho, hparams.population),
+        count=count,
+        scale=problem.scale,
+        active=pool.active,
     )
     elites = replace(rows_of(pool, chosen.index), active=chosen.taken)
     rate = jnp.asarray(at(hparams.rate, state.step), samples.dtype)
@@ -372,7 +388,9 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     for x in jax.tree.leaves(family):
         fine &= jnp.isfinite(x).all()
     new = replace(
-        state, step=state.step + 1, family=family,
+        state,
+        step=state.step + 1,
+        family=family,
         best=better(state.best, fresh, excess, feasible, objective, state.best.objective),
         least=better(state.least, fresh, excess, usable, -excess, -state.least.excess),
         elites=elites if hparams.elite_reuse else None,
@@ -383,13 +401,18 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     )
     num_usable = jnp.sum(usable)
     return new, Metrics(
-        num_evaluated=new.num_evaluated, num_feasible=jnp.sum(feasible), num_invalid=invalid,
+        num_evaluated=new.num_evaluated,
+        num_feasible=jnp.sum(feasible),
+        num_invalid=invalid,
         enough_feasible=chosen.enough_feasible,
         objective=jnp.sum(jnp.where(usable, objective, 0)) / num_usable,
         cost=jnp.sum(jnp.where(usable[:, None], cost, 0), axis=0) / num_usable,
-        best_objective=new.best.objective, least_excess=new.least.excess,
-        spread=jnp.max(families.standard_deviation(family)), rate=rate,
-        num_restarts=new.num_restarts, status=new.status,
+        best_objective=new.best.objective,
+        least_excess=new.least.excess,
+        spread=jnp.max(families.standard_deviation(family)),
+        rate=rate,
+        num_restarts=new.num_restarts,
+        status=new.status,
     )
 
 
@@ -432,7 +455,10 @@ def _moved(
 ) -> Any:
     """The distribution after (4.14), and after what is added to it."""
     weights = elite_weights(
-        elites.objective, elites.active, enough, weighting=hparams.weighting,
+        elites.objective,
+        elites.active,
+        enough,
+        weighting=hparams.weighting,
         temperature=hparams.temperature,
     )
     some = jnp.any(elites.active)
@@ -532,13 +558,15 @@ def assess(
     num_evaluations = given.whole("num_evaluations", num_evaluations, most=2**31 - 1)
     if num_evaluations < 2:
         raise ValueError(
-            f"num_evaluations={num_evaluations}; a confidence interval needs at least 2.")
+            f"num_evaluations={num_evaluations}; a confidence interval needs at least 2."
+        )
     given.instance("problem", problem, Problem, "one of cce.make_problem")
     shape = families.center(problem.family).shape
     if not hasattr(parameters, "dtype") or jnp.shape(parameters) != shape:
         raise ValueError(
             f"parameters is {given.shown(parameters)}; give those of one policy, float{[*shape]}, "
-            "such as cce.policy(state, problem, hparams). Many are a vmap.")
+            "such as cce.policy(state, problem, hparams). Many are a vmap."
+        )
     return _assessed(problem, parameters, require_key(key), num_evaluations)
 
 
@@ -556,7 +584,11 @@ def _assessed(
     lower, upper = (jnp.where(known, mean + s * margin, s * jnp.inf) for s in (-1, 1))
     real = objective < jnp.inf  # and no NaN
     return Assessment(
-        parameters=parameters, objective=objective, cost=mean, lower=lower, upper=upper,
+        parameters=parameters,
+        objective=objective,
+        cost=mean,
+        lower=lower,
+        upper=upper,
         excess=jnp.max((mean - problem.limit) / problem.scale, axis=-1, initial=-jnp.inf),
         feasible=real & (mean <= problem.limit).all(),
         confident=real & (upper <= problem.limit).all(),
@@ -633,8 +665,13 @@ def result(
             f"objective is {float(both[name].objective):.6g}."
         )
     return Result(
-        None if name is None else both[name].parameters, name, both["mean"], both["best"],
-        violation, num_evaluations, message,
+        None if name is None else both[name].parameters,
+        name,
+        both["mean"],
+        both["best"],
+        violation,
+        num_evaluations,
+        message,
     )
 
 
@@ -646,8 +683,12 @@ def _nan_last(x: float) -> float:
 
 
 _RANGES = {
-    "rate": (0, 1), "sample_share": (0, 1), "num_samples": (0, np.inf),
-    "temperature": (0, np.inf), "variance_floor": (0, np.inf), "restart_below": (0, np.inf),
+    "rate": (0, 1),
+    "sample_share": (0, 1),
+    "num_samples": (0, np.inf),
+    "temperature": (0, np.inf),
+    "variance_floor": (0, np.inf),
+    "restart_below": (0, np.inf),
 }
 _SCHEDULES = ("rate", "sample_share", "num_samples")
 _OPTIONAL = ("sample_share", "num_samples", "variance_floor", "restart_below")
@@ -664,7 +705,8 @@ def _require_state(state: State, problem: Problem) -> None:
     if found != own or state.best.cost.shape != problem.limit.shape:
         raise ValueError(
             f"state is of policies float{[*found]} with {len(state.best.cost)} costs, the problem "
-            f"of float{[*own]} with {len(problem.limit)}; give the state of a run on this problem.")
+            f"of float{[*own]} with {len(problem.limit)}; give the state of a run on this problem."
+        )
 
 
 def _check(problem: Problem, hparams: Hparams) -> None:
@@ -692,7 +734,8 @@ def _check(problem: Problem, hparams: Hparams) -> None:
     sharding = hparams.sharding
     if sharding is not None and not isinstance(sharding, jax.sharding.NamedSharding):
         raise ValueError(
-            f"sharding is a {type(sharding).__name__}; give a jax.sharding.NamedSharding.")
+            f"sharding is a {type(sharding).__name__}; give a jax.sharding.NamedSharding."
+        )
     for name in ("rate", "temperature"):
         number = getattr(hparams, name)
         if not is_schedule(number) and not isinstance(number, jax.core.Tracer) and not number > 0:

@@ -119,7 +119,8 @@ def read_arrays(file: BinaryIO) -> dict[str, np.ndarray]:
     file.seek(0)
     if start == np.lib.format.MAGIC_PREFIX:
         raise ValueError(
-            "it holds a single array; numpy.savez(path, name=array) writes named ones.")
+            "it holds a single array; numpy.savez(path, name=array) writes named ones."
+        )
     arrays, what = {}, "it"
     try:
         if not start.startswith(b"PK"):
@@ -147,9 +148,7 @@ def _umask() -> int:
     return mask
 
 
-def save(
-    path: str | os.PathLike[str], state: Any, given: Mapping[str, str] | None = None
-) -> None:
+def save(path: str | os.PathLike[str], state: Any, given: Mapping[str, str] | None = None) -> None:
     """Writes a learner's state as an ``.npz``, atomically.
 
     In several processes all of them call it, with a directory that they share. What lies on the
@@ -191,9 +190,7 @@ def remove(path: str | os.PathLike[str]) -> None:
     parts.remove([path, *parts.parts_of(path), *parts.unfinished(path)])
 
 
-def load(
-    path: str | os.PathLike[str], like: Any, given: Mapping[str, str] | None = None
-) -> Any:
+def load(path: str | os.PathLike[str], like: Any, given: Mapping[str, str] | None = None) -> Any:
     """Reads a state saved by :func:`save`, bit for bit.
 
     Args:
@@ -218,8 +215,10 @@ def load(
             before = json.loads(str(arrays.pop(_GIVEN)))
             stored = json.loads(str(arrays.pop(_PARTS, "{}")))
             arrays |= {name: parts.Stored(*x) for name, x in stored.items()}
-            leaves = [_loaded(str(path), name, leaf, arrays.get(name), others)
-                      for name, leaf in _named(like)]
+            leaves = [
+                _loaded(str(path), name, leaf, arrays.get(name), others)
+                for name, leaf in _named(like)
+            ]
         except _Another as error:
             raise ValueError(str(error)) from None
         except (OSError, ValueError, KeyError, TypeError) as error:
@@ -243,6 +242,7 @@ def _loaded(path: str, name: str, leaf: Any, found: Any, others: parts.Parts) ->
         )
     over = isinstance(expected, jax.Array) and len(expected.sharding.device_set) > 1
     if over:
+
         def block(index: Any) -> np.ndarray:
             return others.read(found, index) if isinstance(found, parts.Stored) else found[index]
 
@@ -369,8 +369,7 @@ def _function(name: str, value: types.FunctionType) -> Iterator[tuple[str, str]]
 
 def _code(code: types.CodeType) -> str:
     held = [_code(c) if isinstance(c, types.CodeType) else _constant(c) for c in code.co_consts]
-    return hashlib.sha256(
-        code.co_code + repr((held, code.co_names)).encode()).hexdigest()[:16]
+    return hashlib.sha256(code.co_code + repr((held, code.co_names)).encode()).hexdigest()[:16]
 
 
 def _constant(value: Any) -> str:

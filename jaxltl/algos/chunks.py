@@ -129,7 +129,8 @@ def run_in_chunks(
         lengths = block_lengths(min(chunk, num_steps - int(made.max())), max_rows)
         now, fresh = advance(strong(now), problem, (hparams, until), lengths)
         rows = jax.tree.map(
-            lambda x, y: np.concatenate([x, y]), jax.device_get(rows), jax.device_get(fresh))
+            lambda x, y: np.concatenate([x, y]), jax.device_get(rows), jax.device_get(fresh)
+        )
         ended, made = on_host((now.done, now.count))
         if checkpoint is not None:
             files.save(checkpoint, (now, rows), given)
@@ -137,7 +138,8 @@ def run_in_chunks(
             report(int(made.max()), jax.tree.map(lambda x: x[-1], rows[1]))
     step_of = np.asarray(rows[0])
     return Chunks(
-        now.state, jax.tree.map(np.asarray, rows[1]), step_of[:, 0] if lanes else step_of, ended)
+        now.state, jax.tree.map(np.asarray, rows[1]), step_of[:, 0] if lanes else step_of, ended
+    )
 
 
 def _begin(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | None) -> Progress:
@@ -149,9 +151,7 @@ def _begin(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | 
     return Progress(state, *to_jax((metrics, count, np.zeros(count.shape, bool))))
 
 
-def _metrics_of(
-    step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | None
-) -> Any:
+def _metrics_of(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | None) -> Any:
     """Shapes of the metrics of one run, from a step's trace."""
     one = (state, hparams)
     if num_lanes is not None:
@@ -215,9 +215,7 @@ def _lane_steps(step: Step, keep: str, num_lanes: int | None) -> Step:
 def _spread(hparams: Any, state: Any) -> Any:
     """Numbers for each of N runs, floats in the precision of the states."""
     size = len(state.step)
-    floats = [
-        x.dtype for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)
-    ]
+    floats = [x.dtype for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)]
 
     def one(x: Any) -> np.ndarray:
         x = np.asarray(x)

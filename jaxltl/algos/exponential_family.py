@@ -198,7 +198,8 @@ def _require_positive(name: str, x: jax.Array) -> None:
     wrong = np.flatnonzero(~((given > 0) & np.isfinite(given)))
     if wrong.size:
         raise ValueError(
-            f"{name}[{wrong[0]}] = {float(given[wrong[0]])!r}; it must be positive and finite.")
+            f"{name}[{wrong[0]}] = {float(given[wrong[0]])!r}; it must be positive and finite."
+        )
 
 
 # --- the protocol ---------------------------------------------------------------------------
@@ -315,9 +316,7 @@ def sample_antithetic(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.A
 
 
 @singledispatch
-def project(
-    family: Any, samples: jax.Array, weights: jax.Array, rate: jax.Array | float
-) -> Any:
+def project(family: Any, samples: jax.Array, weights: jax.Array, rate: jax.Array | float) -> Any:
     """The mean parameter moved towards that of weighted samples (dissertation, (4.11))::
 
         m(v') = rate * sum_i w_i Gamma(x_i) / sum_i w_i + (1 - rate) * m(v),
@@ -413,8 +412,10 @@ def at_least(family: Any, variance: jax.Array | float) -> Any:
 
 
 def _unknown(family: Any) -> str:
-    return (f"{type(family).__name__} is not a family: pass a DiagonalGaussian, a FullGaussian "
-            "or a Gamma.")
+    return (
+        f"{type(family).__name__} is not a family: pass a DiagonalGaussian, a FullGaussian "
+        "or a Gamma."
+    )
 
 
 def _normal(key: chex.PRNGKey, num_samples: int, like: jax.Array) -> jax.Array:
@@ -622,9 +623,7 @@ def _(family: Gamma, key: chex.PRNGKey, num_samples: int) -> jax.Array:
 
 
 @project.register
-def _(
-    family: Gamma, samples: jax.Array, weights: jax.Array, rate: jax.Array | float
-) -> Gamma:
+def _(family: Gamma, samples: jax.Array, weights: jax.Array, rate: jax.Array | float) -> Gamma:
     weights = _shares(weights)
     old = family.shape / family.rate
     mean = old + rate * (weights @ (samples - old))

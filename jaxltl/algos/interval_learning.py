@@ -441,8 +441,10 @@ def guarantee(state: State, problem: Problem, confidence: float, **options: Any)
       ValueError: the confidence.
     """
     if not isinstance(problem, Problem) or not isinstance(state, State):
-        raise ValueError("guarantee takes a state, as init and train return it, and the problem "
-                         "that make_problem returned.")
+        raise ValueError(
+            "guarantee takes a state, as init and train return it, and the problem "
+            "that make_problem returned."
+        )
     world = problem.model.mdp
     counts = np.asarray(state.counts)[support(world)]
     return learn_guarantee(

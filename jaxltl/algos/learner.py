@@ -135,7 +135,8 @@ def run(
     """
     num_steps, max_rows = (
         x if isinstance(x, int) else whole(name, x, least=1)
-        for name, x in (("num_steps", num_steps), ("max_rows", max_rows)))
+        for name, x in (("num_steps", num_steps), ("max_rows", max_rows))
+    )
     if num_steps < 1 or max_rows < 1:
         raise ValueError(f"num_steps={num_steps}, max_rows={max_rows}; both must be at least 1.")
     if num_steps > MOST:
@@ -378,11 +379,13 @@ def while_active(
     def _(size: int, batched: Any, carry: Any, given: Any) -> Any:
         lanes, shared = batched
         carry = jax.tree.map(
-            lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape)), carry, lanes)
+            lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape)), carry, lanes
+        )
         axes = (0, jax.tree.map(lambda b: 0 if b else None, shared))
         found = lax.while_loop(
             lambda c: jnp.any(jax.vmap(active, axes)(c, given)),
-            lambda c: jax.vmap(body, axes)(c, given), carry,
+            lambda c: jax.vmap(body, axes)(c, given),
+            carry,
         )
         return found, jax.tree.map(lambda _: True, lanes)
 
@@ -423,8 +426,10 @@ def bind(init: Init, step: Step, *, step_if: Step | None = None, keep: str = "af
     Returns:
       :class:`Bound`.
     """
-    both = (*_whole(init, step), *_early(init, step if step_if is None else step_if, keep,
-                                         step_if is not None))
+    both = (
+        *_whole(init, step),
+        *_early(init, step if step_if is None else step_if, keep, step_if is not None),
+    )
     for name, function in zip(Bound._fields, both, strict=True):
         function.__name__ = function.__qualname__ = name
         function.__module__ = step.__module__
@@ -477,8 +482,14 @@ def _early(
     init: Init, step: Step, kept: str, idle: bool
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
     def from_state(
-        state: Any, problem: Any, hparams: Any, *, until: Until, num_steps: chex.Numeric,
-        check_every: int = 1, keep: str = kept,
+        state: Any,
+        problem: Any,
+        hparams: Any,
+        *,
+        until: Until,
+        num_steps: chex.Numeric,
+        check_every: int = 1,
+        keep: str = kept,
     ) -> Learned:
         """Steps until a condition is met, or `num_steps` of them. Under ``jit`` and ``vmap``.
 
@@ -504,12 +515,26 @@ def _early(
           ValueError: an unknown `keep`, or a number below 1.
         """
         return run_until(
-            step, state, problem, hparams, until=until, num_steps=num_steps,
-            check_every=check_every, keep=keep, idle=idle)
+            step,
+            state,
+            problem,
+            hparams,
+            until=until,
+            num_steps=num_steps,
+            check_every=check_every,
+            keep=keep,
+            idle=idle,
+        )
 
     def from_key(
-        key: chex.PRNGKey, problem: Any, hparams: Any, *, until: Until, num_steps: chex.Numeric,
-        check_every: int = 1, keep: str = kept,
+        key: chex.PRNGKey,
+        problem: Any,
+        hparams: Any,
+        *,
+        until: Until,
+        num_steps: chex.Numeric,
+        check_every: int = 1,
+        keep: str = kept,
     ) -> Learned:
         """A fresh state and steps until a condition is met; ``vmap`` it over keys for many seeds.
 
@@ -525,8 +550,14 @@ def _early(
           ValueError: an unknown `keep`, or a number below 1.
         """
         return from_state(
-            init(key, problem, hparams), problem, hparams, until=until, num_steps=num_steps,
-            check_every=check_every, keep=keep)
+            init(key, problem, hparams),
+            problem,
+            hparams,
+            until=until,
+            num_steps=num_steps,
+            check_every=check_every,
+            keep=keep,
+        )
 
     return from_state, from_key
 
@@ -616,6 +647,7 @@ def choose(condition: jax.Array, one: Any, other: Any) -> Any:
       >>> choose(jnp.bool_(False), {"x": jnp.zeros(2)}, {"x": jnp.ones(2)})["x"].tolist()
       [1.0, 1.0]
     """
+
     def leaf(x: jax.Array, y: jax.Array) -> jax.Array:
         is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
         return x if is_key else jnp.where(condition, x, y)

@@ -125,8 +125,10 @@ class SequenceNetwork(nn.Module):
             seen = self.events_seen(world)
             seen = seen.reshape(-1, seen.shape[-1]).astype(kind)
             told = asked[:, : self.detailed]
-            parts += [jnp.ravel(seen @ told.reshape(-1, told.shape[-1]).T),
-                      jnp.ravel(asked.mean(-1))]
+            parts += [
+                jnp.ravel(seen @ told.reshape(-1, told.shape[-1]).T),
+                jnp.ravel(asked.mean(-1)),
+            ]
         x = jnp.concatenate([*parts, ahead])
         for i, width in enumerate(self.hidden):
             x = getattr(nn, self.activation)(dense(width, np.sqrt(2), f"hidden_{i}")(x))
@@ -179,7 +181,8 @@ def make_plan(
     """
     automaton = task if isinstance(task, Automaton) else to_automaton(task)
     found = sequences.reach_avoid_sequences(
-        automaton, events, given.names("propositions", propositions), depth=depth, most=most)
+        automaton, events, given.names("propositions", propositions), depth=depth, most=most
+    )
     return Plan(found.reach, found.avoid, found.length)
 
 
@@ -200,8 +203,9 @@ def stack_plans(plans: Sequence[Plan]) -> Plan:
         given.instance("plans", plan, Plan, "a list of those of make_plan")
     shapes = [np.shape(plan.reach) for plan in plans]
     if not shapes or len({shape[2:] for shape in shapes}) > 1:
-        raise ValueError(f"plans have the shapes {shapes}; give some, all of one depth and of the "
-                         "same events.")
+        raise ValueError(
+            f"plans have the shapes {shapes}; give some, all of one depth and of the same events."
+        )
     states, most = (max(shape[i] for shape in shapes) for i in range(2))
 
     def padded(x: Any) -> np.ndarray:
@@ -270,8 +274,10 @@ def sequence_agent(
     given.instance("plan", plan, Plan, "one of make_plan")
     if actions is not None:
         given.instance("actions", actions, Finite | Box, "the environment's, environment.actions")
-    how = _How(given.one_of("squash", squash, action_distributions.SQUASHES),
-               given.truth("sampled", sampled))
+    how = _How(
+        given.one_of("squash", squash, action_distributions.SQUASHES),
+        given.truth("sampled", sampled),
+    )
     begin = Choice(jnp.int32(-1), jnp.int32(0), jnp.asarray(0.0))
     return Agent(Partial(_act, how, actions, as_partial(network, "network"), plan), begin)
 
@@ -307,8 +313,9 @@ def sequence_policy(
     given.instance("plan", plan, Plan, "one of make_plan")
     if not (isinstance(memory, jax.Array) and jnp.issubdtype(memory.dtype, jnp.integer)):
         memory = given.whole("memory", memory)
-    actions, values = _judged(given.called("network", network), plan, observation,
-                              jnp.asarray(memory))
+    actions, values = _judged(
+        given.called("network", network), plan, observation, jnp.asarray(memory)
+    )
     _actions_of(actions)
     return jax.nn.softmax(actions[jnp.argmax(values)])
 
@@ -355,8 +362,10 @@ def _applied(module: _Module, parameters: Any, moments: Any, observation: Any) -
 def _actions_of(parameters: Any) -> Finite:
     """The actions of logits."""
     if isinstance(parameters, tuple):
-        raise ValueError("actions=None, but the network speaks of a box; give the environment's, "
-                         "environment.actions.")
+        raise ValueError(
+            "actions=None, but the network speaks of a box; give the environment's, "
+            "environment.actions."
+        )
     return Finite(parameters.shape[-1])
 
 
@@ -365,25 +374,38 @@ def _judged(
 ) -> tuple[Any, jax.Array]:
     """What the network would do for each sequence of a state, and what it values each at."""
     rows = sequence_task.Sequence(
-        jnp.asarray(plan.reach)[state], jnp.asarray(plan.avoid)[state],
-        jnp.asarray(plan.length)[state])
+        jnp.asarray(plan.reach)[state],
+        jnp.asarray(plan.avoid)[state],
+        jnp.asarray(plan.length)[state],
+    )
     found = jax.vmap(lambda row: network(sequence_task.SequenceObservation(seen, row)))(rows)
     if not isinstance(found, tuple) or len(found) != 2 or jnp.shape(found[1]) != rows.length.shape:
         shapes = jax.tree.map(lambda x: jnp.shape(x)[1:], found)
         raise ValueError(
             f"network returns {shapes} for an observation; return (parameters of the action, "
-            "value), the value a scalar.")
+            "value), the value a scalar."
+        )
     actions, values = found
     return actions, jnp.where(rows.length > 0, values, -jnp.inf)
 
 
 def _act(
-    how: _How, space: Finite | Box | None, network: Callable[..., Any], plan: Plan, memory: Any,
-    observation: Any, allowed: Any, key: chex.PRNGKey,
+    how: _How,
+    space: Finite | Box | None,
+    network: Callable[..., Any],
+    plan: Plan,
+    memory: Any,
+    observation: Any,
+    allowed: Any,
+    key: chex.PRNGKey,
 ) -> tuple[Any, Any]:
     if not (hasattr(observation, "world") and hasattr(observation, "memory")):
-        given.instance("observation", observation, TaskObservation,
-                       "that of an environment of task_environment, with the formula of the plan")
+        given.instance(
+            "observation",
+            observation,
+            TaskObservation,
+            "that of an environment of task_environment, with the formula of the plan",
+        )
     given.instance("memory", memory, Choice, "the agent's own, agent.memory")
     require_key(key)
     seen, state = observation.world, jnp.argmax(observation.memory).astype(jnp.int32)
@@ -396,8 +418,13 @@ def _act(
     worth = jnp.where(kept, late, values[best]).astype(memory.worth.dtype)
     said = jax.tree.map(lambda x: x[taken], actions)
     action = action_distributions.chosen(
-        key, _actions_of(said) if space is None else space, said, allowed,
-        sampled=how.sampled, squash=how.squash)
+        key,
+        _actions_of(said) if space is None else space,
+        said,
+        allowed,
+        sampled=how.sampled,
+        squash=how.squash,
+    )
     return action, Choice(state, taken, worth)
 
 
@@ -460,8 +487,10 @@ def train_in_stages(
     bars = given.numbers("enough", enough)
     bars = np.full(max(count - 1, 0), bars) if bars.ndim == 0 else bars
     if count == 0 or bars.shape != (count - 1,) or np.isnan(bars).any():
-        raise ValueError(f"{count} problems, {len(bars)} thresholds, num_chunks={num_chunks}; give "
-                         "a problem at least, one threshold fewer than problems, and one chunk.")
+        raise ValueError(
+            f"{count} problems, {len(bars)} thresholds, num_chunks={num_chunks}; give "
+            "a problem at least, one threshold fewer than problems, and one chunk."
+        )
     begin, stage = time.perf_counter(), 0
     state = init(key, problems[0], hparams)
     rows, stages, seconds = [], [], []

@@ -52,7 +52,6 @@ many settings, by ``vmap`` over the numbers of ``Hparams``. End when
 the value rests by ``train_until(..., until=value_rests(1e-6), check_every=...)``.
 """
 
-
 from __future__ import annotations
 
 from dataclasses import replace
@@ -285,11 +284,16 @@ def make_problem(
         measured = jnp.asarray(default if measured is None else measured, bool)
         require_shape("measured", measured, shape[:1])
     return Problem(
-        game=game, reward=check_reward(game, reward), allowed=jnp.asarray(mask),
-        behavior=jnp.asarray(behavior, game.dtype), start=jnp.asarray(start, game.dtype),
-        exact=exact, measured=None if exact is None else measured,
+        game=game,
+        reward=check_reward(game, reward),
+        allowed=jnp.asarray(mask),
+        behavior=jnp.asarray(behavior, game.dtype),
+        start=jnp.asarray(start, game.dtype),
+        exact=exact,
+        measured=None if exact is None else measured,
         behavior_table=jnp.asarray(alias_table(behavior)),
-        start_table=jnp.asarray(cumulative(start)), method=method,
+        start_table=jnp.asarray(cumulative(start)),
+        method=method,
     )
 
 
@@ -358,6 +362,7 @@ def _check_alternating(game: Game, system: np.ndarray, reachable: np.ndarray) ->
             "method='generalized'."
         )
 
+
 _MOST_VISITS = 2**30  # counted; a step adds at most as many again
 
 
@@ -391,8 +396,13 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     words = jax.random.bits(learner.init_key(key), (hparams.num_chains,), jnp.uint32)
     waiting = problem.method == "maximin"
     return State(
-        key=key, step=jnp.int32(0), q=q, visits=jnp.zeros(q.shape, jnp.int32),
-        value=value(q, problem), residual=jnp.asarray(jnp.inf, dtype), violations=jnp.int32(0),
+        key=key,
+        step=jnp.int32(0),
+        q=q,
+        visits=jnp.zeros(q.shape, jnp.int32),
+        value=value(q, problem),
+        residual=jnp.asarray(jnp.inf, dtype),
+        violations=jnp.int32(0),
         position=draw(problem.start_table, words),
         pending=jnp.full(hparams.num_chains, -1, jnp.int32) if waiting else None,
         held=jnp.zeros(hparams.num_chains, dtype) if waiting else None,
@@ -419,12 +429,18 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     """
     _check(problem, hparams)
     start_key, action_key, successor_key = (
-        jax.random.fold_in(learner.step_key(state), i) for i in range(3))
+        jax.random.fold_in(learner.step_key(state), i) for i in range(3)
+    )
     state = _restart(start_key, state, problem, hparams)
     stream = splitmix.streams(action_key, (hparams.num_chains,))
     table = Table(
-        state.q.ravel(), state.visits.ravel(), state.position,
-        take(problem.game.system, state.position), state.pending, state.held, state.violations,
+        state.q.ravel(),
+        state.visits.ravel(),
+        state.position,
+        take(problem.game.system, state.position),
+        state.pending,
+        state.held,
+        state.violations,
     )
     one = partial(move, problem, hparams, _epsilons(state.step, hparams), stream, successor_key)
     count = jnp.arange(hparams.moves_per_step, dtype=jnp.uint32)
@@ -433,11 +449,16 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     updated = value(q, problem)
     residual = jnp.max(jnp.abs(updated - state.value))
     state = State(
-        key=state.key, step=state.step + 1, q=q,
+        key=state.key,
+        step=state.step + 1,
+        q=q,
         visits=jnp.minimum(table.visits, _MOST_VISITS).reshape(q.shape),
-        value=updated, residual=residual,
-        violations=jnp.minimum(table.violations, _MOST_VISITS), position=table.position,
-        pending=table.pending, held=table.held,
+        value=updated,
+        residual=residual,
+        violations=jnp.minimum(table.violations, _MOST_VISITS),
+        position=table.position,
+        pending=table.pending,
+        held=table.held,
     )
     return state, measure(state, problem, hparams)
 
@@ -534,6 +555,7 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
 
 def _restart(key, state: State, problem, hparams) -> State:
     """Some chains start anew, and forget a move that waits for its answer."""
+
     def redraw(position, pending):
         words = jax.random.bits(key, (2, hparams.num_chains), jnp.uint32)
         anew = splitmix.uniform(words[0], state.value.dtype) < hparams.restart
@@ -541,12 +563,14 @@ def _restart(key, state: State, problem, hparams) -> State:
         return jnp.where(anew, draw(problem.start_table, words[1]), position), pending
 
     position, pending = lax.cond(
-        jnp.asarray(hparams.restart) > 0, redraw, lambda *x: x, state.position, state.pending)
+        jnp.asarray(hparams.restart) > 0, redraw, lambda *x: x, state.position, state.pending
+    )
     return replace(state, position=position, pending=pending)
 
 
 def _epsilons(step, hparams) -> tuple[Any, Any]:
     """Both players' probabilities of not being greedy; None: never greedy."""
+
     def at(epsilon):
         if epsilon is None:
             return None

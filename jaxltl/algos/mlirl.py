@@ -249,8 +249,7 @@ def make_problem(
     weight: Any = satisfaction_over
     if isinstance(weight, str):
         if weight not in ("initial", "all"):
-            raise ValueError(
-                f'satisfaction_over={weight!r}; choose "initial", "all" or weights.')
+            raise ValueError(f'satisfaction_over={weight!r}; choose "initial", "all" or weights.')
         starts = np.asarray(model.initial) > 0
         weight = np.ones(model.state_shape) if weight == "all" else starts
         weight = to_jax(weight.astype(model.dtype))
@@ -262,8 +261,12 @@ def make_problem(
     if shape != actions:
         raise ValueError(f"the reward has shape {shape}; expected {actions}.")
     return Problem(
-        model=model, features=features, counts=pair_counts(model, demonstrations, kept),
-        start=start, satisfaction_weight=weight, reward=reward,
+        model=model,
+        features=features,
+        counts=pair_counts(model, demonstrations, kept),
+        start=start,
+        satisfaction_weight=weight,
+        reward=reward,
     )
 
 
@@ -360,7 +363,8 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         zero = jnp.zeros((), value.dtype)
         parts = Objective(zero, zero, value, jnp.int32(0))
         optimizer = line_search.start(
-            parameters, line_search.Point(parameters, zero + jnp.inf, parameters, parts))
+            parameters, line_search.Point(parameters, zero + jnp.inf, parameters, parts)
+        )
     else:
         optimizer = learner.strong(_optimizer(hparams).init(parameters))
     return State(key, jnp.int32(0), parameters, value, optimizer)
@@ -371,7 +375,8 @@ def _evaluate(
     parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array
 ) -> line_search.Point:
     (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
-        parameters, problem, hparams, initial)
+        parameters, problem, hparams, initial
+    )
     return line_search.Point(parameters, loss, gradient, parts)
 
 
@@ -394,6 +399,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
 @jax.jit
 def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     if hparams.optimizer == "lbfgs":
+
         def evaluate(parameters: Any, before: line_search.Point) -> line_search.Point:
             return _evaluate(parameters, problem, hparams, _usable(before.parts))
 
@@ -402,11 +408,14 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     else:
         before = _evaluate(state.parameters, problem, hparams, state.value)
         updates, optimizer = _optimizer(hparams).update(
-            before.gradient, state.optimizer, state.parameters)
+            before.gradient, state.optimizer, state.parameters
+        )
         parameters, value = optax.apply_updates(state.parameters, updates), _usable(before.parts)
     metrics = Metrics(
-        loss=before.loss, neg_log_likelihood=before.parts.neg_log_likelihood,
-        satisfaction=before.parts.satisfaction, gradient_norm=optax.tree.norm(before.gradient),
+        loss=before.loss,
+        neg_log_likelihood=before.parts.neg_log_likelihood,
+        satisfaction=before.parts.satisfaction,
+        gradient_norm=optax.tree.norm(before.gradient),
         status=before.parts.status,
     )
     after = State(state.key, state.step + 1, parameters, value, optimizer)

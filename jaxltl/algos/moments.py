@@ -66,7 +66,8 @@ def updated_moments(
     total = jnp.maximum(moments.count + count, 1)
     shift = mean - moments.mean
     return Moments(
-        count=moments.count + count, mean=moments.mean + shift * count / total,
+        count=moments.count + count,
+        mean=moments.mean + shift * count / total,
         squares=moments.squares + squares + shift**2 * moments.count * count / total,
     )
 

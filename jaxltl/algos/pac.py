@@ -38,9 +38,7 @@ from jaxltl.core.types import Solution, require_shape
 # --- the constants of algorithm 5 -------------------------------------------------------------
 
 
-def horizon(
-    epsilon: chex.Numeric, discount: chex.Numeric, reward_bound: chex.Numeric
-) -> jax.Array:
+def horizon(epsilon: chex.Numeric, discount: chex.Numeric, reward_bound: chex.Numeric) -> jax.Array:
     """Moves after which what may still be paid is worth at most ``epsilon / 6``: N.
 
     ``N = log(epsilon (1 - g)^2 / (6 R)) / log g`` (dissertation, section 6.6.2), not rounded,
@@ -65,7 +63,9 @@ def horizon(
 
 
 def accuracy(
-    epsilon: chex.Numeric, discount: chex.Numeric, reward_bound: chex.Numeric,
+    epsilon: chex.Numeric,
+    discount: chex.Numeric,
+    reward_bound: chex.Numeric,
     num_states: chex.Numeric,
 ) -> jax.Array:
     """How well each transition probability has to be known: delta of algorithm 5, line 8.
@@ -93,7 +93,9 @@ def accuracy(
 
 
 def hoeffding_visits(
-    deviation: chex.Numeric, failure: chex.Numeric, num_states: chex.Numeric,
+    deviation: chex.Numeric,
+    failure: chex.Numeric,
+    num_states: chex.Numeric,
     num_actions: chex.Numeric,
 ) -> jax.Array:
     """Visits after which all estimates of probabilities are good at once (lemma 11).
@@ -122,8 +124,12 @@ def hoeffding_visits(
 
 
 def visits(
-    epsilon: chex.Numeric, failure: chex.Numeric, discount: chex.Numeric,
-    reward_bound: chex.Numeric, num_states: chex.Numeric, num_actions: chex.Numeric,
+    epsilon: chex.Numeric,
+    failure: chex.Numeric,
+    discount: chex.Numeric,
+    reward_bound: chex.Numeric,
+    num_states: chex.Numeric,
+    num_actions: chex.Numeric,
 ) -> jax.Array:
     """Visits after which a pair with several successors counts as known: K of algorithm 5.
 
@@ -186,7 +192,9 @@ def exploration(
 
 
 def mixing_gap(
-    probability: chex.Numeric, tolerance: chex.Numeric, discount: chex.Numeric,
+    probability: chex.Numeric,
+    tolerance: chex.Numeric,
+    discount: chex.Numeric,
     reward_bound: chex.Numeric,
 ) -> jax.Array:
     """What rare bad moves and frequent nearly best ones cost at most (lemma 7).
@@ -216,7 +224,9 @@ def mixing_gap(
 
 
 def hat_gap(
-    probability: chex.Numeric, tolerance: chex.Numeric, discount: chex.Numeric,
+    probability: chex.Numeric,
+    tolerance: chex.Numeric,
+    discount: chex.Numeric,
     reward_bound: chex.Numeric,
 ) -> jax.Array:
     """What strategies of the hat game cost at most in the optimistic model (lemma 8).
@@ -236,8 +246,11 @@ def hat_gap(
 
 
 def approximation_gap(
-    deviation: chex.Numeric, num_states: chex.Numeric, num_steps: chex.Numeric,
-    discount: chex.Numeric, reward_bound: chex.Numeric,
+    deviation: chex.Numeric,
+    num_states: chex.Numeric,
+    num_steps: chex.Numeric,
+    discount: chex.Numeric,
+    reward_bound: chex.Numeric,
 ) -> jax.Array:
     """How much inexact probabilities change what is paid in a number of moves (lemma 12).
 
@@ -264,9 +277,7 @@ def approximation_gap(
     return deviation * num_steps * num_states * reward_bound / left / left
 
 
-def epsilon_optimal_states(
-    optimal: Solution, value: Solution, epsilon: chex.Numeric
-) -> jax.Array:
+def epsilon_optimal_states(optimal: Solution, value: Solution, epsilon: chex.Numeric) -> jax.Array:
     """Where a strategy is certainly within `epsilon` of the best: ``bool[S]``.
 
     Decided on the certified bounds, ``value.lower >= optimal.upper - epsilon``, so that a
@@ -319,9 +330,7 @@ def near_optimal(q: chex.Array, allowed: chex.Array, tolerance: chex.Numeric) ->
     return allowed & ((best - q <= tolerance) | (q == best))
 
 
-def hat_strategy(
-    near: chex.Array, allowed: chex.Array, exploration: chex.Numeric
-) -> jax.Array:
+def hat_strategy(near: chex.Array, allowed: chex.Array, exploration: chex.Numeric) -> jax.Array:
     """Nearly best moves, with all allowed ones now and then: ``float[S, A]``.
 
     ``sigma(s, .) = p uniform(allowed(s)) + (1 - p) uniform(near(s))``: what the uniform strategy
@@ -387,9 +396,9 @@ def hat_game(game: Game, near: chex.Array, exploration: chex.Numeric) -> Game:
     num_states, num_actions = mdp.available.shape
     extra = max(0, 2 - mdp.num_successors)
     system = game.system[:, None]
-    choice = jnp.concatenate([
-        mdp.available & ~system, mdp.available, mdp.available & (near | ~system)
-    ])
+    choice = jnp.concatenate(
+        [mdp.available & ~system, mdp.available, mdp.available & (near | ~system)]
+    )
     draws = jnp.concatenate([system, jnp.zeros((2 * num_states, 1), bool)])
     available = jnp.concatenate([choice, draws], axis=1)
     pad = ((0, 0), (0, 1), (0, extra))

@@ -53,8 +53,8 @@ def check_distributions(
         raise ValueError(
             f"{name}: the row{where} is no distribution over available moves: entries must be "
             "at least 0, zero at others, and sum to 1."
-            if len(rows) > 1 else f"{name} is no distribution: entries must be at least 0 and "
-            "sum to 1."
+            if len(rows) > 1
+            else f"{name} is no distribution: entries must be at least 0 and sum to 1."
         )
 
 

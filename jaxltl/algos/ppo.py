@@ -290,23 +290,33 @@ def make_problem(
     actions = environment.actions
     if isinstance(actions, Box) and not jnp.issubdtype(jnp.dtype(actions.dtype), jnp.floating):
         raise ValueError(
-            f"environment.actions is a box of {actions.dtype}; number what is in it, Finite(n).")
+            f"environment.actions is a box of {actions.dtype}; number what is in it, Finite(n)."
+        )
     network = default_network(actions) if network is None else network
     given.instance("network", network, nn.Module, "a flax.linen.Module")
     memory = learner.strong(initial_memory(network, memory))
-    seen = jax.eval_shape(lambda key: environment.observe(environment.reset(key)),
-                          jax.random.key(0))
-    space = (jax.ShapeDtypeStruct((actions.num,), jnp.result_type(float))
-             if isinstance(actions, Finite)
-             else jax.ShapeDtypeStruct(actions.shape, jnp.dtype(actions.dtype)))
+    seen = jax.eval_shape(
+        lambda key: environment.observe(environment.reset(key)), jax.random.key(0)
+    )
+    space = (
+        jax.ShapeDtypeStruct((actions.num,), jnp.result_type(float))
+        if isinstance(actions, Finite)
+        else jax.ShapeDtypeStruct(actions.shape, jnp.dtype(actions.dtype))
+    )
     require_network(network, memory, seen, space, isinstance(actions, Finite))
     return Problem(environment=environment, memory=memory, network=network)
 
 
 _RANGES = {
-    "discount": (0, 1), "gae_lambda": (0, 1), "value_weight": (0, np.inf),
-    "entropy_weight": (0, np.inf), "max_gradient_norm": (0, np.inf), "target_kl": (0, np.inf),
-    "adam_epsilon": (0, np.inf), "learning_rate": (0, np.inf), "clip": (0, np.inf),
+    "discount": (0, 1),
+    "gae_lambda": (0, 1),
+    "value_weight": (0, np.inf),
+    "entropy_weight": (0, np.inf),
+    "max_gradient_norm": (0, np.inf),
+    "target_kl": (0, np.inf),
+    "adam_epsilon": (0, np.inf),
+    "learning_rate": (0, np.inf),
+    "clip": (0, np.inf),
     "value_clip": (0, np.inf),
 }
 
@@ -336,9 +346,14 @@ def _check(problem: Problem, hparams: Hparams) -> None:
         what = "environments" if recurrent else "num_envs times num_steps"
         raise ValueError(
             f"num_minibatches={hparams.num_minibatches} does not divide {size}, the number of "
-            f"{what}; choose a divisor.")
-    lanes.require_split("sharding", hparams.sharding, num_envs=hparams.num_envs, **{
-        "the number of rows of a minibatch": size // hparams.num_minibatches})
+            f"{what}; choose a divisor."
+        )
+    lanes.require_split(
+        "sharding",
+        hparams.sharding,
+        num_envs=hparams.num_envs,
+        **{"the number of rows of a minibatch": size // hparams.num_minibatches},
+    )
     require_numbers(hparams, _RANGES, optional=_OPTIONAL, schedules=_SCHEDULES)
 
 
@@ -392,8 +407,16 @@ def _actor(sampled: bool, squash: str) -> Callable[..., Any]:
 
 
 def _act(
-    problem: Problem, parameters: Any, moments: Any, memory: Any, observation: Any, allowed: Any,
-    key: chex.PRNGKey, *, sampled: bool, squash: str,
+    problem: Problem,
+    parameters: Any,
+    moments: Any,
+    memory: Any,
+    observation: Any,
+    allowed: Any,
+    key: chex.PRNGKey,
+    *,
+    sampled: bool,
+    squash: str,
 ) -> tuple[jax.Array, Any]:
     actions = problem.environment.actions
     said = evaluated(problem, parameters, memory, normalized(moments, observation))
@@ -430,18 +453,27 @@ def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     zeros = jnp.zeros(size, said.value.dtype)
     reward = jnp.zeros(size, jnp.result_type(float))
     walkers = Walkers(
-        world=worlds, memory=jax.tree.map(
-            lambda x: jnp.broadcast_to(x, (size, *x.shape)), problem.memory),
-        episode_return=reward, episode_length=jnp.zeros(size, jnp.int32), discounted=zeros)
+        world=worlds,
+        memory=jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape)), problem.memory),
+        episode_return=reward,
+        episode_length=jnp.zeros(size, jnp.int32),
+        discounted=zeros,
+    )
     moments = None
     if hparams.normalize_observation:
         moments = jax.tree.map(lambda x: no_moments(x.shape), first)
-    return learner.strong(State(
-        key=key, step=jnp.int32(0), parameters=parameters,
-        optimizer=descent(hparams).init(parameters),
-        walkers=lanes.split(walkers, hparams.sharding), moments=moments,
-        return_moments=no_moments(()) if hparams.normalize_reward else None,
-        transitions=jnp.int32(0)))
+    return learner.strong(
+        State(
+            key=key,
+            step=jnp.int32(0),
+            parameters=parameters,
+            optimizer=descent(hparams).init(parameters),
+            walkers=lanes.split(walkers, hparams.sharding),
+            moments=moments,
+            return_moments=no_moments(()) if hparams.normalize_reward else None,
+            transitions=jnp.int32(0),
+        )
+    )
 
 
 def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
@@ -459,24 +491,39 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     collect_key, update_key = jax.random.split(learner.step_key(state))
     after, begun, rows, told = collected(collect_key, state, problem, hparams)
     parameters, optimizer, figures, updates, nonfinite = improved(
-        update_key, state, rows, begun, problem, hparams)
+        update_key, state, rows, begun, problem, hparams
+    )
     parameters, optimizer = learner.choose(
-        told.permitted, (parameters, optimizer), (state.parameters, state.optimizer))
-    status = jnp.where(
-        (nonfinite > 0) | ~told.finite, Status.NONFINITE, Status.CONVERGED)
+        told.permitted, (parameters, optimizer), (state.parameters, state.optimizer)
+    )
+    status = jnp.where((nonfinite > 0) | ~told.finite, Status.NONFINITE, Status.CONVERGED)
     status = jnp.where(told.permitted, status, Status.INVALID).astype(jnp.int32)
     new = replace(
-        after, step=state.step + 1, parameters=parameters, optimizer=optimizer,
-        transitions=learner.count(state.transitions, hparams.num_envs * hparams.num_steps))
+        after,
+        step=state.step + 1,
+        parameters=parameters,
+        optimizer=optimizer,
+        transitions=learner.count(state.transitions, hparams.num_envs * hparams.num_steps),
+    )
     return new, Metrics(
-        transitions=new.transitions, reward=told.reward, cost=told.cost,
-        episodes=told.episodes, episode_return=told.episode_return,
+        transitions=new.transitions,
+        reward=told.reward,
+        cost=told.cost,
+        episodes=told.episodes,
+        episode_return=told.episode_return,
         episode_length=told.episode_length,
-        policy_loss=figures.policy_loss, value_loss=figures.value_loss, entropy=figures.entropy,
-        kl=figures.kl, clip_fraction=figures.clipped, gradient_norm=figures.gradient_norm,
+        policy_loss=figures.policy_loss,
+        value_loss=figures.value_loss,
+        entropy=figures.entropy,
+        kl=figures.kl,
+        clip_fraction=figures.clipped,
+        gradient_norm=figures.gradient_norm,
         explained_variance=told.explained_variance,
         learning_rate=jnp.asarray(_at(hparams.learning_rate, state.step), figures.kl.dtype),
-        updates=updates, nonfinite=nonfinite, status=status)
+        updates=updates,
+        nonfinite=nonfinite,
+        status=status,
+    )
 
 
 run, train, run_until, train_until = learner.bind(init, step)

@@ -97,8 +97,10 @@ def enclose(problem: Problem, low: Any = None, high: Any = None) -> tuple[float,
     low, high = _box(problem, low, high)
     model = problem.model
     if not hasattr(model.numbers, "ranges"):
-        raise ValueError("the ranges of this model's functions over a box are not known; regions "
-                         "are proven for models that read_parametric reads.")
+        raise ValueError(
+            "the ranges of this model's functions over a box are not known; regions "
+            "are proven for models that read_parametric reads."
+        )
     ends, rewards = model.numbers.ranges(low, high)
     interval = make_interval(model.model, ends.lower, ends.upper)
     reward = None if problem.reward is None else rewards[problem.reward]
@@ -116,24 +118,29 @@ def _box(problem: Problem, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]
         d = int(np.flatnonzero(out)[0])
         raise ValueError(
             f"the box [{low[d]:.6g}, {high[d]:.6g}] of {model.parameters[d]} reaches out of the "
-            f"problem's, [{model.low[d]:.6g}, {model.high[d]:.6g}].")
+            f"problem's, [{model.low[d]:.6g}, {model.high[d]:.6g}]."
+        )
     return low, high
 
 
-def _value(
-    problem: Problem, model: IntervalMDP, reward: Any, large: bool
-) -> tuple[float, float]:
+def _value(problem: Problem, model: IntervalMDP, reward: Any, large: bool) -> tuple[float, float]:
     """Bounds of the mean over the initial distribution, with nature making it large or small."""
     maximize = problem.objective == "max"
     depth = problem.model.roundings
     if problem.reward is None:
         found = interval_values.reachability(
-            model.host, problem.target, maximize=maximize, helpful=large, stay=problem.stay,
-            depth=depth)
+            model.host,
+            problem.target,
+            maximize=maximize,
+            helpful=large,
+            stay=problem.stay,
+            depth=depth,
+        )
     else:
         earned = reward.upper if large else np.maximum(reward.lower, 0)
         found = interval_values.total_reward(
-            model.host, earned, problem.target, maximize=maximize, large=large, depth=depth)
+            model.host, earned, problem.target, maximize=maximize, large=large, depth=depth
+        )
     return safe_ends(model, found, highest=1.0 if problem.reward is None else np.inf)
 
 
@@ -160,7 +167,11 @@ def verdict_of(problem: Problem, threshold: float, lower: float, upper: float) -
 
 
 def prove_regions(
-    problem: Problem, threshold: float, *, low: Any = None, high: Any = None,
+    problem: Problem,
+    threshold: float,
+    *,
+    low: Any = None,
+    high: Any = None,
     max_boxes: int = 1000,
 ) -> Regions:
     """A box split into boxes that are accepted, rejected, or left open.

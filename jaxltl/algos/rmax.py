@@ -311,8 +311,13 @@ def make_problem(
     allowed = _allowed(played, region)
     rows = environment_rows(game, base, played, reward, allowed, environment, discount)
     return Problem(
-        game=played, reward=reward, accepting=accepting, region=region, allowed=allowed,
-        environment=to_jax(np.asarray(rows, played.dtype)), start=played.initial,
+        game=played,
+        reward=reward,
+        accepting=accepting,
+        region=region,
+        allowed=allowed,
+        environment=to_jax(np.asarray(rows, played.dtype)),
+        start=played.initial,
         start_table=to_jax(np.asarray(cumulative(np.asarray(played.initial, float)))),
         base_state=to_jax(np.asarray(base, np.int32)),
         memory=to_jax(np.asarray(memory, np.int32)),
@@ -352,13 +357,22 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     value = jnp.where(problem.region, bound / (1 - hparams.discount), 0)
     word = jax.random.bits(learner.init_key(key), (), jnp.uint32)
     return State(
-        key=key, step=jnp.int32(0), moves=jnp.int32(0), position=draw(problem.start_table, word),
-        counts=jnp.zeros(shape, jnp.int32), reward=jnp.full(shape, bound, game.dtype),
-        known_at=jnp.full(shape[:2], -1, jnp.int32), num_known=jnp.int32(0),
+        key=key,
+        step=jnp.int32(0),
+        moves=jnp.int32(0),
+        position=draw(problem.start_table, word),
+        counts=jnp.zeros(shape, jnp.int32),
+        reward=jnp.full(shape, bound, game.dtype),
+        known_at=jnp.full(shape[:2], -1, jnp.int32),
+        num_known=jnp.int32(0),
         probability=listed / jnp.maximum(listed.sum(-1, keepdims=True), 1).astype(game.dtype),
-        gain=gain, value=value.astype(game.dtype),
-        best=problem.allowed & game.system[:, None], error=jnp.zeros((), game.dtype),
-        last_update=jnp.int32(0), num_updates=jnp.int32(0), always_almost_sure=jnp.bool_(True),
+        gain=gain,
+        value=value.astype(game.dtype),
+        best=problem.allowed & game.system[:, None],
+        error=jnp.zeros((), game.dtype),
+        last_update=jnp.int32(0),
+        num_updates=jnp.int32(0),
+        always_almost_sure=jnp.bool_(True),
         fault=jnp.int32(-1),
     )
 
@@ -407,10 +421,13 @@ def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
     return Metrics(
         moves=state.moves,
         num_known=state.num_known,
-        last_update=state.last_update, num_updates=state.num_updates,
+        last_update=state.last_update,
+        num_updates=state.num_updates,
         value=jnp.sum(problem.start * state.value),
-        always_almost_sure=state.always_almost_sure, fault=state.fault,
-        residual=state.error, status=status,
+        always_almost_sure=state.always_almost_sure,
+        fault=state.fault,
+        residual=state.error,
+        status=status,
     )
 
 
@@ -489,8 +506,12 @@ def observe(
 @jax.jit
 def _observe(state, problem, hparams, action, successor, reward) -> State:
     walk = walk_from(state, jnp.int32(1))
-    seen = Seen(state.position, jnp.int32(action), jnp.int32(successor),
-                 jnp.asarray(reward, problem.game.dtype))
+    seen = Seen(
+        state.position,
+        jnp.int32(action),
+        jnp.int32(successor),
+        jnp.asarray(reward, problem.game.dtype),
+    )
     rules = _rules(state, problem, hparams)
     walk = note_last(record(walk, seen, rules, jnp.bool_(True)), problem)
     return updated(state, walk, problem, hparams)
@@ -525,14 +546,27 @@ def evidence(
     near = partial(pac.epsilon_optimal_states, optimal, epsilon=hparams.epsilon)
     reached = restrict(game, problem.start, allowed=problem.allowed).base_state
     return Evidence(
-        strategy=play, almost_sure=wins_almost_surely(problem, play), optimal=optimal,
-        worst=worst, met=met, epsilon_optimal=near(worst) & problem.region,
+        strategy=play,
+        almost_sure=wins_almost_surely(problem, play),
+        optimal=optimal,
+        worst=worst,
+        met=met,
+        epsilon_optimal=near(worst) & problem.region,
         epsilon_optimal_met=near(met) & problem.region,
         reachable=jnp.zeros(game.num_states, bool).at[reached].set(True),
         known_at=state.known_at,
-        data=None if confidence is None else data_evidence(
-            game, problem.allowed, problem.region, problem.reward, state.counts, play,
-            float(hparams.discount), confidence),
+        data=None
+        if confidence is None
+        else data_evidence(
+            game,
+            problem.allowed,
+            problem.region,
+            problem.reward,
+            state.counts,
+            play,
+            float(hparams.discount),
+            confidence,
+        ),
     )
 
 
@@ -556,8 +590,11 @@ def wins_almost_surely(problem: Problem, play: jax.Array) -> jax.Array:
     moves = problem.region & used.any(-1)
     kept = jnp.all(~used | problem.allowed)
     met = attractor(
-        game, problem.accepting & problem.region, used & problem.allowed,
-        rule=game.system, chance="some",
+        game,
+        problem.accepting & problem.region,
+        used & problem.allowed,
+        rule=game.system,
+        chance="some",
     ).region
     return kept & jnp.all(moves | ~problem.region) & jnp.all(met | ~problem.region)
 
@@ -565,10 +602,14 @@ def wins_almost_surely(problem: Problem, play: jax.Array) -> jax.Array:
 def _rules(state: State, problem: Problem, hparams: Hparams) -> Rules:
     dtype, key = problem.game.dtype, learner.step_key(state)
     return Rules(
-        problem, marks(state.best, state.known_at), jax.random.fold_in(key, 1),
+        problem,
+        marks(state.best, state.known_at),
+        jax.random.fold_in(key, 1),
         splitmix.streams(jax.random.fold_in(key, 0)),
-        exploration(problem, hparams), enough(problem, hparams),
-        jnp.asarray(hparams.reward_bound, dtype), jnp.asarray(hparams.restart, dtype),
+        exploration(problem, hparams),
+        enough(problem, hparams),
+        jnp.asarray(hparams.reward_bound, dtype),
+        jnp.asarray(hparams.restart, dtype),
         jnp.bool_(hparams.update == "every"),
     )
 
@@ -576,8 +617,7 @@ def _rules(state: State, problem: Problem, hparams: Hparams) -> Rules:
 def _advance(state: State, problem: Problem, hparams: Hparams, moves: jax.Array) -> State:
     """At most so many moves, and the update that they lead to; none of them if that is zero."""
     rules = _rules(state, problem, hparams)
-    walk = learner.while_active(
-        lambda w, _: w.left > 0, move, walk_from(state, moves), rules)
+    walk = learner.while_active(lambda w, _: w.left > 0, move, walk_from(state, moves), rules)
     return updated(state, note_last(walk, problem), problem, hparams)
 
 

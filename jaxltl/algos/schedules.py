@@ -75,8 +75,6 @@ class Linear:
 Schedule = Any  # a number, a Polynomial, or a pytree that is called with l = 1, 2, ...
 
 
-
-
 def is_schedule(given: Any) -> bool:
     """Whether it is a schedule of the step, and no number: a tree of arrays, so that it is traced.
 
@@ -194,10 +192,12 @@ def theorem_conditions(hparams: Any, *, num_steps: int | None = None) -> Conditi
         share,
         Condition("beta + 2 lambda > 1", both, f"beta = {growth}, lambda = {decay}"),
         Condition(
-            "weights are G", hparams.weighting == "literal", f"weighting={hparams.weighting!r}"),
+            "weights are G", hparams.weighting == "literal", f"weighting={hparams.weighting!r}"
+        ),
         *(
-            Condition(f"no {name}", getattr(hparams, name) in (None, False),
-                      "not part of algorithm 2")
+            Condition(
+                f"no {name}", getattr(hparams, name) in (None, False), "not part of algorithm 2"
+            )
             for name in ("elite_reuse", "antithetic", "variance_floor", "noise", "restart_below")
         ),
     )
@@ -216,9 +216,7 @@ def _polynomial(schedule: Schedule) -> tuple[float, float, float] | None:
 _FUNCTION = "it is a function; its limits cannot be told"
 
 
-def _samples_condition(
-    hparams: Any, num_steps: int | None
-) -> tuple[float | None, Condition]:
+def _samples_condition(hparams: Any, num_steps: int | None) -> tuple[float | None, Condition]:
     name = "samples grow"
     if hparams.num_samples is None:
         return 0.0, Condition(name, False, f"n_l is always {hparams.population}")

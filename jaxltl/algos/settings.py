@@ -48,12 +48,14 @@ def require_numbers(
         kind = getattr(number, "dtype", None)
         kind = np.asarray(number).dtype if kind is None and not isinstance(number, dict) else kind
         real = kind is not None and any(
-            jnp.issubdtype(kind, x) for x in (jnp.integer, jnp.floating))
+            jnp.issubdtype(kind, x) for x in (jnp.integer, jnp.floating)
+        )
         if np.ndim(number) or not real:  # a whole number that is too large is an object
             raise ValueError(
                 f"{name}={given.shown(number)}; give one number"
                 f"{', or a Partial(function) of the step' if name in schedules else ''}. Many "
-                "settings are a vmap.")
+                "settings are a vmap."
+            )
         if not isinstance(number, jax.core.Tracer) and not low <= number <= high:
             raise ValueError(f"{name}={number}; it must lie in [{low}, {high}].")
 
@@ -111,7 +113,8 @@ def applied(network: nn.Module, parameters: Any, *read: Any) -> Any:
     if not isinstance(parameters, Mapping):
         raise ValueError(
             f"the parameters are {given.shown(parameters)}; give the dict of those of the "
-            f"{type(network).__name__}, such as state.parameters.")
+            f"{type(network).__name__}, such as state.parameters."
+        )
     try:
         return network.apply({"params": parameters}, *read)
     except flax.errors.FlaxError as problem:
@@ -119,4 +122,5 @@ def applied(network: nn.Module, parameters: Any, *read: Any) -> Any:
         raise ValueError(
             f"the parameters are not those of this {type(network).__name__} for what it reads: "
             f"{text} Give the state, the problem and the settings of one run, and observations "
-            "of its environment.") from problem
+            "of its environment."
+        ) from problem

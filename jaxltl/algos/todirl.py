@@ -304,16 +304,19 @@ def make_problem(
     network = RewardNetwork() if network is None else network
     _require_reward(network, model, observation)
     return Problem(
-        model=model, observation=observation, counts=counts, held_out=other, weight=weight,
-        predecessors=predecessors([lane(model, w) for w in range(num_worlds)]), network=network,
+        model=model,
+        observation=observation,
+        counts=counts,
+        held_out=other,
+        weight=weight,
+        predecessors=predecessors([lane(model, w) for w in range(num_worlds)]),
+        network=network,
     )
 
 
 def _require_reward(network: nn.Module, model: Product, observation: jax.Array) -> None:
     inputs = _inputs(model, observation[0])
-    found = jax.eval_shape(
-        lambda *x: network.init_with_output(jax.random.key(0), *x)[0], *inputs
-    )
+    found = jax.eval_shape(lambda *x: network.init_with_output(jax.random.key(0), *x)[0], *inputs)
     expected = (*observation.shape[1:2], *(x.shape[-1] for x in inputs[1:]))
     if getattr(found, "shape", None) != expected:
         what = getattr(found, "shape", type(found).__name__)
@@ -400,7 +403,11 @@ def _plan(
     if hparams.horizon is not None:
         return _backward_induction(rewards, model, hparams)
     return soft_value(
-        model, rewards, hparams.discount, initial=initial, method=hparams.method,
+        model,
+        rewards,
+        hparams.discount,
+        initial=initial,
+        method=hparams.method,
         tolerance=hparams.tolerance,
     )
 
@@ -424,8 +431,12 @@ def _backward_induction(rewards: jax.Array, model: Product, hparams: Hparams) ->
     half = lax.stop_gradient(horizon * terms * jnp.finfo(model.dtype).eps * size)
     finite = jnp.all(jnp.isfinite(exact))
     return Solution(
-        value=value, policy=policy, lower=exact - half, upper=exact + half,
-        residual=jnp.zeros((), model.dtype), num_steps=jnp.int32(horizon),
+        value=value,
+        policy=policy,
+        lower=exact - half,
+        upper=exact + half,
+        residual=jnp.zeros((), model.dtype),
+        num_steps=jnp.int32(horizon),
         status=status_code(finite, finite),
     )
 
@@ -444,6 +455,7 @@ def solve(
       :class:`~jaxltl.core.types.Solution`, `value` ``float[W, S, Q]`` and `policy`
       ``float[W, S, Q, A]``, with a horizon ``[W, T, ...]``; differentiable in the parameters.
     """
+
     def world(model, observation, initial):
         return plan(problem.network, parameters, model, observation, hparams, initial=initial)
 
@@ -524,7 +536,12 @@ def objective(
         return find(rewards, model, hparams, counts, held_out, initial)
 
     seen, other, done, value, error, status = _each_world(
-        world, problem.model, problem.observation, counts, held_out, _initial(problem, initial),
+        world,
+        problem.model,
+        problem.observation,
+        counts,
+        held_out,
+        _initial(problem, initial),
         problem.predecessors,
     )
     weight = problem.weight
@@ -534,8 +551,14 @@ def objective(
     loss = neg + hparams.l2 / 2 * squares
     score = lax.stop_gradient(-(weight @ other) / other_pairs)
     found = Objective(
-        neg_log_likelihood=neg, per_pair=neg / pairs, held_out=score, score=score,
-        satisfaction=jnp.mean(done), value=value, error=jnp.max(error), status=jnp.max(status),
+        neg_log_likelihood=neg,
+        per_pair=neg / pairs,
+        held_out=score,
+        score=score,
+        satisfaction=jnp.mean(done),
+        value=value,
+        error=jnp.max(error),
+        status=jnp.max(status),
     )
     if hparams.mu is None:
         return loss, found
@@ -606,7 +629,10 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     drawn = _draw(problem.network, learner.init_key(key), inputs)
     parameters = jax.tree.map(lambda x: jnp.asarray(x, dtype), drawn)
     return State(
-        key=key, step=jnp.int32(0), parameters=parameters, value=_initial(problem, None),
+        key=key,
+        step=jnp.int32(0),
+        parameters=parameters,
+        value=_initial(problem, None),
         # optax starts from weakly typed zeros, which a second run would compile anew for.
         optimizer=jax.tree.map(
             lambda x: jnp.asarray(x, jnp.result_type(x)), _optimizer(hparams).init(parameters)
@@ -642,17 +668,24 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
         gradient, state.optimizer, state.parameters, value=loss, grad=gradient, value_fn=loss_of
     )
     metrics = Metrics(
-        loss=loss, neg_log_likelihood=parts.neg_log_likelihood, per_pair=parts.per_pair,
-        held_out=parts.held_out, satisfaction=parts.satisfaction,
-        gradient_norm=optax.tree.norm(gradient), error=parts.error, status=parts.status,
+        loss=loss,
+        neg_log_likelihood=parts.neg_log_likelihood,
+        per_pair=parts.per_pair,
+        held_out=parts.held_out,
+        satisfaction=parts.satisfaction,
+        gradient_norm=optax.tree.norm(gradient),
+        error=parts.error,
+        status=parts.status,
     )
     parameters = optax.apply_updates(state.parameters, updates)
     best, stopped = stop_early(
-        state, parameters, parts.score, jnp.any(problem.held_out > 0), hparams.patience)
+        state, parameters, parts.score, jnp.any(problem.held_out > 0), hparams.patience
+    )
     # A solve that failed would poison the next one's start.
     value = jnp.where(parts.status != Status.NONFINITE, parts.value, 0)
     after = replace(
-        state, parameters=parameters, value=value, optimizer=optimizer, best=best, stopped=stopped)
+        state, parameters=parameters, value=value, optimizer=optimizer, best=best, stopped=stopped
+    )
     after = learner.choose(stopped, replace(state, best=best, stopped=stopped), after)
     return replace(after, step=state.step + 1), metrics
 

@@ -53,7 +53,6 @@ compiled for a step takes seconds, so shapes alone are shown.)
 ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``.
 """
 
-
 from __future__ import annotations
 
 import math
@@ -311,18 +310,21 @@ def make_problem(
     if not isinstance(actions, Box) or not jnp.issubdtype(jnp.dtype(actions.dtype), jnp.floating):
         raise ValueError(
             f"the environment's actions are {actions}; trust-region search draws from a Gaussian: "
-            "give a box of floats, or learn finitely many actions with ppo.")
+            "give a box of floats, or learn finitely many actions with ppo."
+        )
     if horizon is None:
         horizon = environment.horizon
     if horizon is None:
         raise ValueError(
             "episodes that never end: neither the environment nor horizon says after how many "
-            "steps; give horizon, or with_time_limit(environment, num_steps).")
+            "steps; give horizon, or with_time_limit(environment, num_steps)."
+        )
     horizon = given.whole("horizon", horizon, least=1, most=2**31 - 1)
     if limit is not None:
         known = isinstance(limit, jax.Array)
-        limit = jnp.asarray(limit if known else given.numbers("limit", limit),
-                            jnp.result_type(float))
+        limit = jnp.asarray(
+            limit if known else given.numbers("limit", limit), jnp.result_type(float)
+        )
         require_shape("limit", limit, ())
     return Problem(environment=environment, limit=limit, horizon=horizon)
 
@@ -344,9 +346,16 @@ def _as_action(problem: Problem, action: jax.Array) -> jax.Array:
 
 
 _RANGES = {
-    "discount": (0, 1), "cost_discount": (0, 1), "gae_lambda": (0, 1), "cost_gae_lambda": (0, 1),
-    "delta": (0, np.inf), "damping": (0, np.inf), "penalty": UNBOUNDED,
-    "initial_deviation": (0, np.inf), "backtrack": (0, 1), "value_rate": (0, np.inf),
+    "discount": (0, 1),
+    "cost_discount": (0, 1),
+    "gae_lambda": (0, 1),
+    "cost_gae_lambda": (0, 1),
+    "delta": (0, np.inf),
+    "damping": (0, np.inf),
+    "penalty": UNBOUNDED,
+    "initial_deviation": (0, np.inf),
+    "backtrack": (0, 1),
+    "value_rate": (0, np.inf),
 }
 
 
@@ -365,7 +374,8 @@ def _require_observed(state: State, observation: jax.Array) -> None:
     if not hasattr(observation, "dtype") or jnp.shape(observation)[-1:] != size:
         raise ValueError(
             f"observation is {given.shown(observation)}; the policy was trained on vectors "
-            f"float[..., {size[0]}], as flat_observation makes of an environment's.")
+            f"float[..., {size[0]}], as flat_observation makes of an environment's."
+        )
 
 
 def _check(problem: Problem, hparams: Hparams) -> None:
@@ -423,7 +433,12 @@ def _agent(act: Any, state: State, problem: Problem, hparams: Hparams) -> Agent:
 
 
 def _drawn(
-    state: State, problem: Problem, hparams: Hparams, memory: Any, observation: Any, allowed: Any,
+    state: State,
+    problem: Problem,
+    hparams: Hparams,
+    memory: Any,
+    observation: Any,
+    allowed: Any,
     key: chex.PRNGKey,
 ) -> tuple[jax.Array, Any]:
     del allowed
@@ -433,7 +448,12 @@ def _drawn(
 
 
 def _mean(
-    state: State, problem: Problem, hparams: Hparams, memory: Any, observation: Any, allowed: Any,
+    state: State,
+    problem: Problem,
+    hparams: Hparams,
+    memory: Any,
+    observation: Any,
+    allowed: Any,
     key: chex.PRNGKey,
 ) -> tuple[jax.Array, Any]:
     del allowed, key
@@ -489,12 +509,17 @@ def rollout(
     _require_state(state)
     number = given.whole("num_trajectories", num_trajectories, least=1, most=2**31 - 1)
     return _rollout(
-        require_key(key), state, problem, hparams, number, given.truth("sampled", sampled))
+        require_key(key), state, problem, hparams, number, given.truth("sampled", sampled)
+    )
 
 
 @partial(jax.jit, static_argnames=("num_trajectories", "sampled"))
 def _rollout(
-    key: chex.PRNGKey, state: State, problem: Problem, hparams: Hparams, num_trajectories: int,
+    key: chex.PRNGKey,
+    state: State,
+    problem: Problem,
+    hparams: Hparams,
+    num_trajectories: int,
     sampled: bool,
 ) -> Batch:
     start, path = jax.random.split(key)
@@ -527,17 +552,25 @@ def _rollout(
     )
     last, dtype = jax.vmap(partial(_observed, problem))(worlds), observation.dtype
     parts = (observation, action, reward[..., None], cost[..., None], discount[..., None])
-    finite = jnp.array([
-        jnp.all(jnp.all(jnp.isfinite(x), -1) | ~valid, 0) for x in parts
-    ]).all(0) & (jnp.all(jnp.isfinite(last), -1) | ~truncated)
+    finite = jnp.array([jnp.all(jnp.all(jnp.isfinite(x), -1) | ~valid, 0) for x in parts]).all(
+        0
+    ) & (jnp.all(jnp.isfinite(last), -1) | ~truncated)
     valid &= finite
     truncated &= finite
     observation, action, reward, cost, discount = (
         jnp.where(valid[..., None], x, 0).astype(dtype) for x in parts
     )
     return Batch(
-        observation, action, reward[..., 0], cost[..., 0], discount[..., 0], valid, finite,
-        jnp.where(truncated[:, None], last, 0), truncated)
+        observation,
+        action,
+        reward[..., 0],
+        cost[..., 0],
+        discount[..., 0],
+        valid,
+        finite,
+        jnp.where(truncated[:, None], last, 0),
+        truncated,
+    )
 
 
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
@@ -568,11 +601,14 @@ def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     mean = mean_network(hparams, num_actions, dtype).init(mean_key, jnp.zeros(size, dtype))
     log_deviation = jnp.full(num_actions, jnp.log(hparams.initial_deviation), dtype)
     keys = jax.vmap(partial(jax.random.fold_in, value_key))(jnp.arange(num_values))
-    values = jax.vmap(lambda k: value_network(hparams, dtype).init(
-        k, jnp.zeros(size + 1, dtype)))(keys)["params"]
+    values = jax.vmap(lambda k: value_network(hparams, dtype).init(k, jnp.zeros(size + 1, dtype)))(
+        keys
+    )["params"]
     state = State(
-        key=key, step=jnp.int32(0),
-        parameters={"mean": mean["params"], "log_deviation": log_deviation}, values=values,
+        key=key,
+        step=jnp.int32(0),
+        parameters={"mean": mean["params"], "log_deviation": log_deviation},
+        values=values,
         value_moments=jnp.stack([jnp.zeros(num_values, dtype), jnp.ones(num_values, dtype)]),
         # optax starts from weakly typed zeros, which a second run would compile anew for.
         optimizer=jax.tree.map(
@@ -584,11 +620,10 @@ def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     )
     if not hparams.normalize:
         return state
-    batch = rollout(
-        first_key, state, problem, hparams, num_trajectories=hparams.num_trajectories
-    )
+    batch = rollout(first_key, state, problem, hparams, num_trajectories=hparams.num_trajectories)
     return replace(
-        state, moments=updated_moments(state.moments, batch.observation, batch.valid),
+        state,
+        moments=updated_moments(state.moments, batch.observation, batch.valid),
         trajectories=jnp.int32(hparams.num_trajectories),
     )
 
@@ -606,9 +641,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     _check(problem, hparams)
     _require_state(state)
     draw_key, fit_key = jax.random.split(learner.step_key(state))
-    batch = rollout(
-        draw_key, state, problem, hparams, num_trajectories=hparams.num_trajectories
-    )
+    batch = rollout(draw_key, state, problem, hparams, num_trajectories=hparams.num_trajectories)
     inputs = normalized(state.moments, hparams, batch.observation)
     inputs = jnp.where(batch.valid[..., None], inputs, 0)
     value, found = _estimated(state, batch, inputs, hparams)
@@ -623,13 +656,19 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
         parameters = {**parameters, "mean": fold(parameters["mean"])}
         values = jax.vmap(fold)(values)
     state = State(
-        key=state.key, step=state.step + 1, parameters=parameters, values=values,
-        value_moments=value_moments, optimizer=optimizer, moments=moments,
+        key=state.key,
+        step=state.step + 1,
+        parameters=parameters,
+        values=values,
+        value_moments=value_moments,
+        optimizer=optimizer,
+        moments=moments,
         trajectories=learner.count(state.trajectories, hparams.num_trajectories),
     )
     left_out = weighted_variance(found, batch.valid)
     return state, replace(
-        told, trajectories=state.trajectories,
+        told,
+        trajectories=state.trajectories,
         unexplained=left_out / positive(weighted_variance(value + found, batch.valid)),
     )
 
@@ -654,9 +693,11 @@ def _estimated(
     discount = hparams.discount * batch.discount
     parts = [advantages(reward, value[0], batch.valid, discount, hparams.gae_lambda, after)]
     if hparams.method == "cpo":
-        parts.append(advantages(
-            batch.cost, value[1], batch.valid, hparams.cost_discount, hparams.cost_gae_lambda
-        ))
+        parts.append(
+            advantages(
+                batch.cost, value[1], batch.valid, hparams.cost_discount, hparams.cost_gae_lambda
+            )
+        )
     return value, jnp.stack(parts)
 
 
@@ -689,8 +730,13 @@ def _improved(
 
     def judged(flat: jax.Array) -> Surrogate:
         gains, kl = surrogate(
-            unravel(flat), old, samples[0], samples[1],
-            weighted.reshape(len(weighted), -1), samples[2], hparams,
+            unravel(flat),
+            old,
+            samples[0],
+            samples[1],
+            weighted.reshape(len(weighted), -1),
+            samples[2],
+            hparams,
         )
         return Surrogate(gains[0], gains[1] if constrained else jnp.zeros((), dtype), kl)
 
@@ -710,11 +756,20 @@ def _improved(
     spread = jnp.sum(jnp.where(batch.finite, (sums - cost) ** 2, 0)) / jnp.maximum(number - 1, 1)
     usable = (nonfinite == 0) & jnp.all(jnp.isfinite(change))
     return unravel(new), Metrics(
-        trajectories=jnp.int32(0), reward=batch.reward.sum() / number, cost=cost,
-        cost_error=jnp.sqrt(spread / number), length=batch.valid.sum() / number.astype(dtype),
-        deviation=jnp.exp(parameters["log_deviation"].mean()), kl=after.kl,
-        reward_gain=after.reward, cost_gain=after.cost, scale=scale, case=dual.case,
-        trust_multiplier=dual.trust, cost_multiplier=dual.cost,
-        unexplained=jnp.zeros(len(found), dtype), nonfinite=nonfinite,
+        trajectories=jnp.int32(0),
+        reward=batch.reward.sum() / number,
+        cost=cost,
+        cost_error=jnp.sqrt(spread / number),
+        length=batch.valid.sum() / number.astype(dtype),
+        deviation=jnp.exp(parameters["log_deviation"].mean()),
+        kl=after.kl,
+        reward_gain=after.reward,
+        cost_gain=after.cost,
+        scale=scale,
+        case=dual.case,
+        trust_multiplier=dual.trust,
+        cost_multiplier=dual.cost,
+        unexplained=jnp.zeros(len(found), dtype),
+        nonfinite=nonfinite,
         status=status_code(accepted, usable),
     )

@@ -65,10 +65,12 @@ def make_method(task: EnvironmentTask, environment: Environment, num_steps: int)
     if found.transitions > _MOST:
         raise ValueError(
             f"a step of the learner would make {found.transitions:,} simulated steps; at most "
-            f"{_MOST:,} are counted: simulate fewer side by side, or shorter.")
+            f"{_MOST:,} are counted: simulate fewer side by side, or shorter."
+        )
     # With numbers that are no tracers, so that the learner's own checks see them.
     jax.eval_shape(
-        lambda key: found.algorithm.init(key, found.problem, found.hparams), jax.random.key(0))
+        lambda key: found.algorithm.init(key, found.problem, found.hparams), jax.random.key(0)
+    )
     return found
 
 
@@ -86,8 +88,9 @@ def _value(name: str, value: Any, num_steps: int) -> Any:
 
 
 def _size(shape: Any) -> int:
-    return sum(math.prod(x.shape) for x in jax.tree.leaves(
-        shape, is_leaf=lambda x: isinstance(x, Box)))
+    return sum(
+        math.prod(x.shape) for x in jax.tree.leaves(shape, is_leaf=lambda x: isinstance(x, Box))
+    )
 
 
 def _ppo(spec: Mapping[str, Any], environment: Environment, num_steps: int) -> Method:
@@ -100,24 +103,35 @@ def _ppo(spec: Mapping[str, Any], environment: Environment, num_steps: int) -> M
         return (ppo.greedy if likeliest else ppo.policy)(state, problem, hparams)
 
     return Method(
-        ppo, problem, hparams, agent,
+        ppo,
+        problem,
+        hparams,
+        agent,
         ("episode_return", "episode_length", "entropy", "explained_variance"),
-        ("parameters", "moments"), hparams.num_envs * hparams.num_steps,
-        f"two networks with hidden layers {list(network.hidden)}")
+        ("parameters", "moments"),
+        hparams.num_envs * hparams.num_steps,
+        f"two networks with hidden layers {list(network.hidden)}",
+    )
 
 
 def _cce(spec: Mapping[str, Any], environment: Environment, num_steps: int) -> Method:
     actions, hidden = environment.actions, spec.get("hidden", (16,))
     outputs = actions.num if isinstance(actions, Finite) else math.prod(actions.shape)
     network = make_network(
-        (_size(environment.observations), *hidden, outputs),
-        hidden=spec.get("activation", "tanh"))
+        (_size(environment.observations), *hidden, outputs), hidden=spec.get("activation", "tanh")
+    )
     make, episodes = network_agent(network, environment), spec.get("episodes", 10)
     score = episode_evaluator(
-        environment, make, objective=spec.get("objective", "reward"), costs=spec.get("cost", ()),
-        num_episodes=episodes, num_steps=num_steps)
+        environment,
+        make,
+        objective=spec.get("objective", "reward"),
+        costs=spec.get("cost", ()),
+        num_episodes=episodes,
+        num_steps=num_steps,
+    )
     first = diagonal_gaussian(
-        jnp.zeros(network.num_parameters, jnp.float32), spec.get("deviation", 1.0))
+        jnp.zeros(network.num_parameters, jnp.float32), spec.get("deviation", 1.0)
+    )
     problem = cce.make_problem(score, first, limit=spec.get("limit"))
     hparams = settings(cce.Hparams, {"rate": 0.5, **spec})
 
@@ -126,17 +140,23 @@ def _cce(spec: Mapping[str, Any], environment: Environment, num_steps: int) -> M
         return make(cce.policy(state, problem, hparams))
 
     return Method(
-        cce, problem, hparams, agent,
-        ("objective", "cost", "best_objective", "num_feasible", "spread"), ("family",),
+        cce,
+        problem,
+        hparams,
+        agent,
+        ("objective", "cost", "best_objective", "num_feasible", "spread"),
+        ("family",),
         hparams.population * episodes * num_steps,
-        f"a network {'-'.join(map(str, network.sizes))} of {network.num_parameters} parameters")
+        f"a network {'-'.join(map(str, network.sizes))} of {network.num_parameters} parameters",
+    )
 
 
 def _cpo(spec: Mapping[str, Any], environment: Environment, num_steps: int) -> Method:
     if not isinstance(environment.actions, Box):
         raise ValueError(
             "the actions are finitely many, and this learner takes those of a box: choose "
-            'method = "ppo" or "cce".')
+            'method = "ppo" or "cce".'
+        )
     if spec.get("cost", "world") == "violation":
         step = Partial(_costs_where_violated, environment.step)
         environment = dataclasses.replace(environment, step=step, outcomes=None)
@@ -144,13 +164,18 @@ def _cpo(spec: Mapping[str, Any], environment: Environment, num_steps: int) -> M
     hparams = settings(trust_region.Hparams, {"discount": 1.0, **spec})
 
     def agent(state: Any, likeliest: bool) -> Agent:
-        return (trust_region.greedy if likeliest else trust_region.policy)(
-            state, problem, hparams)
+        return (trust_region.greedy if likeliest else trust_region.policy)(state, problem, hparams)
 
     return Method(
-        trust_region, problem, hparams, agent, ("reward", "cost", "length", "deviation", "kl"),
-        ("parameters", "moments"), hparams.num_trajectories * num_steps,
-        f"a Gaussian whose mean is a network with hidden layers {list(hparams.hidden)}")
+        trust_region,
+        problem,
+        hparams,
+        agent,
+        ("reward", "cost", "length", "deviation", "kl"),
+        ("parameters", "moments"),
+        hparams.num_trajectories * num_steps,
+        f"a Gaussian whose mean is a network with hidden layers {list(hparams.hidden)}",
+    )
 
 
 def _costs_where_violated(

@@ -42,13 +42,21 @@ _FIGURES = ("loss", "neg_log_likelihood", "satisfaction", "gradient_norm")
 def pictures(outcome: Any) -> list[Picture]:
     """The report's pictures of what was learned."""
     cells, history = outcome.setup.world.cells, outcome.learned.history
-    return [*([] if cells is None else _maps(outcome, cells)), Picture(
-        "learning.svg", "Learning",
-        drawing("curves", {k: v.T for k, v in history.items() if k != "step"},
-                steps=history["step"], show=_FIGURES),
-        "Figures of the weights before each step" + over_seeds(len(outcome.learned.loss)),
-        "learning",
-    )]
+    return [
+        *([] if cells is None else _maps(outcome, cells)),
+        Picture(
+            "learning.svg",
+            "Learning",
+            drawing(
+                "curves",
+                {k: v.T for k, v in history.items() if k != "step"},
+                steps=history["step"],
+                show=_FIGURES,
+            ),
+            "Figures of the weights before each step" + over_seeds(len(outcome.learned.loss)),
+            "learning",
+        ),
+    ]
 
 
 def live(outcome: Any) -> list[Explorer | TooLarge | Curves]:
@@ -59,13 +67,21 @@ def live(outcome: Any) -> list[Explorer | TooLarge | Curves]:
     logged = setup.world.logged
     return [
         explorer(
-            LIVE, "What it does", _TABLE if setup.world.cells is None else _MAP, model.automaton,
+            LIVE,
+            "What it does",
+            _TABLE if setup.world.cells is None else _MAP,
+            model.automaton,
             _layers(outcome),
-            [*demonstrated_runs(model, setup.demonstrations),
-             *learned_runs(model, policy, outcome.seed)],
-            size=setup.world.mdp.num_states, place=setup.world.cells, actions=setup.world.actions,
+            [
+                *demonstrated_runs(model, setup.demonstrations),
+                *learned_runs(model, policy, outcome.seed),
+            ],
+            size=setup.world.mdp.num_states,
+            place=setup.world.cells,
+            actions=setup.world.actions,
             places=None if logged is None else dict(enumerate(logged.states)),
-            label=_LABEL, wall=setup.task.world.get("wall", "#"),
+            label=_LABEL,
+            wall=setup.task.world.get("wall", "#"),
             marked=left_out(model, setup.guarantee, setup.demonstrations),
             marks="Demonstrated steps that lower the best probability and were left out",
         ),
@@ -76,10 +92,12 @@ def live(outcome: Any) -> list[Explorer | TooLarge | Curves]:
 _LABEL = "probability of doing the task"
 _MAP = (
     "An arrow is as long as its action is likely; colours are the probability of doing the task "
-    "from there. Cells that cannot be met with a memory are blank.")
+    "from there. Cells that cannot be met with a memory are blank."
+)
 _TABLE = (
     "How likely each action is, and the probability of doing the task from there, stand in the "
-    "table below, for each memory.")
+    "table below, for each memory."
+)
 
 
 def _layers(outcome: Any) -> dict[str, Layer]:
@@ -93,8 +111,11 @@ def _layers(outcome: Any) -> dict[str, Layer]:
     shown = np.flatnonzero(open_ & met.any(axis=0)).tolist()
     names = model.automaton.state_names or ("",) * model.num_memory
     found = {
-        str(q): Layer(f"memory {q}: {names[q]}", np.where(met[:, q], value[:, q], np.nan),
-                      np.where(met[:, q, None], policy[:, q], np.nan))
+        str(q): Layer(
+            f"memory {q}: {names[q]}",
+            np.where(met[:, q], value[:, q], np.nan),
+            np.where(met[:, q, None], policy[:, q], np.nan),
+        )
         for q in shown
     }
     at_start = np.where(starts, from_starts(model, value), np.nan)
@@ -104,22 +125,36 @@ def _layers(outcome: Any) -> dict[str, Layer]:
 def _maps(outcome: Any, cells: np.ndarray) -> list[Picture]:
     layers = _layers(outcome)
     start = layers.pop(START)
-    maps = [Picture(
-        "values.svg", "From where it works", drawing("grid", cells, start.value, label=_LABEL),
-        "Probability that the learned policy does the task, from each initial state.", LIVE,
-    )]
+    maps = [
+        Picture(
+            "values.svg",
+            "From where it works",
+            drawing("grid", cells, start.value, label=_LABEL),
+            "Probability that the learned policy does the task, from each initial state.",
+            LIVE,
+        )
+    ]
     if layers:
         drawn = drawing(
-            "grid", cells, [x.value for x in layers.values()], [x.policy for x in layers.values()],
-            titles=[short_name(x.name) for x in layers.values()], label=_LABEL,
+            "grid",
+            cells,
+            [x.value for x in layers.values()],
+            [x.policy for x in layers.values()],
+            titles=[short_name(x.name) for x in layers.values()],
+            label=_LABEL,
             actions=outcome.setup.world.actions,
         )
-        maps.append(Picture(
-            "policy.svg", "What it does", drawn,
-            "One map for each state of the automaton, which is the policy's memory. An arrow is as "
-            "long as its action is likely; colours are the probability of doing the task from "
-            "there. Cells that cannot be met with that memory are blank.", LIVE,
-        ))
+        maps.append(
+            Picture(
+                "policy.svg",
+                "What it does",
+                drawn,
+                "One map for each state of the automaton, which is the policy's memory. An arrow is as "
+                "long as its action is likely; colours are the probability of doing the task from "
+                "there. Cells that cannot be met with that memory are blank.",
+                LIVE,
+            )
+        )
     return maps
 
 

@@ -14,8 +14,10 @@ import threading
 
 FATAL = "Terminating process because the JAX distributed service detected"
 END = "jaxltl ends: "  # what the process itself says, which may not live to see it printed
-AGAIN = ("what was saved is kept: start all processes again, as many or another number, and the "
-         "run goes on")
+AGAIN = (
+    "what was saved is kept: start all processes again, as many or another number, and the "
+    "run goes on"
+)
 _CHATTER = ("[Gloo] Rank ",)
 _PATIENCE = 1.0  # seconds for the rest of a message
 
@@ -33,18 +35,26 @@ def told(text: str, process: int) -> str:
     silent = re.search(r"stopped sending heartbeats\):\n([\d,\s]+)", text)
     if silent is not None:
         names = re.findall(r"\d+", silent[1])
-        who = f"process {names[0]} gives" if len(names) == 1 else (
-            f"processes {', '.join(names)} give")
+        who = (
+            f"process {names[0]} gives"
+            if len(names) == 1
+            else (f"processes {', '.join(names)} give")
+        )
         return f"process {process} stops, for {who} no sign of life any more; {AGAIN}."
     if "RegisterTask" in text and "ALREADY_EXISTS" in text:
-        return (f"process {process}: another process has the same number; give each its own "
-                "--process, from 0 to one less than --processes.")
+        return (
+            f"process {process}: another process has the same number; give each its own "
+            "--process, from 0 to one less than --processes."
+        )
     if "RegisterTask" in text:
-        return (f"process {process}: not all processes have joined in time; start as many as "
-                "--processes says, all with the same --coordinator, or give them longer by --wait.")
+        return (
+            f"process {process}: not all processes have joined in time; start as many as "
+            "--processes says, all with the same --coordinator, or give them longer by --wait."
+        )
     if ("PollForError" in text and "Failed to send RPC" in text) or "Socket closed" in text:
-        return (f"process {process} stops, for process 0, which the others meet at, has ended; "
-                f"{AGAIN}.")
+        return (
+            f"process {process} stops, for process 0, which the others meet at, has ended; {AGAIN}."
+        )
     return f"process {process} stops, for another process has ended; {AGAIN}."
 
 

@@ -53,12 +53,14 @@ def check_attainable(setup: Setup) -> None:
 
         try:
             require_attainable(
-                part_of(setup.worlds.model, w), sure.best, float(setup.asked), task.over, place)
+                part_of(setup.worlds.model, w), sure.best, float(setup.asked), task.over, place
+            )
         except ValueError as error:
             kind = "training" if w < setup.num_training else "test"
             fix = "" if kind == "training" else " Or name it in [test] leave_out."
             raise ValueError(
-                f"{task.path}: [task] in the {kind} world {scene.name}: {error}{fix}") from None
+                f"{task.path}: [task] in the {kind} world {scene.name}: {error}{fix}"
+            ) from None
 
 
 def hold(setup: Setup, policy: Any, inside: Any) -> Held:
@@ -70,9 +72,16 @@ def hold(setup: Setup, policy: Any, inside: Any) -> Held:
     found = []
     for w, sure in enumerate(setup.sure[: len(policy)]):
         model = part_of(setup.worlds.model, w)
-        found.append(reaching(
-            model, np.asarray(policy[w]), np.asarray(inside[w]), sure.best, float(setup.asked),
-            over=setup.task.over))
+        found.append(
+            reaching(
+                model,
+                np.asarray(policy[w]),
+                np.asarray(inside[w]),
+                sure.best,
+                float(setup.asked),
+                over=setup.task.over,
+            )
+        )
     policies, shares, reached = zip(*found, strict=True)
     return Held(np.stack(policies), np.array(shares), np.array(reached))
 
@@ -106,7 +115,9 @@ def is_weighable(setup: Setup) -> bool:
 
 
 def likeliest(
-    setup: Setup, counts: np.ndarray, free: Learned,
+    setup: Setup,
+    counts: np.ndarray,
+    free: Learned,
     train: Callable[[float, Learned], Learned] | None,
     plans: Callable[[Learned], tuple[np.ndarray, np.ndarray]],
 ) -> tuple[Learned, float]:

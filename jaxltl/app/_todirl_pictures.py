@@ -44,22 +44,30 @@ def task_pictures(setup: Setup) -> list[Picture]:
     same = setup.memory is setup.judge
     found = [automaton_picture(setup.judge, "training-1" if same else "")]
     if not same:
-        found.append(Picture(
-            "memory.svg", "What the learner remembers", drawing("automaton", setup.memory),
-            "The automaton whose state is the learner's memory; the task above judges it.",
-            "training-1",
-        ))
+        found.append(
+            Picture(
+                "memory.svg",
+                "What the learner remembers",
+                drawing("automaton", setup.memory),
+                "The automaton whose state is the learner's memory; the task above judges it.",
+                "training-1",
+            )
+        )
     return found
 
 
 def pictures(outcome: Outcome) -> list[Picture]:
     """The report's pictures of what was learned."""
     history = outcome.learned.history
-    found = [Picture(
-        "learning.svg", "Learning",
-        drawing("curves", {k: history[k].T for k in _FIGURES}, steps=history["step"]),
-        _caption_of_curves(outcome), "learning",
-    )]
+    found = [
+        Picture(
+            "learning.svg",
+            "Learning",
+            drawing("curves", {k: history[k].T for k in _FIGURES}, steps=history["step"]),
+            _caption_of_curves(outcome),
+            "learning",
+        )
+    ]
     for one in _drawn_worlds(outcome):
         found += _draw(outcome, one)
     return found
@@ -78,8 +86,11 @@ def _caption_of_curves(outcome: Outcome) -> str:
     return (
         "Negative log-likelihood of the average demonstrated pair, of the average held-out pair "
         "where there are any, and the gradient's length, before each step"
-        + ("" if np.isnan(outcome.learned.held_out).any()
-           else ". What is kept has the least held-out figure")
+        + (
+            ""
+            if np.isnan(outcome.learned.held_out).any()
+            else ". What is kept has the least held-out figure"
+        )
         + over_seeds(len(outcome.learned.held_out))
     )
 
@@ -114,15 +125,23 @@ class _Drawn(NamedTuple):
 def _drawn_worlds(outcome: Outcome) -> Iterator[_Drawn]:
     setup, training, test = outcome.setup, outcome.setup.training, outcome.setup.test
 
-    def drawn(worlds: Worlds, judged: Judged, w: int, stem: str, title: str, arrows: bool,
-              shown: Trajectories | None = None) -> _Drawn:
+    def drawn(
+        worlds: Worlds,
+        judged: Judged,
+        w: int,
+        stem: str,
+        title: str,
+        arrows: bool,
+        shown: Trajectories | None = None,
+    ) -> _Drawn:
         mean = float(judged.performance["learned"].mean[w])
         title = f"{title}: {worlds.scenes[w].name} ({mean:.4f})"
         return _Drawn(worlds, judged, w, stem, title, arrows, shown)
 
     for w, shown in enumerate(setup.demonstrations[:_PICTURES]):
-        yield drawn(training, outcome.training, w, f"training_{w + 1}", "Training world", True,
-                    shown)
+        yield drawn(
+            training, outcome.training, w, f"training_{w + 1}", "Training world", True, shown
+        )
     if test is not None and outcome.test is not None:
         for n, (rank, w) in enumerate(_chosen_worlds(setup, outcome.test)):
             yield drawn(test, outcome.test, w, f"test_{n + 1}", f"Test world, {rank}", n == 0)
@@ -148,10 +167,17 @@ def _look_into(outcome: Outcome, one: _Drawn) -> Explorer | TooLarge:
     shown = [] if one.demonstrations is None else demonstrated_runs(model, one.demonstrations)
     place: Any = scene.cells if scene.colored is None else part_of(scene.colored, ...)
     return explorer(
-        one.live, one.title, _CAPTION.format("" if stationary else " at the first step"),
-        setup.memory, layers, [*shown, *_runs(outcome, one)],
-        size=scene.mdp.num_states, place=place, actions=ACTIONS,
-        label="probability of doing the task", wall=setup.task.world.get("wall", "#"),
+        one.live,
+        one.title,
+        _CAPTION.format("" if stationary else " at the first step"),
+        setup.memory,
+        layers,
+        [*shown, *_runs(outcome, one)],
+        size=scene.mdp.num_states,
+        place=place,
+        actions=ACTIONS,
+        label="probability of doing the task",
+        wall=setup.task.world.get("wall", "#"),
         goal="the task" if setup.memory is setup.judge else "what it remembers",
     )
 
@@ -181,8 +207,11 @@ def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
     if scene.colored is None:
         assert scene.cells is not None
         drawn = drawing(
-            "grid", scene.cells, np.broadcast_to(one.value, (len(shown), one.value.size)),
-            moving.transpose(1, 0, 2)[shown], titles=titles,
+            "grid",
+            scene.cells,
+            np.broadcast_to(one.value, (len(shown), one.value.size)),
+            moving.transpose(1, 0, 2)[shown],
+            titles=titles,
             label="probability from a start there",
             wall=setup.task.world.get("wall", "#"),
         )
@@ -190,18 +219,23 @@ def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
         return [Picture(f"{one.stem}.svg", one.title, drawn, caption, one.live)]
     found: list[Picture] = []
     if one.arrows:
-        drawn = drawing("temporal_gridworld", part_of(scene.colored, ...), moving, memory=shown,
-                        title=titles)
+        drawn = drawing(
+            "temporal_gridworld", part_of(scene.colored, ...), moving, memory=shown, title=titles
+        )
         found.append(Picture(f"{one.stem}.svg", one.title, drawn, caption, one.live))
     pairs = [[(s, a) for s, _, a in run.steps if a is not None] for run in _runs(outcome, one)]
     if policy.ndim == 3 and any(pairs):
         walks = make_trajectories(scene.mdp, [each for each in pairs if each])
-        found.append(Picture(
-            f"{one.stem}_runs.svg", f"Runs in {scene.name}" if one.arrows else one.title,
-            drawing("temporal_gridworld", part_of(scene.colored, ...), trajectories=walks),
-            f"{len(walks.length)} runs of the learned policy from random starts, each until the "
-            f"task {_END[setup.judge.acceptance]}.", one.live,
-        ))
+        found.append(
+            Picture(
+                f"{one.stem}_runs.svg",
+                f"Runs in {scene.name}" if one.arrows else one.title,
+                drawing("temporal_gridworld", part_of(scene.colored, ...), trajectories=walks),
+                f"{len(walks.length)} runs of the learned policy from random starts, each until the "
+                f"task {_END[setup.judge.acceptance]}.",
+                one.live,
+            )
+        )
     return found
 
 
@@ -216,7 +250,9 @@ def _runs(outcome: Outcome, one: _Drawn) -> list[Run]:
     setup, policy, count = outcome.setup, one.policy, 1
     if setup.memory is not setup.judge:
         # The task's state varies fastest.
-        policy, count = np.asarray(lift_memory(jnp.asarray(policy), setup.judge)), len(
-            setup.judge.delta)
+        policy, count = (
+            np.asarray(lift_memory(jnp.asarray(policy), setup.judge)),
+            len(setup.judge.delta),
+        )
     found = learned_runs(part_of(one.worlds.judged, one.w), policy, outcome.seed)
     return [Run(run.name, [(s, q // count, a) for s, q, a in run.steps]) for run in found]

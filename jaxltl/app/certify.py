@@ -58,8 +58,13 @@ class Asked:
 
 
 def read_evidence(
-    log: Path, *, labels: Path | None = None, model: Path | None = None,
-    initial: Sequence[str] = (), terminal: Sequence[str] = (), graph: str = "seen",
+    log: Path,
+    *,
+    labels: Path | None = None,
+    model: Path | None = None,
+    initial: Sequence[str] = (),
+    terminal: Sequence[str] = (),
+    graph: str = "seen",
     option: str = "--{} ",
 ) -> Evidence:
     """A log, with its world: a given model, or one that is made of what was counted.
@@ -85,8 +90,10 @@ def read_evidence(
         if not isinstance(given, SparseMDP):
             raise ValueError(f"{str(model)!r} has intervals already; solve it by `jaxltl solve`.")
         if labels is not None or terminal or initial:
-            raise ValueError("a model has its labels and initial states; leave --labels, --initial "
-                             "and --terminal out.")
+            raise ValueError(
+                "a model has its labels and initial states; leave --labels, --initial "
+                "and --terminal out."
+            )
         return _named(given, counts_on(given, read_log(log, given)))
     if not initial:
         raise ValueError(f"name the state in which runs start: {option.format('initial')}STATE.")
@@ -94,12 +101,18 @@ def read_evidence(
     for what, names in (("initial", initial), ("terminal", terminal)):
         unknown = [x for x in names if x not in counts.states]
         if unknown:
-            raise ValueError(f"{option.format(what)}{unknown[0]}: the log has no such state; it "
-                             f"has {_some(counts)}.")
+            raise ValueError(
+                f"{option.format(what)}{unknown[0]}: the log has no such state; it "
+                f"has {_some(counts)}."
+            )
     known = None if labels is None else read_labels(labels, counts.states)
     sparse, count = counted_model(
-        counts, initial=list(initial), labels=known, terminal=terminal,
-        graph="complete" if graph == "complete" else "seen")
+        counts,
+        initial=list(initial),
+        labels=known,
+        terminal=terminal,
+        graph="complete" if graph == "complete" else "seen",
+    )
     return _named(sparse, count)
 
 
@@ -143,8 +156,13 @@ def certify(evidence: Evidence, asked: Asked) -> DataGuarantee:
       True
     """
     return learn_guarantee(
-        evidence.model, evidence.counts, asked.formula, asked.confidence,
-        method=asked.method, objective=asked.objective)  # type: ignore[arg-type]
+        evidence.model,
+        evidence.counts,
+        asked.formula,
+        asked.confidence,
+        method=asked.method,
+        objective=asked.objective,
+    )  # type: ignore[arg-type]
 
 
 def text(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float) -> str:
@@ -155,14 +173,16 @@ def text(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float)
         f"  of {asked.formula!r}, under the policy found; none has {other} than "
         f"{_outward(found.optimistic, side == '>=')}",
         f"  {int(evidence.counts.sum())} transitions of {evidence.model.num_rows} choices in "
-        f"{evidence.model.num_states} states, {found.sets.num_claims} claims of {asked.method}"]
+        f"{evidence.model.num_states} states, {found.sets.num_claims} claims of {asked.method}",
+    ]
     status = Status(int(found.satisfaction.solution.status))
     if status != Status.CONVERGED:
         lines.append(f"  the bounds could not be made narrow ({status.name})")
     for row in most_helpful(found):
         lines.append(
             f"  more samples of {evidence.actions[row]} in {_state(evidence, row)} "
-            f"({int(found.sets.num_samples[row])} so far) help most: up to {found.gain[row]:.3g}")
+            f"({int(found.sets.num_samples[row])} so far) help most: up to {found.gain[row]:.3g}"
+        )
     return "\n".join([*lines, f"  {seconds:.3f} s"])
 
 
@@ -185,20 +205,33 @@ def _state(evidence: Evidence, row: int) -> str:
 def entry(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float) -> dict[str, Any]:
     """The guarantee as a JSON object."""
     return {
-        "formula": asked.formula, "objective": asked.objective, "bound": found.bound,
-        "optimistic": found.optimistic, "confidence": found.confidence, "method": asked.method,
+        "formula": asked.formula,
+        "objective": asked.objective,
+        "bound": found.bound,
+        "optimistic": found.optimistic,
+        "confidence": found.confidence,
+        "method": asked.method,
         "status": Status(int(found.satisfaction.solution.status)).name,
-        "samples": int(evidence.counts.sum()), "claims": found.sets.num_claims,
-        "states": evidence.model.num_states, "choices": evidence.model.num_rows,
-        "sample_next": sample_next(evidence, found), "seconds": seconds}
+        "samples": int(evidence.counts.sum()),
+        "claims": found.sets.num_claims,
+        "states": evidence.model.num_states,
+        "choices": evidence.model.num_rows,
+        "sample_next": sample_next(evidence, found),
+        "seconds": seconds,
+    }
 
 
 def sample_next(evidence: Evidence, found: DataGuarantee) -> list[dict[str, Any]]:
     """Where more samples help, the most first, as JSON objects."""
     return [
-        {"state": _state(evidence, r), "action": evidence.actions[r],
-         "gain": float(found.gain[r]), "samples": int(found.sets.num_samples[r])}
-        for r in most_helpful(found)]
+        {
+            "state": _state(evidence, r),
+            "action": evidence.actions[r],
+            "gain": float(found.gain[r]),
+            "samples": int(found.sets.num_samples[r]),
+        }
+        for r in most_helpful(found)
+    ]
 
 
 def policy_file(evidence: Evidence, asked: Asked, found: DataGuarantee) -> bytes:
@@ -206,20 +239,32 @@ def policy_file(evidence: Evidence, asked: Asked, found: DataGuarantee) -> bytes
     of = found.satisfaction
     product, automaton = of.product, of.automaton
     rows = np.asarray(of.solution.policy)
-    letters = [sorted(p for p, holds in zip(automaton.propositions, letter, strict=True) if holds)
-               for letter in automaton.letters]
+    letters = [
+        sorted(p for p, holds in zip(automaton.propositions, letter, strict=True) if holds)
+        for letter in automaton.letters
+    ]
     moves = [
         {"state": evidence.states[s], "memory": int(q), "action": evidence.actions[r]}
         for s, q, r, still in zip(
-            product.base_state.tolist(), product.memory.tolist(), rows.tolist(),
-            product.still.tolist(), strict=True) if not still]
+            product.base_state.tolist(),
+            product.memory.tolist(),
+            rows.tolist(),
+            product.still.tolist(),
+            strict=True,
+        )
+        if not still
+    ]
     table = {
-        **entry(evidence, asked, found, 0.0), "initial_memory": int(automaton.initial),
+        **entry(evidence, asked, found, 0.0),
+        "initial_memory": int(automaton.initial),
         "letters": letters,
-        "letter": {name: letters[i] for name, i in zip(
-            evidence.states, of.letter.tolist(), strict=True)},
+        "letter": {
+            name: letters[i] for name, i in zip(evidence.states, of.letter.tolist(), strict=True)
+        },
         "update": np.asarray(automaton.delta).tolist(),
-        "update_by": "the letter of the state that is left", "policy": moves}
+        "update_by": "the letter of the state that is left",
+        "policy": moves,
+    }
     del table["seconds"]
     return (json.dumps(table, allow_nan=False) + "\n").encode()
 
@@ -229,8 +274,14 @@ def curve(evidence: Evidence, asked: Asked) -> tuple[list[int], list[float]]:
     total = int(evidence.counts.sum())
     sizes = np.unique(np.geomspace(max(total / 10**3, 1), max(total, 1), POINTS).astype(int))
     bound = guarantee_curve(
-        evidence.model, evidence.counts, asked.formula, asked.confidence, sizes.tolist(),
-        method=asked.method, objective=asked.objective)  # type: ignore[arg-type]
+        evidence.model,
+        evidence.counts,
+        asked.formula,
+        asked.confidence,
+        sizes.tolist(),
+        method=asked.method,
+        objective=asked.objective,
+    )  # type: ignore[arg-type]
     return sizes.tolist(), bound.tolist()
 
 
@@ -241,8 +292,13 @@ def timed(evidence: Evidence, asked: Asked) -> tuple[DataGuarantee, float]:
 
 
 def certify_and_write(
-    log: Path, asked: Asked, world: Mapping[str, Any], policy: Path | None, picture: Path | None,
-    as_json: bool, say: Callable[[str], None],
+    log: Path,
+    asked: Asked,
+    world: Mapping[str, Any],
+    policy: Path | None,
+    picture: Path | None,
+    as_json: bool,
+    say: Callable[[str], None],
 ) -> bool:
     """The whole command; whether some bound could not be made narrow.
 
@@ -254,8 +310,10 @@ def certify_and_write(
     if picture is not None and picture.suffix not in PICTURES:
         raise ValueError(f"--curve {picture}: the name must end in {', '.join(PICTURES)}.")
     nothing: Any = contextlib.nullcontext()
-    with nothing if policy is None else atomic_write(policy) as file, (
-            nothing if picture is None else atomic_write(picture)) as drawing:
+    with (
+        nothing if policy is None else atomic_write(policy) as file,
+        nothing if picture is None else atomic_write(picture) as drawing,
+    ):
         evidence = read_evidence(log, **world)
         found, seconds = timed(evidence, asked)
         say(text(evidence, asked, found, seconds))

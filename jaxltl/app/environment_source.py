@@ -49,14 +49,22 @@ def load_environment(task: EnvironmentTask, world: Environment | None = None) ->
         with errors_in(f"{task.path}: [world] labels: "):
             labels = _function(spec["labels"], folder) if "labels" in spec else None
         with errors_in(f"{task.path}: [world] environment: "):
-            world = _made(spec["environment"], spec.get("arguments", {}), folder, labels,
-                          spec.get("propositions", ()))
+            world = _made(
+                spec["environment"],
+                spec.get("arguments", {}),
+                folder,
+                labels,
+                spec.get("propositions", ()),
+            )
     with errors_in(f"{task.path}: [world] "):
         return with_time_limit(world, spec["horizon"]) if "horizon" in spec else world
 
 
 def _made(
-    name: str, arguments: Mapping[str, Any], folder: Path, labels: Callable[..., Any] | None,
+    name: str,
+    arguments: Mapping[str, Any],
+    folder: Path,
+    labels: Callable[..., Any] | None,
     propositions: list[str],
 ) -> Environment:
     root, _, rest = name.partition(":")
@@ -72,14 +80,24 @@ def _made(
     if not isinstance(found, Environment):
         raise ValueError(
             f"{name!r} returns a {type(found).__name__}, no Environment; let it return one of "
-            "make_environment, or of an adapter such as from_gymnax.")
+            "make_environment, or of an adapter such as from_gymnax."
+        )
     if labels is None:
         return found
     with _theirs("labels"):
         return make_environment(
-            found.reset, found.step, found.observe, actions=found.actions, labels=labels,
-            propositions=propositions, allowed=found.allowed, observations=found.observations,
-            horizon=found.horizon, starts=found.starts, outcomes=found.outcomes)
+            found.reset,
+            found.step,
+            found.observe,
+            actions=found.actions,
+            labels=labels,
+            propositions=propositions,
+            allowed=found.allowed,
+            observations=found.observations,
+            horizon=found.horizon,
+            starts=found.starts,
+            outcomes=found.outcomes,
+        )
 
 
 def _of_package(
@@ -92,7 +110,8 @@ def _of_package(
         make = getattr(importlib.import_module(module), function)
     except ImportError as problem:
         raise ValueError(
-            f'needs the package {root} ({problem}); pip install "jaxltl[{root}]".') from None
+            f'needs the package {root} ({problem}); pip install "jaxltl[{root}]".'
+        ) from None
     extra = {"auto_reset": False} if root == "craftax" else {}
     adapter = getattr(adapters, f"from_{root}")
     ours = {x: arguments[x] for x in inspect.getfullargspec(adapter).kwonlyargs if x in arguments}
@@ -109,15 +128,22 @@ def _function(name: str, folder: Path) -> Callable[..., Any]:
         known = ", ".join((*OWN, *(f"{p}:NAME" for p in PACKAGES)))
         raise ValueError(
             f'{name!r} names no function; write "package.module:function", "file.py:function" '
-            f"for a file beside the task file, or one of {known}.")
+            f"for a file beside the task file, or one of {known}."
+        )
     module = _module_of_file(folder / place) if place.endswith(".py") else _module(place)
     found = getattr(module, attribute, None)
     if not callable(found):
-        there = [n for n, x in vars(module).items() if callable(x) and not n.startswith("_")
-                 and getattr(x, "__module__", None) == module.__name__]
+        there = [
+            n
+            for n, x in vars(module).items()
+            if callable(x)
+            and not n.startswith("_")
+            and getattr(x, "__module__", None) == module.__name__
+        ]
         is_ = "is no function" if hasattr(module, attribute) else "is not there"
         raise ValueError(
-            f"{attribute!r} {is_} in {place!r}; its functions are {', '.join(there) or '(none)'}.")
+            f"{attribute!r} {is_} in {place!r}; its functions are {', '.join(there) or '(none)'}."
+        )
     return found
 
 
@@ -125,7 +151,8 @@ def _module(name: str) -> Any:
     if not all(part.isidentifier() for part in name.split(".")):
         raise ValueError(
             f"{name!r} is neither the name of a module, package.module, nor that of a file, "
-            "file.py.")
+            "file.py."
+        )
     try:
         return importlib.import_module(name)
     except ImportError as problem:
@@ -134,7 +161,8 @@ def _module(name: str) -> Any:
             raise ValueError(f"{name!r} cannot be imported: {problem}.") from None
         raise ValueError(
             f"there is no module {name!r}: {problem}. Install its package, or name a file beside "
-            'the task file, "file.py:function".') from None
+            'the task file, "file.py:function".'
+        ) from None
     except (Exception, SystemExit) as problem:
         raise ValueError(_told(name, problem)) from problem
 
@@ -176,6 +204,9 @@ def _told(name: str, problem: BaseException) -> str:
         return f"{name!r}: {text}."
     places = traceback.extract_tb(problem.__traceback__)
     # A SyntaxError names its own place.
-    where = "" if isinstance(problem, SyntaxError) or not places else (
-        f" ({Path(places[-1].filename).name}, line {places[-1].lineno})")
+    where = (
+        ""
+        if isinstance(problem, SyntaxError) or not places
+        else (f" ({Path(places[-1].filename).name}, line {places[-1].lineno})")
+    )
     return f"{name!r} raises {type(problem).__name__}{': ' if text else ''}{text}{where}."

@@ -97,11 +97,23 @@ class TooLarge(NamedTuple):
 
 
 def explorer(
-    name: str, title: str, caption: str, automaton: Automaton | None,
-    layers: Mapping[str, Layer], runs: list[Run], *, size: int, place: Any = None,
-    actions: Sequence[str] = (), label: str = "", wall: str = "#",
-    goal: str = "the task", marked: Iterable[tuple[int, int, int]] = (), marks: str = "",
-    cells: Mapping[int, Sequence[int]] | None = None, places: Mapping[int, str] | None = None,
+    name: str,
+    title: str,
+    caption: str,
+    automaton: Automaton | None,
+    layers: Mapping[str, Layer],
+    runs: list[Run],
+    *,
+    size: int,
+    place: Any = None,
+    actions: Sequence[str] = (),
+    label: str = "",
+    wall: str = "#",
+    goal: str = "the task",
+    marked: Iterable[tuple[int, int, int]] = (),
+    marks: str = "",
+    cells: Mapping[int, Sequence[int]] | None = None,
+    places: Mapping[int, str] | None = None,
 ) -> Explorer | TooLarge:
     """What there is to see of a policy; or why that is too much for a page.
 
@@ -112,12 +124,16 @@ def explorer(
     """
     count = 0 if automaton is None else len(automaton.delta)
     if size * len(layers) > MOST_CELLS or count > MOST_STATES:
-        return TooLarge(name, (
-            f"{size} states by {len(layers)} maps, and an automaton of {count} states, are more "
-            f"than a page holds well (at most {MOST_CELLS} states over all maps, and {MOST_STATES} "
-            "automaton states), so there are pictures in place of maps to look into; the files "
-            "beside this page have the figures."
-        ), {})
+        return TooLarge(
+            name,
+            (
+                f"{size} states by {len(layers)} maps, and an automaton of {count} states, are more "
+                f"than a page holds well (at most {MOST_CELLS} states over all maps, and {MOST_STATES} "
+                "automaton states), so there are pictures in place of maps to look into; the files "
+                "beside this page have the figures."
+            ),
+            {},
+        )
     marked = [(int(s), int(q), int(a)) for s, q, a in marked]
     drawn = {} if automaton is None else {"automaton": drawing("live_automaton", automaton, name)}
     shape, names = None, [""] * size
@@ -130,13 +146,34 @@ def explorer(
     if place is not None:
         shape = (int(place.shape[0]), int(place.shape[1]))
         drawn["map"] = drawing(
-            "live_map", place, name, {key: (x.value, x.policy) for key, x in layers.items()},
+            "live_map",
+            place,
+            name,
+            {key: (x.value, x.policy) for key, x in layers.items()},
             runs=[[(cells or {}).get(s, [s])[0] for s, _, _ in run.steps] for run in runs],
-            marked=marked, actions=actions, wall=wall,
+            marked=marked,
+            actions=actions,
+            wall=wall,
             pieces=max((len(each) for each in (cells or {}).values()), default=1),
         )
-    return Explorer(name, title, caption, label, automaton, goal, shape, names, tuple(actions),
-                    layers, runs, marked, marks, cells or {}, places or {}, drawn)
+    return Explorer(
+        name,
+        title,
+        caption,
+        label,
+        automaton,
+        goal,
+        shape,
+        names,
+        tuple(actions),
+        layers,
+        runs,
+        marked,
+        marks,
+        cells or {},
+        places or {},
+        drawn,
+    )
 
 
 def curves(
@@ -172,8 +209,11 @@ class _Steps(NamedTuple):
 def _steps(model: Product) -> _Steps:
     mdp: Any = model.mdp
     return _Steps(
-        np.asarray(mdp.successor), np.asarray(mdp.probability), np.asarray(model.initial_memory),
-        np.asarray(model.next_memory), model.label_on == "entry",
+        np.asarray(mdp.successor),
+        np.asarray(mdp.probability),
+        np.asarray(model.initial_memory),
+        np.asarray(model.next_memory),
+        model.label_on == "entry",
     )
 
 

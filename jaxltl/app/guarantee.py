@@ -59,7 +59,11 @@ class Guarantee:
 
 
 def ask(
-    model: Product, world: World, shown: Trajectories, best: Solution, asked: str | float,
+    model: Product,
+    world: World,
+    shown: Trajectories,
+    best: Solution,
+    asked: str | float,
     over: str = "mean",
 ) -> Guarantee:
     """What is to be guaranteed of a product's task.
@@ -85,7 +89,7 @@ def ask(
         what = "its only step" if count == 1 else f"each of its {count} steps"
         raise ValueError(
             f"demonstration {n + 1}: {what} lowers the best probability of the task, so that "
-            "nothing of it is left to learn from; leave it out, or write guarantee = \"none\"."
+            'nothing of it is left to learn from; leave it out, or write guarantee = "none".'
         )
     return Guarantee(asked, over, best, actions, lost, cost)
 
@@ -146,8 +150,12 @@ def left_out(
 
 
 def kept(
-    guarantee: Guarantee, attempt: Attempt | None, model: Product, world: World,
-    shown: Trajectories, solution: Solution,
+    guarantee: Guarantee,
+    attempt: Attempt | None,
+    model: Product,
+    world: World,
+    shown: Trajectories,
+    solution: Solution,
 ) -> dict[str, Any]:
     """What was asked and done, for ``result.json``."""
     found: dict[str, Any] = {"asked": guarantee.asked, "over": guarantee.over}
@@ -159,8 +167,12 @@ def kept(
         n, t = np.argwhere(guarantee.forbidden)[0]
         before, after = guarantee.cost or (None, None)
         found["left_out"] = {
-            "steps": int(guarantee.forbidden.sum()), "of": int(np.sum(shown.length)),
-            "demonstration": int(n) + 1, "step": int(t) + 1, "from": before, "to": after,
+            "steps": int(guarantee.forbidden.sum()),
+            "of": int(np.sum(shown.length)),
+            "demonstration": int(n) + 1,
+            "step": int(t) + 1,
+            "from": before,
+            "to": after,
             **world.where(int(np.asarray(shown.state)[n, t])),
         }
     if guarantee.asked == "none":
@@ -198,9 +210,13 @@ Train = Callable[[float, Any], Any]
 
 
 def at_least(
-    model: Product, guarantee: Guarantee, counts: np.ndarray, free: Any,
+    model: Product,
+    guarantee: Guarantee,
+    counts: np.ndarray,
+    free: Any,
     inside: Callable[[], tuple[np.ndarray, Any]],
-    train: Train, policy_of: Callable[[Any], np.ndarray],
+    train: Train,
+    policy_of: Callable[[Any], np.ndarray],
 ) -> Attempt:
     """The most likely policy found whose certified probability is at least the one asked for.
 
@@ -231,9 +247,18 @@ def at_least(
 
     def between(below: Attempt, above: Attempt) -> Attempt:
         found = least_mixture(model, below.policy, above.policy, asked, over=guarantee.over)
-        return above if found.share == 1 else Attempt(
-            found.policy, loss_of(found.policy), found.attained, above.weight, found.share,
-            above.learned)
+        return (
+            above
+            if found.share == 1
+            else Attempt(
+                found.policy,
+                loss_of(found.policy),
+                found.attained,
+                above.weight,
+                found.share,
+                above.learned,
+            )
+        )
 
     first = attempt(policy_of(free), free, 0.0, 0.0)
     if first.attained >= asked:
@@ -259,7 +284,10 @@ def at_least(
 
 
 def bracket(
-    train: Train, first: Any, judged: Callable[[Any, float], Any], asked: float,
+    train: Train,
+    first: Any,
+    judged: Callable[[Any, float], Any],
+    asked: float,
     halvings: int = _HALVINGS,
 ) -> Iterator[Any]:
     """Attempts with more and more weight until it is enough, then between the last two.

@@ -36,8 +36,13 @@ def settings(kind: Any, spec: Mapping[str, Any]) -> Any:
 
 
 def run_seeds(
-    algorithm: Any, seeds: tuple[int, int], problem: Any, hparams: Any, report: Report | None,
-    mesh: Mesh | None = None, **options: Any,
+    algorithm: Any,
+    seeds: tuple[int, int],
+    problem: Any,
+    hparams: Any,
+    report: Report | None,
+    mesh: Mesh | None = None,
+    **options: Any,
 ) -> tuple[Chunks, dict[str, np.ndarray]]:
     """Runs of a learner from N seeds side by side, and their figures ``[T, N]`` by name.
 
@@ -72,6 +77,7 @@ def _first_states(
     init: Callable[..., Any], seed: int, num_seeds: int, problem: Any, hparams: Any
 ) -> Any:
     """A learner's N first states, each from a key of its own; one program."""
+
     def first(n: Any) -> Any:
         return _first_of(init)(n, seed, problem, hparams)
 
@@ -83,6 +89,7 @@ def _first_states(
 @functools.cache  # compiled once for each learner, so it must stay the same function
 def _first_of(init: Callable[..., Any]) -> Callable[..., Any]:
     """The first state of lane n."""
+
     def first(n: Any, seed: Any, problem: Any, hparams: Any) -> Any:
         root = jax.random.fold_in(jax.random.key(seed), 1)
         return init(jax.random.fold_in(root, n), problem, hparams)
@@ -91,8 +98,7 @@ def _first_of(init: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def one_seed(learned: Any, i: int) -> Any:
-    """One of N seeds alone, of a frozen dataclass of arrays ``[N, ...]`` with a history ``[T, N]``.
-    """
+    """One of N seeds alone, of a frozen dataclass of arrays ``[N, ...]`` with a history ``[T, N]``."""
     one = {k: v[i : i + 1] for k, v in vars(learned).items() if isinstance(v, np.ndarray)}
     history = {k: v if v.ndim == 1 else v[:, i : i + 1] for k, v in learned.history.items()}
     return dataclasses.replace(learned, **one, history=history)
@@ -100,8 +106,10 @@ def one_seed(learned: Any, i: int) -> Any:
 
 def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
     """What the progress bar tells of the newest figures of a gradient's descent."""
-    return {"loss": f"{figures['loss'].min():.4f}",
-            "gradient": f"{figures['gradient_norm'].max():.1e}"}
+    return {
+        "loss": f"{figures['loss'].min():.4f}",
+        "gradient": f"{figures['gradient_norm'].max():.1e}",
+    }
 
 
 def compile_beside(function: Any, *given: Any) -> Callable[[], None]:
@@ -122,8 +130,14 @@ def compile_beside(function: Any, *given: Any) -> Callable[[], None]:
 
 def fingerprint(task: Any, seed: int, num_seeds: int) -> str:
     """What a checkpoint must agree on to be gone on from."""
-    parts = [task.digest, seed, num_seeds, jaxltl.__version__, jax.__version__,
-             str(jnp.result_type(float))]
+    parts = [
+        task.digest,
+        seed,
+        num_seeds,
+        jaxltl.__version__,
+        jax.__version__,
+        str(jnp.result_type(float)),
+    ]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
 
 
@@ -176,9 +190,12 @@ def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
 def automaton_picture(automaton: Automaton, live: str) -> Picture:
     """The task's automaton."""
     return Picture(
-        "automaton.svg", "The task as an automaton", drawing("automaton", automaton),
+        "automaton.svg",
+        "The task as an automaton",
+        drawing("automaton", automaton),
         "States with a double circle: the task is done, whatever follows. Grey: it has failed. "
-        "Each state is named by the formula that is left to satisfy.", live,
+        "Each state is named by the formula that is left to satisfy.",
+        live,
     )
 
 

@@ -119,24 +119,39 @@ def _problem(setup: Setup, allowed: np.ndarray | None) -> tuple[tuple[str, ...],
             f"features: {', '.join(features.names)}."
         )
     problem = mlirl.make_problem(
-        model.mdp if in_world else model, features.values, setup.demonstrations,
-        start=start, satisfaction_over=spec.get("satisfaction_over", "initial"),
+        model.mdp if in_world else model,
+        features.values,
+        setup.demonstrations,
+        start=start,
+        satisfaction_over=spec.get("satisfaction_over", "initial"),
         allowed=None if allowed is None else to_jax(allowed),
     )
     return features.names, problem
 
 
 def _trained(
-    setup: Setup, names: tuple[str, ...], problem: mlirl.Problem, hparams: mlirl.Hparams,
-    seeds: tuple[int, int], report: Report | None, checkpoint: Path | None,
+    setup: Setup,
+    names: tuple[str, ...],
+    problem: mlirl.Problem,
+    hparams: mlirl.Hparams,
+    seeds: tuple[int, int],
+    report: Report | None,
+    checkpoint: Path | None,
     mesh: Mesh | None = None,
 ) -> Learned:
     """What N seeds learn of a problem."""
     spec, model = setup.task.learner, setup.model
     wait = _compile_policy(problem, hparams)
     found, history = run_seeds(
-        mlirl, seeds, problem, hparams, report, num_steps=spec.get("steps", STEPS), keep="before",
-        until=learner.gradient_vanishes(spec.get("tolerance", _TOLERANCE)), checkpoint=checkpoint,
+        mlirl,
+        seeds,
+        problem,
+        hparams,
+        report,
+        num_steps=spec.get("steps", STEPS),
+        keep="before",
+        until=learner.gradient_vanishes(spec.get("tolerance", _TOLERANCE)),
+        checkpoint=checkpoint,
         mesh=mesh,
     )
     wait()
@@ -150,20 +165,27 @@ def _trained(
     gradient_norm, status = history["gradient_norm"][-1], np.asarray(codes)
     return Learned(
         policy=np.asarray(policy),
-        weights=weights, names=names, loss=history["loss"][-1],
-        neg_log_likelihood=np.asarray(nll), gradient_norm=gradient_norm, status=status,
+        weights=weights,
+        names=names,
+        loss=history["loss"][-1],
+        neg_log_likelihood=np.asarray(nll),
+        gradient_norm=gradient_norm,
+        status=status,
         num_steps=np.asarray(states.step),
         # Beyond contraction no value of a softmax policy has a certificate.
-        converged=found.done & (status <= Status.UNCERTIFIED), history=history,
+        converged=found.done & (status <= Status.UNCERTIFIED),
+        history=history,
     )
 
 
 def _with_guarantee(
-    setup: Setup, seeds: tuple[int, int], report: Report | None, checkpoint: Path | None,
+    setup: Setup,
+    seeds: tuple[int, int],
+    report: Report | None,
+    checkpoint: Path | None,
     mesh: Mesh | None,
 ) -> tuple[Learned, int, Attempt | None]:
-    """What is learned under the guarantee, which seed is kept, and how a probability was reached.
-    """
+    """What is learned under the guarantee, which seed is kept, and how a probability was reached."""
     guarantee = setup.guarantee
     names, problem = setup.learning
     hparams = settings(mlirl.Hparams, setup.task.learner)
@@ -182,9 +204,12 @@ def _with_guarantee(
         found = [
             _trained(setup, names, one, scaled, (seeds[0], 1), None, None)
             for one, scaled in (
-                (dataclasses.replace(problem, start=start),
-                 dataclasses.replace(there, start_scale=0.0)),
-                (problem, there))
+                (
+                    dataclasses.replace(problem, start=start),
+                    dataclasses.replace(there, start_scale=0.0),
+                ),
+                (problem, there),
+            )
         ]
         return found[int(np.argmin([np.nan_to_num(one.loss[0], nan=np.inf) for one in found]))]
 
@@ -196,11 +221,19 @@ def _with_guarantee(
         return one.policy[0], one
 
     found = at_least(
-        setup.model, guarantee, np.asarray(problem.counts), free, inside, train,
-        lambda one: one.policy[0])
+        setup.model,
+        guarantee,
+        np.asarray(problem.counts),
+        free,
+        inside,
+        train,
+        lambda one: one.policy[0],
+    )
     kept = dataclasses.replace(
-        found.learned, policy=found.policy[None],
-        neg_log_likelihood=np.array([found.neg_log_likelihood]))
+        found.learned,
+        policy=found.policy[None],
+        neg_log_likelihood=np.array([found.neg_log_likelihood]),
+    )
     return kept, 0, found
 
 
@@ -346,8 +379,9 @@ def learn(
     checkpoint: Path | None = None,
     progress: Callable[[str], None] = lambda stage: None,
     mesh: Mesh | None = None,
-) -> tuple[Learned, int, Solution, Attempt | None, dict[str, Any] | None, np.ndarray,
-           dict[str, Any] | None]:
+) -> tuple[
+    Learned, int, Solution, Attempt | None, dict[str, Any] | None, np.ndarray, dict[str, Any] | None
+]:
     """Learns with N seeds, keeps the best, and evaluates it; see :class:`Outcome`.
 
     What it is at is told to `report`, steps and figures, and to `progress`, the stage's name.
@@ -356,8 +390,7 @@ def learn(
       ValueError: the learner cannot work on this task.
     """
     model = setup.model
-    learned, chosen, attempt = _with_guarantee(
-        setup, (seed, num_seeds), report, checkpoint, mesh)
+    learned, chosen, attempt = _with_guarantee(setup, (seed, num_seeds), report, checkpoint, mesh)
     progress("checking")
     solution = satisfaction_probability(model, learned.policy[chosen])
     at_start = functools.partial(from_starts, model)
@@ -373,8 +406,7 @@ def learn(
         from jaxltl.app.logged import guaranteed
 
         progress("certifying")
-        data = guaranteed(
-            setup.world.logged, model, setup.task.formula, learned.policy[chosen])
+        data = guaranteed(setup.world.logged, model, setup.task.formula, learned.policy[chosen])
     return learned, chosen, solution, attempt, expected_steps, values, data
 
 
@@ -400,7 +432,8 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             "dropped": setup.dropped,
         },
         "guarantee": kept(
-            setup.guarantee, outcome.attempt, model, world, setup.demonstrations, outcome.solution),
+            setup.guarantee, outcome.attempt, model, world, setup.demonstrations, outcome.solution
+        ),
         "trivial": setup.trivial,
         "remark": setup.features.remark,
         "expected_steps": outcome.expected_steps,
@@ -460,7 +493,9 @@ def _evidence(
     return {
         "mean": {name: at_starts(model, getattr(solution, name), "mean")[0] for name in names},
         "minimum": {
-            "value": value[worst], "lower": lower[starts].min(), "upper": upper[worst],
+            "value": value[worst],
+            "lower": lower[starts].min(),
+            "upper": upper[worst],
             **world.where(worst),
         },
         "num_starts": len(starts),
@@ -482,15 +517,18 @@ def save(out: Path, outcome: Outcome) -> None:
     """
     model, learned, i = outcome.setup.model, outcome.learned, outcome.chosen
     logged = outcome.setup.world.logged
-    save_arrays(out / "policy.npz", {
-        "policy": learned.policy[i],
-        **memory_arrays(model),
-        "actions": outcome.setup.world.actions,
-        "weights": learned.weights[i],
-        "features": learned.names,
-        "all_weights": learned.weights,
-        "satisfaction": outcome.solution.value,
-        "lower": outcome.solution.lower,
-        "upper": outcome.solution.upper,
-        **({} if logged is None else {"states": logged.states}),
-    })
+    save_arrays(
+        out / "policy.npz",
+        {
+            "policy": learned.policy[i],
+            **memory_arrays(model),
+            "actions": outcome.setup.world.actions,
+            "weights": learned.weights[i],
+            "features": learned.names,
+            "all_weights": learned.weights,
+            "satisfaction": outcome.solution.value,
+            "lower": outcome.solution.lower,
+            "upper": outcome.solution.upper,
+            **({} if logged is None else {"states": logged.states}),
+        },
+    )

@@ -126,7 +126,8 @@ def prepare(task: EnvironmentTask, seed: int, world: Environment | None = None) 
         raise ValueError(
             f"{task.path}: [world] environment {task.world['environment']!r} has no labels, and "
             f"the formula mentions {', '.join(automaton.propositions)}: give labels = "
-            '"file.py:function" and propositions = [...].')
+            '"file.py:function" and propositions = [...].'
+        )
     with errors_in(f"{task.path}: [task] formula: "):
         require_known(automaton.propositions, world.propositions, f"{task.formula!r}")
     with errors_in(f"{task.path}: [task] "):
@@ -135,7 +136,8 @@ def prepare(task: EnvironmentTask, seed: int, world: Environment | None = None) 
     if steps is None and world.horizon is None:
         raise ValueError(
             f"{task.path}: [world] the environment's episodes never end, as far as it says: give "
-            "horizon = N, after which they are truncated, or steps = N in [evaluation].")
+            "horizon = N, after which they are truncated, or steps = N in [evaluation]."
+        )
     num_steps = checked_steps(environment, steps)
     with errors_in(f"{task.path}: [{task.method}] "):
         method = make_method(task, environment, num_steps)
@@ -147,8 +149,11 @@ def describe(setup: Setup) -> str:
     task, made = setup.task, setup.environment
     actions = made.actions
     seen = sum(x.size for x in jax.tree.leaves(_shapes(setup)))
-    does = (f"{actions.num} actions" if isinstance(actions, Finite)
-            else f"actions in a box {list(actions.shape)}")
+    does = (
+        f"{actions.num} actions"
+        if isinstance(actions, Finite)
+        else f"actions in a box {list(actions.shape)}"
+    )
     steps = task.learner["steps"]
     return (
         f"{task.world['environment']}: {does}, {many(seen, 'number')} observed, "
@@ -193,8 +198,15 @@ def learn(
     """
     task, method = setup.task, setup.method
     found, history = run_seeds(
-        method.algorithm, (seed, num_seeds), method.problem, method.hparams, report,
-        num_steps=task.learner["steps"], checkpoint=checkpoint, mesh=mesh)
+        method.algorithm,
+        (seed, num_seeds),
+        method.problem,
+        method.hparams,
+        report,
+        num_steps=task.learner["steps"],
+        checkpoint=checkpoint,
+        mesh=mesh,
+    )
     # One cost of a search is a number like the others.
     history = {k: v[..., 0] if v.shape[2:] == (1,) else v for k, v in history.items()}
     # No key of the learner's is one of these.
@@ -203,16 +215,27 @@ def learn(
     chosen = 0
     if num_seeds > 1:
         progress("choosing")
-        chosen = max(range(num_seeds), key=lambda i: _merit(
-            setup, _evaluated(keys[0], agents[i], setup, threshold=False)))
+        chosen = max(
+            range(num_seeds),
+            key=lambda i: _merit(setup, _evaluated(keys[0], agents[i], setup, threshold=False)),
+        )
     progress("evaluating")
-    each = [_evaluated(keys[1], agent, setup, threshold=i == chosen)
-            for i, agent in enumerate(agents)]
+    each = [
+        _evaluated(keys[1], agent, setup, threshold=i == chosen) for i, agent in enumerate(agents)
+    ]
     progress("drawing")
     run = jax.jit(run_episode, static_argnames="num_steps")
-    shown = [jax.device_get(run(jax.random.fold_in(keys[2], i), setup.environment,
-                                agents[chosen], num_steps=setup.num_steps))
-             for i in range(_DRAWN)]
+    shown = [
+        jax.device_get(
+            run(
+                jax.random.fold_in(keys[2], i),
+                setup.environment,
+                agents[chosen],
+                num_steps=setup.num_steps,
+            )
+        )
+        for i in range(_DRAWN)
+    ]
     return found.state, history, chosen, each, shown
 
 
@@ -229,9 +252,15 @@ def _acting(setup: Setup, state: Any) -> Agent:
 def _evaluated(key: jax.Array, agent: Agent, setup: Setup, *, threshold: bool) -> Evaluation:
     asked = setup.task.evaluation
     return evaluate(
-        key, agent, setup.environment, num_episodes=_num_episodes(setup.task),
-        num_steps=setup.num_steps, confidence=asked.get("confidence", 0.95),
-        discount=asked.get("discount"), threshold=asked.get("threshold") if threshold else None)
+        key,
+        agent,
+        setup.environment,
+        num_episodes=_num_episodes(setup.task),
+        num_steps=setup.num_steps,
+        confidence=asked.get("confidence", 0.95),
+        discount=asked.get("discount"),
+        threshold=asked.get("threshold") if threshold else None,
+    )
 
 
 def _merit(setup: Setup, found: Evaluation) -> tuple[float, float, float]:
@@ -254,34 +283,43 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     task, made, kept = setup.task, setup.environment, outcome.evaluations[outcome.chosen]
     last = {name: history[name][-1, outcome.chosen] for name in _drawn(outcome)}
     status = history["status"][:, outcome.chosen]
-    return plain({
-        **about(task),  # type: ignore[arg-type]
-        "environment": {
-            "name": task.world["environment"], "arguments": task.world.get("arguments", {}),
-            "propositions": list(made.propositions), "horizon": made.horizon,
-            "actions": made.actions.num if isinstance(made.actions, Finite)
-            else list(made.actions.shape),
-        },
-        "num_memory": len(setup.automaton.delta),
-        "acceptance": setup.automaton.acceptance,
-        "trivial": setup.trivial,
-        "policy": {"made_of": setup.method.told,
-                   "acts": task.evaluation.get("policy", "drawn")},
-        "evaluation": _as_numbers(kept),
-        "training": {
-            "steps": int(task.learner["steps"]),
-            "transitions": _transitions(outcome),
-            "troubled_rows": int((status != 0).sum()),
-            "last": last,
-            "hyperparameters": dict(task.settings),
-        },
-        "seeds": {
-            "first": outcome.seed, "number": len(outcome.evaluations), "kept": outcome.chosen,
-            "evaluations": [_as_numbers(x) for x in outcome.evaluations],
-        },
-        "drawn": _pictured(outcome) is not None,
-        **took(outcome.seconds),
-    })
+    return plain(
+        {
+            **about(task),  # type: ignore[arg-type]
+            "environment": {
+                "name": task.world["environment"],
+                "arguments": task.world.get("arguments", {}),
+                "propositions": list(made.propositions),
+                "horizon": made.horizon,
+                "actions": made.actions.num
+                if isinstance(made.actions, Finite)
+                else list(made.actions.shape),
+            },
+            "num_memory": len(setup.automaton.delta),
+            "acceptance": setup.automaton.acceptance,
+            "trivial": setup.trivial,
+            "policy": {
+                "made_of": setup.method.told,
+                "acts": task.evaluation.get("policy", "drawn"),
+            },
+            "evaluation": _as_numbers(kept),
+            "training": {
+                "steps": int(task.learner["steps"]),
+                "transitions": _transitions(outcome),
+                "troubled_rows": int((status != 0).sum()),
+                "last": last,
+                "hyperparameters": dict(task.settings),
+            },
+            "seeds": {
+                "first": outcome.seed,
+                "number": len(outcome.evaluations),
+                "kept": outcome.chosen,
+                "evaluations": [_as_numbers(x) for x in outcome.evaluations],
+            },
+            "drawn": _pictured(outcome) is not None,
+            **took(outcome.seconds),
+        }
+    )
 
 
 def _transitions(outcome: Outcome) -> int:
@@ -295,15 +333,21 @@ def _as_numbers(found: Evaluation) -> dict[str, Any]:
     numbers: dict[str, Any] = {}
     for name, value in vars(found).items():
         numbers[name] = vars(value) if isinstance(value, Estimate) else value
-    return {**numbers, "status": found.status.name,
-            "estimates": [n for n in ESTIMATES if getattr(found, n) is not None]}
+    return {
+        **numbers,
+        "status": found.status.name,
+        "estimates": [n for n in ESTIMATES if getattr(found, n) is not None],
+    }
 
 
 def _drawn(outcome: Outcome) -> list[str]:
     """The names of the learning curves: those that are numbers, one for each seed."""
     history = outcome.history
-    return [n for n in outcome.setup.method.figures
-            if history[n].ndim == 2 and np.isfinite(history[n]).any()]
+    return [
+        n
+        for n in outcome.setup.method.figures
+        if history[n].ndim == 2 and np.isfinite(history[n]).any()
+    ]
 
 
 def task_pictures(setup: Setup) -> list[Picture]:
@@ -314,10 +358,15 @@ def task_pictures(setup: Setup) -> list[Picture]:
 def pictures(outcome: Outcome) -> list[Picture]:
     """The report's pictures of what was learned."""
     history, names = outcome.history, _drawn(outcome)
-    found = [Picture(
-        "learning.svg", "Learning",
-        drawing("curves", {k: history[k].T for k in names}, steps=history["step"], show=names),
-        "Figures of each step of the learner" + over_seeds(len(outcome.evaluations)), "learning")]
+    found = [
+        Picture(
+            "learning.svg",
+            "Learning",
+            drawing("curves", {k: history[k].T for k in names}, steps=history["step"], show=names),
+            "Figures of each step of the learner" + over_seeds(len(outcome.evaluations)),
+            "learning",
+        )
+    ]
     drawn = _pictured(outcome)
     return found if drawn is None else [drawn, *found]
 
@@ -346,9 +395,12 @@ def _pictured(outcome: Outcome) -> Picture | None:
     except ValueError:
         return None
     return Picture(
-        "episodes.svg", "A few episodes", to_bytes(figure),
+        "episodes.svg",
+        "A few episodes",
+        to_bytes(figure),
         "The first episodes of the policy that is kept, chosen by nothing; episode.html plays "
-        "the first.")
+        "the first.",
+    )
 
 
 def save(out: Path, outcome: Outcome) -> None:
@@ -365,9 +417,14 @@ def save(out: Path, outcome: Outcome) -> None:
 
     one = jax.tree.map(lambda x: x[outcome.chosen], outcome.states)
     task = outcome.setup.task
-    save_arrays(out / "policy.npz", {
-        **dict(_parts(outcome.setup.method, one)), "task": task.text,
-        "task_file": str(task.path.absolute())})
+    save_arrays(
+        out / "policy.npz",
+        {
+            **dict(_parts(outcome.setup.method, one)),
+            "task": task.text,
+            "task_file": str(task.path.absolute()),
+        },
+    )
     try:
         page = play_episode(outcome.setup.environment, outcome.episodes[0])
     except ValueError:
@@ -419,7 +476,8 @@ def load_policy(
     setup = prepare(task, 0, None if environment is None else require_environment(environment))
     method = setup.method
     state = jax.eval_shape(
-        lambda key: method.algorithm.init(key, method.problem, method.hparams), jax.random.key(0))
+        lambda key: method.algorithm.init(key, method.problem, method.hparams), jax.random.key(0)
+    )
     for name, x in _parts(method, state):
         found = arrays.get(name)
         if found is None or found.shape != x.shape:
@@ -427,7 +485,8 @@ def load_policy(
             raise ValueError(
                 f"{policy_file}: {name} is {is_}, and the policy of {task.path} has one of "
                 f"{list(x.shape)}; give the file that was learned from this task, in this "
-                "environment.")
+                "environment."
+            )
     kept = {name: getattr(state, name) for name in method.kept}
     leaves = [jnp.asarray(arrays[name], x.dtype) for name, x in _parts(method, state)]
     state = replace(state, **jax.tree.unflatten(jax.tree.structure(kept), leaves))
@@ -439,10 +498,14 @@ def _kept_task(policy_file: Path, arrays: Mapping[str, np.ndarray]) -> Environme
     if not all(name in arrays and arrays[name].dtype.kind == "U" for name in ("task", "task_file")):
         raise ValueError(
             f"{policy_file}: no task is kept with it, as jaxltl learn does for environments; give "
-            "the policy.npz of such a job, or task_file=.")
+            "the policy.npz of such a job, or task_file=."
+        )
     path, raw = Path(str(arrays["task_file"])), str(arrays["task"]).encode()
     beside = policy_file.absolute().parent
     named = named_files(read_task(path, raw).world)
-    there = [folder for folder in (path.parent, beside)
-             if all((folder / name).is_file() for name in named)]
+    there = [
+        folder
+        for folder in (path.parent, beside)
+        if all((folder / name).is_file() for name in named)
+    ]
     return read_task((there or [path.parent])[0] / path.name, raw)

@@ -118,17 +118,33 @@ def prepare(task: Task, seed: int) -> Setup:
             model = product(scene.mdp, judge, label_on=task.label_on)
             own = jax.random.fold_in(key, w)
             if soft:
-                found.append(temporal_gridworld.demonstrations(
-                    own, model, expert[w, : scene.mdp.num_states],
-                    task.demonstrations["synthetic"], task.demonstrations.get("length", LENGTH)))
+                found.append(
+                    temporal_gridworld.demonstrations(
+                        own,
+                        model,
+                        expert[w, : scene.mdp.num_states],
+                        task.demonstrations["synthetic"],
+                        task.demonstrations.get("length", LENGTH),
+                    )
+                )
             else:
                 runs, lost = synthetic_demonstrations(task, model, own, bests[w])
                 found, dropped = [*found, runs], dropped + lost
     if memory is not judge:
         expert = np.tile(expert, (1, 1, len(memory.delta), 1))  # the task's state varies fastest
     setup = Setup(
-        task, judge, memory, worlds, len(scenes), jnp.asarray(expert), soft, found, dropped,
-        asked="best" if task.guarantee == 1 else task.guarantee, trivial=trivial)
+        task,
+        judge,
+        memory,
+        worlds,
+        len(scenes),
+        jnp.asarray(expert),
+        soft,
+        found,
+        dropped,
+        asked="best" if task.guarantee == 1 else task.guarantee,
+        trivial=trivial,
+    )
     if setup.asked == "none":
         return setup
     lanes = [part_of(worlds.model, w) for w in range(len(worlds.scenes))]
@@ -184,9 +200,14 @@ def _stack(task: Task, scenes: list[Scene], judge: Automaton, memory: Automaton)
 
 def _observations(scenes: list[Scene], model: Product) -> jax.Array:
     size = model.mdp.num_states
-    return jnp.asarray(np.stack([
-        np.pad(np.asarray(s.observation), ((0, size - len(s.observation)), (0, 0))) for s in scenes
-    ]))
+    return jnp.asarray(
+        np.stack(
+            [
+                np.pad(np.asarray(s.observation), ((0, size - len(s.observation)), (0, 0)))
+                for s in scenes
+            ]
+        )
+    )
 
 
 def describe(setup: Setup) -> str:
@@ -226,8 +247,12 @@ def learn(
     )
     masks = setup.worlds.model.allowed
     problem = todirl.make_problem(
-        model, _observations(scenes, model), setup.demonstrations,
-        held_out=spec.get("held_out", 0.2), network=network, horizon=spec.get("horizon"),
+        model,
+        _observations(scenes, model),
+        setup.demonstrations,
+        held_out=spec.get("held_out", 0.2),
+        network=network,
+        horizon=spec.get("horizon"),
         allowed=masks if masks is None else masks[: len(scenes), : model.mdp.num_states],
     )
     hparams = settings(todirl.Hparams, spec)
@@ -244,23 +269,38 @@ def learn(
 
 
 def _trained(
-    setup: Setup, problem: todirl.Problem, hparams: todirl.Hparams, seeds: tuple[int, int],
-    report: Report | None = None, checkpoint: Path | None = None, mesh: Mesh | None = None,
+    setup: Setup,
+    problem: todirl.Problem,
+    hparams: todirl.Hparams,
+    seeds: tuple[int, int],
+    report: Report | None = None,
+    checkpoint: Path | None = None,
+    mesh: Mesh | None = None,
 ) -> Learned:
     """What N seeds learn of a problem."""
     found, history = run_seeds(
-        todirl, seeds, problem, hparams, report, num_steps=setup.task.learner.get("steps", STEPS),
-        until=learner.has_stopped, checkpoint=checkpoint, mesh=mesh,
+        todirl,
+        seeds,
+        problem,
+        hparams,
+        report,
+        num_steps=setup.task.learner.get("steps", STEPS),
+        until=learner.has_stopped,
+        checkpoint=checkpoint,
+        mesh=mesh,
     )
     states, best = found.state, found.state.best
     score = np.asarray(best.neg_log_likelihood)
     kept = np.minimum(np.asarray(best.step), len(history["held_out"]) - 1)
     return Learned(
         parameters=best.parameters,
-        held_out=score if hparams.mu is None else np.where(
-            np.isfinite(score), history["held_out"][kept, np.arange(len(kept))], score),
-        best_step=np.asarray(best.step), stopped=np.asarray(states.stopped),
-        num_steps=int(np.max(states.step)), history=history,
+        held_out=score
+        if hparams.mu is None
+        else np.where(np.isfinite(score), history["held_out"][kept, np.arange(len(kept))], score),
+        best_step=np.asarray(best.step),
+        stopped=np.asarray(states.stopped),
+        num_steps=int(np.max(states.step)),
+        history=history,
     )
 
 
@@ -273,14 +313,14 @@ def _least_loss(learned: Learned) -> int:
 
 def _lane(learned: Learned, i: int) -> Learned:
     """One of the seeds alone."""
-    return replace(
-        one_seed(learned, i), parameters=part_of(learned.parameters, slice(i, i + 1)))
+    return replace(one_seed(learned, i), parameters=part_of(learned.parameters, slice(i, i + 1)))
 
 
 def _weighed(
     setup: Setup, problem: todirl.Problem, hparams: todirl.Hparams, free: Learned, seed: int
 ) -> Learned:
     """What is kept of what one seed learns with more and more weight of the task."""
+
     def train(mu: float, _: Learned) -> Learned:
         return _trained(setup, problem, replace(hparams, mu=mu), (seed, 1))
 
@@ -290,13 +330,15 @@ def _weighed(
         return _plans(setup, problem.network, parameters, replace(hparams, mu=None), count)[:2]
 
     counts = np.asarray(problem.counts + problem.held_out)
-    found, weight = likeliest(
-        setup, counts, free, None if hparams.mu is None else train, plans)
+    found, weight = likeliest(setup, counts, free, None if hparams.mu is None else train, plans)
     return replace(found, weight=weight)
 
 
 def _judge(
-    setup: Setup, learned: Learned, network: todirl.RewardNetwork, hparams: todirl.Hparams,
+    setup: Setup,
+    learned: Learned,
+    network: todirl.RewardNetwork,
+    hparams: todirl.Hparams,
     chosen: int,
 ) -> Judged:
     worlds = setup.worlds
@@ -306,7 +348,8 @@ def _judge(
         parameters = part_of(learned.parameters, i)
         if setup.is_probability:
             free, inside, status = _plans(
-                setup, network, parameters, replace(hparams, mu=None), len(worlds.scenes))
+                setup, network, parameters, replace(hparams, mu=None), len(worlds.scenes)
+            )
             held = hold(setup, free, inside)
             policy = jnp.asarray(held.policy)
         else:
@@ -321,7 +364,8 @@ def _judge(
     blind = jnp.broadcast_to(blind, (*expert.shape[:-1], blind.shape[-1]))
     horizon = hparams.horizon
     return Judged(
-        policy=np.asarray(policies[chosen]), status=np.asarray(codes[chosen]),
+        policy=np.asarray(policies[chosen]),
+        status=np.asarray(codes[chosen]),
         performance={
             "learned": performances[chosen],
             "expert": _probability(judged, expert, horizon),
@@ -333,7 +377,10 @@ def _judge(
 
 
 def _plans(
-    setup: Setup, network: Any, parameters: Any, hparams: todirl.Hparams,
+    setup: Setup,
+    network: Any,
+    parameters: Any,
+    hparams: todirl.Hparams,
     count: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Policies of all moves and of those that lose nothing in the first worlds, and statuses.
@@ -348,7 +395,8 @@ def _plans(
             only = slice(w, w + 1)
             model, seen, allowed = part_of((worlds.model, worlds.observation, mask), only)
             policy, status = _plan(
-                network, parameters, replace(model, allowed=allowed), seen, hparams)
+                network, parameters, replace(model, allowed=allowed), seen, hparams
+            )
             each.append(np.asarray(policy)[0])
             codes[w] = max(codes[w], int(status[0]))
         found.append(np.stack(each))
@@ -357,7 +405,10 @@ def _plans(
 
 @partial(jax.jit, static_argnames=("network",))
 def _plan(
-    network: todirl.RewardNetwork, parameters: Any, model: Product, observation: jax.Array,
+    network: todirl.RewardNetwork,
+    parameters: Any,
+    model: Product,
+    observation: jax.Array,
     hparams: todirl.Hparams,
 ) -> tuple[jax.Array, jax.Array]:
     """Policies ``float[W, S, Q, A]``, with a horizon ``[W, T, S, Q, A]``, and statuses."""
@@ -414,9 +465,14 @@ def _within(model: Product, policy: jax.Array) -> Performance:
     finite = jnp.all(jnp.isfinite(value))
     slack = half + 4 * jnp.finfo(model.dtype).eps * jnp.sqrt(1.0 * value.size)
     return Performance(
-        mean=mean, lower=jnp.maximum(mean - slack, 0), upper=jnp.minimum(mean + slack, 1),
-        worst=value[worst], worst_lower=jnp.maximum(value[worst] - half, 0),
-        worst_upper=jnp.minimum(value[worst] + half, 1), worst_state=worst, value=value,
+        mean=mean,
+        lower=jnp.maximum(mean - slack, 0),
+        upper=jnp.minimum(mean + slack, 1),
+        worst=value[worst],
+        worst_lower=jnp.maximum(value[worst] - half, 0),
+        worst_upper=jnp.minimum(value[worst] + half, 1),
+        worst_state=worst,
+        value=value,
         status=status_code(finite, finite),
     )
 
@@ -425,9 +481,12 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     """The outcome as numbers, lists and texts, for ``result.json``; NaN becomes None."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, history, count = setup.task, learned.history, setup.num_training
-    infeasible = np.array([
-        np.asarray(infeasible_starts(part_of(setup.worlds.judged, w))).sum()
-        for w in range(len(setup.worlds.scenes))])
+    infeasible = np.array(
+        [
+            np.asarray(infeasible_starts(part_of(setup.worlds.judged, w))).sum()
+            for w in range(len(setup.worlds.scenes))
+        ]
+    )
     result = {
         **about(task),
         "memory": task.memory,
@@ -435,8 +494,12 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "radius": task.radius,
         "horizon": task.learner.get("horizon"),
         "guarantee": {
-            "asked": setup.asked, "over": task.over, "left_out": setup.left_out,
-            "loss": setup.loss, "weight": learned.weight},
+            "asked": setup.asked,
+            "over": task.over,
+            "left_out": setup.left_out,
+            "loss": setup.loss,
+            "weight": learned.weight,
+        },
         "trivial": setup.trivial,
         "acceptance": setup.judge.acceptance,
         "expert": "soft" if setup.soft else "quickest",
@@ -448,8 +511,11 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             "dropped": setup.dropped,
         },
         "training": _about_worlds(setup.training, outcome.training, infeasible[:count], ()),
-        "test": outcome.test and setup.test and _about_worlds(
-            setup.test, outcome.test, infeasible[count:], task.test.get("leave_out", ())),
+        "test": outcome.test
+        and setup.test
+        and _about_worlds(
+            setup.test, outcome.test, infeasible[count:], task.test.get("leave_out", ())
+        ),
         "learning": {**_about_learning(learned, i), "hyperparameters": hyperparameters(task)},
         "history": {
             "step": history["step"],
@@ -509,8 +575,7 @@ def _about_worlds(
         found["num_counted"] = mean.num_worlds
     found["solver"] = Status(int(judged.status.max())).name
     found["worlds"] = [
-        _about_world(scene, judged, w, int(infeasible[w]))
-        for w, scene in enumerate(worlds.scenes)
+        _about_world(scene, judged, w, int(infeasible[w])) for w, scene in enumerate(worlds.scenes)
     ]
     return found
 
@@ -521,7 +586,9 @@ def _about_world(scene: Scene, judged: Judged, w: int, infeasible: int) -> dict[
         "name": scene.name,
         "mean": {"value": one.mean, "lower": one.lower, "upper": one.upper},
         "minimum": {
-            "value": one.worst, "lower": one.worst_lower, "upper": one.worst_upper,
+            "value": one.worst,
+            "lower": one.worst_lower,
+            "upper": one.worst_upper,
             **scene.place(one.worst_state),
         },
         "status": Status(int(one.status)).name,
@@ -529,8 +596,11 @@ def _about_world(scene: Scene, judged: Judged, w: int, infeasible: int) -> dict[
         "random": judged.performance["random"].mean[w],
         "num_starts": int(np.sum(np.asarray(scene.mdp.initial) > 0)),
         "infeasible_starts": infeasible,
-        **({} if judged.share is None or judged.attained is None else {
-            "share": judged.share[w], "attained": judged.attained[w]}),
+        **(
+            {}
+            if judged.share is None or judged.attained is None
+            else {"share": judged.share[w], "attained": judged.attained[w]}
+        ),
     }
 
 
@@ -552,24 +622,32 @@ def save(out: Path, outcome: Outcome) -> None:
     worlds = outcome.setup.training
     for w, scene in enumerate(worlds.scenes):
         model, size = part_of(worlds.model, w), scene.mdp.num_states
-        save_arrays(out / f"policy_{w + 1}.npz", {
-            "policy": outcome.training.policy[w][..., :size, :, :],
-            **memory_arrays(model, size),
-            "actions": ACTIONS,
-            "satisfaction": outcome.training.performance["learned"].value[w, :size],
-        })
+        save_arrays(
+            out / f"policy_{w + 1}.npz",
+            {
+                "policy": outcome.training.policy[w][..., :size, :, :],
+                **memory_arrays(model, size),
+                "actions": ACTIONS,
+                "satisfaction": outcome.training.performance["learned"].value[w, :size],
+            },
+        )
 
 
 def learned_reward(outcome: Outcome) -> LearnedReward:
     """The kept seed's reward, with all that planning with it needs."""
     task, i = outcome.setup.task, outcome.chosen
     spec = task.learner
-    kinds = (COLORS if task.is_colored
-             else (*cell_kinds(task.world), "off the map"))
+    kinds = COLORS if task.is_colored else (*cell_kinds(task.world), "off the map")
     return LearnedReward(
         parameters=part_of(outcome.learned.parameters, i),
-        hidden=tuple(spec.get("hidden", (80, 80))), memory=outcome.setup.memory,
-        label_on=task.label_on, discount=spec["discount"], horizon=spec.get("horizon"),
-        radius=task.radius, formula=task.formula, kinds=tuple(kinds),
-        guarantee=outcome.setup.asked, over=task.over,
+        hidden=tuple(spec.get("hidden", (80, 80))),
+        memory=outcome.setup.memory,
+        label_on=task.label_on,
+        discount=spec["discount"],
+        horizon=spec.get("horizon"),
+        radius=task.radius,
+        formula=task.formula,
+        kinds=tuple(kinds),
+        guarantee=outcome.setup.asked,
+        over=task.over,
     )

@@ -59,10 +59,16 @@ def load_logged(beside: Path, spec: Mapping[str, Any]) -> tuple[MDP, tuple[str, 
         beside / spec["transitions"],
         labels=beside / spec["labels"] if "labels" in spec else None,
         initial=[initial] if isinstance(initial, str) else initial,
-        terminal=spec.get("terminal", ()), graph=spec.get("graph", "seen"), option="{} = ")
+        terminal=spec.get("terminal", ()),
+        graph=spec.get("graph", "seen"),
+        option="{} = ",
+    )
     mdp, actions, column = padded(evidence.model)
-    return mdp, actions, Logged(
-        evidence, column, float(spec["confidence"]), spec.get("method", "anytime"))
+    return (
+        mdp,
+        actions,
+        Logged(evidence, column, float(spec["confidence"]), spec.get("method", "anytime")),
+    )
 
 
 def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> dict[str, Any]:
@@ -92,8 +98,12 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> dic
     codes = int(found.status), int(best.satisfaction.solution.status)
     status = next((c for c in codes if c != Status.CONVERGED), int(Status.CONVERGED))
     return {
-        "confidence": logged.confidence, "guaranteed": safe_mean(share[share > 0], lower, up=False),
-        "best_guaranteed": best.bound, "optimistic": best.optimistic,
-        "samples": logged.num_samples, "method": logged.method, "status": Status(status).name,
+        "confidence": logged.confidence,
+        "guaranteed": safe_mean(share[share > 0], lower, up=False),
+        "best_guaranteed": best.bound,
+        "optimistic": best.optimistic,
+        "samples": logged.num_samples,
+        "method": logged.method,
+        "status": Status(status).name,
         "sample_next": sample_next(evidence, best),
     }

@@ -37,8 +37,11 @@ _TO_THE_END = 7 * 24 * 3600  # seconds that others wait for the first to write i
 # the first one's address from.
 _LAUNCHERS = {
     "Open MPI": ("OMPI_COMM_WORLD_SIZE", "OMPI_COMM_WORLD_RANK", ("OMPI_MCA_orte_hnp_uri",)),
-    "Slurm": ("SLURM_NTASKS", "SLURM_PROCID",
-              ("SLURM_JOB_ID", "SLURM_STEP_NODELIST", "SLURM_LOCALID")),
+    "Slurm": (
+        "SLURM_NTASKS",
+        "SLURM_PROCID",
+        ("SLURM_JOB_ID", "SLURM_STEP_NODELIST", "SLURM_LOCALID"),
+    ),
 }
 
 
@@ -84,8 +87,11 @@ def launched(asked: Asked, environment: Mapping[str, str] = os.environ) -> Launc
       ...                          "SLURM_STEP_NODELIST": "n[1-4]", "SLURM_LOCALID": "0"})
       Launch(process=3, processes=4, coordinator=None)
     """
-    options = {"--coordinator": asked.coordinator, "--process": asked.process,
-               "--processes": asked.processes}
+    options = {
+        "--coordinator": asked.coordinator,
+        "--process": asked.process,
+        "--processes": asked.processes,
+    }
     given = [name for name, value in options.items() if value is not None]
     if asked.mesh is None:
         if given:
@@ -103,17 +109,23 @@ def launched(asked: Asked, environment: Mapping[str, str] = os.environ) -> Launc
         return Launch()
     if processes is None or process is None:
         missing = "--processes" if processes is None else "--process"
-        raise ValueError(f"{missing} is missing: give --coordinator HOST:PORT, --process I and "
-                         "--processes N, or start with srun or mpirun, which say so themselves.")
+        raise ValueError(
+            f"{missing} is missing: give --coordinator HOST:PORT, --process I and "
+            "--processes N, or start with srun or mpirun, which say so themselves."
+        )
     if not 0 <= process < processes:
-        raise ValueError(f"--process {process} is none of {processes} processes; number them from "
-                         f"0 to {processes - 1}.")
+        raise ValueError(
+            f"--process {process} is none of {processes} processes; number them from "
+            f"0 to {processes - 1}."
+        )
     if address is not None:
         _host_and_port(address)
     elif told is None or any(name not in environment for name in _LAUNCHERS[launcher][2]):
         who = f"{launcher} does not say where process 0 is" if told else "nobody else says it"
-        raise ValueError(f"--coordinator is missing, and {who}: give all processes --coordinator "
-                         "HOST:PORT, the machine of process 0 and a free port of it.")
+        raise ValueError(
+            f"--coordinator is missing, and {who}: give all processes --coordinator "
+            "HOST:PORT, the machine of process 0 and a free port of it."
+        )
     return Launch(process, processes, address)
 
 
@@ -205,7 +217,8 @@ class Place:
                     raise SystemExit(2)
                 raise ValueError(
                     f"process {process} has {name} {two}, and process 0 {one}; start all processes "
-                    "with the same arguments, files and versions.")
+                    "with the same arguments, files and versions."
+                )
 
     def sees(self, what: str, here: bool) -> bool:
         """Whether something of the file system is there, if all processes agree.
@@ -218,15 +231,15 @@ class Place:
             without = every.index("False")
             if not self.is_first:
                 raise SystemExit(2)
-            raise ValueError(f"process {without} does not see {what}; give --out a directory that "
-                             "all processes share.")
+            raise ValueError(
+                f"process {without} does not see {what}; give --out a directory that "
+                "all processes share."
+            )
         return here
 
 
 @contextlib.contextmanager
-def taking_part(
-    asked: Asked, launch: Launch, say: Callable[[str], None]
-) -> Iterator[Place]:
+def taking_part(asked: Asked, launch: Launch, say: Callable[[str], None]) -> Iterator[Place]:
     """The run of this process among the others: joined before any device is used, left at the end.
 
     Args:
@@ -267,8 +280,10 @@ def taking_part(
 def _choose_devices(asked: Asked, launch: Launch) -> None:
     """What JAX must know before it makes its devices."""
     if asked.mesh is not None and asked.mesh % launch.processes:
-        raise ValueError(f"--mesh {asked.mesh} cannot be split evenly over {launch.processes} "
-                         "processes; give a multiple of them.")
+        raise ValueError(
+            f"--mesh {asked.mesh} cannot be split evenly over {launch.processes} "
+            "processes; give a multiple of them."
+        )
     import jax
 
     if launch.processes > 1:
@@ -302,15 +317,18 @@ def _mesh(asked: Asked, launch: Launch) -> Mesh:
     number = len(each[0])
     other = next((p for p, x in enumerate(each) if len(x) != number), None)
     if other is not None:
-        raise ValueError(f"process {other} has another number of devices, {len(each[other])}, than "
-                         f"process 0, {number}; give all processes as many.")
+        raise ValueError(
+            f"process {other} has another number of devices, {len(each[other])}, than "
+            f"process 0, {number}; give all processes as many."
+        )
     per = asked.mesh // launch.processes if asked.mesh else number
     if number < per:
         several = launch.processes > 1
         takes = f" takes {per} devices of each process" if several else ""
         raise ValueError(
             f"--mesh {asked.mesh}{takes}: {'each has' if several else 'there are'} {number} "
-            f"({jax.default_backend()}); give fewer, or --mesh alone for all.")
+            f"({jax.default_backend()}); give fewer, or --mesh alone for all."
+        )
     return Mesh(np.array([d for x in each for d in x[:per]]), ("devices",))
 
 
@@ -339,9 +357,14 @@ def _meet(launch: Launch, wait: float) -> None:
                 one.bind(("", port))
         except OSError as error:
             used = error.errno == errno.EADDRINUSE
-            raise ValueError(f"--coordinator {launch.coordinator}: "
-                             + (f"port {port} of this machine is in use; choose another."
-                                if used else f"{error.strerror}.")) from None
+            raise ValueError(
+                f"--coordinator {launch.coordinator}: "
+                + (
+                    f"port {port} of this machine is in use; choose another."
+                    if used
+                    else f"{error.strerror}."
+                )
+            ) from None
         return
     end = time.monotonic() + wait
     while True:
@@ -353,7 +376,8 @@ def _meet(launch: Launch, wait: float) -> None:
                 raise ValueError(
                     f"process {launch.process} has not reached process 0 at {launch.coordinator} "
                     f"in {wait:g} s ({error.strerror or error}); start it there, with the same "
-                    "--coordinator, or give it longer by --wait.") from None
+                    "--coordinator, or give it longer by --wait."
+                ) from None
         time.sleep(0.2)
 
 
@@ -365,11 +389,18 @@ def _join(launch: Launch, wait: float) -> None:
     if address is not None and _host_and_port(address)[0] in ("127.0.0.1", "localhost"):
         bind = address  # of no use to other machines, and so not open to them
     later: dict[str, Any] = {
-        "heartbeat_timeout_seconds": seconds, "shutdown_timeout_seconds": _TO_THE_END}
+        "heartbeat_timeout_seconds": seconds,
+        "shutdown_timeout_seconds": _TO_THE_END,
+    }
     known = inspect.signature(jax.distributed.initialize).parameters  # by the version of JAX
     jax.distributed.initialize(
-        address, launch.processes, launch.process, initialization_timeout=seconds,
-        coordinator_bind_address=bind, **{k: v for k, v in later.items() if k in known})
+        address,
+        launch.processes,
+        launch.process,
+        initialization_timeout=seconds,
+        coordinator_bind_address=bind,
+        **{k: v for k, v in later.items() if k in known},
+    )
 
 
 def _leave() -> None:
@@ -392,7 +423,10 @@ def _read_apart(launch: Launch) -> None:
     source, sink = os.pipe()
     subprocess.Popen(
         [sys.executable, "-I", "-S", str(Path(_teller.__file__)), str(launch.process)],
-        stdin=source, stdout=err, stderr=err)
+        stdin=source,
+        stdout=err,
+        stderr=err,
+    )
     os.close(source)
     os.dup2(sink, 1)
     os.dup2(sink, 2)
@@ -400,9 +434,16 @@ def _read_apart(launch: Launch) -> None:
     for name, number in (("stdout", out), ("stderr", err)):
         old = getattr(sys, name)
         old.flush()
-        setattr(sys, name, io.TextIOWrapper(
-            io.BufferedWriter(io.FileIO(number, "w")), encoding=old.encoding, errors=old.errors,
-            line_buffering=name == "stderr" or old.line_buffering))
+        setattr(
+            sys,
+            name,
+            io.TextIOWrapper(
+                io.BufferedWriter(io.FileIO(number, "w")),
+                encoding=old.encoding,
+                errors=old.errors,
+                line_buffering=name == "stderr" or old.line_buffering,
+            ),
+        )
     if launch.process:
         sys.stdout = io.TextIOWrapper(io.BufferedWriter(io.FileIO(os.devnull, "w")))
     with contextlib.suppress(ImportError, ValueError, OSError):  # no dump of all that it holds

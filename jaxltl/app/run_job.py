@@ -65,8 +65,14 @@ def make_directory(out: Path) -> Path:
 
 
 def run_job(
-    job: Any, task: Any, out: Path, seeds: tuple[int, int], mark: str, begin: Artist,
-    say: Callable[[str], None], place: Place,
+    job: Any,
+    task: Any,
+    out: Path,
+    seeds: tuple[int, int],
+    mark: str,
+    begin: Artist,
+    say: Callable[[str], None],
+    place: Place,
 ) -> dict[str, Any] | None:
     """Does the whole job, shows how far it is, and returns what ``result.json`` holds.
 
@@ -91,8 +97,15 @@ def run_job(
 
 
 def _done(
-    job: Any, task: Any, out: Path, seeds: tuple[int, int], mark: str, begin: Artist,
-    say: Callable[[str], None], place: Place, checkpoint: Path,
+    job: Any,
+    task: Any,
+    out: Path,
+    seeds: tuple[int, int],
+    mark: str,
+    begin: Artist,
+    say: Callable[[str], None],
+    place: Place,
+    checkpoint: Path,
 ) -> dict[str, Any] | None:
     from jaxltl.algos import checkpoint as files
 
@@ -114,8 +127,14 @@ def _done(
             bar.update(step - bar.n)
             bar.set_postfix(job.postfix(figures))
 
-        parts = job.learn(setup, *seeds, report=report, checkpoint=checkpoint,
-                          progress=bar.set_description_str, mesh=place.mesh)
+        parts = job.learn(
+            setup,
+            *seeds,
+            report=report,
+            checkpoint=checkpoint,
+            progress=bar.set_description_str,
+            mesh=place.mesh,
+        )
         if not place.is_first:
             return None
         files.remove(checkpoint)
@@ -146,8 +165,9 @@ def spread(num_seeds: int, place: Place) -> str:
     """
     number = place.num_devices
     if num_seeds == 1:
-        return ("one seed is learned on one device"
-                + ("" if number == 1 else ", and the others bring nothing; --seeds N uses them"))
+        return "one seed is learned on one device" + (
+            "" if number == 1 else ", and the others bring nothing; --seeds N uses them"
+        )
     most = -(-num_seeds // number)
     used = -(-num_seeds // most)
     enough = f"{used} devices are" if used > 1 else "one device is"
@@ -184,7 +204,10 @@ def _learning(total: int, *, shown: bool) -> Iterator[Any]:
 
 
 def _write(
-    job: Any, outcome: Any, out: Path, mark: str,
+    job: Any,
+    outcome: Any,
+    out: Path,
+    mark: str,
     pictures: list[tuple[Picture, Callable[[], bytes]]],
     live: list[tuple[Any, dict[str, Callable[[], bytes]]]],
 ) -> dict[str, Any]:

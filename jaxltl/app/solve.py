@@ -131,11 +131,15 @@ def load(path: Path) -> SparseMDP | IntervalMDP:
 
     model = read_model(path)
     if isinstance(model, Game):
-        raise ValueError(f"{str(path)!r} is a game; properties of chains and decision processes "
-                         "are solved, games by `jaxltl synthesize`.")
+        raise ValueError(
+            f"{str(path)!r} is a game; properties of chains and decision processes "
+            "are solved, games by `jaxltl synthesize`."
+        )
     if not isinstance(model, SparseMDP | IntervalMDP):
-        raise ValueError(f"{str(path)!r} holds a {type(model).__name__}; properties of chains and "
-                         "decision processes are solved.")
+        raise ValueError(
+            f"{str(path)!r} holds a {type(model).__name__}; properties of chains and "
+            "decision processes are solved."
+        )
     return model
 
 
@@ -172,7 +176,8 @@ def solve(
                     if isinstance(model, IntervalMDP):
                         raise ValueError(
                             f"{one.text}: several objectives are not solved for where "
-                            "probabilities are intervals; ask for one at a time.")
+                            "probabilities are intervals; ask for one at a time."
+                        )
                     found = answer_several(model, one.parsed, tolerance=tolerance)
                 else:
                     found = solve_property(model, one.parsed, tolerance=tolerance)
@@ -192,15 +197,25 @@ def solve(
 def model_entry(model: SparseMDP | IntervalMDP, seconds: float) -> dict[str, Any]:
     """The model's part of the JSON object."""
     kinds = ("idtmc", "imdp") if isinstance(model, IntervalMDP) else ("chain", "mdp")
-    return {"kind": kinds[not model.is_chain], "states": model.num_states,
-            "choices": model.num_rows, "transitions": model.num_transitions, "seconds": seconds}
+    return {
+        "kind": kinds[not model.is_chain],
+        "states": model.num_states,
+        "choices": model.num_rows,
+        "transitions": model.num_transitions,
+        "seconds": seconds,
+    }
 
 
 def result_entry(result: Result) -> dict[str, Any]:
     """A result as its JSON object."""
     found = result.answer
-    entry: dict[str, Any] = {"property": result.asked.text, "value": None, "lower": None,
-                             "upper": None, "status": "INVALID"}
+    entry: dict[str, Any] = {
+        "property": result.asked.text,
+        "value": None,
+        "lower": None,
+        "upper": None,
+        "status": "INVALID",
+    }
     if result.asked.parsed is not None and result.asked.parsed.name is not None:
         entry["name"] = result.asked.parsed.name
     if isinstance(found, Answer):
@@ -208,7 +223,9 @@ def result_entry(result: Result) -> dict[str, Any]:
             "value": _over_states(found.value.tolist() if found.holds is None else found.holds),
             "lower": _over_states(found.lower.tolist()),
             "upper": _over_states(found.upper.tolist()),
-            "status": found.status.name, "method": found.method}
+            "status": found.status.name,
+            "method": found.method,
+        }
         if found.states.size > 1:
             entry["states"] = found.states.tolist()
     elif found is not None:
@@ -228,13 +245,19 @@ def _several_entry(found: Achievable | ConstrainedOptimum | Pareto) -> dict[str,
         return entry | {"value": points, "gap": _number(float(found.gap))}
     if found.nearest is not None:
         near = found.nearest
-        entry["nearest"] = {"lower": _over_states(near.lower.tolist()),
-                            "upper": _over_states(near.upper.tolist()),
-                            "gap": _over_states(near.gap.tolist())}
+        entry["nearest"] = {
+            "lower": _over_states(near.lower.tolist()),
+            "upper": _over_states(near.upper.tolist()),
+            "gap": _over_states(near.gap.tolist()),
+        }
     if isinstance(found, Achievable):
         return entry | {"value": found.holds}
-    return entry | {"value": _number(found.value), "lower": _number(found.lower),
-                    "upper": _number(found.upper), "achievable": found.holds}
+    return entry | {
+        "value": _number(found.value),
+        "lower": _number(found.lower),
+        "upper": _number(found.upper),
+        "achievable": found.holds,
+    }
 
 
 def _over_states(values: list[Any]) -> Any:
@@ -290,10 +313,13 @@ def _several_text(found: Achievable | ConstrainedOptimum | Pareto) -> list[str]:
     lines = [f"  the thresholds can be met: {verdict}"]
     if found.nearest is not None:
         near = found.nearest
-        lines += [f"  attained: in [{low!r}, {high!r}]"
-                  + (f", at most {gap:.1e} short of what is asked" if gap else "")
-                  for low, high, gap in zip(near.lower.tolist(), near.upper.tolist(),
-                                            near.gap.tolist(), strict=True)]
+        lines += [
+            f"  attained: in [{low!r}, {high!r}]"
+            + (f", at most {gap:.1e} short of what is asked" if gap else "")
+            for low, high, gap in zip(
+                near.lower.tolist(), near.upper.tolist(), near.gap.tolist(), strict=True
+            )
+        ]
     return lines
 
 
@@ -310,14 +336,15 @@ def _value_text(found: Answer, i: int) -> str:
 # --- strategies -------------------------------------------------------------------------------
 
 
-def strategies(
-    model: SparseMDP | IntervalMDP, results: Sequence[Result], source: Path
-) -> bytes:
+def strategies(model: SparseMDP | IntervalMDP, results: Sequence[Result], source: Path) -> bytes:
     """A file of the strategies that attain the answers, as JSON; see docs/solve.md."""
     found = [
         {"property": r.asked.text, **_strategy(model, r.answer.strategy)}
-        for r in results if isinstance(r.answer, Answer) and r.answer.strategy is not None
-        and (isinstance(model, IntervalMDP) or not model.is_chain)]
+        for r in results
+        if isinstance(r.answer, Answer)
+        and r.answer.strategy is not None
+        and (isinstance(model, IntervalMDP) or not model.is_chain)
+    ]
     table = {"model": source.name, "states": model.num_states, "strategies": found}
     return (json.dumps(table, allow_nan=False) + "\n").encode()
 
@@ -342,16 +369,21 @@ def _strategy(given: SparseMDP | IntervalMDP, strategy: PropertyStrategy) -> dic
     if strategy.nature is not None:
         entry["letter_of"] = "the state that is left"
         entry["nature"] = _nature(
-            product.host, product.base_state[product.host.successor], strategy.nature,
-            product.still)
+            product.host, product.base_state[product.host.successor], strategy.nature, product.still
+        )
     return {
         "kind": "memory",
         "initial": np.stack([product.base_state[start], product.memory[start]], 1).tolist(),
-        "letters": [sorted(p for p, holds in zip(found.automaton.propositions, letter, strict=True)
-                           if holds) for letter in found.automaton.letters],
+        "letters": [
+            sorted(
+                p for p, holds in zip(found.automaton.propositions, letter, strict=True) if holds
+            )
+            for letter in found.automaton.letters
+        ],
         "letter": found.letter.tolist(),
         "update": found.automaton.delta.tolist(),
-        "state": product.base_state.tolist(), "memory": product.memory.tolist(),
+        "state": product.base_state.tolist(),
+        "memory": product.memory.tolist(),
         **{k: v for k, v in entry.items() if k != "kind"},
     }
 
@@ -369,11 +401,13 @@ def _nature(
     """
     names, mass = list(map(str, successor.tolist())), probability.tolist()
     starts = host.entry_start.tolist()
-    rows = [{names[t]: mass[t] for t in range(a, b) if mass[t]}
-            for a, b in pairwise(starts)]
+    rows = [{names[t]: mass[t] for t in range(a, b) if mass[t]} for a, b in pairwise(starts)]
     found = [rows[a:b] for a, b in pairwise(host.row_start.tolist())]
-    return found if still is None else [
-        [] if stands else x for x, stands in zip(found, still.tolist(), strict=True)]
+    return (
+        found
+        if still is None
+        else [[] if stands else x for x, stands in zip(found, still.tolist(), strict=True)]
+    )
 
 
 def _names(model: SparseMDP) -> Callable[[np.ndarray], list[str]] | None:

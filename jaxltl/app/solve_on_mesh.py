@@ -1,5 +1,4 @@
-"""Solving properties over the devices of a mesh, saved on the way: what `jaxltl solve --mesh` does.
-"""
+"""Solving properties over the devices of a mesh, saved on the way: what `jaxltl solve --mesh` does."""
 
 from __future__ import annotations
 
@@ -44,8 +43,9 @@ def on_mesh(model: SparseMDP | IntervalMDP, place: Place) -> ShardedMDP:
       ValueError: it has intervals, or fewer states than there are devices.
     """
     if isinstance(model, IntervalMDP):
-        raise ValueError("models whose probabilities are intervals are not solved over a mesh; "
-                         "leave --mesh out.")
+        raise ValueError(
+            "models whose probabilities are intervals are not solved over a mesh; leave --mesh out."
+        )
     missing = tuple(x for x in BUILT_IN if x not in model.propositions)
     label = np.hstack([np.asarray(model.label), label_columns(model, missing, "the model")])
     whole = replace(model, label=label, propositions=(*model.propositions, *missing))
@@ -94,23 +94,39 @@ def _entry(model: ShardedMDP, seconds: float) -> dict[str, Any]:
     ours = filled if model.place is None else model.num_devices  # rows of what is filled
     transitions = sum(count(table.probability) for table in model.tables) - ours
     kind = "chain" if choices == model.num_given else "mdp"
-    return {"kind": kind, "states": model.num_given, "choices": choices,
-            "transitions": transitions, "seconds": seconds}
+    return {
+        "kind": kind,
+        "states": model.num_given,
+        "choices": choices,
+        "transitions": transitions,
+        "seconds": seconds,
+    }
 
 
 def solve_in(
-    place: Place, model: ShardedMDP, given: Mapping[str, str], asked: Sequence[Asked],
-    tolerance: float, directory: Path | None, properties: list[str],
+    place: Place,
+    model: ShardedMDP,
+    given: Mapping[str, str],
+    asked: Sequence[Asked],
+    tolerance: float,
+    directory: Path | None,
+    properties: list[str],
 ) -> Iterator[Result]:
     """The result of each property, when the processes have agreed on what is asked.
 
     Raises:
       ValueError: they were not asked the same, or the directory is not one of all.
     """
-    place.agree({"the model": hashlib.sha256(repr(sorted(given.items())).encode()).hexdigest(),
-                 "the properties": properties, "--tolerance": tolerance,
-                 "--checkpoint": directory, "jax": jax.__version__,
-                 "jaxltl": jaxltl.__version__})
+    place.agree(
+        {
+            "the model": hashlib.sha256(repr(sorted(given.items())).encode()).hexdigest(),
+            "the properties": properties,
+            "--tolerance": tolerance,
+            "--checkpoint": directory,
+            "jax": jax.__version__,
+            "jaxltl": jaxltl.__version__,
+        }
+    )
     if directory is not None:
         place.together(lambda: make_directory(directory) if place.is_first else None)
         place.sees(str(directory), directory.is_dir())
@@ -118,8 +134,12 @@ def solve_in(
 
 
 def solve_on_mesh(
-    model: ShardedMDP, given: Mapping[str, str], asked: Sequence[Asked], tolerance: float,
-    place: Place, directory: Path | None,
+    model: ShardedMDP,
+    given: Mapping[str, str],
+    asked: Sequence[Asked],
+    tolerance: float,
+    place: Place,
+    directory: Path | None,
 ) -> Iterator[Result]:
     """The result of each property, as soon as it is there.
 
@@ -148,7 +168,11 @@ def solve_on_mesh(
 
 
 def _answered(
-    model: ShardedMDP, given: Mapping[str, str], prop: Property, tolerance: float, place: Place,
+    model: ShardedMDP,
+    given: Mapping[str, str],
+    prop: Property,
+    tolerance: float,
+    place: Place,
     directory: Path | None,
 ) -> Answer:
     question = question_on_mesh(model, prop)
@@ -188,8 +212,12 @@ def _name(given: Mapping[str, str]) -> str:
 
 
 def _state(model: ShardedMDP, bounds: Bounds, part: int, made: int) -> dict[str, Any]:
-    return {"bounds": bounds, "devices": np.int32(model.num_devices), "part": np.int32(part),
-            "made": np.int32(made)}
+    return {
+        "bounds": bounds,
+        "devices": np.int32(model.num_devices),
+        "part": np.int32(part),
+        "made": np.int32(made),
+    }
 
 
 def _restored(
@@ -206,9 +234,11 @@ def _restored(
         found = files.load(path, {**small, "bounds": empty}, given)
         count, size = model.num_given, -(-model.num_given // devices)
         begins = np.arange(devices + 1) * count // devices
-        each = np.concatenate([np.arange(b - a) + i * size
-                               for i, (a, b) in enumerate(pairwise(begins))])
+        each = np.concatenate(
+            [np.arange(b - a) + i * size for i, (a, b) in enumerate(pairwise(begins))]
+        )
         found["bounds"] = tuple(
-            to_mesh(model, np.asarray(x)[each], fill) for x, fill in
-            zip(found["bounds"], (0, 1), strict=True))
+            to_mesh(model, np.asarray(x)[each], fill)
+            for x, fill in zip(found["bounds"], (0, 1), strict=True)
+        )
     return found["bounds"], int(found["part"]), int(found["made"])

@@ -245,8 +245,9 @@ def lost_play(nodes: Nodes, winning: Winning, node: int, actions: tuple[str, ...
             return Play(steps, met[node, memory], False, bool(by_chance))
         met[node, memory] = len(steps) - 1
     # An automaton reads the label of the state that is left, so the step before decides.
-    return Play(steps[: max(1, len(steps) - (nodes.automaton is not None))], None, True,
-                bool(by_chance))
+    return Play(
+        steps[: max(1, len(steps) - (nodes.automaton is not None))], None, True, bool(by_chance)
+    )
 
 
 def _failed(nodes: Nodes, objective: Parity | GR1) -> np.ndarray:

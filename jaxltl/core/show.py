@@ -34,12 +34,19 @@ def brief(cls: Class, /) -> Class: ...
 
 @overload
 def brief(
-    *, facts: Facts | None = None, drawn: bool = False, codes: Mapping[str, Any] = ...,
+    *,
+    facts: Facts | None = None,
+    drawn: bool = False,
+    codes: Mapping[str, Any] = ...,
 ) -> Callable[[Class], Class]: ...
 
 
 def brief(
-    cls: Any = None, /, *, facts: Facts | None = None, drawn: bool = False,
+    cls: Any = None,
+    /,
+    *,
+    facts: Facts | None = None,
+    drawn: bool = False,
     codes: Mapping[str, Any] | None = None,
 ) -> Any:
     """A class whose ``repr`` is short, whatever its fields hold.
@@ -159,8 +166,11 @@ def over(propositions: Sequence[str]) -> str:
 
 def lanes(shape: Sequence[int]) -> str:
     """How many there are side by side; nothing where there is one."""
-    return count(shape[0], "lane") if len(shape) == 1 else (
-        f"{' x '.join(f'{n:,}' for n in shape)} lanes" if shape else "")
+    return (
+        count(shape[0], "lane")
+        if len(shape) == 1
+        else (f"{' x '.join(f'{n:,}' for n in shape)} lanes" if shape else "")
+    )
 
 
 # --- arrays ---------------------------------------------------------------------------------------

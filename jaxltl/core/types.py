@@ -42,7 +42,7 @@ class Status(enum.IntEnum):
 
 _REMEDY = {
     Status.UNCERTIFIED: "nothing bounds the error here; check(..., certified=False) accepts a "
-                        "small residual in place of a bound",
+    "small residual in place of a bound",
     Status.PRECISION: "rounding alone exceeds the tolerance; loosen it, or use float64",
     Status.MAX_STEPS: "raise max_steps, loosen tolerance, or use float64",
     Status.NONFINITE: "look for NaN or infinity in the reward, the policy or the discount",
@@ -91,8 +91,11 @@ class Method:
 
 def _facts(solution: Any) -> Iterator[str]:
     more = solution.status.shape
-    yield f"{lanes(more)}: {coded(solution.status, Status)}" if more else (
-        coded(solution.status, Status))
+    yield (
+        f"{lanes(more)}: {coded(solution.status, Status)}"
+        if more
+        else (coded(solution.status, Status))
+    )
     yield f"value {told(solution.value)}"
     yield apart(solution.lower, solution.upper)
     steps = span(solution.num_steps)
@@ -211,8 +214,7 @@ def status_code(
       valid: whether what it was given is allowed.
     """
     code = jnp.where(exhausted, Status.PRECISION, Status.MAX_STEPS)
-    code = jnp.where(
-        converged, jnp.where(certified, Status.CONVERGED, Status.UNCERTIFIED), code)
+    code = jnp.where(converged, jnp.where(certified, Status.CONVERGED, Status.UNCERTIFIED), code)
     code = jnp.where(finite, code, Status.NONFINITE)
     return jnp.where(valid, code, Status.INVALID).astype(jnp.int32)
 
@@ -247,8 +249,10 @@ def _invalid_weights(policy: np.ndarray) -> str:
     """What is wrong with weights ``[R]`` of a sparse model's choices; the states are not known."""
     if (bad := ~(policy >= 0)).any():
         row = int(np.argmax(bad))
-        return (f"the policy's weight of choice {row} is {policy[row]:.4g}; give each state a "
-                "distribution over its choices")
+        return (
+            f"the policy's weight of choice {row} is {policy[row]:.4g}; give each state a "
+            "distribution over its choices"
+        )
     return "the policy's weights of some state's choices do not sum to 1; give it a distribution"
 
 
@@ -262,8 +266,10 @@ def describe_row(row: np.ndarray, state: tuple[Any, ...]) -> str:
         what = f"has the negative probability {row.min():.4g}"
     else:
         what = f"sums to {row.sum():.6g}, not 1"
-    return (f"the policy's row {shown} of state {where} {what}; give each state a distribution "
-            "over its available actions")
+    return (
+        f"the policy's row {shown} of state {where} {what}; give each state a distribution "
+        "over its available actions"
+    )
 
 
 def require_shape(name: str, array: Any, shape: tuple[int, ...]) -> None:

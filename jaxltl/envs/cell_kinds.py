@@ -35,7 +35,9 @@ def many_objects(num: int) -> dict[str, dict[str, int]]:
       {'purple': 5, 'black': 4}
     """
     pairs = [
-        (inside, around) for around in reversed(COLORS) for inside in COLORS
+        (inside, around)
+        for around in reversed(COLORS)
+        for inside in COLORS
         if inside not in (around, "black")
     ]
     if not 0 <= num <= len(pairs):

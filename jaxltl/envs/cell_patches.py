@@ -86,8 +86,11 @@ def _stamp(colors: NDArray[np.int64], stamp: NDArray[np.int64], row: int, column
 
 
 def filled(
-    random: np.random.Generator, colors: NDArray[np.int64], kind: NDArray[np.int32],
-    codes: NDArray[np.int64], margin: int,
+    random: np.random.Generator,
+    colors: NDArray[np.int64],
+    kind: NDArray[np.int32],
+    codes: NDArray[np.int64],
+    margin: int,
 ) -> NDArray[np.int64]:
     """Random colours for free cells that make nothing that is not planned, and outer rings."""
     free = colors == FREE
@@ -114,8 +117,12 @@ def filled(
 
 
 def placed(
-    random: np.random.Generator, shape: tuple[int, int], counts: Sequence[int],
-    distances: Sequence[int], num_objects: int, stamps: list[NDArray[np.int64]],
+    random: np.random.Generator,
+    shape: tuple[int, int],
+    counts: Sequence[int],
+    distances: Sequence[int],
+    num_objects: int,
+    stamps: list[NDArray[np.int64]],
     codes: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]] | None:
     """Patches in random cells and the kinds of cells, or None if there is no room.

@@ -29,13 +29,28 @@ from jaxltl.core.show import brief
 
 # Colour, place and radius of each disc.
 DISCS = (
-    ("red", -1.4, 0.55, 0.4), ("magenta", -1.1, 1.1, 0.5), ("yellow", -1.0, -1.2, 0.3),
-    ("orange", -1.53, -0.5, 0.32), ("blue", 0.1, 0.0, 0.8), ("red", 0.5, -1.3, 0.35),
-    ("green", 0.7, 0.7, 0.5), ("green", 1.5, -0.75, 0.4), ("aqua", 0.8, 0.2, 0.3),
+    ("red", -1.4, 0.55, 0.4),
+    ("magenta", -1.1, 1.1, 0.5),
+    ("yellow", -1.0, -1.2, 0.3),
+    ("orange", -1.53, -0.5, 0.32),
+    ("blue", 0.1, 0.0, 0.8),
+    ("red", 0.5, -1.3, 0.35),
+    ("green", 0.7, 0.7, 0.5),
+    ("green", 1.5, -0.75, 0.4),
+    ("aqua", 0.8, 0.2, 0.3),
 )
-_ROOT = 0.5 ** 0.5
-_MOVES = ((0, 1), (1, 0), (0, -1), (-1, 0), (_ROOT, _ROOT), (_ROOT, -_ROOT), (-_ROOT, _ROOT),
-          (-_ROOT, -_ROOT), (0, 0))
+_ROOT = 0.5**0.5
+_MOVES = (
+    (0, 1),
+    (1, 0),
+    (0, -1),
+    (-1, 0),
+    (_ROOT, _ROOT),
+    (_ROOT, -_ROOT),
+    (-_ROOT, _ROOT),
+    (-_ROOT, -_ROOT),
+    (0, 0),
+)
 
 
 @brief
@@ -113,17 +128,19 @@ def flat_world(
     names = tuple(sorted({name for name, *_ in rows}))
     numbers = given.numbers("discs", [row[1:] for row in rows]).astype(np.float32).reshape(-1, 3)
     if not len(numbers) or not np.isfinite(numbers).all() or not (numbers[:, 2] > 0).all():
-        raise ValueError("flat_world: discs are (colour, x, y, radius), at least one, with radii "
-                         "above zero.")
+        raise ValueError(
+            "flat_world: discs are (colour, x, y, radius), at least one, with radii above zero."
+        )
     extent, time_step = given.number("extent", extent), given.number("time_step", time_step)
     num_starts = given.whole("num_starts", num_starts, least=1, most=2**26)
     seed, discrete = given.whole("seed", seed), given.truth("discrete", discrete)
     if not (0 < extent < 1e6 and 0 < time_step < 1e6):
         raise ValueError(
-            f"extent={extent}, time_step={time_step}; both must be positive, and below a million.")
+            f"extent={extent}, time_step={time_step}; both must be positive, and below a million."
+        )
     if start is not None and not (
-            np.shape(place := given.numbers("start", start)) == (2,)
-            and np.abs(place).max() <= extent):
+        np.shape(place := given.numbers("start", start)) == (2,) and np.abs(place).max() <= extent
+    ):
         raise ValueError(f"start={start!r}; give a place (x, y) within {extent} of the middle.")
     color = np.array([[name == one for one in names] for name, *_ in rows])
     scene = Discs(numbers[:, :2], numbers[:, 2], color, np.float32(extent))
@@ -135,9 +152,14 @@ def flat_world(
     velocity: Any = 9 if discrete else make_box(-1, 1, (2,), np.float32)
     most = extent + time_step  # of the step that leaves the square the place outside is seen
     world = make_environment(
-        reset, Partial(_move, number, np.array(_MOVES, np.float32) if discrete else None), _see,
-        actions=velocity, labels=Partial(_labels, scene), propositions=names,
-        observations=make_box(-most, most, (2,), np.float32))
+        reset,
+        Partial(_move, number, np.array(_MOVES, np.float32) if discrete else None),
+        _see,
+        actions=velocity,
+        labels=Partial(_labels, scene),
+        propositions=names,
+        observations=make_box(-most, most, (2,), np.float32),
+    )
     return world if horizon is None else with_time_limit(world, horizon)
 
 
@@ -224,17 +246,29 @@ def events_around(
     """
     scene, rows = discs_of(environment), given.numbers("events", events).astype(bool)
     if rows.ndim != 2 or not len(rows) or rows.shape[1] != len(environment.propositions):
-        raise ValueError(f"events has shape {list(rows.shape)}; give Booleans "
-                         f"[E, {len(environment.propositions)}], a column for each colour.")
+        raise ValueError(
+            f"events has shape {list(rows.shape)}; give Booleans "
+            f"[E, {len(environment.propositions)}], a column for each colour."
+        )
     far = given.numbers("radii", radii)
     if far.ndim != 1 or not ((far > 0) & np.isfinite(far)).all():
         raise ValueError(f"radii={far.tolist()}; give distances, all positive.")
-    discs = [(*center, radius, color) for center, radius, color in zip(
-        np.asarray(scene.center).tolist(), np.asarray(scene.radius).tolist(),
-        np.argmax(scene.color, -1).tolist(), strict=True)]
+    discs = [
+        (*center, radius, color)
+        for center, radius, color in zip(
+            np.asarray(scene.center).tolist(),
+            np.asarray(scene.radius).tolist(),
+            np.argmax(scene.color, -1).tolist(),
+            strict=True,
+        )
+    ]
     return EventsAround(
-        tuple(map(tuple, rows.tolist())), tuple(discs), float(scene.extent), tuple(far.tolist()),
-        given.whole("directions", directions, least=1, most=2**10))
+        tuple(map(tuple, rows.tolist())),
+        tuple(discs),
+        float(scene.extent),
+        tuple(far.tolist()),
+        given.whole("directions", directions, least=1, most=2**10),
+    )
 
 
 def _free_places(scene: Discs, extent: float, count: int, seed: int) -> np.ndarray:

@@ -77,9 +77,7 @@ def gridworld(
         probability = np.broadcast_to([1 - slip, slip / 2, slip / 2], successor.shape)
     if initial is None or isinstance(initial, str):
         initial = _initial(initial, label, propositions, ~is_wall)
-    return make_mdp(
-        successor, probability, initial=initial, label=label, propositions=propositions
-    )
+    return make_mdp(successor, probability, initial=initial, label=label, propositions=propositions)
 
 
 def _labels(

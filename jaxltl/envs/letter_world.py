@@ -118,7 +118,8 @@ def letter_world(
         if size < 2 or copies < 1 or used >= size * size:
             raise ValueError(
                 f"letter_world: {len(names)} letters on {copies} cells each do not fit on "
-                f"{size} x {size} cells with one left for the agent.")
+                f"{size} x {size} cells with one left for the agent."
+            )
         if connected:
             maps = connected_cells(size, used, num_maps, seed)
             reset = Partial(_draw_connected, *_orders(maps, size), np.zeros((copies, len(names))))
@@ -136,10 +137,15 @@ def letter_world(
     views, count = _views(size), len(names)
     shape = (size * size * (count + 1),) if flat else (size, size, count + 1)
     made = make_environment(
-        reset, Partial(_move, _neighbors(size)), Partial(_see, views, np.zeros(shape, np.float32),
-                                                         np.arange(count + 1, dtype=np.int8)),
-        actions=4, labels=Partial(_labels, np.arange(count, dtype=np.int8)), propositions=names,
-        observations=make_box(0, 1, shape, np.float32), starts=starts)
+        reset,
+        Partial(_move, _neighbors(size)),
+        Partial(_see, views, np.zeros(shape, np.float32), np.arange(count + 1, dtype=np.int8)),
+        actions=4,
+        labels=Partial(_labels, np.arange(count, dtype=np.int8)),
+        propositions=names,
+        observations=make_box(0, 1, shape, np.float32),
+        starts=starts,
+    )
     return made if horizon is None else with_time_limit(made, horizon)
 
 
@@ -161,19 +167,26 @@ def _given(
         for name in found:
             if name not in names:
                 raise ValueError(
-                    f"layout: {name!r} is none of the letters {list(names)}; name it in letters=.")
+                    f"layout: {name!r} is none of the letters {list(names)}; name it in letters=."
+                )
         number = {".": len(names)} | {name: i for i, name in enumerate(names)}
         table = np.array([[number[str(x)] for x in row] for row in cells])
     else:
         table = np.asarray(layout)
-        if table.dtype.kind not in "iu" or table.ndim != 2 or (
-                table.size and not -1 <= table.min() <= table.max() < len(names)):
+        if (
+            table.dtype.kind not in "iu"
+            or table.ndim != 2
+            or (table.size and not -1 <= table.min() <= table.max() < len(names))
+        ):
             raise ValueError(
-                f"layout: give a text, or integers [size, size] from -1 to {len(names) - 1}.")
+                f"layout: give a text, or integers [size, size] from -1 to {len(names) - 1}."
+            )
         table = np.where(table < 0, len(names), table)
     if len(set(table.shape)) != 1 or len(table) < 2:
-        raise ValueError(f"layout has {' x '.join(map(str, table.shape))} cells; it must be square "
-                         "and have at least 2 x 2.")
+        raise ValueError(
+            f"layout has {' x '.join(map(str, table.shape))} cells; it must be square "
+            "and have at least 2 x 2."
+        )
     return table.ravel().astype(np.int8), len(table), names
 
 
@@ -205,7 +218,8 @@ def connected_cells(size: int, used: int, count: int, seed: int = 0) -> np.ndarr
         if (tries := tries + 1) > 200 + 200 * have:
             raise ValueError(
                 f"letter_world: connected maps of {size} x {size} cells, {used} of them with "
-                "letters, are too rare; take fewer letters, or connected=False.")
+                "letters, are too rare; take fewer letters, or connected=False."
+            )
         some = random.permuted(np.tile(np.arange(size * size) < used, (8192, 1)), axis=1)
         found.append(some[is_connected(some.reshape(-1, size, size))])
     return np.concatenate(found)[:count]
@@ -221,6 +235,7 @@ def is_connected(used: np.ndarray) -> np.ndarray:
       >>> is_connected(np.array([[[1, 0], [0, 0]], [[0, 1], [1, 0]]], bool)).tolist()
       [True, False]
     """
+
     def beside(x: np.ndarray) -> np.ndarray:
         return np.roll(x, 1, 1) | np.roll(x, -1, 1) | np.roll(x, 1, 2) | np.roll(x, -1, 2)
 
@@ -248,8 +263,9 @@ def _orders(maps: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _neighbors(size: int) -> np.ndarray:
     row, column = np.divmod(np.arange(size * size), size)
-    return np.stack([(row + i) % size * size + (column + j) % size for i, j in _MOVES],
-                    axis=1).astype(np.int32)
+    return np.stack(
+        [(row + i) % size * size + (column + j) % size for i, j in _MOVES], axis=1
+    ).astype(np.int32)
 
 
 def _views(size: int) -> np.ndarray:
@@ -310,7 +326,7 @@ def _see(
     seen = world.letter[jnp.asarray(views)[world.place]]
     cells, count = views.shape[0], numbers.shape[0] - 1
     planes = seen[:, None] == numbers
-    size = round(cells ** 0.5)
+    size = round(cells**0.5)
     middle = jnp.arange(cells) == size // 2 * (size + 1)
     planes = planes.at[:, count].set(middle)
     return planes.astype(jnp.float32).reshape(shape.shape)

@@ -122,8 +122,11 @@ def lqr(
     x = np.asarray(start, float)
     n, m = len(a), b.shape[-1]
     for name, found, shape in (
-        ("dynamics", a, (n, n)), ("control", b, (n, m)), ("state_cost", q, (n, n)),
-        ("control_cost", r, (m, m)), ("start", x, (n,)),
+        ("dynamics", a, (n, n)),
+        ("control", b, (n, m)),
+        ("state_cost", q, (n, n)),
+        ("control_cost", r, (m, m)),
+        ("start", x, (n,)),
     ):
         if found.shape != shape:
             raise ValueError(f"{name} has shape {list(found.shape)}; expected {list(shape)}.")
@@ -238,7 +241,9 @@ def _plain(network: Network, world: LQR, parameters: jax.Array) -> tuple[jax.Arr
     since whole chains of steps were then computed again for every number that they lead to."""
     world = _as(world, parameters)
     _, total, violation = lax.fori_loop(
-        0, world.horizon, lambda _, carry: _step(network, world, parameters, carry)[0],
+        0,
+        world.horizon,
+        lambda _, carry: _step(network, world, parameters, carry)[0],
         _start(world, parameters),
     )
     return _finished(total, violation)
@@ -356,8 +361,12 @@ def as_environment(world: LQR, dtype: Any = None) -> Environment:
     world = jax.tree.map(lambda x: np.asarray(x, dtype), world)
     reset, step = (jax.tree_util.Partial(f, world) for f in (_first_state, _controlled))
     return make_environment(
-        reset, step, _observed, actions=make_box(-np.inf, np.inf, world.control.shape[-1:], dtype),
-        horizon=world.horizon)
+        reset,
+        step,
+        _observed,
+        actions=make_box(-np.inf, np.inf, world.control.shape[-1:], dtype),
+        horizon=world.horizon,
+    )
 
 
 def _first_state(world: LQR, key: Any) -> Plant:
@@ -376,8 +385,7 @@ def _controlled(world: LQR, plant: Plant, control: jax.Array, key: Any) -> Times
     none = jnp.zeros_like(plant.violation)
     state, total, violation = _after(world, plant.state, control, none, plant.violation)
     after = Plant(state, violation, plant.time + 1)
-    return Timestep(
-        after, -total, after.time >= world.horizon, cost=violation - plant.violation)
+    return Timestep(after, -total, after.time >= world.horizon, cost=violation - plant.violation)
 
 
 # --- the best controls, on the host -----------------------------------------------------------
@@ -406,9 +414,15 @@ def optimum(world: LQR) -> Optimum:
     from scipy.optimize import lsq_linear
 
     a, b, q, r, low, high, start = (
-        np.asarray(x, float) for x in (
-            world.dynamics, world.control, world.state_cost, world.control_cost, world.low,
-            world.high, world.start,
+        np.asarray(x, float)
+        for x in (
+            world.dynamics,
+            world.control,
+            world.state_cost,
+            world.control_cost,
+            world.low,
+            world.high,
+            world.start,
         )
     )
     matrix, offset = _least_squares(a, b, q, r, start, world.horizon)
@@ -418,8 +432,11 @@ def optimum(world: LQR) -> Optimum:
     if not pinned.all():
         free = ~pinned
         found = lsq_linear(
-            matrix[:, free], -offset - matrix[:, pinned] @ u[pinned],
-            (bounds[0][free], bounds[1][free]), method="bvls", tol=1e-15,
+            matrix[:, free],
+            -offset - matrix[:, pinned] @ u[pinned],
+            (bounds[0][free], bounds[1][free]),
+            method="bvls",
+            tol=1e-15,
             max_iter=100 * len(u),
         )
         if not found.success:

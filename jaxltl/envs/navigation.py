@@ -157,8 +157,14 @@ def navigation(
     """
     boxes = {"goal": goal, "obstacle": obstacle, "bounds": bounds, "start": start}
     corners = {name: _box(name, box) for name, box in boxes.items()}
-    sizes = {"speed": speed, "turn": turn, "time_step": time_step, "num_directions": num_directions,
-             "horizon": horizon, "the least of radii": min(radii, default=0)}
+    sizes = {
+        "speed": speed,
+        "turn": turn,
+        "time_step": time_step,
+        "num_directions": num_directions,
+        "horizon": horizon,
+        "the least of radii": min(radii, default=0),
+    }
     for name, size in sizes.items():
         if not size > 0:
             raise ValueError(f"{name} is {size}; it must be positive.")
@@ -171,8 +177,7 @@ def navigation(
     # NumPy's, so that a computation in either precision starts from the exact numbers.
     numbers = {"speed": speed, "turn": turn, "time_step": time_step, "weight": weight}
     arrays = {name: np.asarray(x, float) for name, x in numbers.items()}
-    return Navigation(
-        **corners, **arrays, offset=offset, strip=low_high, horizon=int(horizon))
+    return Navigation(**corners, **arrays, offset=offset, strip=low_high, horizon=int(horizon))
 
 
 def _box(name: str, corners: ArrayLike) -> np.ndarray:
@@ -254,7 +259,8 @@ def move(world: Navigation, state: State, action: jax.Array) -> State:
     y = state.y + way * jnp.sin(state.heading)
     (left, bottom), (right, top) = world.bounds
     return State(
-        jnp.clip(x, left, right), jnp.clip(y, bottom, top),
+        jnp.clip(x, left, right),
+        jnp.clip(y, bottom, top),
         _wrapped(state.heading + world.turn * share[..., 1]),
     )
 
@@ -330,7 +336,8 @@ def labels(world: Navigation, state: State) -> jax.Array:
     """
     world = _as(world, state.x)
     return jnp.stack(
-        [_inside(box, state.x, state.y) for box in (world.goal, world.obstacle)], axis=-1)
+        [_inside(box, state.x, state.y) for box in (world.goal, world.obstacle)], axis=-1
+    )
 
 
 def obstacle_distance(world: Navigation, state: State) -> jax.Array:
@@ -453,7 +460,10 @@ def simulate(
 
 @jax.jit  # so that calls outside of jit share one compilation
 def _simulate(
-    network: Network, settings: _Static, world: Navigation, parameters: jax.Array,
+    network: Network,
+    settings: _Static,
+    world: Navigation,
+    parameters: jax.Array,
     key: chex.PRNGKey,
 ) -> Run:
     num_trajectories, absorbing = settings.value
@@ -539,11 +549,16 @@ def _table_4(task: _Static, world: Navigation, run: Run) -> tuple[jax.Array, jax
 
 @jax.jit
 def _evaluate(
-    network: Network, settings: _Static, world: Navigation, score: Scores, parameters: jax.Array,
+    network: Network,
+    settings: _Static,
+    world: Navigation,
+    score: Scores,
+    parameters: jax.Array,
     key: chex.PRNGKey,
 ) -> tuple[jax.Array, jax.Array]:
     num_trajectories, absorbing = settings.value
     run = simulate(
-        world, network, parameters, key, num_trajectories=num_trajectories, absorbing=absorbing)
+        world, network, parameters, key, num_trajectories=num_trajectories, absorbing=absorbing
+    )
     objective, cost = score(world, run)
     return objective.mean(axis=0), cost.mean(axis=0)

@@ -92,12 +92,20 @@ def as_environment(
         raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4.")
     stays = task == 1 if absorbing is None else given.truth("absorbing", absorbing)
     settings = _Settings(
-        jnp.int32(task), jnp.bool_(stays), np.dtype(dtype or jnp.result_type(float)))
+        jnp.int32(task), jnp.bool_(stays), np.dtype(dtype or jnp.result_type(float))
+    )
     reset, step, observe, labels = (
-        jax.tree_util.Partial(f, settings, world) for f in (_reset, _step, _observe, _labels))
+        jax.tree_util.Partial(f, settings, world) for f in (_reset, _step, _observe, _labels)
+    )
     return make_environment(
-        reset, step, observe, actions=make_box(-1, 1, (2,), settings.dtype), labels=labels,
-        propositions=nav.PROPOSITIONS, horizon=world.horizon)
+        reset,
+        step,
+        observe,
+        actions=make_box(-1, 1, (2,), settings.dtype),
+        labels=labels,
+        propositions=nav.PROPOSITIONS,
+        horizon=world.horizon,
+    )
 
 
 def _reset(settings: _Settings, world: Navigation, key: chex.PRNGKey) -> Place:
@@ -125,7 +133,8 @@ def _step(
     nearest = jnp.where(place.first, distance, jnp.minimum(place.nearest, distance))
     closer = nearest - place.nearest  # which is zero before the first state
     reward = jnp.where(
-        (task == 1) | (task == 4), nav.reward(world, place.state),
+        (task == 1) | (task == 4),
+        nav.reward(world, place.state),
         jnp.asarray(world.weight, dtype) * closer,
     )
     visit = goal.astype(dtype) - place.goal
@@ -136,5 +145,5 @@ def _step(
     following = jax.tree.map(lambda x, y: jnp.where(stays, x, y), place.state, following)
     place = Place(following, jnp.bool_(False), nearest, goal, obstacle, place.time + 1)
     return Timestep(
-        place, reward.astype(dtype), place.time >= world.horizon,
-        cost=0 - cost.astype(dtype))  # no -0
+        place, reward.astype(dtype), place.time >= world.horizon, cost=0 - cost.astype(dtype)
+    )  # no -0

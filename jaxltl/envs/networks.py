@@ -272,7 +272,8 @@ def apply_lanes(network: Network, parameters: jax.Array, inputs: jax.Array) -> j
     ):
         inputs = weighted(weight.reshape(*weight.shape[:2], *middle, *lanes), inputs)
         inputs = activation(
-            inputs if bias is None else inputs + bias.reshape(len(bias), *middle, *lanes))
+            inputs if bias is None else inputs + bias.reshape(len(bias), *middle, *lanes)
+        )
     return inputs
 
 
@@ -336,13 +337,15 @@ def network_agent(network: Network, environment: Environment) -> Partial:
       1
     """
     actions, shown = environment.actions, environment.observations
-    inputs = sum(math.prod(x.shape) for x in jax.tree.leaves(
-        shown, is_leaf=lambda x: isinstance(x, Box)))
+    inputs = sum(
+        math.prod(x.shape) for x in jax.tree.leaves(shown, is_leaf=lambda x: isinstance(x, Box))
+    )
     outputs = actions.num if isinstance(actions, Finite) else math.prod(actions.shape)
     if (network.sizes[0], network.sizes[-1]) != (inputs, outputs):
         raise ValueError(
             f"the network has the sizes {network.sizes}; the environment has {inputs} "
-            f"observations, its inputs, and its actions take {outputs} outputs.")
+            f"observations, its inputs, and its actions take {outputs} outputs."
+        )
     return Partial(_agent, network, actions)
 
 
@@ -353,8 +356,13 @@ def _agent(network: Network, actions: Finite | Box, parameters: jax.Array) -> Ag
 
 
 def _act(
-    network: Network, actions: Finite | Box, parts: Layers, memory: Any, observation: Any,
-    allowed: Any, key: chex.PRNGKey,
+    network: Network,
+    actions: Finite | Box,
+    parts: Layers,
+    memory: Any,
+    observation: Any,
+    allowed: Any,
+    key: chex.PRNGKey,
 ) -> tuple[jax.Array, Any]:
     del key
     said = apply_layers(network, parts, flat_observation(observation).astype(parts[0][0].dtype))

@@ -70,8 +70,11 @@ def post_offices() -> Game:
     available[:, :moves] = system[:, None] & (walk != cell[:, None])
     available[:, moves:] = ~system[:, None]
     mdp = make_mdp(
-        successor, available[:, :, None].astype(float), available=available,
-        initial=system / system.sum(), label=np.asarray(world.label)[cell],
+        successor,
+        available[:, :, None].astype(float),
+        available=available,
+        initial=system / system.sum(),
+        label=np.asarray(world.label)[cell],
         propositions=world.propositions,
     )
     return make_game(mdp, system)

@@ -65,7 +65,8 @@ def robots(size: int) -> Game:
     """
     if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 2 <= size <= _MOST:
         raise ValueError(
-            f"size={size!r}; give the cells along a side, an integer from 2 to {_MOST}.")
+            f"size={size!r}; give the cells along a side, an integer from 2 to {_MOST}."
+        )
     size = int(size)
     world = grid.gridworld("\n".join(["." * size] * size))
     cells = np.arange(size * size).reshape(size, size)[::-1].ravel()  # the map's first row is up
@@ -154,11 +155,16 @@ def grid_game(
     start = [
         _start(where, argument, position, rows_columns, label, world.propositions)
         for argument, where in (
-            ("environment_start", environment_start), ("system_start", system_start)
+            ("environment_start", environment_start),
+            ("system_start", system_start),
         )
     ]
     return _in_turns(
-        system, environment, position=position, mark=label, names=world.propositions,
+        system,
+        environment,
+        position=position,
+        mark=label,
+        names=world.propositions,
         start=_different(*start),
     )
 
@@ -409,5 +415,8 @@ def _labels(
     label[..., 3 + each :] = mark[None, :, None]
     robots = ("environment", "system")
     return label, (
-        "collision", "diagonal", "system_turn", *(f"{robot}_{p}" for robot in robots for p in names)
+        "collision",
+        "diagonal",
+        "system_turn",
+        *(f"{robot}_{p}" for robot in robots for p in names),
     )

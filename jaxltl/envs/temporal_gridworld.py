@@ -75,7 +75,6 @@ class World:
     kinds: Kinds = struct.field(pytree_node=False, default=())
 
 
-
 def colored_world(
     colors: ArrayLike,
     *,
@@ -167,7 +166,8 @@ def make_world(
     _check_shape(shape)
     kind = plan_map(plan, kinds, shape)
     colors = filled(
-        np.random.default_rng(seed), planned(kind, kinds), kind, codes_of(kinds), margin)
+        np.random.default_rng(seed), planned(kind, kinds), kind, codes_of(kinds), margin
+    )
     return _assemble(_blank(shape, slip), colors, kind, kinds, margin)
 
 
@@ -187,7 +187,9 @@ def training_world(seed: int = 0, *, margin: int = 1, slip: float = 0.0) -> Worl
       [1, 1, 1, 5]
     """
     plan = {
-        "o1": [(1, 7)], "o2": [(7, 1)], "o3": [(10, 10)],
+        "o1": [(1, 7)],
+        "o2": [(7, 1)],
+        "o3": [(10, 10)],
         "ob": [(4, 4), (4, 5), (4, 6), (4, 7), (10, 7)],
     }
     return make_world(plan, seed, margin=margin, slip=slip)
@@ -317,8 +319,11 @@ def _is_feasible(family: _Family, kind: NDArray[np.int32]) -> bool:
     if task.acceptance != "cosafe":
         label = flat[:, None] == np.arange(len(family.kinds))
         world = replace(
-            family.blank, label=to_jax(label), initial=to_jax(flat < 0),
-            propositions=tuple(name for name, _ in family.kinds))
+            family.blank,
+            label=to_jax(label),
+            initial=to_jax(flat < 0),
+            propositions=tuple(name for name, _ in family.kinds),
+        )
         return not np.asarray(infeasible_starts(product(world, task, label_on="exit"))).any()
     # The last row of the table is of cells of no kind, whose number is -1.
     can = _can_finish(family.successor, family.step[flat], np.asarray(task.final))
@@ -406,7 +411,6 @@ def observations(world: World, radius: int = 1) -> jax.Array:
     """
     hot = jax.nn.one_hot(patches(world, radius), len(COLORS), dtype=world.mdp.dtype)
     return hot.reshape(hot.shape[0], -1)
-
 
 
 def _distance(automaton: Any) -> jax.Array:
@@ -544,7 +548,5 @@ def demonstrations(
       >>> runs.state.shape, runs.state_shape
       ((3, 5), (16,))
     """
-    runs = rollout(
-        model, policy, key, num_trajectories=num, num_steps=horizon, stop=is_over(model)
-    )
+    runs = rollout(model, policy, key, num_trajectories=num, num_steps=horizon, stop=is_over(model))
     return project_trajectories(model, runs)

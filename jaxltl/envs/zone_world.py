@@ -122,21 +122,46 @@ def zone_world(
     names = given.names("colors", colors)
     zones, num_maps = given.whole("zones", zones), given.whole("num_maps", num_maps, most=2**20)
     seed = given.whole("seed", seed)
-    for name, number in (("radius", radius), ("extent", extent), ("saturation", saturation),
-                         ("zones", zones), ("num_maps", num_maps), ("colors", len(names))):
+    for name, number in (
+        ("radius", radius),
+        ("extent", extent),
+        ("saturation", saturation),
+        ("zones", zones),
+        ("num_maps", num_maps),
+        ("colors", len(names)),
+    ):
         if not 0 < given.number(name, number) < 1e7:
             raise ValueError(
-                f"zone_world: {name}={number}; it must be positive, and below ten million.")
+                f"zone_world: {name}={number}; it must be positive, and below ten million."
+            )
     radius, extent, saturation = float(radius), float(extent), float(saturation)
     places = draw_places(len(names) * zones, extent, num_maps, seed)
-    numbers = _Numbers(*(np.float32(x) for x in (
-        radius, extent, 0.02, 0.3 * 0.05 / _MASS, saturation, 0.01 / _MASS, 0.3 / 0.095, 3.0, 0.5)))
+    numbers = _Numbers(
+        *(
+            np.float32(x)
+            for x in (
+                radius,
+                extent,
+                0.02,
+                0.3 * 0.05 / _MASS,
+                saturation,
+                0.01 / _MASS,
+                0.3 / 0.095,
+                3.0,
+                0.5,
+            )
+        )
+    )
     count = len(names) * _BINS + 11
     world = make_environment(
         Partial(_begin, places.astype(np.float32), np.zeros((zones, len(names)))),
-        Partial(_move, numbers), Partial(_see, numbers), actions=make_box(-1, 1, (2,), np.float32),
-        labels=Partial(_labels, numbers), propositions=names,
-        observations=make_box(-np.inf, np.inf, (count,), np.float32))
+        Partial(_move, numbers),
+        Partial(_see, numbers),
+        actions=make_box(-1, 1, (2,), np.float32),
+        labels=Partial(_labels, numbers),
+        propositions=names,
+        observations=make_box(-np.inf, np.inf, (count,), np.float32),
+    )
     return world if horizon is None else with_time_limit(world, horizon)
 
 
@@ -165,8 +190,10 @@ def draw_places(count: int, extent: float, num_maps: int, seed: int = 0) -> np.n
         rounds += 1
         too_many = count * _KEEPOUT[0] ** 2 * np.pi > 4 * extent**2
         if (rounds > 4 and have < 2 * rounds) or too_many or extent <= _KEEPOUT[0]:
-            raise ValueError(f"zone_world: {count} zones hardly fit into a square of {2 * extent} "
-                             "a side, apart from one another; take fewer, or a larger extent.")
+            raise ValueError(
+                f"zone_world: {count} zones hardly fit into a square of {2 * extent} "
+                "a side, apart from one another; take fewer, or a larger extent."
+            )
         maps, good = np.zeros((512, count + 1, 2)), np.ones(512, bool)
         for i in range(count + 1):
             own = _KEEPOUT[i == count]
@@ -210,23 +237,26 @@ def _move(n: _Numbers, world: ZoneState, action: Any, key: chex.PRNGKey) -> Time
     toward = thrust / n.drag * _ahead(world.heading + turning * n.time_step / 2)
     kept = jnp.exp(-n.drag * n.time_step)
     velocity = toward + kept * (world.velocity - toward)
-    place = world.place + n.time_step * toward + (
-        (1 - kept) / n.drag * (world.velocity - toward))
+    place = world.place + n.time_step * toward + ((1 - kept) / n.drag * (world.velocity - toward))
     most = n.extent - _ROBOT
     stopped = jnp.abs(place) > most
     velocity = jnp.where(stopped, 0, velocity)
     place = jnp.clip(place, -most, most)
     acceleration = (velocity - world.velocity) / n.time_step
     heading = heading % np.float32(2 * np.pi)
-    return Timestep(ZoneState(place, velocity, heading, acceleration, turning, world.zone), 0.0,
-                    jnp.bool_(False))
+    return Timestep(
+        ZoneState(place, velocity, heading, acceleration, turning, world.zone),
+        0.0,
+        jnp.bool_(False),
+    )
 
 
 def _own_frame(heading: jax.Array, vector: jax.Array) -> jax.Array:
     """``float[..., 2]`` as parts ahead and to the left."""
     x, y = _ahead(heading)
-    return jnp.stack([vector[..., 0] * x + vector[..., 1] * y,
-                      vector[..., 1] * x - vector[..., 0] * y], axis=-1)
+    return jnp.stack(
+        [vector[..., 0] * x + vector[..., 1] * y, vector[..., 1] * x - vector[..., 0] * y], axis=-1
+    )
 
 
 def _lidar(n: _Numbers, world: ZoneState) -> jax.Array:
@@ -243,12 +273,18 @@ def _lidar(n: _Numbers, world: ZoneState) -> jax.Array:
 
 def _see(n: _Numbers, world: ZoneState) -> jax.Array:
     walls = jnp.exp(-n.gain * jnp.concatenate([n.extent - world.place, n.extent + world.place]))
-    return jnp.concatenate([
-        _lidar(n, world).ravel(), _own_frame(world.heading, world.acceleration),
-        _own_frame(world.heading, world.velocity), world.turning[None], _ahead(world.heading),
-        walls]).astype(jnp.float32)
+    return jnp.concatenate(
+        [
+            _lidar(n, world).ravel(),
+            _own_frame(world.heading, world.acceleration),
+            _own_frame(world.heading, world.velocity),
+            world.turning[None],
+            _ahead(world.heading),
+            walls,
+        ]
+    ).astype(jnp.float32)
 
 
 def _labels(n: _Numbers, world: ZoneState) -> jax.Array:
     apart = jnp.sum((world.zone - world.place) ** 2, axis=-1)
-    return (apart <= n.radius ** 2).any(axis=-1)
+    return (apart <= n.radius**2).any(axis=-1)

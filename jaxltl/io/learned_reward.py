@@ -115,8 +115,7 @@ def plan_in(learned: LearnedReward, world: MDP, observation: Any) -> tuple[Produ
             f"observation has shape {seen.shape}; the network reads {width} numbers in each of the "
             f"world's states: {(world.num_states, width)}."
         )
-    plan = partial(
-        todirl.plan, learned.network, learned.parameters, model, seen, learned.hparams)
+    plan = partial(todirl.plan, learned.network, learned.parameters, model, seen, learned.hparams)
     asked = learned.guarantee
     if asked == "none":
         return model, plan()
@@ -134,8 +133,17 @@ def plan_in(learned: LearnedReward, world: MDP, observation: Any) -> tuple[Produ
 # --- files ----------------------------------------------------------------------------------
 
 
-_ABOUT = ("hidden", "label_on", "discount", "horizon", "radius", "formula", "kinds",
-          "guarantee", "over")
+_ABOUT = (
+    "hidden",
+    "label_on",
+    "discount",
+    "horizon",
+    "radius",
+    "formula",
+    "kinds",
+    "guarantee",
+    "over",
+)
 
 
 def save_reward(path: str | Path, learned: LearnedReward) -> None:

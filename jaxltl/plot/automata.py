@@ -88,8 +88,14 @@ def canvas(graph: drawing.Graph, lines: Sequence[str]) -> tuple[Figure, Axes]:
     axes.axis("off")
     for i, line in enumerate(lines):
         figure.text(
-            0.25 / full, (below - 0.19 * (i + 0.5)) / (height + below), line, fontsize=8,
-            color=MUTED, va="center", family="monospace", parse_math=False,
+            0.25 / full,
+            (below - 0.19 * (i + 0.5)) / (height + below),
+            line,
+            fontsize=8,
+            color=MUTED,
+            va="center",
+            family="monospace",
+            parse_math=False,
         )
     return figure, axes
 
@@ -128,14 +134,10 @@ def pretty_guard(text: str) -> str:
     '¬a ∧ b ∨ "x & y"'
     """
     signs = {"!": "¬", "&": "∧", "|": "∨", "true": "⊤"}
-    return re.sub(
-        r'"(?:[^"\\]|\\.)*"|!|&|\||\btrue\b', lambda m: signs.get(m[0], m[0]), text
-    )
+    return re.sub(r'"(?:[^"\\]|\\.)*"|!|&|\||\btrue\b', lambda m: signs.get(m[0], m[0]), text)
 
 
-def edge_texts(
-    table: Automaton, doomed: NDArray[np.bool_]
-) -> dict[drawing.Key, drawing.Rows]:
+def edge_texts(table: Automaton, doomed: NDArray[np.bool_]) -> dict[drawing.Key, drawing.Rows]:
     """The marks and guards on each curve.
 
     Two states have one curve from one to the other, with a guard for each priority; but
@@ -162,9 +164,7 @@ def edge_texts(
     return curves
 
 
-def _notes(
-    table: Automaton, texts: Mapping[drawing.Key, drawing.Rows], width: float
-) -> list[str]:
+def _notes(table: Automaton, texts: Mapping[drawing.Key, drawing.Rows], width: float) -> list[str]:
     """What stands under the graph."""
     lines = _state_lines(table, width)
     if table.acceptance in _NOTES:
@@ -196,7 +196,10 @@ def draw_label(axes: Axes, label: drawing.Label, color: str) -> None:
     """The lines of a label in the middle; if some have marks, to the left, after the marks."""
     rows, (x, y) = label.rows, label.center
     style: dict[str, Any] = {
-        "fontsize": drawing.FONT_SIZE, "color": color, "zorder": 4, "parse_math": False,
+        "fontsize": drawing.FONT_SIZE,
+        "color": color,
+        "zorder": 4,
+        "parse_math": False,
         "bbox": {"facecolor": PAPER, "edgecolor": "none", "pad": 0.8},
     }
     if not drawing.is_marked(rows):
@@ -215,12 +218,25 @@ def _mark(axes: Axes, center: tuple[float, float], mark: str) -> None:
     """A dot, or a priority in a circle that is filled if it is even."""
     filled = mark == "●" or int(mark) % 2 == 0
     axes.add_patch(
-        Circle(center, 0.04 if mark == "●" else 0.078, facecolor=ACCENT if filled else PAPER,
-               edgecolor=ACCENT if filled else MUTED, lw=0.8, zorder=4.5)
+        Circle(
+            center,
+            0.04 if mark == "●" else 0.078,
+            facecolor=ACCENT if filled else PAPER,
+            edgecolor=ACCENT if filled else MUTED,
+            lw=0.8,
+            zorder=4.5,
+        )
     )
     if mark != "●":
-        axes.text(*center, mark, ha="center", va="center_baseline", fontsize=7,
-                  color=PAPER if filled else INK, zorder=5)
+        axes.text(
+            *center,
+            mark,
+            ha="center",
+            va="center_baseline",
+            fontsize=7,
+            color=PAPER if filled else INK,
+            zorder=5,
+        )
 
 
 def draw_edge(axes: Axes, curve: NDArray[np.float64], color: str) -> None:
@@ -228,8 +244,13 @@ def draw_edge(axes: Axes, curve: NDArray[np.float64], color: str) -> None:
     codes = [Path.MOVETO] + [Path.CURVE3 if len(curve) == 3 else Path.CURVE4] * (len(curve) - 1)
     axes.add_patch(
         FancyArrowPatch(
-            path=Path(curve, codes), arrowstyle="-|>,head_length=5,head_width=2.4",
-            mutation_scale=1, color=color, linewidth=1.1, zorder=2, joinstyle="miter",
+            path=Path(curve, codes),
+            arrowstyle="-|>,head_length=5,head_width=2.4",
+            mutation_scale=1,
+            color=color,
+            linewidth=1.1,
+            zorder=2,
+            joinstyle="miter",
         )
     )
 
@@ -253,5 +274,13 @@ def draw_state(
         axes.add_patch(
             Circle(tuple(center), inner, facecolor="none", edgecolor=line, lw=1, zorder=5)
         )
-    axes.text(center[0], center[1], text, ha="center", va="center_baseline", fontsize=11,
-              color=line, zorder=6)
+    axes.text(
+        center[0],
+        center[1],
+        text,
+        ha="center",
+        va="center_baseline",
+        fontsize=11,
+        color=line,
+        zorder=6,
+    )

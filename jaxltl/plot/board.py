@@ -48,8 +48,18 @@ def fill_cells(axes: Axes, world: Board, colors: Sequence[str], lines: str = PAP
         axes.add_patch(Rectangle((column, row), 1, 1, facecolor=color, lw=0))
         kind = world.cells[row, column]
         if kind not in (".", world.wall) and max(world.cells.shape) <= 16:
-            axes.text(column + 0.07, row + 0.07, short_name(kind), ha="left", va="top",
-                      fontsize=6.5, color=MUTED, weight="bold", parse_math=False, zorder=5)
+            axes.text(
+                column + 0.07,
+                row + 0.07,
+                short_name(kind),
+                ha="left",
+                va="top",
+                fontsize=6.5,
+                color=MUTED,
+                weight="bold",
+                parse_math=False,
+                zorder=5,
+            )
     frame_cells(axes, world, lines)
 
 
@@ -89,8 +99,14 @@ def draw_robot(axes: Axes, world: Board, place: int) -> None:
 
 
 def draw_moves(
-    axes: Axes, world: Board, mask: NDArray[np.bool_], actions: Sequence[str],
-    dark: NDArray[np.bool_] | None = None, *, hollow: bool = False, scale: float = 1.0,
+    axes: Axes,
+    world: Board,
+    mask: NDArray[np.bool_],
+    actions: Sequence[str],
+    dark: NDArray[np.bool_] | None = None,
+    *,
+    hollow: bool = False,
+    scale: float = 1.0,
 ) -> None:
     """A triangle towards each neighbour that a mask allows, and a dot for staying."""
     for place, a in np.argwhere(mask):
@@ -100,8 +116,11 @@ def draw_moves(
         row, column = world.places[place]
         center, step = np.array([column + 0.5, row + 0.5]), np.array(DIRECTIONS[actions[a]], float)
         if not step.any():
-            axes.add_patch(Circle(tuple(center), 0.09 * scale, facecolor=face, edgecolor=edge,
-                                  lw=0.7, zorder=6))
+            axes.add_patch(
+                Circle(
+                    tuple(center), 0.09 * scale, facecolor=face, edgecolor=edge, lw=0.7, zorder=6
+                )
+            )
             continue
         corners = _triangle(center, step, 0.18, 0.18 + 0.24 * scale, 0.12 * scale)
         axes.add_patch(Polygon(corners, facecolor=face, edgecolor=edge, lw=0.7, zorder=6))
@@ -111,8 +130,9 @@ def number_cells(axes: Axes, rows: int, columns: int) -> None:
     """Numbers rows and columns, from 1."""
     for axis, count in ((axes.xaxis, columns), (axes.yaxis, rows)):
         stride = max(1, count // 10)
-        axis.set_ticks(np.arange(0, count, stride) + 0.5, labels=[
-            str(i + 1) for i in range(0, count, stride)])
+        axis.set_ticks(
+            np.arange(0, count, stride) + 0.5, labels=[str(i + 1) for i in range(0, count, stride)]
+        )
     axes.xaxis.tick_top()
     axes.tick_params(length=0, labelsize=6.5, labelcolor=MUTED, pad=2)
     for spine in axes.spines.values():
@@ -120,8 +140,13 @@ def number_cells(axes: Axes, rows: int, columns: int) -> None:
 
 
 def draw_arrows(
-    axes: Axes, shape: tuple[int, int], policy: NDArray[np.float64],
-    values: NDArray[np.float64] | None, low: float, high: float, actions: Sequence[str],
+    axes: Axes,
+    shape: tuple[int, int],
+    policy: NDArray[np.float64],
+    values: NDArray[np.float64] | None,
+    low: float,
+    high: float,
+    actions: Sequence[str],
 ) -> None:
     """Triangles from the centre of each cell, as long as the action is likely."""
     shapes: list[Any] = []
@@ -152,15 +177,14 @@ def cell_size(shape: tuple[int, ...]) -> float:
     return float(np.clip(5.2 / max(shape), 0.3, 0.6))
 
 
-def rows_of_maps(
-    shape: tuple[int, ...], count: int, across: int
-) -> tuple[Figure, NDArray[Any]]:
+def rows_of_maps(shape: tuple[int, ...], count: int, across: int) -> tuple[Figure, NDArray[Any]]:
     """A figure with so many axes of maps, in rows."""
     (rows, columns), size = shape, cell_size(shape)
     down = -(-count // across)
     figure = Figure(
         figsize=(max(across * (columns * size + 0.4), 3.4), down * (rows * size + 0.55) + 0.6),
-        layout=ConstrainedLayoutEngine(h_pad=0.1), facecolor=PAPER,
+        layout=ConstrainedLayoutEngine(h_pad=0.1),
+        facecolor=PAPER,
     )
     every = figure.subplots(down, across, squeeze=False).ravel()
     for axes in every[count:]:
@@ -189,4 +213,3 @@ def as_mask(policy: ArrayLike, num_actions: int) -> NDArray[np.bool_]:
     if given.dtype.kind in "iu":
         return np.asarray(given[:, None] == np.arange(num_actions))
     return given.astype(bool)
-

@@ -82,8 +82,9 @@ def _curve(
     rows = np.where(np.isfinite(rows), rows, np.nan)
     middle = np.nanmedian(rows, axis=0) if len(rows) > 1 else rows[0]
     if len(rows) > 1:
-        axes.fill_between(x, np.nanmin(rows, axis=0), np.nanmax(rows, axis=0), color=color,
-                          alpha=0.18, lw=0)
+        axes.fill_between(
+            x, np.nanmin(rows, axis=0), np.nanmax(rows, axis=0), color=color, alpha=0.18, lw=0
+        )
     axes.plot(x, middle, color=color, lw=1.6)
     positive = rows[rows > 0]
     if positive.size and np.nanmin(rows) > 0 and positive.max() > 100 * positive.min():
@@ -132,8 +133,15 @@ def bands(
             axes.axhline(limits[row][column], color=INK, lw=1, ls="--")
     bottom_labels(panels, [label] * len(panels))
     handles = [Line2D([], [], color=SERIES[i % len(SERIES)]) for i in range(len(names))]
-    figure.legend(handles, names, loc="outside lower center", ncols=len(names), frameon=False,
-                  fontsize=8.5, labelcolor=INK)
+    figure.legend(
+        handles,
+        names,
+        loc="outside lower center",
+        ncols=len(names),
+        frameon=False,
+        fontsize=8.5,
+        labelcolor=INK,
+    )
     return figure
 
 
@@ -168,18 +176,21 @@ def sweep(
     series, count = _shown("sweep", metrics, show), len(settings)
     if count > len(SERIES):
         raise ValueError(
-            f"sweep: {count} settings; show at most {len(SERIES)} at a time, whose colours differ.")
+            f"sweep: {count} settings; show at most {len(SERIES)} at a time, whose colours differ."
+        )
     panels = {}
     for name, found in series.items():
         if found.ndim != 3 or len(found) != count:
             raise ValueError(
                 f"sweep: {name} has shape {list(found.shape)}; give [{count}, N, T]: settings, "
-                "seeds, steps.")
+                "seeds, steps."
+            )
         place = np.arange(1, found.shape[2] + 1) if steps is None else steps
         held = np.ma.masked_invalid(found)
         mean, spread = (x.filled(np.nan) for x in (held.mean(axis=1), held.std(axis=1)))
         panels[name.replace("_", " ")] = {
-            str(setting): (place, mean[i], spread[i]) for i, setting in enumerate(settings)}
+            str(setting): (place, mean[i], spread[i]) for i, setting in enumerate(settings)
+        }
     return bands({"": panels})
 
 
@@ -211,19 +222,32 @@ def lines(
     for (row, column), axes in panels.items():
         runs, reference = rows[row][column]
         several = np.asarray(runs, float)
-        axes.plot(several.T, color=ACCENT, lw=1.4 if len(several) == 1 else 0.7,
-                  alpha=1 if len(several) == 1 else 0.35)
+        axes.plot(
+            several.T,
+            color=ACCENT,
+            lw=1.4 if len(several) == 1 else 0.7,
+            alpha=1 if len(several) == 1 else 0.35,
+        )
         if reference is not None:
             axes.plot(np.asarray(reference, float), color=SERIES[1], lw=1.3, ls="--")
     bottom_labels(panels, labels)
     figure.legend(
-        [Line2D([], [], color=ACCENT), Line2D([], [], color=SERIES[1], ls="--")], names,
-        loc="outside lower center", ncols=2, frameon=False, fontsize=8.5, labelcolor=INK)
+        [Line2D([], [], color=ACCENT), Line2D([], [], color=SERIES[1], ls="--")],
+        names,
+        loc="outside lower center",
+        ncols=2,
+        frameon=False,
+        fontsize=8.5,
+        labelcolor=INK,
+    )
     return figure
 
 
 def guarantees(
-    samples: ArrayLike, bounds: Mapping[str, ArrayLike], *, reference: float | None = None,
+    samples: ArrayLike,
+    bounds: Mapping[str, ArrayLike],
+    *,
+    reference: float | None = None,
     names: tuple[str, str] = ("transitions", "probability"),
 ) -> Figure:
     """Bounds over the number of samples, on a logarithmic axis.
@@ -299,8 +323,9 @@ def paths(
         raise ValueError("paths: nothing to show; give at least one map.")
     columns = min(columns, len(maps))
     count = -(-len(maps) // columns)
-    figure = Figure(figsize=(2.3 * columns, 2.4 * count + 0.3), layout="constrained",
-                    facecolor=PAPER)
+    figure = Figure(
+        figsize=(2.3 * columns, 2.4 * count + 0.3), layout="constrained", facecolor=PAPER
+    )
     every = figure.subplots(count, columns, squeeze=False).ravel()
     low, high = np.asarray(bounds, float)
     handles: list[Any] = []
@@ -320,9 +345,17 @@ def paths(
         axes.plot(xs[:, -1], ys[:, -1], "s", color=SERIES[1], ms=2.6)
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         axes.set_title(title, fontsize=8.5, color=INK, loc="left", parse_math=False)
-    ends = [Line2D([], [], ls="", marker=m, color=c, ms=4) for m, c in (
-        ("o", INK), ("s", SERIES[1]))]
-    figure.legend([*handles, *ends], [*boxes, "first", "last"], loc="outside lower center",
-                  ncols=len(boxes) + 2, frameon=False, fontsize=8.5, labelcolor=INK)
+    ends = [
+        Line2D([], [], ls="", marker=m, color=c, ms=4) for m, c in (("o", INK), ("s", SERIES[1]))
+    ]
+    figure.legend(
+        [*handles, *ends],
+        [*boxes, "first", "last"],
+        loc="outside lower center",
+        ncols=len(boxes) + 2,
+        frameon=False,
+        fontsize=8.5,
+        labelcolor=INK,
+    )
     settle(figure)
     return figure

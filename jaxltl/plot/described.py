@@ -39,7 +39,8 @@ class Described(NamedTuple):
         if self.page is not None:
             data["text/html"] = (
                 f'<iframe title="{html.escape(self.text)}" srcdoc="{html.escape(self.page)}" '
-                'sandbox="allow-scripts" width="100%" height="640" style="border:0"></iframe>')
+                'sandbox="allow-scripts" width="100%" height="640" style="border:0"></iframe>'
+            )
         width, height = (round(x * _SCREEN) for x in self.figure.get_size_inches())
         return data, {"image/png": {"alt": self.text, "width": width, "height": height}}
 
@@ -67,6 +68,7 @@ def described(figure: Figure, text: str, *, page: str | None = None) -> Describe
     Nothing yet: white paper.
     """
     if not text.strip() or any(x in text for x in "[]\n"):
-        raise ValueError(f"text: {text!r}; say in one line, without square brackets, what the "
-                         "figure shows.")
+        raise ValueError(
+            f"text: {text!r}; say in one line, without square brackets, what the figure shows."
+        )
     return Described(figure, text.strip(), page)

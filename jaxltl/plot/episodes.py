@@ -125,8 +125,9 @@ def _draw_scene(axes: Axes, scene: Scene, title: str | None) -> None:
     _draw_ground(axes, scene)
     halo = [withStroke(linewidth=3.0, foreground=PAPER, alpha=0.8)]
     for part in _segments(scene):
-        axes.plot(*part.T, color=ACCENT, lw=1.5, zorder=5, path_effects=halo,
-                  solid_capstyle="round")
+        axes.plot(
+            *part.T, color=ACCENT, lw=1.5, zorder=5, path_effects=halo, solid_capstyle="round"
+        )
     places = _spread(scene)
     for place, marker in ((places[0], "o"), (places[-1], "s")):
         axes.plot(*place, marker, color=ACCENT, ms=7, mec=PAPER, mew=1.0, zorder=6)
@@ -137,12 +138,16 @@ def scene_of(environment: Any, episode: Any) -> Scene:
     """What :func:`draw_episode` and :func:`play_episode` show."""
     valid = np.asarray(episode.valid)
     if valid.ndim != 1:
-        raise ValueError(f"the episode has {valid.ndim} axes of steps; take one trajectory of "
-                         "many, jax.tree.map(lambda x: x[0], episode).")
+        raise ValueError(
+            f"the episode has {valid.ndim} axes of steps; take one trajectory of "
+            "many, jax.tree.map(lambda x: x[0], episode)."
+        )
     world, count = _place_of(episode.world), int(valid.sum()) + 1
     label = np.asarray(episode.label)[:count]
-    shown = [", ".join(name for name, holds in zip(environment.propositions, row, strict=True)
-                       if holds) for row in label]
+    shown = [
+        ", ".join(name for name, holds in zip(environment.propositions, row, strict=True) if holds)
+        for row in label
+    ]
     if not isinstance(world, LetterState | FlatState | ZoneState):
         return _free(np.asarray(world, float)[:count], shown)
     numbers: Any = environment.labels
@@ -153,8 +158,9 @@ def scene_of(environment: Any, episode: Any) -> Scene:
         letter, place = np.asarray(world.letter)[0], np.asarray(world.place)[:count]
         cells = round(len(letter) ** 0.5)
         names = environment.propositions
-        letters = [(c % cells, c // cells, names[x]) for c, x in enumerate(letter)
-                   if x < len(names)]
+        letters = [
+            (c % cells, c // cells, names[x]) for c, x in enumerate(letter) if x < len(names)
+        ]
         track = np.stack([place % cells, place // cells], axis=1) + 0.5
         return Scene(cells, cells, letters, [], track, None, shown, True)
     track = np.asarray(world.place, float)[:count]
@@ -162,8 +168,11 @@ def scene_of(environment: Any, episode: Any) -> Scene:
         discs = _named(numbers, environment.propositions)
         return _upright(float(numbers.extent), discs, track, None, shown)
     zone, radius = np.asarray(world.zone, float)[0], float(numbers.radius)
-    zones = [(x, y, radius, name) for name, places in zip(
-        environment.propositions, zone, strict=True) for x, y in places]
+    zones = [
+        (x, y, radius, name)
+        for name, places in zip(environment.propositions, zone, strict=True)
+        for x, y in places
+    ]
     heading = np.asarray(world.heading, float)[:count]
     return _upright(float(numbers.extent), zones, track, heading, shown)
 
@@ -179,9 +188,11 @@ def _place_of(world: Any) -> Any:
         elif type(world) is tuple and len(world) == 2:
             world = world[0]
         else:
-            raise ValueError(f"{type(world).__name__} has no picture; give an episode of a "
-                             "letter_world, a flat_world or a zone_world, or of a world with a "
-                             "place, float[2].")
+            raise ValueError(
+                f"{type(world).__name__} has no picture; give an episode of a "
+                "letter_world, a flat_world or a zone_world, or of a world with a "
+                "place, float[2]."
+            )
     return world
 
 
@@ -257,15 +268,34 @@ def _segments(scene: Scene) -> list[NDArray[np.float64]]:
 def _draw_ground(axes: Axes, scene: Scene) -> None:
     for column, row, name in scene.letters:
         axes.add_patch(Rectangle((column, row), 1, 1, facecolor="#eef2f5", lw=0))
-        axes.text(column + 0.5, row + 0.53, name, ha="center", va="center", fontsize=12,
-                  color=MUTED, weight="bold", parse_math=False, zorder=7,
-                  path_effects=[withStroke(linewidth=2.5, foreground="#eef2f5", alpha=0.8)])
+        axes.text(
+            column + 0.5,
+            row + 0.53,
+            name,
+            ha="center",
+            va="center",
+            fontsize=12,
+            color=MUTED,
+            weight="bold",
+            parse_math=False,
+            zorder=7,
+            path_effects=[withStroke(linewidth=2.5, foreground="#eef2f5", alpha=0.8)],
+        )
     if scene.cells:
         rule_cells(axes, scene.cells, scene.cells, FAINT)
     for i, (x, y, radius, name) in enumerate(scene.discs):
         axes.add_patch(Circle((x, y), radius, facecolor=tint(name, i), alpha=0.75, lw=0, zorder=1))
-        axes.text(x, y, name, ha="center", va="center", fontsize=7.5, color=INK,
-                  parse_math=False, zorder=3)
+        axes.text(
+            x,
+            y,
+            name,
+            ha="center",
+            va="center",
+            fontsize=7.5,
+            color=INK,
+            parse_math=False,
+            zorder=3,
+        )
     axes.set(xlim=(0, scene.size), ylim=(scene.size, 0), aspect="equal", xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set(color=MUTED, lw=0.8, ls="--" if scene.joined else "-")
@@ -340,8 +370,10 @@ def play_episode(environment: Any, episode: Any, *, title: str | None = None) ->
     zoom = _PIXELS / scene.size
     name = html.escape(_met(scene) if title is None else title)
     frames: dict[str, Any] = {
-        "place": (scene.track * zoom).round(1).tolist(), "shown": scene.shown,
-        "wait": 260 if scene.cells else 40}
+        "place": (scene.track * zoom).round(1).tolist(),
+        "shown": scene.shown,
+        "wait": 260 if scene.cells else 40,
+    }
     if scene.heading is not None:
         frames["turn"] = (-np.degrees(scene.heading)).round(1).tolist()
     data = json.dumps(frames).replace("<", "\\u003c")
@@ -354,7 +386,8 @@ def play_episode(environment: Any, episode: Any, *, title: str | None = None) ->
         f'<input id="at" type="range" min="0" max="{last}" value="0" aria-label="step"></div>'
         '<p><output id="told" for="at"></output></p></main>'
         f'<script type="application/json" id="frames">{data}</script>'
-        f"<script>{_SCRIPT}</script></html>")
+        f"<script>{_SCRIPT}</script></html>"
+    )
 
 
 def _ground_svg(scene: Scene, zoom: float) -> str:
@@ -365,16 +398,19 @@ def _ground_svg(scene: Scene, zoom: float) -> str:
         parts.append(
             f'<g class="letter"><rect x="{x:.1f}" y="{y:.1f}" width="{zoom:.1f}" '
             f'height="{zoom:.1f}"/><text x="{x + zoom / 2:.1f}" y="{y + zoom / 2:.1f}" '
-            f'font-size="{zoom * 0.4:.1f}">{html.escape(name)}</text></g>')
+            f'font-size="{zoom * 0.4:.1f}">{html.escape(name)}</text></g>'
+        )
     for i in range(1, scene.cells):
-        parts.append(f'<path class="rule" d="M{i * zoom:.1f} 0V{side:.1f}M0 {i * zoom:.1f}'
-                     f'H{side:.1f}"/>')
+        parts.append(
+            f'<path class="rule" d="M{i * zoom:.1f} 0V{side:.1f}M0 {i * zoom:.1f}H{side:.1f}"/>'
+        )
     for i, (x, y, radius, name) in enumerate(scene.discs):
         x, y = x * zoom, y * zoom
         parts.append(
             f'<g class="disc"><circle cx="{x:.1f}" cy="{y:.1f}" r="{radius * zoom:.1f}" '
             f'fill="{tint(name, i)}"/><text x="{x:.1f}" y="{y:.1f}" font-size="13">'
-            f"{html.escape(name)}</text></g>")
+            f"{html.escape(name)}</text></g>"
+        )
     for t in range(len(scene.track) - 1):
         piece = scene._replace(track=scene.track[t : t + 2], shown=[])
         for line in _segments(piece._replace(cells=0)):
@@ -384,5 +420,7 @@ def _ground_svg(scene: Scene, zoom: float) -> str:
     nose = "" if scene.heading is None else f'<path d="M{radius} -4L{radius + 8} 0L{radius} 4Z"/>'
     parts.append(f'<g id="token" fill="{ROBOT}"><circle r="{radius:.1f}"/>{nose}</g>')
     told = "A map of cells" if scene.cells else "A map"
-    return (f'<svg viewBox="0 0 {side:.1f} {side:.1f}" role="img" aria-label="{told} with the '
-            f'agent on it">{"".join(parts)}</svg>')
+    return (
+        f'<svg viewBox="0 0 {side:.1f} {side:.1f}" role="img" aria-label="{told} with the '
+        f'agent on it">{"".join(parts)}</svg>'
+    )

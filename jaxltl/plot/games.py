@@ -212,8 +212,11 @@ def game_moves(
         draw_robot(axes, world, environment)
         if system is not None:
             row, column = world.places[system]
-            axes.add_patch(Circle((column + 0.5, row + 0.5), 0.44, fill=False, lw=1.6,
-                                  edgecolor=ACCENT, zorder=6))
+            axes.add_patch(
+                Circle(
+                    (column + 0.5, row + 0.5), 0.44, fill=False, lw=1.6, edgecolor=ACCENT, zorder=6
+                )
+            )
         head(axes, titles[m])
         keep_out_of_layout(axes)
     marks = [*_REGION_MARKS, (INK, "allowed", "^")]
@@ -258,7 +261,8 @@ def _small_multiples(
     gap = 0.18 if environment is None else 0.32
     width = across * (columns * size + 0.14) + bar + 0.2
     figure = Figure(
-        figsize=(max(width, 3.4), down * (rows * size + gap) + 0.5), layout="constrained",
+        figsize=(max(width, 3.4), down * (rows * size + gap) + 0.5),
+        layout="constrained",
         facecolor=PAPER,
     )
     every = figure.subplots(down, across, squeeze=False).ravel()
@@ -284,8 +288,12 @@ def _shade(
 ) -> Any:
     rows, columns = world.cells.shape
     image = axes.imshow(
-        np.ma.masked_invalid(_on_board(world, values)), cmap=SCALE, vmin=limits[0],
-        vmax=limits[1], extent=(0, columns, rows, 0), interpolation="nearest",
+        np.ma.masked_invalid(_on_board(world, values)),
+        cmap=SCALE,
+        vmin=limits[0],
+        vmax=limits[1],
+        extent=(0, columns, rows, 0),
+        interpolation="nearest",
     )
     frame_cells(axes, world)
     return image
@@ -300,8 +308,16 @@ def _figures(
 ) -> None:
     for place, (row, column) in enumerate(world.places):
         if place != robot and np.isfinite(values[place]):
-            axes.text(column + 0.5, row + 0.5, f"{values[place]:.3g}", ha="center", va="center",
-                      fontsize=6.5, color=PAPER if values[place] < middle else INK, zorder=4)
+            axes.text(
+                column + 0.5,
+                row + 0.5,
+                f"{values[place]:.3g}",
+                ha="center",
+                va="center",
+                fontsize=6.5,
+                color=PAPER if values[place] < middle else INK,
+                zorder=4,
+            )
 
 
 def compare(
@@ -344,24 +360,50 @@ def compare(
     place = np.arange(count) + 1.5 * group[order]
     figure = Figure(
         figsize=(float(np.clip(0.085 * count + 1.2, 4, 10)), 3.2),
-        layout=ConstrainedLayoutEngine(h_pad=0.1), facecolor=PAPER,
+        layout=ConstrainedLayoutEngine(h_pad=0.1),
+        facecolor=PAPER,
     )
     axes = figure.subplots()
     styles = [("_", 8), ("o", 4.5), ("x", 4), ("D", 3.5), ("v", 4), ("s", 3.5)]
     for i, (name, value) in reversed(list(enumerate(series.items()))):
         marker, size = styles[i % len(styles)]
-        axes.plot(place, value[order], ls="", marker=marker, ms=size, label=name,
-                  color=SERIES[i % len(SERIES)], mew=1.4 if marker in "_x" else 0)
+        axes.plot(
+            place,
+            value[order],
+            ls="",
+            marker=marker,
+            ms=size,
+            label=name,
+            color=SERIES[i % len(SERIES)],
+            mew=1.4 if marker in "_x" else 0,
+        )
     for i, name in enumerate(kinds):
         here = place[group[order] == i]
-        axes.text(here.mean(), 1.02, name, transform=axes.get_xaxis_transform(), ha="center",
-                  va="bottom", fontsize=8.5, color=MUTED, parse_math=False)
+        axes.text(
+            here.mean(),
+            1.02,
+            name,
+            transform=axes.get_xaxis_transform(),
+            ha="center",
+            va="bottom",
+            fontsize=8.5,
+            color=MUTED,
+            parse_math=False,
+        )
         if i:
             axes.axvline(here[0] - 1.25, color=FAINT, lw=1)
     axes.set_ylabel(label, fontsize=9, color=INK)
     axes.set(xticks=[], ylim=(min(0, axes.get_ylim()[0]), None))
     plain_axes(axes)
     handles, texts = axes.get_legend_handles_labels()
-    figure.legend(handles[::-1], texts[::-1], loc="outside lower left", ncols=len(series),
-                  frameon=False, fontsize=8.5, labelcolor=INK, handletextpad=0.2)
+    figure.legend(
+        handles[::-1],
+        texts[::-1],
+        loc="outside lower left",
+        ncols=len(series),
+        frameon=False,
+        fontsize=8.5,
+        labelcolor=INK,
+        handletextpad=0.2,
+    )
     return figure

@@ -143,20 +143,27 @@ def graphviz_positions(count: int, initial: int, texts: Mapping[Key, Rows]) -> P
     if program is None:
         return None
     lines = [
-        "digraph {", "rankdir=LR; nodesep=0.8; ranksep=0.7;",
+        "digraph {",
+        "rankdir=LR; nodesep=0.8; ranksep=0.7;",
         f"node [shape=circle, fixedsize=true, width={2 * RADIUS}];",
         f"edge [fontsize={FONT_SIZE}];",
-        f"{initial};", *map(str, range(count)),  # the first that is named stands on the left
+        f"{initial};",
+        *map(str, range(count)),  # the first that is named stands on the left
     ]
     for (source, target, _), rows in texts.items():
         # The room that the label takes is all that counts, not what it says.
         text = "\\n".join("m" * (len(line) + 2) for _, line in _wrapped(rows))
         lines.append(f'{source} -> {target} [label="{text}"];')
     try:
-        done = subprocess.run([program, "-Tplain"], input="\n".join([*lines, "}"]), text=True,
-                              capture_output=True, check=True, timeout=60)
-        found = [line.split()[1:4] for line in done.stdout.splitlines()
-                 if line.startswith("node ")]
+        done = subprocess.run(
+            [program, "-Tplain"],
+            input="\n".join([*lines, "}"]),
+            text=True,
+            capture_output=True,
+            check=True,
+            timeout=60,
+        )
+        found = [line.split()[1:4] for line in done.stdout.splitlines() if line.startswith("node ")]
         places = {int(name): (float(x), float(y)) for name, x, y in found}
         return np.array([places[q] for q in range(count)])
     except (OSError, subprocess.SubprocessError, ValueError, KeyError):
@@ -183,7 +190,9 @@ def _framed(
 
 
 def _positions(
-    delta: NDArray[np.integer], initial: int, doomed: NDArray[np.bool_],
+    delta: NDArray[np.integer],
+    initial: int,
+    doomed: NDArray[np.bool_],
     texts: Mapping[Key, Rows],
 ) -> Points:
     layer = _layers(delta, initial)
@@ -196,8 +205,11 @@ def _positions(
     for i, states in enumerate(order):
         if i:
             # Room for the widest label between this layer and the one before.
-            between = [label_size(t)[0] for (a, b, _), t in texts.items()
-                       if a != b and {place.get(a), place.get(b)} == {i - 1, i}]
+            between = [
+                label_size(t)[0]
+                for (a, b, _), t in texts.items()
+                if a != b and {place.get(a), place.get(b)} == {i - 1, i}
+            ]
             x += max(1.6, 2 * RADIUS + 0.75 + max(between, default=0.0))
         column[states] = x
         last = i
@@ -210,7 +222,7 @@ def _positions(
     sinks = np.flatnonzero(doomed)
     if sinks.size:
         lowest = min((position[~doomed, 1]).min(initial=0), 0) - 1.35 * _ROW
-        middle = (column[~doomed].mean() if (~doomed).any() and last > 0 else 0.0)
+        middle = column[~doomed].mean() if (~doomed).any() and last > 0 else 0.0
         spread = 1.6 * (np.arange(sinks.size) - (sinks.size - 1) / 2)
         position[sinks] = np.stack([middle + spread, np.full(sinks.size, lowest)], axis=1)
     return position
@@ -244,8 +256,12 @@ def _ordered(delta: NDArray[np.integer], layers: list[NDArray[np.int64]]) -> lis
     linked |= linked.T
     for _ in range(4):
         for i in [*range(1, len(order)), *range(len(order) - 2, -1, -1)]:
-            place = {q: k - (len(states) - 1) / 2 for j, states in enumerate(order) if j != i
-                     for k, q in enumerate(states)}
+            place = {
+                q: k - (len(states) - 1) / 2
+                for j, states in enumerate(order)
+                if j != i
+                for k, q in enumerate(states)
+            }
 
             def mean(q: int, place: dict[int, float] = place) -> float:
                 near = [place[t] for t in np.flatnonzero(linked[q]).tolist() if t in place]
@@ -262,16 +278,25 @@ def _along(curve: Points) -> Points:
     t = _SAMPLES
     if len(curve) == 3:
         return (1 - t) ** 2 * curve[0] + 2 * t * (1 - t) * curve[1] + t**2 * curve[2]
-    return ((1 - t) ** 3 * curve[0] + 3 * t * (1 - t) ** 2 * curve[1]
-            + 3 * t**2 * (1 - t) * curve[2] + t**3 * curve[3])
+    return (
+        (1 - t) ** 3 * curve[0]
+        + 3 * t * (1 - t) ** 2 * curve[1]
+        + 3 * t**2 * (1 - t) * curve[2]
+        + t**3 * curve[3]
+    )
 
 
 def _best_curve(
-    position: Points, source: int, target: int, crowded: bool, placed: list[Points],
+    position: Points,
+    source: int,
+    target: int,
+    crowded: bool,
+    placed: list[Points],
     boxes: list[Box],
 ) -> Points:
-    bends = (0.22, -0.22, 0.4, -0.4) if crowded else (
-        0, 0.12, -0.12, 0.25, -0.25, 0.4, -0.4, 0.6, -0.6)
+    bends = (
+        (0.22, -0.22, 0.4, -0.4) if crowded else (0, 0.12, -0.12, 0.25, -0.25, 0.4, -0.4, 0.6, -0.6)
+    )
     others = np.delete(position, [source, target], axis=0)
     drawn = np.concatenate(placed)
 
@@ -291,11 +316,13 @@ def _curve(start: Points, end: Points, bend: float) -> Points:
     along = end - start
     control = (start + end) / 2 + bend * np.array([-along[1], along[0]])
     first, last = control - start, control - end
-    return np.array([
-        start + first / np.hypot(*first) * (RADIUS + 0.01),
-        control,
-        end + last / np.hypot(*last) * (RADIUS + 0.02),
-    ])
+    return np.array(
+        [
+            start + first / np.hypot(*first) * (RADIUS + 0.01),
+            control,
+            end + last / np.hypot(*last) * (RADIUS + 0.02),
+        ]
+    )
 
 
 def _best_loop(
@@ -310,8 +337,14 @@ def _best_loop(
         def rim(turn: float, reach: float) -> Points:
             return position[q] + reach * np.array([np.cos(angle + turn), np.sin(angle + turn)])
 
-        curve = np.array([rim(0.42, RADIUS + 0.01), rim(0.5, 3 * RADIUS), rim(-0.5, 3 * RADIUS),
-                          rim(-0.42, RADIUS + 0.02)])
+        curve = np.array(
+            [
+                rim(0.42, RADIUS + 0.01),
+                rim(0.5, 3 * RADIUS),
+                rim(-0.5, 3 * RADIUS),
+                rim(-0.42, RADIUS + 0.02),
+            ]
+        )
         way = np.array([np.cos(angle), np.sin(angle)])
         tip = position[q] + 2.33 * RADIUS * way
         return curve, Box(tip + way * (half * np.abs(way) + 0.06), half)
@@ -386,8 +419,7 @@ def _distances(points: Points, others: Points) -> NDArray[np.float64]:
 def _wrapped(rows: Rows) -> Rows:
     """Rows of one line each; the mark of a guard stands before its first line."""
     return tuple(
-        (mark if i == 0 else "", line)
-        for mark, text in rows for i, line in enumerate(_wrap(text))
+        (mark if i == 0 else "", line) for mark, text in rows for i, line in enumerate(_wrap(text))
     )
 
 

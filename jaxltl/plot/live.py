@@ -52,9 +52,7 @@ def live_automaton(automaton: Automaton, name: str) -> str:
     """
     table = on_the_host(automaton)
     doomed = layout.rejecting(table)
-    graph = layout.arrange(
-        table.delta, int(table.initial), doomed, edge_texts(table, doomed)
-    )
+    graph = layout.arrange(table.delta, int(table.initial), doomed, edge_texts(table, doomed))
     height = graph.size[1]
 
     def at(points: ArrayLike) -> NDArray[np.float64]:
@@ -95,8 +93,13 @@ def live_automaton(automaton: Automaton, name: str) -> str:
             f'<text x="{x:.1f}" y="{y:.1f}">{q}</text></g>'
         )
     wide, high = np.array(graph.size) * _INCH
-    return _svg(f"{name}-automaton", "automaton", (0, 0, wide, high), parts,
-                f"An automaton of {len(table.delta)} states; a table follows")
+    return _svg(
+        f"{name}-automaton",
+        "automaton",
+        (0, 0, wide, high),
+        parts,
+        f"An automaton of {len(table.delta)} states; a table follows",
+    )
 
 
 def _lines(rows: layout.Rows, center: NDArray[np.float64]) -> str:
@@ -136,9 +139,11 @@ def _ground(place: NDArray[np.str_] | World, wall: str) -> _Ground:
         kinds = [str(kind) for kind in place.ravel()]
         special = kind_colors(place, wall)
         return _Ground(
-            (place.shape[0], place.shape[1]), [special.get(kind, "") for kind in kinds],
+            (place.shape[0], place.shape[1]),
+            [special.get(kind, "") for kind in kinds],
             [kind if kind in special else "" for kind in kinds],
-            [state for state, kind in enumerate(kinds) if kind == wall], [],
+            [state for state, kind in enumerate(kinds) if kind == wall],
+            [],
         )
     (rows, columns), margin = place.shape, place.margin
     tints = np.array(TINTS)[np.asarray(place.colors)]
@@ -146,7 +151,8 @@ def _ground(place: NDArray[np.str_] | World, wall: str) -> _Ground:
     label = np.asarray(place.mdp.label)
     names = [", ".join(np.array(place.mdp.propositions)[row]) for row in label]
     ring = [
-        (r - margin, c - margin, str(tints[r, c])) for r, c in np.ndindex(*tints.shape)
+        (r - margin, c - margin, str(tints[r, c]))
+        for r, c in np.ndindex(*tints.shape)
         if not (0 <= r - margin < rows and 0 <= c - margin < columns)
     ]
     return _Ground((rows, columns), inside.ravel().tolist(), names, [], ring)
@@ -201,8 +207,10 @@ def live_map(
     for state, text in enumerate(ground.names):
         if text and max(ground.shape) <= 24:
             row, column = divmod(state, columns)
-            parts.append(f'<text class="name" x="{column * CELL + 3}" y="{row * CELL + 11}">'
-                         f"{html.escape(text)}</text>")
+            parts.append(
+                f'<text class="name" x="{column * CELL + 3}" y="{row * CELL + 11}">'
+                f"{html.escape(text)}</text>"
+            )
     for state, memory, action in marked:
         row, column = divmod(int(state), columns)
         parts.append(
@@ -212,8 +220,9 @@ def live_map(
         )
     parts += [_track(i, cells, columns) for i, cells in enumerate(runs)]
     parts.append(_cell(0, 0, "cursor", ""))
-    parts += [f'<circle class="token piece-{i}" r="{CELL * (0.28 - 0.04 * i):g}"/>'
-              for i in range(pieces)]
+    parts += [
+        f'<circle class="token piece-{i}" r="{CELL * (0.28 - 0.04 * i):g}"/>' for i in range(pieces)
+    ]
     stride = -(-max(ground.shape) // 16)
     beyond = max([0, *(-row for row, _, _ in ground.ring)]) * CELL
     # Numbers grow with the map, so that they can be read where it is scaled down.
@@ -226,14 +235,22 @@ def live_map(
             parts.append(f'<text class="number" x="{x:g}" y="{y:g}">{i + 1}</text>')
     low, more = -beyond - margin, 2 * beyond + margin + 2
     box = (low, low, columns * CELL + more, rows * CELL + more)
-    return _svg(f"{name}-map", "map", box, parts,
-                f"A map of {rows} rows and {columns} columns; a table follows", zoom)
+    return _svg(
+        f"{name}-map",
+        "map",
+        box,
+        parts,
+        f"A map of {rows} rows and {columns} columns; a table follows",
+        zoom,
+    )
 
 
 def _cell(row: int, column: int, kind: str, color: str, more: str = "") -> str:
     fill = f' fill="{color}"' if color else ""
-    return (f'<rect class="{kind}" x="{column * CELL}" y="{row * CELL}" width="{CELL}" '
-            f'height="{CELL}"{fill}{more}/>')
+    return (
+        f'<rect class="{kind}" x="{column * CELL}" y="{row * CELL}" width="{CELL}" '
+        f'height="{CELL}"{fill}{more}/>'
+    )
 
 
 def _layer(
@@ -253,7 +270,8 @@ def _layer(
         # Where nothing is beneath, an arrow takes the ink of the page.
         tone = "" if not color else " light" if np.mean(to_rgb(color)) < 0.5 else " dark"
         heads.setdefault(tone, []).append(
-            _triangle(*divmod(state, columns), actions[action], chances[state, action]))
+            _triangle(*divmod(state, columns), actions[action], chances[state, action])
+        )
     return parts + [f'<path class="arrows{k}" d="{"".join(d)}"/>' for k, d in heads.items()]
 
 
@@ -262,19 +280,25 @@ def _triangle(row: int, column: int, action: str, chance: float) -> str:
     step = np.array(STEPS[action], float)
     side = step[::-1] * (0.055 + 0.085 * chance)
     middle = np.array([column + 0.5, row + 0.5])
-    corners = (middle + step * 0.03 + side, middle + step * (0.12 + 0.34 * chance),
-               middle + step * 0.03 - side)
+    corners = (
+        middle + step * 0.03 + side,
+        middle + step * (0.12 + 0.34 * chance),
+        middle + step * 0.03 - side,
+    )
     return "M" + "L".join(f"{x * CELL:.1f} {y * CELL:.1f}" for x, y in corners) + "Z"
 
 
 def _track(number: int, cells: Sequence[int], columns: int) -> str:
     """The line of a run, from a dot."""
-    points = [(state % columns * CELL + CELL / 2, state // columns * CELL + CELL / 2)
-              for state in cells]
+    points = [
+        (state % columns * CELL + CELL / 2, state // columns * CELL + CELL / 2) for state in cells
+    ]
     line = " ".join(f"{x:g},{y:g}" for x, y in points)
     (x, y), *_ = points
-    return (f'<g class="track" data-run="{number}" style="display:none"><polyline points="{line}"/>'
-            f'<circle cx="{x:g}" cy="{y:g}" r="5"/></g>')
+    return (
+        f'<g class="track" data-run="{number}" style="display:none"><polyline points="{line}"/>'
+        f'<circle cx="{x:g}" cy="{y:g}" r="5"/></g>'
+    )
 
 
 def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
@@ -325,13 +349,19 @@ def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
         parts.append(f'<text x="{left - 6}" y="{y:.1f}" class="tick end">{told}</text>')
     for step, anchor in ((x[0], "start"), (x[-1], "end")):
         told = f"{'step ' if anchor == 'end' else ''}{step:g}"
-        parts.append(f'<text x="{float(across(step)):.1f}" y="{high - 9}" class="tick {anchor}">'
-                     f"{told}</text>")
+        parts.append(
+            f'<text x="{float(across(step)):.1f}" y="{high - 9}" class="tick {anchor}">'
+            f"{told}</text>"
+        )
     return _svg(f"{name}-curve", "plot", (0, 0, wide, high), parts, f"{name}; a table follows")
 
 
 def _svg(
-    name: str, kind: str, box: Sequence[float], parts: Iterable[str], label: str,
+    name: str,
+    kind: str,
+    box: Sequence[float],
+    parts: Iterable[str],
+    label: str,
     zoom: float = 1.0,
 ) -> str:
     sides = " ".join(f"{x:.0f}" for x in box)

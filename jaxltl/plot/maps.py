@@ -91,9 +91,12 @@ def grid(
     down = -(-count // across)
     size = float(np.clip(5.2 / max(rows, columns), 0.16, 0.52))
     figure = Figure(
-        figsize=(across * (columns * size + 0.35) + (0.75 if panels is not None else 0.1),
-                 down * (rows * size + 0.55)),
-        layout="constrained", facecolor=PAPER,
+        figsize=(
+            across * (columns * size + 0.35) + (0.75 if panels is not None else 0.1),
+            down * (rows * size + 0.55),
+        ),
+        layout="constrained",
+        facecolor=PAPER,
     )
     all_axes = np.atleast_1d(figure.subplots(down, across, squeeze=False)).ravel()
     low, high = value_limits(np.zeros(0) if panels is None else panels, limits)
@@ -142,8 +145,13 @@ def _panels(
 
 
 def _cells(
-    axes: Axes, kinds: NDArray[np.str_], values: NDArray[np.float64] | None,
-    low: float, high: float, wall: str, numbers: bool,
+    axes: Axes,
+    kinds: NDArray[np.str_],
+    values: NDArray[np.float64] | None,
+    low: float,
+    high: float,
+    wall: str,
+    numbers: bool,
 ) -> Any:
     rows, columns = kinds.shape
     special = kind_colors(kinds, wall)
@@ -151,8 +159,12 @@ def _cells(
     if values is not None:
         shown = values.reshape(kinds.shape)
     image = axes.imshow(
-        np.ma.masked_invalid(shown), cmap=SCALE, vmin=low, vmax=high,
-        extent=(0, columns, rows, 0), interpolation="nearest",
+        np.ma.masked_invalid(shown),
+        cmap=SCALE,
+        vmin=low,
+        vmax=high,
+        extent=(0, columns, rows, 0),
+        interpolation="nearest",
     )
     tiny = max(rows, columns) > 16
     for (r, c), kind in np.ndenumerate(kinds):
@@ -164,16 +176,41 @@ def _cells(
             if blank:
                 axes.add_patch(Rectangle((c, r), 1, 1, facecolor=color, lw=0))
             if not tiny and blank:
-                axes.text(c + 0.5, r + 0.5, short_name(kind), ha="center", va="center",
-                          fontsize=9, color=INK, parse_math=False)
+                axes.text(
+                    c + 0.5,
+                    r + 0.5,
+                    short_name(kind),
+                    ha="center",
+                    va="center",
+                    fontsize=9,
+                    color=INK,
+                    parse_math=False,
+                )
             elif not tiny:
-                axes.text(c + 0.06, r + 0.06, short_name(kind), ha="left", va="top",
-                          fontsize=6.5, color=INK, weight="bold", parse_math=False, zorder=5,
-                          bbox={"facecolor": color, "edgecolor": "none", "pad": 0.9})
+                axes.text(
+                    c + 0.06,
+                    r + 0.06,
+                    short_name(kind),
+                    ha="left",
+                    va="top",
+                    fontsize=6.5,
+                    color=INK,
+                    weight="bold",
+                    parse_math=False,
+                    zorder=5,
+                    bbox={"facecolor": color, "edgecolor": "none", "pad": 0.9},
+                )
         if numbers and not blank and not tiny:
             dark = shown[r, c] < low + 0.5 * (high - low)
-            axes.text(c + 0.5, r + 0.58, _short_number(float(shown[r, c])), ha="center",
-                      va="center", fontsize=7, color=PAPER if dark else INK)
+            axes.text(
+                c + 0.5,
+                r + 0.58,
+                _short_number(float(shown[r, c])),
+                ha="center",
+                va="center",
+                fontsize=7,
+                color=PAPER if dark else INK,
+            )
     rule_cells(axes, rows, columns, FAINT)
     axes.set(xlim=(0, columns), ylim=(rows, 0), aspect="equal")
     number_cells(axes, rows, columns)
@@ -256,21 +293,29 @@ def strategies(
     figure, every = rows_of_maps(kinds.shape, len(panels), min(len(panels), across))
     for axes, chance, here, title in zip(every, panels, colored, titles, strict=True):
         blank = np.isnan(chance).any(-1)
-        fill_cells(axes, world, [
-            NEVER if never else MARKED if good else PAPER
-            for never, good in zip(blank, here, strict=True)
-        ], FAINT)
+        fill_cells(
+            axes,
+            world,
+            [
+                NEVER if never else MARKED if good else PAPER
+                for never, good in zip(blank, here, strict=True)
+            ],
+            FAINT,
+        )
         number_cells(axes, *kinds.shape)
         draw_moves(axes, world, chance >= seldom, actions, scale=1.15)
         draw_moves(axes, world, (chance > 0) & (chance < seldom), actions, scale=0.5)
         head(axes, title)
         keep_out_of_layout(axes)
     rare = ((panels > 0) & (panels < seldom)).any()
-    note(figure, [
-        *([(MARKED, mark, "s")] if mark else []),
-        *([(NEVER, "never reached", "s")] if np.isnan(panels).any() else []),
-        *([(INK, "often", "^", 7), (INK, "seldom", "^", 4)] if rare else []),
-    ])
+    note(
+        figure,
+        [
+            *([(MARKED, mark, "s")] if mark else []),
+            *([(NEVER, "never reached", "s")] if np.isnan(panels).any() else []),
+            *([(INK, "often", "^", 7), (INK, "seldom", "^", 4)] if rare else []),
+        ],
+    )
     return figure
 
 

@@ -100,7 +100,8 @@ def solution(solution: Solution, model: Any = None, *, memories: Any = None) -> 
     if values.shape != tuple(model.state_shape):
         raise ValueError(
             f"solution: its value has shape {values.shape}, the model's states "
-            f"{tuple(model.state_shape)}; give the model that was solved, and one lane.")
+            f"{tuple(model.state_shape)}; give the model that was solved, and one lane."
+        )
     cells = map_of(world)
     if cells is None:
         if is_product:
@@ -110,18 +111,30 @@ def solution(solution: Solution, model: Any = None, *, memories: Any = None) -> 
     policy = given if is_known else None
     inside = (cells != _WALL).ravel()
     if not is_product:
-        return grid(cells, np.where(inside, values, np.nan), _arrows(policy, inside),
-                    limits=_limits(values), wall=_WALL)
+        return grid(
+            cells,
+            np.where(inside, values, np.nan),
+            _arrows(policy, inside),
+            limits=_limits(values),
+            wall=_WALL,
+        )
     chosen = _open_memories(values, inside) if memories is None else [int(q) for q in memories]
     if not chosen or not all(0 <= q < values.shape[1] for q in chosen):
         raise ValueError(f"memories={memories}; give some of 0 to {values.shape[1] - 1}.")
     names = model.automaton.state_names or ("",) * values.shape[1]
-    titles = [textwrap.shorten(f"memory {q}: {names[q]}".rstrip(": "), 34, placeholder=" …")
-              for q in chosen]
-    arrows = None if policy is None else np.stack(
-        [_arrows(policy[:, q], inside) for q in chosen])  # type: ignore[misc]
-    return grid(cells, np.stack([np.where(inside, values[:, q], np.nan) for q in chosen]), arrows,
-                titles=titles, limits=_limits(values), wall=_WALL)
+    titles = [
+        textwrap.shorten(f"memory {q}: {names[q]}".rstrip(": "), 34, placeholder=" …")
+        for q in chosen
+    ]
+    arrows = None if policy is None else np.stack([_arrows(policy[:, q], inside) for q in chosen])  # type: ignore[misc]
+    return grid(
+        cells,
+        np.stack([np.where(inside, values[:, q], np.nan) for q in chosen]),
+        arrows,
+        titles=titles,
+        limits=_limits(values),
+        wall=_WALL,
+    )
 
 
 def _limits(values: NDArray[Any]) -> tuple[float, float] | None:
@@ -148,13 +161,15 @@ def _strip(found: Solution) -> Figure:
     figure = Figure(figsize=(4.6, 1.7), layout="constrained", facecolor=PAPER)
     axes = figure.subplots()
     plain_axes(axes)
-    for mine, least, most in zip(*(x.reshape(lanes, -1)[:8] for x in (value, low, high)),
-                                 strict=True):
+    for mine, least, most in zip(
+        *(x.reshape(lanes, -1)[:8] for x in (value, low, high)), strict=True
+    ):
         order = np.argsort(mine, kind="stable")
         kept = order[np.linspace(0, order.size - 1, min(order.size, 1000)).astype(int)]
         edges = np.linspace(0, order.size, len(kept) + 1)
         below, above, middle = (
-            np.where(np.isfinite(x[kept]), x[kept], np.nan) for x in (least, most, mine))
+            np.where(np.isfinite(x[kept]), x[kept], np.nan) for x in (least, most, mine)
+        )
         axes.stairs(above, edges, baseline=below, fill=True, color=ACCENT, alpha=0.25)
         axes.stairs(middle, edges, baseline=None, color=ACCENT, lw=1.4)
     axes.set_xlabel("states, from the least value to the greatest", fontsize=8, color=MUTED)
@@ -178,7 +193,8 @@ def map_of(world: Any) -> NDArray[np.str_] | None:
     if hasattr(world, "row_start") or not (hasattr(world, "successor") or _is_dense(world)):
         return None
     if world.available.ndim != 2 or not (
-            world.num_actions == len(STEPS) and 1 < world.num_states <= MOST_CELLS):
+        world.num_actions == len(STEPS) and 1 < world.num_states <= MOST_CELLS
+    ):
         return None
     state = np.arange(world.num_states)
     target = _likeliest(world)
@@ -187,9 +203,13 @@ def map_of(world: Any) -> NDArray[np.str_] | None:
     heights = {*np.abs(np.stack([up, down])).ravel().tolist()} - {0}
     columns = heights.pop() if heights else len(state)
     fits = (
-        not heights and len(state) % columns == 0 and step.any()
-        and (up <= 0).all() and (down >= 0).all()
-        and np.isin(left, (-1, 0)).all() and np.isin(right, (0, 1)).all()
+        not heights
+        and len(state) % columns == 0
+        and step.any()
+        and (up <= 0).all()
+        and (down >= 0).all()
+        and np.isin(left, (-1, 0)).all()
+        and np.isin(right, (0, 1)).all()
         and not (left[state % columns == 0]).any()
         and not (right[state % columns == columns - 1]).any()
     )
@@ -200,10 +220,12 @@ def map_of(world: Any) -> NDArray[np.str_] | None:
     entered[(state[:, None] + step)[step != 0]] = True
     wall = stuck & ~entered & ~(np.asarray(world.initial) > 0)
     label = np.asarray(world.label)
-    names = np.array([
-        _WALL if here else ",".join(np.array(world.propositions)[row]) or "."
-        for here, row in zip(wall, label, strict=True)
-    ])
+    names = np.array(
+        [
+            _WALL if here else ",".join(np.array(world.propositions)[row]) or "."
+            for here, row in zip(wall, label, strict=True)
+        ]
+    )
     return None if _WALL in world.propositions else names.reshape(-1, columns)
 
 
@@ -223,8 +245,11 @@ def _likeliest(world: Any) -> NDArray[np.int64]:
 def board_of_robots(game: Any) -> Board | None:
     """The board of a game of two robots in turns, read off the system's moves, or None."""
     world, count = game.mdp, round((game.num_states / 2) ** 0.5)
-    known = hasattr(world, "probability") and world.available.shape[1:] == (5,) and (
-        world.propositions[:3] == ("collision", "diagonal", "system_turn"))
+    known = (
+        hasattr(world, "probability")
+        and world.available.shape[1:] == (5,)
+        and (world.propositions[:3] == ("collision", "diagonal", "system_turn"))
+    )
     if not known or 2 * count**2 != world.num_states or count > MOST_CELLS:
         return None
     own = 2 * np.arange(count) + 1  # the environment in its first place, the system to move
@@ -248,8 +273,11 @@ def board_of_robots(game: Any) -> Board | None:
     places = np.array([place[i] for i in range(count)])
     places -= places.min(axis=0)
     cells = np.full(places.max(axis=0) + 1, _WALL, dtype="<U64")
-    marks = [(i, p.removeprefix("system_")) for i, p in enumerate(world.propositions[3:], 3)
-             if p.startswith("system_")]
+    marks = [
+        (i, p.removeprefix("system_"))
+        for i, p in enumerate(world.propositions[3:], 3)
+        if p.startswith("system_")
+    ]
     label = np.asarray(world.label)[own]
     for i, spot in enumerate(places):
         cells[tuple(spot)] = ",".join(name for k, name in marks if label[i, k]) or "."
@@ -289,14 +317,18 @@ def _arrows_of(world: Any) -> Iterator[_Arrow]:
 
 
 def _graph(
-    world: Any, system: NDArray[np.bool_] | None, values: NDArray[Any] | None,
-    policy: NDArray[np.int64] | None, region: NDArray[np.bool_] | None = None,
+    world: Any,
+    system: NDArray[np.bool_] | None,
+    values: NDArray[Any] | None,
+    policy: NDArray[np.int64] | None,
+    region: NDArray[np.bool_] | None = None,
 ) -> Figure:
     count = world.num_states
     if count > MOST_STATES:
         raise ValueError(
             f"model: it has {count} states and its moves lie on no map; graphs have up to "
-            f"{MOST_STATES} states.")
+            f"{MOST_STATES} states."
+        )
     arrows = list(_arrows_of(world))
     rows: dict[drawing.Key, drawing.Rows] = {}
     for x in arrows:
@@ -306,8 +338,7 @@ def _graph(
         key = (x.source, x.target, 0)
         rows[key] = (*rows.get(key, ()), ("", text))
     if len(rows) > MOST_ARROWS:
-        raise ValueError(
-            f"model: it has {len(rows)} arrows; graphs have up to {MOST_ARROWS}.")
+        raise ValueError(f"model: it has {len(rows)} arrows; graphs have up to {MOST_ARROWS}.")
     delta = np.repeat(np.arange(count)[:, None], max(1, len(arrows)), axis=1)
     for i, x in enumerate(arrows):
         delta[x.source, i] = x.target
@@ -315,8 +346,9 @@ def _graph(
     first = int(starts[0]) if starts.size else 0
     graph = drawing.arrange(delta, first, np.zeros(count, bool), rows)
     figure, axes = canvas(graph, _notes(world, values))
-    taken = {(x.source, x.target) for x in arrows if policy is not None
-             and policy[x.source] == x.number}
+    taken = {
+        (x.source, x.target) for x in arrows if policy is not None and policy[x.source] == x.number
+    }
     for edge in graph.edges:
         draw_edge(axes, edge.curve, ACCENT if edge.key[:2] in taken else INK)
     for label in graph.labels:
@@ -333,11 +365,27 @@ def _graph(
 
 def _square(axes: Axes, center: NDArray[np.float64], text: str, good: bool) -> None:
     half = drawing.RADIUS * 0.9
-    axes.add_patch(Rectangle(
-        tuple(center - half), 2 * half, 2 * half, facecolor=GOOD if good else FAINT, edgecolor=INK,
-        lw=1.3, zorder=5))
-    axes.text(center[0], center[1], text, ha="center", va="center_baseline", fontsize=11,
-              color=INK, zorder=6)
+    axes.add_patch(
+        Rectangle(
+            tuple(center - half),
+            2 * half,
+            2 * half,
+            facecolor=GOOD if good else FAINT,
+            edgecolor=INK,
+            lw=1.3,
+            zorder=5,
+        )
+    )
+    axes.text(
+        center[0],
+        center[1],
+        text,
+        ha="center",
+        va="center_baseline",
+        fontsize=11,
+        color=INK,
+        zorder=6,
+    )
 
 
 def _notes(world: Any, values: NDArray[Any] | None) -> list[str]:
@@ -348,6 +396,9 @@ def _notes(world: Any, values: NDArray[Any] | None) -> list[str]:
         held = ", ".join(np.array(world.propositions)[label[s]]) if label.size else ""
         value = "" if values is None else f"{values[s]:.6g}"
         if held or value:
-            lines.append(textwrap.shorten(
-                f"{s}: {'; '.join(x for x in (value, held) if x)}", 60, placeholder=" …"))
+            lines.append(
+                textwrap.shorten(
+                    f"{s}: {'; '.join(x for x in (value, held) if x)}", 60, placeholder=" …"
+                )
+            )
     return lines

@@ -45,17 +45,21 @@ def _stacked(pictures: list[str], text: str) -> str | None:
     """Pictures one below the other, as one."""
     if not pictures:
         return None
-    sizes = [[float(re.search(rf' {side}="([0-9.]+)pt"', one)[1]) for side in ("width", "height")]  # type: ignore[index]
-             for one in pictures]
+    sizes = [
+        [float(re.search(rf' {side}="([0-9.]+)pt"', one)[1]) for side in ("width", "height")]  # type: ignore[index]
+        for one in pictures
+    ]
     wide, high = max(w for w, _ in sizes), sum(h for _, h in sizes)
     told, y, parts = html.escape(" ".join(text.split())), 0.0, []
     for one, (_, height) in zip(pictures, sizes, strict=True):
-        inner = one.replace('role="img"', f'y="{y:.2f}"', 1).replace("pt\"", "\"", 2)
+        inner = one.replace('role="img"', f'y="{y:.2f}"', 1).replace('pt"', '"', 2)
         parts.append(re.sub(r' aria-label="[^"]*" style="[^"]*"', "", inner, count=1))
         y += height
-    return (f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{told}" '
-            f'style="max-width:100%;height:auto" width="{wide:.2f}pt" height="{high:.2f}pt" '
-            f'viewBox="0 0 {wide:.2f} {high:.2f}"><title>{told}</title>{"".join(parts)}</svg>')
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{told}" '
+        f'style="max-width:100%;height:auto" width="{wide:.2f}pt" height="{high:.2f}pt" '
+        f'viewBox="0 0 {wide:.2f} {high:.2f}"><title>{told}</title>{"".join(parts)}</svg>'
+    )
 
 
 @picture.register

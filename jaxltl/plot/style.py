@@ -77,16 +77,32 @@ def settle(figure: Figure) -> None:
 def note(figure: Figure, marks: Sequence[tuple[Any, ...]], title: str = "") -> None:
     """What colours and marks mean, under the maps: colour, text, marker and, if not 7, its size."""
     handles = [
-        Line2D([], [], ls="", marker=marker, color=color, markersize=size[0] if size else 7,
-               label=text, markeredgecolor=MUTED if color == PAPER else "none")
+        Line2D(
+            [],
+            [],
+            ls="",
+            marker=marker,
+            color=color,
+            markersize=size[0] if size else 7,
+            label=text,
+            markeredgecolor=MUTED if color == PAPER else "none",
+        )
         for color, text, marker, *size in marks
     ]
     if not handles:
         return
     across = max(1, min(len(handles), int(figure.get_figwidth() / 1.6)))
     legend = figure.legend(
-        handles=handles, loc="outside lower left", ncols=across, frameon=False, fontsize=8,
-        labelcolor=INK, handletextpad=0.1, columnspacing=1.2, title=title, alignment="left",
+        handles=handles,
+        loc="outside lower left",
+        ncols=across,
+        frameon=False,
+        fontsize=8,
+        labelcolor=INK,
+        handletextpad=0.1,
+        columnspacing=1.2,
+        title=title,
+        alignment="left",
     )
     legend.get_title().set(fontsize=8, color=MUTED)
 
@@ -103,13 +119,18 @@ def value_limits(
 
 
 def scale_bar(
-    figure: Figure, image: Any, axes: Sequence[Axes], label: str, shrink: float = 0.6,
+    figure: Figure,
+    image: Any,
+    axes: Sequence[Axes],
+    label: str,
+    shrink: float = 0.6,
     aspect: float = 24,
 ) -> None:
     """What the colours of values mean, beside the maps."""
     # As many ticks at any height, so that the layout, which comes first, finds labels as they are.
-    bar = figure.colorbar(image, ax=list(axes), shrink=shrink, pad=0.015, aspect=aspect,
-                          ticks=MaxNLocator(5))
+    bar = figure.colorbar(
+        image, ax=list(axes), shrink=shrink, pad=0.015, aspect=aspect, ticks=MaxNLocator(5)
+    )
     bar.set_label(label, fontsize=9, color=INK)
     bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=8, color=MUTED, labelcolor=INK, length=2)
@@ -138,8 +159,10 @@ def panel_rows(
     if not columns:
         raise ValueError(f"{name}: nothing to show; give at least one row with a panel.")
     figure = Figure(
-        figsize=(size[0] * len(columns), size[1] * len(rows) + 0.5), layout="constrained",
-        facecolor=PAPER)
+        figsize=(size[0] * len(columns), size[1] * len(rows) + 0.5),
+        layout="constrained",
+        facecolor=PAPER,
+    )
     grid = figure.subplots(len(rows), len(columns), squeeze=False)
     found = {}
     for i, row in enumerate(rows):

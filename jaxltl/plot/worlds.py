@@ -88,10 +88,12 @@ def temporal_gridworld(
     inches = float(np.clip(5.4 / wide, 0.06, 0.42)) * wide
     down = 1 if values is None else 2
     figure = Figure(
-        figsize=(len(chosen) * (inches + 0.3) + (0.8 if down == 2 else 0.1),
-                 down * (inches * (shape[0] + 2 * world.margin) / wide + 0.55)
-                 + (0.3 if lines else 0)),
-        layout=ConstrainedLayoutEngine(h_pad=0.1), facecolor=PAPER,
+        figsize=(
+            len(chosen) * (inches + 0.3) + (0.8 if down == 2 else 0.1),
+            down * (inches * (shape[0] + 2 * world.margin) / wide + 0.55) + (0.3 if lines else 0),
+        ),
+        layout=ConstrainedLayoutEngine(h_pad=0.1),
+        facecolor=PAPER,
     )
     every = figure.subplots(down, len(chosen), squeeze=False)
     for i, (axes, name) in enumerate(zip(every[0], titles, strict=True)):
@@ -136,12 +138,14 @@ def _color_cells(axes: Axes, world: World) -> NDArray[np.float64]:
     colors = np.asarray(world.colors)
     axes.imshow(
         np.array([to_rgb(tint) for tint in TINTS])[colors],
-        extent=(-margin, columns + margin, rows + margin, -margin), interpolation="nearest",
+        extent=(-margin, columns + margin, rows + margin, -margin),
+        interpolation="nearest",
     )
     for corner, width, height in (
         ((-margin, -margin), columns + 2 * margin, margin),
         ((-margin, rows), columns + 2 * margin, margin),
-        ((-margin, 0), margin, rows), ((columns, 0), margin, rows),
+        ((-margin, 0), margin, rows),
+        ((columns, 0), margin, rows),
     ):
         axes.add_patch(Rectangle(corner, width, height, facecolor=PAPER, alpha=0.62, lw=0))
     if max(rows, columns) <= 32:
@@ -161,16 +165,33 @@ def _name_kinds(axes: Axes, world: World) -> None:
         row, column = divmod(int(state), world.shape[1])
         name = world.mdp.propositions[number]
         inset = 0.05
-        axes.add_patch(Rectangle(
-            (column + inset, row + inset), 1 - 2 * inset, 1 - 2 * inset, fill=False,
-            edgecolor=SERIES[1], lw=0.9 if tiny else 1.6, zorder=5,
-        ))
+        axes.add_patch(
+            Rectangle(
+                (column + inset, row + inset),
+                1 - 2 * inset,
+                1 - 2 * inset,
+                fill=False,
+                edgecolor=SERIES[1],
+                lw=0.9 if tiny else 1.6,
+                zorder=5,
+            )
+        )
         # Where cells are tiny, the name of what is rare stands beside it.
         if not tiny or kinds[:, number].sum() <= 3:
             x, y = (column + 1.2, row + 0.04) if tiny else (column + 0.04, row + 0.04)
-            axes.text(x, y, name, ha="left", va="top", fontsize=6.5,
-                      color=PAPER, weight="bold", parse_math=False, zorder=7,
-                      bbox={"facecolor": SERIES[1], "edgecolor": "none", "pad": 0.9})
+            axes.text(
+                x,
+                y,
+                name,
+                ha="left",
+                va="top",
+                fontsize=6.5,
+                color=PAPER,
+                weight="bold",
+                parse_math=False,
+                zorder=7,
+                bbox={"facecolor": SERIES[1], "edgecolor": "none", "pad": 0.9},
+            )
 
 
 def _walks(trajectories: Any, world: World) -> list[NDArray[np.float64]]:
@@ -200,13 +221,26 @@ def _draw_walks(axes: Axes, walks: Sequence[NDArray[np.float64]]) -> None:
     for walk in walks:
         axes.plot(*walk.T, color=ACCENT, lw=1.3, alpha=faint, zorder=5.5, path_effects=halo)
         for point, marker in ((walk[0], "o"), (walk[-1], "s")):
-            axes.plot(*point, marker, color=ACCENT, ms=4.5, mec=PAPER, mew=0.8, zorder=6,
-                      alpha=max(faint, 0.6))
+            axes.plot(
+                *point,
+                marker,
+                color=ACCENT,
+                ms=4.5,
+                mec=PAPER,
+                mew=0.8,
+                zorder=6,
+                alpha=max(faint, 0.6),
+            )
 
 
 def _value_panels(
-    figure: Figure, every: Sequence[Axes], world: World, values: NDArray[np.float64],
-    moves: NDArray[np.float64] | None, limits: tuple[float, float] | None, label: str,
+    figure: Figure,
+    every: Sequence[Axes],
+    world: World,
+    values: NDArray[np.float64],
+    moves: NDArray[np.float64] | None,
+    limits: tuple[float, float] | None,
+    label: str,
     actions: Sequence[str],
 ) -> None:
     limits = value_limits(values, limits)
@@ -214,8 +248,12 @@ def _value_panels(
     image: Any = None
     for i, axes in enumerate(every):
         image = axes.imshow(
-            np.ma.masked_invalid(values[i].reshape(rows, columns)), cmap=SCALE, vmin=limits[0],
-            vmax=limits[1], extent=(0, columns, rows, 0), interpolation="nearest",
+            np.ma.masked_invalid(values[i].reshape(rows, columns)),
+            cmap=SCALE,
+            vmin=limits[0],
+            vmax=limits[1],
+            extent=(0, columns, rows, 0),
+            interpolation="nearest",
         )
         if moves is not None:
             draw_arrows(axes, world.shape, moves[i], values[i], *limits, actions)

@@ -109,27 +109,30 @@ def figures(
         rows_of.append([_judged(robot, run, plan) for robot, run in runs])
     found, curves, maps = zip(*rows_of[0], strict=True) if usual else ((), (), ())
     anew, curves_anew, _ = zip(*rows_of[1], strict=True) if taught else ((), (), ())
-    return plain({
-        "lqr_optimum": optimum.total,
-        "lqr": rows,
-        "navigation": found,
-        "navigation_feasible_start": anew,
-        "seconds": round(time.perf_counter() - begin, 2),
-        "figure8": {
-            "optimum": {"state": optimum.state, "control": optimum.control[:, 0]},
-            "learned": drawn,
-        },
-        "figure10": curves,
-        "figure11": curves_anew,
-        "maps": maps,
-    })
+    return plain(
+        {
+            "lqr_optimum": optimum.total,
+            "lqr": rows,
+            "navigation": found,
+            "navigation_feasible_start": anew,
+            "seconds": round(time.perf_counter() - begin, 2),
+            "figure8": {
+                "optimum": {"state": optimum.state, "control": optimum.control[:, 0]},
+                "learned": drawn,
+            },
+            "figure10": curves,
+            "figure11": curves_anew,
+            "maps": maps,
+        }
+    )
 
 
 # --- the regulator ------------------------------------------------------------------------------
 
 _train = jax.jit(
     lambda keys, problem, hparams, num_steps: jax.vmap(
-        lambda key: cce.train(key, problem, hparams, num_steps=num_steps))(keys),
+        lambda key: cce.train(key, problem, hparams, num_steps=num_steps)
+    )(keys),
     static_argnums=3,
 )
 
@@ -145,12 +148,13 @@ def _regulator(
     world, network = lqr.lqr(), make_network(name)
     size = network.num_parameters
     problem = cce.make_problem(
-        lqr.evaluator(world, network), families.diagonal_gaussian(jnp.zeros(size), 1.0), limit=0.0)
+        lqr.evaluator(world, network), families.diagonal_gaussian(jnp.zeros(size), 1.0), limit=0.0
+    )
     state, _ = _train(
-        _keys(seeds, 0), problem, cce.Hparams(rate=0.1, population=100, rho=0.2), plan.lqr_steps)
+        _keys(seeds, 0), problem, cce.Hparams(rate=0.1, population=100, rho=0.2), plan.lqr_steps
+    )
     # Nothing is random, so that one evaluation tells all.
-    sampled = jnp.where(
-        state.best.found[:, None], state.best.parameters, state.least.parameters)
+    sampled = jnp.where(state.best.found[:, None], state.best.parameters, state.least.parameters)
     both = jnp.stack([families.center(state.family), sampled], 1)
     objective, cost = jax.vmap(jax.vmap(lambda p: problem.evaluate(p, None)))(both)
     allowed = cost <= 0
@@ -162,15 +166,20 @@ def _regulator(
     gap = np.asarray(run.total) - optimum.total
     good = gap[feasible]
     row = {
-        "network": name, "parameters": size, "seeds": seeds, "feasible": feasible.sum(),
+        "network": name,
+        "parameters": size,
+        "seeds": seeds,
+        "feasible": feasible.sum(),
         "gap_median": np.median(good) if good.size else None,
         "gap_max": good.max() if good.size else None,
         "mean_policy_feasible": (cost[:, 0] <= 0).sum(),
         "gap_within_tenth": (good < 0.1).sum(),
     }
     shown = {
-        "network": name, "state": _rounded(jnp.moveaxis(run.state, -1, 0)),
-        "control": _rounded(run.control[:, 0].T), "gap": np.sort(gap),
+        "network": name,
+        "state": _rounded(jnp.moveaxis(run.state, -1, 0)),
+        "control": _rounded(run.control[:, 0].T),
+        "gap": np.sort(gap),
         "violation": np.sort(run.violation),
     }
     return row, shown
@@ -216,24 +225,33 @@ class Search(NamedTuple):
 
 _NUM_TRAJECTORIES = 10  # of each policy that is tried
 _TRUST = tr.Hparams(
-    discount=0.999, delta=0.01, num_trajectories=200, hidden=(30, 30), value_hidden=(30, 30),
+    discount=0.999,
+    delta=0.01,
+    num_trajectories=200,
+    hidden=(30, 30),
+    value_hidden=(30, 30),
     # With little damping the steps follow the noise of the sample: CPO then believes that one step
     # meets the limit, and rests above it.
-    damping=0.1, fisher_stride=4, value_epochs=3,
+    damping=0.1,
+    fisher_stride=4,
+    value_epochs=3,
 )
 
 
 def _robot(task: int) -> Robot:
     world = nav.navigation()
     evaluate = nav.evaluator(
-        world, jax.tree_util.Partial(_scores, jnp.int32(task)),
-        num_trajectories=_NUM_TRAJECTORIES, absorbing=task == 1,
+        world,
+        jax.tree_util.Partial(_scores, jnp.int32(task)),
+        num_trajectories=_NUM_TRAJECTORIES,
+        absorbing=task == 1,
     )
     size = nav.policy_network(world).num_parameters
     family = families.diagonal_gaussian(jnp.zeros(size, jnp.float32), 0.6)
     problem = cce.make_problem(evaluate, family, limit=nav.LIMITS[task])
     hparams = cce.Hparams(
-        rate=0.8, temperature=30.0, margin=0.5 if task == 3 else 0.1, population=100, rho=0.2)
+        rate=0.8, temperature=30.0, margin=0.5 if task == 3 else 0.1, population=100, rho=0.2
+    )
     environment = as_environment(world, task, dtype=jnp.float32)
     by_steps = tr.make_problem(environment, limit=nav.LIMITS[task])
     return Robot(task, world, problem, hparams, environment, by_steps)
@@ -245,9 +263,7 @@ def _scores(task: jax.Array, world: nav.Navigation, run: nav.Run) -> tuple[jax.A
     return tuple(jnp.stack(part)[task - 1] for part in zip(*every, strict=True))  # type: ignore
 
 
-def _search(
-    robot: Robot, method: str, seeds: int, plan: Plan, taught: Any = None
-) -> Search:
+def _search(robot: Robot, method: str, seeds: int, plan: Plan, taught: Any = None) -> Search:
     """A method from its usual start, or from the policies that were taught."""
     keys = _keys(seeds, robot.task)
     if method == "CCE":
@@ -260,10 +276,16 @@ def _by_samples(robot: Robot, keys: jax.Array, plan: Plan, taught: Any) -> Searc
         state, metrics = _train(keys, robot.problem, robot.hparams, plan.steps)
     else:
         state, metrics = _train_from(
-            keys, taught, robot.problem, robot.hparams, plan.feasible_steps[0])
+            keys, taught, robot.problem, robot.hparams, plan.feasible_steps[0]
+        )
     return Search(
-        "CCE", keys, metrics.num_evaluated * _NUM_TRAJECTORIES, metrics.objective,
-        metrics.cost[..., 0], state, robot.hparams,
+        "CCE",
+        keys,
+        metrics.num_evaluated * _NUM_TRAJECTORIES,
+        metrics.objective,
+        metrics.cost[..., 0],
+        state,
+        robot.hparams,
     )
 
 
@@ -272,6 +294,7 @@ def _train_from(
     keys: jax.Array, family: Any, problem: cce.Problem, hparams: cce.Hparams, num_steps: int
 ) -> Any:
     """The search from a distribution for each seed."""
+
     def one(key: jax.Array, family: Any) -> Any:
         return cce.train(key, replace(problem, family=family), hparams, num_steps=num_steps)
 
@@ -290,7 +313,8 @@ def _feasible_policies(robot: Robot, seeds: int, plan: Plan) -> Any:
 
 def _by_steps(robot: Robot, method: str, keys: jax.Array, plan: Plan, taught: Any) -> Search:
     hparams = replace(
-        _TRUST, method="cpo" if method == "CPO" else "trpo",
+        _TRUST,
+        method="cpo" if method == "CPO" else "trpo",
         # A penalty of zero is none, and does not recompile.
         penalty=None if method == "CPO" else PENALTY * (method == "penalised TRPO"),
     )
@@ -299,8 +323,7 @@ def _by_steps(robot: Robot, method: str, keys: jax.Array, plan: Plan, taught: An
     if taught is not None:
         state = _taught(state, robot, hparams, taught)
     state, metrics = _run(state, robot.stepwise, hparams, num_steps)
-    return Search(
-        method, keys, metrics.trajectories, metrics.reward, metrics.cost, state, hparams)
+    return Search(method, keys, metrics.trajectories, metrics.reward, metrics.cost, state, hparams)
 
 
 @partial(jax.jit, static_argnums=3)
@@ -316,14 +339,18 @@ def _taught(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: Any) 
 
     def teach(state: tr.State, family: Any) -> tr.State:
         policy = families.center(family)
-        seen, _, _ = _drive(robot.environment, partial(_by_network, network, policy),
-                            state.key, 200, robot.world.horizon)
+        seen, _, _ = _drive(
+            robot.environment,
+            partial(_by_network, network, policy),
+            state.key,
+            200,
+            robot.world.horizon,
+        )
         seen = seen.reshape(-1, seen.shape[-1])
         wanted = apply(network, policy, seen)
 
         def loss(parameters: Any, chosen: jax.Array) -> jax.Array:
-            mean, _ = tr.act(
-                replace(state, parameters=parameters), hparams, seen[chosen])
+            mean, _ = tr.act(replace(state, parameters=parameters), hparams, seen[chosen])
             return jnp.mean((mean - wanted[chosen]) ** 2)
 
         def descend(carry: Any, key: jax.Array) -> Any:
@@ -335,8 +362,7 @@ def _taught(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: Any) 
         first = {**state.parameters, "log_deviation": jnp.full(2, jnp.log(0.2), jnp.float32)}
         keys = jax.random.split(jax.random.fold_in(state.key, 2), 3000)
         (parameters, _), _ = jax.lax.scan(descend, (first, descent.init(first)), keys)
-        return replace(
-            state, parameters={**parameters, "log_deviation": first["log_deviation"]})
+        return replace(state, parameters={**parameters, "log_deviation": first["log_deviation"]})
 
     return jax.jit(lambda s, f: jax.lax.map(lambda x: teach(*x), (s, f)))(state, families_)
 
@@ -349,15 +375,16 @@ def _by_network(network: Any, policy: jax.Array, seen: jax.Array, key: jax.Array
     return apply(network, policy, seen)
 
 
-def _drawn(
-    state: tr.State, hparams: tr.Hparams, seen: jax.Array, key: jax.Array
-) -> jax.Array:
+def _drawn(state: tr.State, hparams: tr.Hparams, seen: jax.Array, key: jax.Array) -> jax.Array:
     mean, deviation = tr.act(state, hparams, seen)
     return mean + deviation * jax.random.normal(key, mean.shape, mean.dtype)
 
 
 def _drive(
-    environment: Environment, act: Callable[..., jax.Array], key: jax.Array, number: int,
+    environment: Environment,
+    act: Callable[..., jax.Array],
+    key: jax.Array,
+    number: int,
     horizon: int,
 ) -> tuple[jax.Array, Any, tuple[jax.Array, jax.Array]]:
     """Observations ``[T, M, O]``, places ``[T, M]``, and J and Z ``[M]`` of trajectories."""
@@ -370,8 +397,7 @@ def _drive(
         found: Timestep = jax.vmap(lambda p, a: environment.step(p, a, None))(places, action)
         return found.world, (seen, places, found.reward, found.cost)
 
-    _, (seen, path, reward, cost) = jax.lax.scan(
-        move, places, jax.random.split(noise, horizon))
+    _, (seen, path, reward, cost) = jax.lax.scan(move, places, jax.random.split(noise, horizon))
     return seen, path, (reward.sum(0), cost.sum(0))
 
 
@@ -396,7 +422,10 @@ def _policies(robot: Robot, run: Search, plan: Plan) -> list[Any]:
             found.append((state, run.hparams))
             continue
         result = cce.result(
-            state, robot.problem, run.hparams, jax.random.fold_in(key, 1),
+            state,
+            robot.problem,
+            run.hparams,
+            jax.random.fold_in(key, 1),
             num_evaluations=max(plan.fresh // _NUM_TRAJECTORIES, 2),
         )
         least = min((result.mean, result.best), key=lambda a: float(a.excess))
@@ -410,43 +439,59 @@ def _judged(
     """A row, the learning curves, and some trajectories of the first seed's policy."""
     limit = nav.LIMITS[robot.task]
     trajectories, objectives, costs = (
-        np.asarray(x) for x in (run.trajectories, run.objective, run.cost))
+        np.asarray(x) for x in (run.trajectories, run.objective, run.cost)
+    )
     policies = _policies(robot, run, plan)
     path: Any = None
     objective, cost, interval = [], [], []
     for policy in policies:
         state, (j, z) = _driven(
-            robot.environment, policy, plan.fresh, robot.world.horizon, jax.random.key(10**6))
+            robot.environment, policy, plan.fresh, robot.world.horizon, jax.random.key(10**6)
+        )
         path = state if path is None else path
         objective.append(float(j.mean()))
         cost.append(float(z.mean()))
         margin = 1.96 * float(z.std(ddof=1)) / np.sqrt(plan.fresh)
         interval.append((cost[-1] - margin, cost[-1] + margin))
     reached = costs <= limit
-    first = [int(t[c.argmax()]) if c.any() else None
-             for t, c in zip(trajectories, reached, strict=True)]
+    first = [
+        int(t[c.argmax()]) if c.any() else None for t, c in zip(trajectories, reached, strict=True)
+    ]
     row = {
-        "task": robot.task, "method": run.method, "limit": limit, "seeds": len(policies),
+        "task": robot.task,
+        "method": run.method,
+        "limit": limit,
+        "seeds": len(policies),
         "seeds_feasible": sum(z <= limit for z in cost),
         "seeds_confident": sum(high <= limit for _, high in interval),
         "seeds_feasible_at_end": int(reached[:, -1].sum()),
         "trajectories": int(trajectories[0, -1]),
         "trajectories_to_feasible": first,
-        "objective_mean": np.mean(objective), "cost_mean": np.mean(cost),
-        "objective": _rounded(objective), "cost": _rounded(cost),
+        "objective_mean": np.mean(objective),
+        "cost_mean": np.mean(cost),
+        "objective": _rounded(objective),
+        "cost": _rounded(cost),
         "cost_interval": _rounded(interval),
         "final_objective": _rounded(objectives[:, -1]),
         "final_cost": _rounded(costs[:, -1]),
     }
     curve = {
-        "task": robot.task, "method": run.method, "limit": limit,
+        "task": robot.task,
+        "method": run.method,
+        "limit": limit,
         "trajectories": trajectories[0],
-        **{f"{name}_{of}": _rounded(getattr(np, of)(x, axis=0), 3)
-           for name, x in (("objective", objectives), ("cost", costs))
-           for of in ("mean", "std")},
+        **{
+            f"{name}_{of}": _rounded(getattr(np, of)(x, axis=0), 3)
+            for name, x in (("objective", objectives), ("cost", costs))
+            for of in ("mean", "std")
+        },
     }
-    paths = {"task": robot.task, "method": run.method,
-             "x": _rounded(path.x[:, :10].T, 3), "y": _rounded(path.y[:, :10].T, 3)}
+    paths = {
+        "task": robot.task,
+        "method": run.method,
+        "x": _rounded(path.x[:, :10].T, 3),
+        "y": _rounded(path.y[:, :10].T, 3),
+    }
     return row, curve, paths
 
 
@@ -473,15 +518,16 @@ def table(result: dict[str, Any]) -> str:
         ("from policies that are feasible", result["navigation_feasible_start"]),
     ):
         lines += [
-            "", *([title] if title else []),
-            f"{'':28}{'feasible':>10}{'':>4}{'returned policies':>20}"
-            f"{'':>4}thousand trajectories",
+            "",
+            *([title] if title else []),
+            f"{'':28}{'feasible':>10}{'':>4}{'returned policies':>20}{'':>4}thousand trajectories",
             f"{'task':6}{'limit':>6}  {'method':16}{'seeds':>8}{'sure':>6}{'J':>8}{'H':>8}"
             f"    until first feasible, of how many",
         ]
         for x in rows:
             first = ", ".join(
-                "-" if t is None else f"{t / 1000:.1f}" for t in x["trajectories_to_feasible"])
+                "-" if t is None else f"{t / 1000:.1f}" for t in x["trajectories_to_feasible"]
+            )
             lines.append(
                 f"{x['task']:<6}{x['limit']:>6}  {x['method']:16}"
                 f"{x['seeds_feasible']:>4} / {x['seeds']:<2}{x['seeds_confident']:>5}"
@@ -513,18 +559,32 @@ def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
     from jaxltl import plot
 
     best = result["figure8"]["optimum"]
-    drawn = {"figure_8_regulator": plot.lines({
-        x["network"]: {
-            "first state": (np.asarray(x["state"])[..., 0], np.asarray(best["state"])[:, 0]),
-            "second state": (np.asarray(x["state"])[..., 1], np.asarray(best["state"])[:, 1]),
-            "control": (x["control"], best["control"]),
-            "cost beyond the optimum": ([x["gap"]], None),
-            "violation": ([x["violation"]], None),
-        } for x in result["figure8"]["learned"]
-    }, labels=("time", "time", "time", "seeds, sorted", "seeds, sorted"), names=(
-        "learned", "optimal"))}
-    for name, curves in (("figure_10_robot", result["figure10"]),
-                         ("figure_11_feasible_start", result["figure11"])):
+    drawn = {
+        "figure_8_regulator": plot.lines(
+            {
+                x["network"]: {
+                    "first state": (
+                        np.asarray(x["state"])[..., 0],
+                        np.asarray(best["state"])[:, 0],
+                    ),
+                    "second state": (
+                        np.asarray(x["state"])[..., 1],
+                        np.asarray(best["state"])[:, 1],
+                    ),
+                    "control": (x["control"], best["control"]),
+                    "cost beyond the optimum": ([x["gap"]], None),
+                    "violation": ([x["violation"]], None),
+                }
+                for x in result["figure8"]["learned"]
+            },
+            labels=("time", "time", "time", "seeds, sorted", "seeds, sorted"),
+            names=("learned", "optimal"),
+        )
+    }
+    for name, curves in (
+        ("figure_10_robot", result["figure10"]),
+        ("figure_11_feasible_start", result["figure11"]),
+    ):
         if not curves:
             continue
         rows: dict[str, Any] = {}
@@ -534,12 +594,14 @@ def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
             limits[f"task {x['task']}"] = {"cost": x["limit"]}
             for part in row:
                 row[part][x["method"]] = tuple(
-                    np.asarray(x[k]) for k in ("trajectories", f"{part}_mean", f"{part}_std"))
+                    np.asarray(x[k]) for k in ("trajectories", f"{part}_mean", f"{part}_std")
+                )
         drawn[name] = plot.bands(rows, limits=limits, label="trajectories")
     world = nav.navigation()
     drawn["maps"] = plot.paths(
         {f"task {x['task']}: {x['method']}": (x["x"], x["y"]) for x in result["maps"]},
         {"goal": world.goal, "obstacle": world.obstacle, "start": world.start},
-        bounds=world.bounds, columns=len({x["method"] for x in result["maps"]}),
+        bounds=world.bounds,
+        columns=len({x["method"] for x in result["maps"]}),
     )
     return [(f"{name}.svg", plot.to_bytes(figure)) for name, figure in drawn.items()]

@@ -99,8 +99,14 @@ def learn_cases(
         return irl.init(jax.random.key(0), replace(problem, start=start), one)
 
     learned = run_in_chunks(
-        irl.step, jax.vmap(begin)(starts), problem, hparams, num_steps=400, lanes=True,
-        until=learner.gradient_vanishes(1e-6), keep="before",
+        irl.step,
+        jax.vmap(begin)(starts),
+        problem,
+        hparams,
+        num_steps=400,
+        lanes=True,
+        until=learner.gradient_vanishes(1e-6),
+        keep="before",
     )
     states, last = learned.state, jax.tree.map(lambda x: x[-1], learned.metrics)
     shape = (len(mus), len(STARTS))
@@ -137,7 +143,9 @@ def _evaluated(
     each = from_starts(model, solution.value)
     worst = int(np.argwhere(starts)[np.argmin(value)][0])
     return {
-        "mean": value.mean(), "min": value.min(), "worst": worst,
+        "mean": value.mean(),
+        "min": value.min(),
+        "worst": worst,
         "bound": float(np.max((solution.upper - solution.lower)[starts])),
         **{name: each[state] for name, state in named.items()},
     }
@@ -236,7 +244,8 @@ def table(result: dict[str, Any]) -> str:
         ours, theirs = result[f"case{i}"], PUBLISHED[f"case{i}"]
         lines += [
             f"  case {i}  published " + " ".join(f"{x:8.3f}" for x in theirs["theta"]),
-            "          measured  " + " ".join(f"{x:8.3f}" for x in ours["theta"])
+            "          measured  "
+            + " ".join(f"{x:8.3f}" for x in ours["theta"])
             + f"   {ours['neg_log_likelihood']:.3f}",
         ]
     lines += ["", f"{'mu':>10}{'mean':>10}{'minimum':>10}{'neg. log-likelihood':>22}"]
@@ -245,9 +254,15 @@ def table(result: dict[str, Any]) -> str:
         for x in result["mu_sweep"]
     ]
     bound = max(result[f"case{i}"]["bound"] for i in (1, 2, 3))
-    return "\n".join([*lines, "", *_DIFFERENCES, "",
-                      f"every probability is certified within {bound:.0e}; "
-                      f"{result['seconds']:.1f} s"])
+    return "\n".join(
+        [
+            *lines,
+            "",
+            *_DIFFERENCES,
+            "",
+            f"every probability is certified within {bound:.0e}; {result['seconds']:.1f} s",
+        ]
+    )
 
 
 _DIFFERENCES = (

@@ -29,13 +29,21 @@ RESTART = 1 / 50  # before a move, with this probability, a run starts anew
 REST = 20_000  # moves without an update after which learning ends
 SEEDS = 10
 
-PUBLISHED = {"states": 144, "system_states": 72, "system_transitions": 192,
-             "seconds": 58.05, "last_update_seconds": 29.77}
+PUBLISHED = {
+    "states": 144,
+    "system_states": 72,
+    "system_transitions": 192,
+    "seconds": 58.05,
+    "last_update_seconds": 29.77,
+}
 
 _MAP = ". . p1\n. . .\np2 . ."
 _DANGER = {"on": (0, 1, 3, 4), "off": (4, 5, 7, 8)}
 _HPARAMS = rmax.Hparams(
-    discount=DISCOUNT, reward_bound=REWARD_BOUND, epsilon=EPSILON, failure=FAILURE,
+    discount=DISCOUNT,
+    reward_bound=REWARD_BOUND,
+    epsilon=EPSILON,
+    failure=FAILURE,
 )
 
 
@@ -131,7 +139,8 @@ def _known(model: Patrol) -> dict[str, Any]:
     winning = jax.nn.one_hot(almost_sure_buchi(game, model.accepting).action, game.num_actions)
     by_graph = worst(winning)
     values, counts = np.unique(
-        np.round(np.asarray(optimal)[np.asarray(game.system)], 6), return_counts=True)
+        np.round(np.asarray(optimal)[np.asarray(game.system)], 6), return_counts=True
+    )
     return {
         "figures": {
             "values": {f"{v:.6f}": int(n) for v, n in zip(values, counts, strict=True)},
@@ -139,7 +148,8 @@ def _known(model: Patrol) -> dict[str, Any]:
             "winning_strategy": _summary(model, by_graph),
             "hat_strategy_gap": jnp.max(optimal - worst(of_hat)),
             "uniform_hat_strategy_gap": jnp.max(
-                optimal - worst(pac.hat_strategy(near, game.available, p))),
+                optimal - worst(pac.hat_strategy(near, game.available, p))
+            ),
         },
         "values": {"optimal": optimal, "initial": uniform, "winning": by_graph},
         "winning": winning,
@@ -170,8 +180,7 @@ def _learn(
     key: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, most: jax.Array
 ) -> learner.Learned:
     """Until the strategy rests, or for so many moves."""
-    return rmax.train_until(
-        key, problem, hparams, until=Partial(_rests, most), num_steps=10**6)
+    return rmax.train_until(key, problem, hparams, until=Partial(_rests, most), num_steps=10**6)
 
 
 def _rests(most: Any, before: rmax.State, after: rmax.State, metrics: rmax.Metrics) -> jax.Array:
@@ -219,16 +228,18 @@ def _judged(
         evidence = rmax.evidence(one.state, problem, hparams)
         every.append(evidence)
         asked = evidence.reachable & problem.game.system
-        rows.append({
-            "seed": seed,
-            "restart": hparams.restart,
-            "last_update_step": one.state.last_update,
-            "moves": one.state.moves,
-            "updates": one.state.num_updates,
-            "eps_optimal_states": jnp.sum(evidence.epsilon_optimal & asked),
-            "eps_optimal_states_met": jnp.sum(evidence.epsilon_optimal_met & asked),
-            "always_almost_sure": bool(one.state.always_almost_sure & evidence.almost_sure),
-        })
+        rows.append(
+            {
+                "seed": seed,
+                "restart": hparams.restart,
+                "last_update_step": one.state.last_update,
+                "moves": one.state.moves,
+                "updates": one.state.num_updates,
+                "eps_optimal_states": jnp.sum(evidence.epsilon_optimal & asked),
+                "eps_optimal_states_met": jnp.sum(evidence.epsilon_optimal_met & asked),
+                "always_almost_sure": bool(one.state.always_almost_sure & evidence.almost_sure),
+            }
+        )
     return rows, every[0]
 
 
@@ -239,7 +250,8 @@ def table(result: dict[str, Any]) -> str:
     """Section 6.7, published beside measured."""
     first, graph = result["initial_strategy"], result["winning_strategy"]
     rows = [
-        ("states", "states"), ("of the system", "system_states"),
+        ("states", "states"),
+        ("of the system", "system_states"),
         ("moves of the system", "system_transitions"),
         ("almost surely winning", "almost_sure_states"),
     ]
@@ -257,10 +269,13 @@ def table(result: dict[str, Any]) -> str:
         + ", ".join(f"{v}: {n}" for v, n in result["values"].items()),
         "",
         f"{'worst-case value (published as a picture)':48}{'min':>10}{'max':>10}{'mean':>10}",
-        *(f"  {title:46}{x['min']:>10.6f}{x['max']:>10.6f}{x['mean']:>10.6f}" for title, x in (
-            ("initial strategy: any move, all alike", first),
-            ("pure winning strategy, by the graph alone", graph),
-        )),
+        *(
+            f"  {title:46}{x['min']:>10.6f}{x['max']:>10.6f}{x['mean']:>10.6f}"
+            for title, x in (
+                ("initial strategy: any move, all alike", first),
+                ("pure winning strategy, by the graph alone", graph),
+            )
+        ),
         "",
         "with the model known, the largest loss of the strategies of algorithm 4, which play any",
         f"move now and then: {result['hat_strategy_gap']:.3e} for the winning strategy of the hat "
@@ -275,18 +290,27 @@ def table(result: dict[str, Any]) -> str:
     ]
     both = zip(result["learned"], result["learned_without_restarts"], strict=True)
     for pair in both:
-        lines.append(f"{pair[0]['seed']:>6}" + "".join(
-            f"{x['last_update_step']:>14}{x['updates']:>10}{x['eps_optimal_states']:>7}"
-            f"{x['eps_optimal_states_met']:>7}" for x in pair
-        ))
+        lines.append(
+            f"{pair[0]['seed']:>6}"
+            + "".join(
+                f"{x['last_update_step']:>14}{x['updates']:>10}{x['eps_optimal_states']:>7}"
+                f"{x['eps_optimal_states_met']:>7}"
+                for x in pair
+            )
+        )
     runs = [*result["learned"], *result["learned_without_restarts"]]
     sure = sum(x["always_almost_sure"] for x in runs)
-    return "\n".join([
-        *lines, "", *_DIFFERENCES, "",
-        f"{sure} of {len(runs)} runs won almost surely at every moment, by the graph; "
-        f"{len(result['learned'])} runs side by side take {result['seconds_together']:.3f} s; "
-        f"{result['total_seconds']:.1f} s in all",
-    ])
+    return "\n".join(
+        [
+            *lines,
+            "",
+            *_DIFFERENCES,
+            "",
+            f"{sure} of {len(runs)} runs won almost surely at every moment, by the graph; "
+            f"{len(result['learned'])} runs side by side take {result['seconds_together']:.3f} s; "
+            f"{result['total_seconds']:.1f} s in all",
+        ]
+    )
 
 
 _DIFFERENCES = (
@@ -320,9 +344,7 @@ def _figure_17(model: Patrol, quantity: jax.Array) -> dict[str, Any]:
 def _figure_19(model: Patrol, winning: jax.Array, learned: rmax.Evidence) -> dict[str, Any]:
     """Strategies for each light, on first, and automaton state; None where no run comes."""
     system = np.asarray(model.game.system)
-    place = tuple(
-        np.asarray(x)[system] for x in (1 - model.light, model.memory, model.cell)
-    )
+    place = tuple(np.asarray(x)[system] for x in (1 - model.light, model.memory, model.cell))
     reached = np.asarray(learned.reachable)[system]
 
     def laid_out(play: jax.Array) -> np.ndarray:
@@ -333,15 +355,20 @@ def _figure_19(model: Patrol, winning: jax.Array, learned: rmax.Evidence) -> dic
 
     near = np.zeros((2, 4, 9), bool)
     near[place] = np.asarray(learned.epsilon_optimal)[system] & reached
-    return {"initial": laid_out(winning), "learned": laid_out(learned.strategy),
-            "epsilon_optimal": near}
+    return {
+        "initial": laid_out(winning),
+        "learned": laid_out(learned.strategy),
+        "epsilon_optimal": near,
+    }
 
 
 def _without_both(automaton: Automaton) -> Automaton:
     """The automaton without the letter that holds in no cell, for shorter guards."""
     kept = ~automaton.letters.all(axis=1)
     return replace(
-        automaton, letters=automaton.letters[kept], delta=automaton.delta[:, kept],
+        automaton,
+        letters=automaton.letters[kept],
+        delta=automaton.delta[:, kept],
         priority=automaton.priority[:, kept],
     )
 
@@ -354,26 +381,33 @@ def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
     danger = np.array([np.isin(np.arange(9), cells) for cells in _DANGER.values()])
     shown, maps = result["figure18"], result["figure19"]
     titles = [f"light {light}, q{q}" for light in _DANGER for q in (1, 2, 3, 4)]
-    laid_out = {
-        k: np.asarray(maps[k], float).reshape(8, 9, -1) for k in ("initial", "learned")
-    }
+    laid_out = {k: np.asarray(maps[k], float).reshape(8, 9, -1) for k in ("initial", "learned")}
     drawn = {
         "figure_17_automaton": plot.automaton(_without_both(surveillance())),
         "figure_17_best_moves": plot.strategies(
-            _MAP, best, marked=danger, mark="dangerous",
+            _MAP,
+            best,
+            marked=danger,
+            mark="dangerous",
             titles=[f"light {light}" for light in _DANGER],
         ),
         "figure_18_values": plot.compare(
-            {"optimal": shown["optimal"], "learned": shown["learned"],
-             "initial (uniform)": shown["initial"],
-             "winning, by the graph alone": shown["winning"]},
+            {
+                "optimal": shown["optimal"],
+                "learned": shown["learned"],
+                "initial (uniform)": shown["initial"],
+                "winning, by the graph alone": shown["winning"],
+            },
             groups=["reachable" if x else "never reached" for x in shown["reachable"]],
             label="worst-case value",
         ),
         "figure_19_initial": plot.strategies(_MAP, laid_out["initial"], titles=titles),
         "figure_19_learned": plot.strategies(
-            _MAP, laid_out["learned"], titles=titles,
-            marked=np.asarray(maps["epsilon_optimal"]).reshape(8, 9), mark="epsilon-optimal",
+            _MAP,
+            laid_out["learned"],
+            titles=titles,
+            marked=np.asarray(maps["epsilon_optimal"]).reshape(8, 9),
+            mark="epsilon-optimal",
         ),
     }
     return [(f"{name}.svg", plot.to_bytes(figure)) for name, figure in drawn.items()]

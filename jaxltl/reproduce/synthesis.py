@@ -141,8 +141,10 @@ def _learn(problem: Any, hparams: Any) -> tuple[Any, Any]:
         metrics = jax.tree.map(lambda x: x[-1], metrics)
         if float(metrics.error) < TOLERANCE:
             return state, metrics
-    raise NotConverged(f"after {float(metrics.moves):.3g} moves the error is still "
-                       f"{float(metrics.error):.2g}; it should fall below {TOLERANCE}.")
+    raise NotConverged(
+        f"after {float(metrics.moves):.3g} moves the error is still "
+        f"{float(metrics.error):.2g}; it should fall below {TOLERANCE}."
+    )
 
 
 def _learning_curve(size: int, found: Any, problem: Any, learnt: Any) -> dict[str, Any]:
@@ -162,7 +164,8 @@ def _counters(bound: int) -> dict[str, Any]:
     game = robots(3)
     found = _restricted(game, buchi(game, CORNERS, safe="!collision"), bound)
     return {
-        "bound": bound, "states": found.model.num_states,
+        "bound": bound,
+        "states": found.model.num_states,
         "max_value": float(_value(found.model).max()),
     }
 
@@ -170,8 +173,10 @@ def _counters(bound: int) -> dict[str, Any]:
 def _example_2() -> dict[str, Any]:
     game = robots(4)
     task = gr1(
-        game, ["environment_lower_left", "environment_upper_right"],
-        ["system_lower_right", "system_upper_left"], safe="!collision",
+        game,
+        ["environment_lower_left", "environment_upper_right"],
+        ["system_lower_right", "system_upper_left"],
+        safe="!collision",
     )
     strategy = permissive_strategy(game, task)
     found = apply_strategy(strategy)
@@ -180,7 +185,10 @@ def _example_2() -> dict[str, Any]:
     here = value[initial]
     return {
         "summary": {
-            "n": 4, "max": here.max(), "min": here.min(), "mean": here.mean(),
+            "n": 4,
+            "max": here.max(),
+            "min": here.min(),
+            "mean": here.mean(),
             "maximal": strategy.maximal,
         },
         "values": {"n": 4, "state": np.asarray(found.base_state)[initial], "value": here},
@@ -232,14 +240,19 @@ def table(result: dict[str, Any]) -> str:
         )
     lines += ["", "values at the system's states, and at how many of them"]
     lines += [
-        f"{row['n']:>4}  " + ", ".join(
-            f"{value}: {count}" for value, count in reversed(row["values"].items()))
+        f"{row['n']:>4}  "
+        + ", ".join(f"{value}: {count}" for value, count in reversed(row["values"].items()))
         for row in result["table5"]
     ]
-    lines += ["", "Example 3 at N = 3: the best value under each strategy", "",
-              f"{'counter':>12}{'states':>8}{'published':>12}{'measured':>12}"]
-    lines.append(f"{'memoryless':>12}{'':8}{MEMORYLESS:>12.4f}"
-                 f"{result['memoryless_permissive_max']:>12.6f}")
+    lines += [
+        "",
+        "Example 3 at N = 3: the best value under each strategy",
+        "",
+        f"{'counter':>12}{'states':>8}{'published':>12}{'measured':>12}",
+    ]
+    lines.append(
+        f"{'memoryless':>12}{'':8}{MEMORYLESS:>12.4f}{result['memoryless_permissive_max']:>12.6f}"
+    )
     lines += [
         f"{row['bound']:>12}{row['states']:>8}{TABLE6[row['bound']]:>12.4f}"
         f"{row['max_value']:>12.6f}"

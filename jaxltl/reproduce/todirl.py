@@ -88,13 +88,15 @@ def figures(
             rows.append(row)
             drawn += [curve] if curve else []
     progress("the expert, and a random policy")
-    return plain({
-        "by_demonstrations": rows,
-        "reference": _references(setting),
-        "seconds": round(time.perf_counter() - begin, 2),
-        "seeds": num_seeds,
-        "figure6": drawn,
-    })
+    return plain(
+        {
+            "by_demonstrations": rows,
+            "reference": _references(setting),
+            "seconds": round(time.perf_counter() - begin, 2),
+            "seeds": num_seeds,
+            "figure6": drawn,
+        }
+    )
 
 
 # --- worlds and demonstrations ------------------------------------------------------------------
@@ -166,9 +168,9 @@ def _begin(learner: Any, keys: jax.Array, problems: Any, hparams: Any) -> Any:
 
 @partial(jax.jit, static_argnums=(0, 4))
 def _run(learner: Any, states: Any, problems: Any, hparams: Any, num_steps: int) -> Any:
-    return jax.vmap(
-        lambda s, p: learner.run(s, p, hparams, num_steps=num_steps, max_rows=1)[0]
-    )(states, problems)
+    return jax.vmap(lambda s, p: learner.run(s, p, hparams, num_steps=num_steps, max_rows=1)[0])(
+        states, problems
+    )
 
 
 def _learned(
@@ -213,8 +215,9 @@ class Judged(NamedTuple):
 def _judged(setting: Setting, memory: Automaton, method: str, radius: int, parameters: Any):
     """Each seed's parameters in its own training world and in all test worlds."""
     seeds = len(setting.train)
-    own = _policies(method, parameters, _stacked(setting.train, memory),
-                    _observed(setting.train, radius))
+    own = _policies(
+        method, parameters, _stacked(setting.train, memory), _observed(setting.train, radius)
+    )
     new_models, new_seen = _stacked(setting.test, memory), _observed(setting.test, radius)
     new = _everywhere(method, parameters, new_models, new_seen)
     return Judged(
@@ -232,14 +235,15 @@ def _policies(method: str, parameters: Any, models: Product, seen: jax.Array) ->
     if method == "cloning":
         network = cloning.ConvolutionalPolicy(num_actions=models.num_actions)
         return jax.vmap(partial(cloning.policy_in_world, network))(parameters, models, seen)
-    return jax.vmap(
-        lambda p, m, o: todirl.plan(todirl.RewardNetwork(), p, m, o, _HPARAMS).policy
-    )(parameters, models, seen)
+    return jax.vmap(lambda p, m, o: todirl.plan(todirl.RewardNetwork(), p, m, o, _HPARAMS).policy)(
+        parameters, models, seen
+    )
 
 
 @partial(jax.jit, static_argnums=0)
 def _everywhere(method: str, parameters: Any, models: Product, seen: jax.Array) -> jax.Array:
     """Of each seed in all worlds: ``float[N, M, S, Q, A]``."""
+
     def one(parameters: Any) -> jax.Array:
         copies = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(seen), *x.shape)), parameters)
         return _policies(method, copies, models, seen)
@@ -271,8 +275,10 @@ def _bounds(found: Any) -> Bounds:
 def _row(judged: Judged, states: Any) -> dict[str, Any]:
     each = judged.test.mean.mean(1)
     return {
-        "train_mean": judged.train.mean.mean(), "train_std": _spread(judged.train.mean),
-        "test_mean": each.mean(), "test_std": _spread(each),
+        "train_mean": judged.train.mean.mean(),
+        "train_std": _spread(judged.train.mean),
+        "test_mean": each.mean(),
+        "test_std": _spread(each),
         "test_worst": judged.test.mean.min(),
         "test_of_each_seed": np.round(each, 5),
         "test_worst_of_each_seed": np.round(judged.test.mean.min(1), 5),
@@ -298,8 +304,11 @@ def _curve(judged: list[Judged]) -> dict[str, Any]:
 def _walks(setting: Setting, states: Any) -> list[dict[str, Any]]:
     """Runs of the first seed's policy in its own world and in two new ones."""
     parameters, found = jax.tree.map(lambda x: x[:1], states.best.parameters), []
-    worlds = {"training world": setting.train[0], "test world": setting.test[0],
-              "another test world": setting.test[1]}
+    worlds = {
+        "training world": setting.train[0],
+        "test world": setting.test[0],
+        "another test world": setting.test[1],
+    }
     for title, world in worlds.items():
         models = _stacked([world], setting.task)
         ((policy,),) = _everywhere("todirl", parameters, models, _observed([world], 1))
@@ -321,8 +330,14 @@ def _references(setting: Setting) -> list[dict[str, Any]]:
             if name == "random":
                 policies = jnp.full_like(policies, 1 / models.num_actions)
             found.append(_bounds(task_performances(models, policies)).mean)
-        rows.append({"policy": name, "train_mean": found[0].mean(), "test_mean": found[1].mean(),
-                     "test_worst": found[1].min()})
+        rows.append(
+            {
+                "policy": name,
+                "train_mean": found[0].mean(),
+                "test_mean": found[1].mean(),
+                "test_worst": found[1].min(),
+            }
+        )
     return rows
 
 
@@ -350,7 +365,11 @@ def table(result: dict[str, Any]) -> str:
             f"{'':8}{x['test_worst']:>8.3f}"
             for x in result["reference"]
         ),
-        "", *_orders(result["by_demonstrations"]), "", *_DIFFERENCES, "",
+        "",
+        *_orders(result["by_demonstrations"]),
+        "",
+        *_DIFFERENCES,
+        "",
         f"{result['seconds']:.1f} s in all",
     ]
     return "\n".join(lines)
@@ -373,7 +392,8 @@ def _orders(rows: list[dict[str, Any]]) -> list[str]:
         verdict = "ahead" if mean > 2 * error else "behind" if mean < -2 * error else "level"
         found.append(
             f"{number:>4} demonstrations: todirl less {method:10} {mean:+.4f} +- {2 * error:.4f}, "
-            f"{verdict}")
+            f"{verdict}"
+        )
     return found
 
 
@@ -397,8 +417,12 @@ def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
         for part, title in columns.items():
             learning[title][x["method"]] = tuple(
                 np.asarray(y, float)
-                for y in (np.asarray(x["steps"]) / x["steps"][-1], x[f"{part}_mean"],
-                          x[f"{part}_std"]))
+                for y in (
+                    np.asarray(x["steps"]) / x["steps"][-1],
+                    x[f"{part}_mean"],
+                    x[f"{part}_std"],
+                )
+            )
     shown: dict[str, Any] = {title: {} for title in columns.values()}
     rows = result["by_demonstrations"]
     for method in dict.fromkeys(x["method"] for x in rows):
@@ -406,17 +430,35 @@ def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
         for part, title in columns.items():
             shown[title][method] = (
                 np.log10([x["demonstrations"] for x in mine]),
-                [x[f"{part}_mean"] for x in mine], [x[f"{part}_std"] for x in mine])
-    drawn = [("figure_7_demonstrations.svg", plot.to_bytes(plot.bands(
-        {"probability of the task": shown}, label="demonstrations, decimal logarithm")))]
+                [x[f"{part}_mean"] for x in mine],
+                [x[f"{part}_std"] for x in mine],
+            )
+    drawn = [
+        (
+            "figure_7_demonstrations.svg",
+            plot.to_bytes(
+                plot.bands(
+                    {"probability of the task": shown}, label="demonstrations, decimal logarithm"
+                )
+            ),
+        )
+    ]
     if result["figure6"]:
-        drawn.append(("figure_6_learning.svg", plot.to_bytes(plot.bands(
-            {"probability of the task": learning}, label="share of all steps"))))
+        drawn.append(
+            (
+                "figure_6_learning.svg",
+                plot.to_bytes(
+                    plot.bands({"probability of the task": learning}, label="share of all steps")
+                ),
+            )
+        )
     for x in result["figure6"]:
         for place in x["worlds"]:
             world = read_world(place["world"])
             figure = plot.temporal_gridworld(
-                world, trajectories=make_trajectories(world.mdp, place["runs"]),
-                title=f"{place['title']}: runs of the learned policy")
+                world,
+                trajectories=make_trajectories(world.mdp, place["runs"]),
+                title=f"{place['title']}: runs of the learned policy",
+            )
             drawn.append((f"{place['title'].replace(' ', '_')}.svg", plot.to_bytes(figure)))
     return drawn

@@ -36,7 +36,10 @@ def demonstrations():
 @cache
 def problem(held_out=None):
     return bc.make_problem(
-        two_worlds(), jnp.stack([jnp.eye(6)] * 2), demonstrations(), held_out=held_out,
+        two_worlds(),
+        jnp.stack([jnp.eye(6)] * 2),
+        demonstrations(),
+        held_out=held_out,
         network=SMALL,
     )
 
@@ -54,7 +57,8 @@ def test_the_loss_is_cross_entropy_of_the_logits():
         total -= float(found.counts[w, s, q, a]) * np.log(probability[a])
     assert len(pairs) > 2 and float(found.counts.sum()) == 10
     np.testing.assert_allclose(
-        bc.neg_log_likelihood(state.parameters, found, found.counts), total / 10, rtol=1e-10)
+        bc.neg_log_likelihood(state.parameters, found, found.counts), total / 10, rtol=1e-10
+    )
 
 
 def test_minibatches_are_drawn_by_counts():
@@ -83,7 +87,9 @@ def test_the_prior_keeps_the_policy_soft():
     found = problem()
     ends = [
         bc.train(
-            jax.random.key(0), found, bc.Hparams(learning_rate=0.03, batch=16, l2=l2),
+            jax.random.key(0),
+            found,
+            bc.Hparams(learning_rate=0.03, batch=16, l2=l2),
             num_steps=150,
         )[1].loss[-1]
         for l2 in (0.0, 10.0)
@@ -95,7 +101,8 @@ def test_learning_stops_at_the_best_held_out_likelihood():
     """Held out is what contradicts the demonstrations, so that learning soon makes it worse."""
     other = [runs((0, 1), (3, 0))] * 2
     found = bc.make_problem(
-        two_worlds(), [jnp.eye(6)] * 2, demonstrations(), held_out=other, network=SMALL)
+        two_worlds(), [jnp.eye(6)] * 2, demonstrations(), held_out=other, network=SMALL
+    )
     hparams = bc.Hparams(learning_rate=0.03, patience=20, batch=16)
     state, metrics = bc.train(jax.random.key(0), found, hparams, num_steps=150)
     curve = np.asarray(metrics.held_out)
@@ -104,7 +111,8 @@ def test_learning_stops_at_the_best_held_out_likelihood():
     assert best == int(np.argmin(curve)) < 100
     np.testing.assert_allclose(state.best.neg_log_likelihood, curve.min())
     np.testing.assert_allclose(
-        bc.neg_log_likelihood(state.best.parameters, found, found.held_out), curve.min(), rtol=1e-9)
+        bc.neg_log_likelihood(state.best.parameters, found, found.held_out), curve.min(), rtol=1e-9
+    )
     assert (curve[best + 21 :] == curve[best + 20]).all(), "it stays as it was"
     longer, _ = bc.run(state, found, hparams, num_steps=150)
     jax.tree.map(np.testing.assert_array_equal, longer.parameters, state.parameters)
@@ -120,7 +128,8 @@ def test_the_network_is_that_of_the_dissertation():
     network = bc.ConvolutionalPolicy()
     observation, memory = jnp.zeros((7, 1, 45)), jnp.eye(5)[None]
     scores, parameters = jax.eval_shape(
-        network.init_with_output, jax.random.key(0), observation, memory)
+        network.init_with_output, jax.random.key(0), observation, memory
+    )
     assert scores.shape == (7, 5, 4)
     shapes = sorted(x.shape for x in jax.tree.leaves(parameters) if x.ndim > 1)
     # What two convolutions leave of 3 x 3 are 24 numbers; with the memory 29 go into 100.
@@ -144,7 +153,9 @@ def test_memory_enters_beside_what_is_seen():
 
 def test_unavailable_actions_have_no_probability():
     mdp = jl.make_mdp(
-        [[[0], [1]], [[1], [0]]], [[[1.0], [1.0]], [[1.0], [0.0]]], label=[[0], [1]],
+        [[[0], [1]], [[1], [0]]],
+        [[[1.0], [1.0]], [[1.0], [0.0]]],
+        label=[[0], [1]],
         propositions=["g"],
     )
     model = stack_products([mdp], "F g")
@@ -170,17 +181,27 @@ make = partial(bc.make_problem, held_out=None, network=SMALL)
     ("call", "message"),
     [
         (lambda: make(two_worlds(), jnp.eye(6), demonstrations()), "observation has shape"),
-        (lambda: make(two_worlds(), [np.eye(6), np.full((6, 6), np.inf)], demonstrations()),
-         "world 1: the observation in state 0 is not finite"),
+        (
+            lambda: make(two_worlds(), [np.eye(6), np.full((6, 6), np.inf)], demonstrations()),
+            "world 1: the observation in state 0 is not finite",
+        ),
         (lambda: make(two_worlds(), [np.eye(6)] * 2, demonstrations()[:1]), "in 1 worlds"),
         (lambda: make(two_worlds(), [np.eye(6)] * 2, demonstrations(), held_out=1.0), "held_out=1"),
-        (lambda: make(two_worlds(), [np.eye(6)] * 2, demonstrations(), held_out=0.95),
-         "no pair is left"),
+        (
+            lambda: make(two_worlds(), [np.eye(6)] * 2, demonstrations(), held_out=0.95),
+            "no pair is left",
+        ),
         (lambda: make(two_worlds(), [np.eye(6)] * 2, [runs((0, 7))] * 2), "action 7"),
-        (lambda: make(two_worlds(), [np.eye(6)] * 2, demonstrations(), network=Single()),
-         r"scores have shape \(6, 1, 1\); expected \(6, 3, 4\)"),
-        (lambda: make(two_worlds(), [np.eye(6)] * 2, demonstrations(),
-                      network=bc.ConvolutionalPolicy()), "6 numbers, which are none of shape"),
+        (
+            lambda: make(two_worlds(), [np.eye(6)] * 2, demonstrations(), network=Single()),
+            r"scores have shape \(6, 1, 1\); expected \(6, 3, 4\)",
+        ),
+        (
+            lambda: make(
+                two_worlds(), [np.eye(6)] * 2, demonstrations(), network=bc.ConvolutionalPolicy()
+            ),
+            "6 numbers, which are none of shape",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(call, message):

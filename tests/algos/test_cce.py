@@ -116,8 +116,7 @@ def test_fewer_than_k_feasible_are_ranked_by_their_violation():
 
 def test_several_constraints_count_by_the_largest_normalised_violation():
     cost = np.array([[12.0, 0.0], [0.0, 1.5], [30.0, -5.0]])
-    chosen = select(
-        np.zeros(3), cost, np.array([10.0, 1.0]), num=3, scale=np.array([10.0, 1.0]))
+    chosen = select(np.zeros(3), cost, np.array([10.0, 1.0]), num=3, scale=np.array([10.0, 1.0]))
     np.testing.assert_allclose(chosen.excess, [0.2, 0.5, 2.0])
     assert chosen.index.tolist() == [0, 1, 2]
     given = cce.make_problem(lambda x, key: (x[0], x), start(), limit=[10.0, 0.0])
@@ -129,17 +128,25 @@ def test_of_equals_the_earlier_is_taken():
     assert chosen.index.tolist() == [0, 1]
 
 
-@pytest.mark.parametrize(("weighting", "enough", "expected"), [
-    ("until_feasible", False, [1, 1, 1, 0]), ("until_feasible", True, [4, 2, 1, 0]),
-    ("literal", False, [4, 2, 1, 0]), ("literal", True, [4, 2, 1, 0]),
-    ("uniform", True, [1, 1, 1, 0]),
-])
+@pytest.mark.parametrize(
+    ("weighting", "enough", "expected"),
+    [
+        ("until_feasible", False, [1, 1, 1, 0]),
+        ("until_feasible", True, [4, 2, 1, 0]),
+        ("literal", False, [4, 2, 1, 0]),
+        ("literal", True, [4, 2, 1, 0]),
+        ("uniform", True, [1, 1, 1, 0]),
+    ],
+)
 @pytest.mark.parametrize("shift", [0.0, 1e5, -1e5])
 def test_weights(weighting, enough, expected, shift):
     """exp(objective / temperature) of numbers that would overflow."""
     objective = 3.0 * np.log(np.array([4.0, 2.0, 1.0, 16.0])) + shift
     weights = elite_weights(
-        objective, np.array([True, True, True, False]), np.bool_(enough), weighting=weighting,
+        objective,
+        np.array([True, True, True, False]),
+        np.bool_(enough),
+        weighting=weighting,
         temperature=3.0,
     )
     np.testing.assert_allclose(weights, np.array(expected) / sum(expected), rtol=1e-9)
@@ -165,7 +172,8 @@ def test_a_step_is_4_14(share):
     """The mean parameter after a step, from the same samples in NumPy."""
     given = problem(limit=0.0)
     hparams = Hparams(
-        rate=0.3, sample_share=share, population=15, rho=0.3, weighting="literal", temperature=2.0)
+        rate=0.3, sample_share=share, population=15, rho=0.3, weighting="literal", temperature=2.0
+    )
     state = cce.init(jax.random.key(5), given, hparams)
     draw_key, _ = jax.random.split(jax.random.fold_in(state.key, 0))
     x = np.asarray(ef.sample(start(), draw_key, 15))
@@ -176,11 +184,10 @@ def test_a_step_is_4_14(share):
     new, metrics = quick_step(state, given, hparams)
     old = ef.mean_parameter(start())
     own = share or 0.0
-    for statistic, eta, moved in zip(
-        (x, x**2), old, ef.mean_parameter(new.family), strict=True
-    ):
+    for statistic, eta, moved in zip((x, x**2), old, ef.mean_parameter(new.family), strict=True):
         expected = 0.3 * weights @ statistic[elites] + 0.7 * (
-            own * statistic.mean(0) + (1 - own) * np.asarray(eta))
+            own * statistic.mean(0) + (1 - own) * np.asarray(eta)
+        )
         np.testing.assert_allclose(moved, expected, rtol=1e-9)
     assert metrics.num_feasible == (cost <= 0).sum()
     np.testing.assert_allclose(metrics.objective, objective.mean())
@@ -203,7 +210,8 @@ def test_later_samples_are_masked():
     objective, cost = map(np.asarray, jax.jit(jax.vmap(lambda v: quadratic(v, None)))(x))
     for num in (7, 12):
         elites, enough = slow_elites(
-            objective[:num], cost[:num, None], 1.0, cce.num_elites(0.3, num))
+            objective[:num], cost[:num, None], 1.0, cce.num_elites(0.3, num)
+        )
         weight = np.exp(objective[elites]) if enough else np.ones(len(elites))
         expected = 0.1 * weight @ np.asarray(x)[elites] / weight.sum()
         np.testing.assert_allclose(growing(num), expected, rtol=1e-9)
@@ -213,10 +221,15 @@ def test_later_samples_are_masked():
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("family", [
-    start(), ef.full_gaussian(jnp.zeros(2), jnp.eye(2)),
-    ef.diagonal_gaussian(jnp.zeros(2, jnp.float32), 1.0),
-], ids=["diagonal", "full", "float32"])
+@pytest.mark.parametrize(
+    "family",
+    [
+        start(),
+        ef.full_gaussian(jnp.zeros(2), jnp.eye(2)),
+        ef.diagonal_gaussian(jnp.zeros(2, jnp.float32), 1.0),
+    ],
+    ids=["diagonal", "full", "float32"],
+)
 def test_a_constrained_quadratic_is_solved(family):
     given = cce.make_problem(quadratic, family, limit=1.0)
     solved = found(given, Hparams(rate=0.4), num_evaluations=2)
@@ -233,7 +246,9 @@ def test_a_constrained_quadratic_is_solved(family):
 def test_a_gamma_family_searches_positive_numbers():
     given = cce.make_problem(
         lambda x, key: (-jnp.sum(jnp.log(x / jnp.array([0.2, 3.0])) ** 2), x[1]),
-        ef.gamma(jnp.full(2, 2.0), 2.0), limit=2.5)
+        ef.gamma(jnp.full(2, 2.0), 2.0),
+        limit=2.5,
+    )
     solved = found(given, Hparams(rate=0.4), num_steps=60, num_evaluations=2)
     np.testing.assert_allclose(solved.solution, [0.2, 2.5], rtol=0.03)
 
@@ -253,13 +268,15 @@ def test_without_a_constraint_the_objective_alone_is_returned_or_the_cost_is_fre
 @pytest.mark.slow
 def test_uniform_weights_until_feasible_keep_the_search_alive():
     """Where G falls steeply towards feasibility, G-weights collapse onto the infeasible."""
+
     def steep(x, key):
         return -50.0 * x[0], 6.0 - x[0]
 
     given = cce.make_problem(steep, start(1.0, 1), limit=0.0)
     default, literal = (
         found(given, Hparams(rate=0.5, weighting=w), 40, num_evaluations=2)
-        for w in ("until_feasible", "literal"))
+        for w in ("until_feasible", "literal")
+    )
     assert default.solution is not None
     assert literal.violation > default.violation
     assert literal.solution is None
@@ -267,18 +284,26 @@ def test_uniform_weights_until_feasible_keep_the_search_alive():
 
 OPTIONS = [
     {"elite_reuse": True, "sample_share": Polynomial(0.5, -1.0), "variance_floor": 1e-6},
-    {"antithetic": True, "noise": Polynomial(0.01, -2.0), "rate": Polynomial(0.9, -0.3),
-     "num_samples": Polynomial(20.0, 0.5)},
+    {
+        "antithetic": True,
+        "noise": Polynomial(0.01, -2.0),
+        "rate": Polynomial(0.9, -0.3),
+        "num_samples": Polynomial(20.0, 0.5),
+    },
 ]
 ONE_BY_ONE = [
-    {"restart_below": 1e-5}, {"rate": jax.tree_util.Partial(lambda n: 0.9 / n**0.3)},
+    {"restart_below": 1e-5},
+    {"rate": jax.tree_util.Partial(lambda n: 0.9 / n**0.3)},
     *({name: value} for options in OPTIONS for name, value in options.items()),
 ]
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("options", [
-    *OPTIONS, *(pytest.param(o, marks=pytest.mark.exhaustive) for o in ONE_BY_ONE)], ids=", ".join)
+@pytest.mark.parametrize(
+    "options",
+    [*OPTIONS, *(pytest.param(o, marks=pytest.mark.exhaustive) for o in ONE_BY_ONE)],
+    ids=", ".join,
+)
 def test_options_solve_it_too(options):
     solved = found(problem(), Hparams(**{"rate": 0.3, **options}), 80, num_evaluations=2)
     np.testing.assert_allclose(solved.best.parameters, [1.0, 0.0], atol=5e-2)
@@ -326,6 +351,7 @@ def test_an_infeasible_problem_is_told_with_the_least_violation():
 
 def test_an_infeasible_mean_is_never_the_solution():
     """Feasible only near a ring, whose middle the mean is."""
+
     def ring(x, key):
         radius = jnp.sqrt(jnp.sum(x**2))
         return jnp.zeros(()), jnp.abs(radius - 1.0)
@@ -340,6 +366,7 @@ def test_an_infeasible_mean_is_never_the_solution():
 @pytest.mark.slow
 def test_a_lucky_sample_is_not_presented_as_a_solution():
     """Costs of 1 on average that are at times seen below the limit of 0."""
+
     def lucky(x, key):
         return x[0], 1.0 + jax.random.normal(key)
 
@@ -375,7 +402,9 @@ def test_intervals_cover_as_often_as_they_say():
 def test_costs_at_the_limit_are_feasible_to_the_bit():
     given = cce.make_problem(
         lambda x, key: (x[0], 0.1 + 0 * x[0]),
-        ef.diagonal_gaussian(jnp.zeros(1, jnp.float32), 1.0), limit=0.1)
+        ef.diagonal_gaussian(jnp.zeros(1, jnp.float32), 1.0),
+        limit=0.1,
+    )
     seen = cce.assess(given, jnp.ones(1, jnp.float32), jax.random.key(0), num_evaluations=999)
     assert seen.feasible
     assert seen.confident
@@ -439,33 +468,59 @@ def test_worlds_travel_as_arguments():
     assert second.family.mean[0] < first.family.mean[0]
 
 
-@pytest.mark.parametrize(("make", "message"), [
-    (lambda: cce.make_problem(lambda x, k: (x, 0.0), start(), limit=0),
-     r"an objective of shape \(2,\); it is called with one policy"),
-    (lambda: cce.make_problem(lambda x, k: (x[0], x[None]), start(), limit=0),
-     r"a cost of shape \(1, 2\)"),
-    (lambda: cce.make_problem(lambda x, k: (0.0, 0.0, x), start(), limit=0), "returned 3 things"),
-    (lambda: cce.make_problem(lambda x, k: x[0], start(), limit=0.0), "returns no cost"),
-    (lambda: cce.make_problem(lambda x, k: (x[0], x), start(), limit=0.5),
-     r"limit=0\.5, but evaluate returns 2 costs; give one limit for each, float\[2\]"),
-    (lambda: problem(limit=[0.0, 1.0]), r"limit has shape \(2,\); expected \(1,\)"),
-    (lambda: problem(limit=math.nan), r"limit=\[nan\]"),
-    (lambda: problem(limit=-math.inf), r"limit=\[-inf\]; no cost is at most"),
-    (lambda: problem(scale=0.0), r"scale=\[0\.0\]; it must be positive"),
-    (lambda: searched(problem(), Hparams(rho=0.005)), r"rho=0\.005 of population=100 leaves no"),
-    (lambda: searched(problem(), Hparams(rho=1.0)), "leaves no elite, or all"),
-    (lambda: searched(problem(), Hparams(weighting="G")),
-     "weighting='G'; choose one of until_feasible"),
-    (lambda: searched(problem(), Hparams(rate=1.5)), r"rate=1\.5; it must lie in \[0, 1\]"),
-    (lambda: searched(problem(), Hparams(sample_share=-1)), r"sample_share=-1; it must lie in"),
-    (lambda: searched(problem(), Hparams(temperature=0)), r"temperature=0; it must be positive"),
-    (lambda: searched(problem(), Hparams(margin=jnp.zeros(3))), r"margin has shape \(3,\)"),
-    (lambda: searched(problem(), Hparams(sharding="cpu")), "sharding is a str"),
-    (lambda: searched(cce.make_problem(quadratic, ef.gamma([1.0, 1.0], 1.0)),
-                      Hparams(antithetic=True)), "Gamma has no mirrored samples"),
-    (lambda: cce.assess(problem(), jnp.zeros(2), jax.random.key(0), num_evaluations=1),
-     "num_evaluations=1; a confidence interval needs"),
-])
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: cce.make_problem(lambda x, k: (x, 0.0), start(), limit=0),
+            r"an objective of shape \(2,\); it is called with one policy",
+        ),
+        (
+            lambda: cce.make_problem(lambda x, k: (x[0], x[None]), start(), limit=0),
+            r"a cost of shape \(1, 2\)",
+        ),
+        (
+            lambda: cce.make_problem(lambda x, k: (0.0, 0.0, x), start(), limit=0),
+            "returned 3 things",
+        ),
+        (lambda: cce.make_problem(lambda x, k: x[0], start(), limit=0.0), "returns no cost"),
+        (
+            lambda: cce.make_problem(lambda x, k: (x[0], x), start(), limit=0.5),
+            r"limit=0\.5, but evaluate returns 2 costs; give one limit for each, float\[2\]",
+        ),
+        (lambda: problem(limit=[0.0, 1.0]), r"limit has shape \(2,\); expected \(1,\)"),
+        (lambda: problem(limit=math.nan), r"limit=\[nan\]"),
+        (lambda: problem(limit=-math.inf), r"limit=\[-inf\]; no cost is at most"),
+        (lambda: problem(scale=0.0), r"scale=\[0\.0\]; it must be positive"),
+        (
+            lambda: searched(problem(), Hparams(rho=0.005)),
+            r"rho=0\.005 of population=100 leaves no",
+        ),
+        (lambda: searched(problem(), Hparams(rho=1.0)), "leaves no elite, or all"),
+        (
+            lambda: searched(problem(), Hparams(weighting="G")),
+            "weighting='G'; choose one of until_feasible",
+        ),
+        (lambda: searched(problem(), Hparams(rate=1.5)), r"rate=1\.5; it must lie in \[0, 1\]"),
+        (lambda: searched(problem(), Hparams(sample_share=-1)), r"sample_share=-1; it must lie in"),
+        (
+            lambda: searched(problem(), Hparams(temperature=0)),
+            r"temperature=0; it must be positive",
+        ),
+        (lambda: searched(problem(), Hparams(margin=jnp.zeros(3))), r"margin has shape \(3,\)"),
+        (lambda: searched(problem(), Hparams(sharding="cpu")), "sharding is a str"),
+        (
+            lambda: searched(
+                cce.make_problem(quadratic, ef.gamma([1.0, 1.0], 1.0)), Hparams(antithetic=True)
+            ),
+            "Gamma has no mirrored samples",
+        ),
+        (
+            lambda: cce.assess(problem(), jnp.zeros(2), jax.random.key(0), num_evaluations=1),
+            "num_evaluations=1; a confidence interval needs",
+        ),
+    ],
+)
 def test_bad_input_is_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()
@@ -475,8 +530,12 @@ def test_bad_input_is_named(make, message):
 
 
 COMPLIANT = Hparams(
-    rate=Polynomial(0.5, -0.7), sample_share=Polynomial(1.0, -0.5),
-    num_samples=Polynomial(10.0, 0.5), population=1000, weighting="literal")
+    rate=Polynomial(0.5, -0.7),
+    sample_share=Polynomial(1.0, -0.5),
+    num_samples=Polynomial(10.0, 0.5),
+    population=1000,
+    weighting="literal",
+)
 
 
 def test_compliant_settings_meet_the_theorem():
@@ -489,23 +548,28 @@ def test_compliant_settings_meet_the_theorem():
     assert theorem_conditions(no_share, num_steps=10_000).holds
 
 
-@pytest.mark.parametrize(("change", "failing"), [
-    ({"rate": 0.1}, {"rate decreases", "rate vanishes"}),
-    ({"rate": Polynomial(0.5, -1.2)}, {"rate has an infinite sum"}),
-    ({"rate": Polynomial(1.5, -0.5)}, {"rate in (0, 1]"}),
-    ({"rate": Polynomial(0.5, 0.1)}, {"rate in (0, 1]", "rate decreases", "rate vanishes"}),
-    ({"num_samples": None}, {"samples grow", "beta + 2 lambda > 1"}),
-    ({"num_samples": 100}, {"samples grow", "beta + 2 lambda > 1"}),
-    ({"num_samples": None, "sample_share": None}, {"samples grow"}),
-    ({"population": 999}, {"samples grow"}),
-    ({"sample_share": Polynomial(1.0, -0.25)}, {"beta + 2 lambda > 1"}),
-    ({"sample_share": 0.5}, {"sample share decays", "beta + 2 lambda > 1"}),
-    ({"weighting": "uniform"}, {"weights are G"}),
-    ({"weighting": "until_feasible"}, {"weights are G"}),
-    ({"elite_reuse": True}, {"no elite_reuse"}), ({"antithetic": True}, {"no antithetic"}),
-    ({"variance_floor": 0.1}, {"no variance_floor"}), ({"noise": 0.1}, {"no noise"}),
-    ({"restart_below": 0.1}, {"no restart_below"}),
-])
+@pytest.mark.parametrize(
+    ("change", "failing"),
+    [
+        ({"rate": 0.1}, {"rate decreases", "rate vanishes"}),
+        ({"rate": Polynomial(0.5, -1.2)}, {"rate has an infinite sum"}),
+        ({"rate": Polynomial(1.5, -0.5)}, {"rate in (0, 1]"}),
+        ({"rate": Polynomial(0.5, 0.1)}, {"rate in (0, 1]", "rate decreases", "rate vanishes"}),
+        ({"num_samples": None}, {"samples grow", "beta + 2 lambda > 1"}),
+        ({"num_samples": 100}, {"samples grow", "beta + 2 lambda > 1"}),
+        ({"num_samples": None, "sample_share": None}, {"samples grow"}),
+        ({"population": 999}, {"samples grow"}),
+        ({"sample_share": Polynomial(1.0, -0.25)}, {"beta + 2 lambda > 1"}),
+        ({"sample_share": 0.5}, {"sample share decays", "beta + 2 lambda > 1"}),
+        ({"weighting": "uniform"}, {"weights are G"}),
+        ({"weighting": "until_feasible"}, {"weights are G"}),
+        ({"elite_reuse": True}, {"no elite_reuse"}),
+        ({"antithetic": True}, {"no antithetic"}),
+        ({"variance_floor": 0.1}, {"no variance_floor"}),
+        ({"noise": 0.1}, {"no noise"}),
+        ({"restart_below": 0.1}, {"no restart_below"}),
+    ],
+)
 def test_settings_outside_the_theorem_are_named(change, failing):
     report = theorem_conditions(COMPLIANT.replace(**change), num_steps=10_000)
     assert report.holds is False
@@ -570,9 +634,15 @@ print("equal on", len(jax.devices()))
 @pytest.mark.exhaustive
 def test_a_population_over_two_devices_is_the_population():
     done = subprocess.run(
-        [sys.executable, "-c", SHARDED], capture_output=True, text=True, check=False,
-        env={**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
-             "JAX_PLATFORMS": "cpu"},
+        [sys.executable, "-c", SHARDED],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={
+            **os.environ,
+            "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
+            "JAX_PLATFORMS": "cpu",
+        },
     )
     assert done.returncode == 0, done.stderr[-3000:]
     assert done.stdout.strip() == "equal on 2"

@@ -67,8 +67,7 @@ def test_states_of_another_run_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"does not belong to this run: .* is missing"):
         checkpoint.load(path, start("cce"))
     with pytest.raises(ValueError, match="Delete the file to start afresh"):
-        run_in_chunks(
-            toy_step, start("toy"), jnp.zeros(3), 0.1, num_steps=3, checkpoint=path)
+        run_in_chunks(toy_step, start("toy"), jnp.zeros(3), 0.1, num_steps=3, checkpoint=path)
 
 
 def test_a_state_of_another_problem_is_refused(tmp_path):
@@ -97,6 +96,7 @@ def test_an_axis_of_length_zero_stands_for_any(tmp_path):
 def outer(number):
     def inner(x):
         return x in {"a", "b", "c"} and number
+
     return inner
 
 
@@ -125,7 +125,10 @@ def test_another_process_finds_the_same_fingerprint():
     )
     found = {
         subprocess.run(
-            [sys.executable, "-c", program], capture_output=True, text=True, check=True,
+            [sys.executable, "-c", program],
+            capture_output=True,
+            text=True,
+            check=True,
             env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": os.getcwd()},
         ).stdout
         for seed in ("1", "2")

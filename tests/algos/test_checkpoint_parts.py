@@ -10,8 +10,10 @@ from jaxltl.algos import _checkpoint_parts as parts
 
 def written(path, array, cuts):
     """An array in a part for each of its blocks between cuts of every axis."""
-    ends = [list(itertools.pairwise((0, *cut, size)))
-            for cut, size in zip(cuts, array.shape, strict=True)]
+    ends = [
+        list(itertools.pairwise((0, *cut, size)))
+        for cut, size in zip(cuts, array.shape, strict=True)
+    ]
     pieces = []
     for i, block in enumerate(itertools.product(*ends)):
         begin, end = [list(x) for x in zip(*block, strict=True)]
@@ -31,7 +33,8 @@ def test_any_block_is_read_from_any_pieces(tmp_path, cuts):
         for a, b in itertools.combinations(range(8), 2):
             np.testing.assert_array_equal(found.read(stored, (slice(a, b),)), array[a:b])
             np.testing.assert_array_equal(
-                found.read(stored, (slice(a, b), slice(1, None))), array[a:b, 1:])
+                found.read(stored, (slice(a, b), slice(1, None))), array[a:b, 1:]
+            )
 
 
 def test_only_the_parts_that_are_needed_are_read(tmp_path):

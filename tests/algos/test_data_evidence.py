@@ -12,8 +12,9 @@ from jaxltl.core.values.minimax import minimax_value, strategy_value
 
 
 def random_game(rng):
-    successor = np.stack([np.stack([rng.choice(5, 3, replace=False) for _ in range(2)])
-                          for _ in range(5)])
+    successor = np.stack(
+        [np.stack([rng.choice(5, 3, replace=False) for _ in range(2)]) for _ in range(5)]
+    )
     probability = rng.dirichlet(np.ones(3), (5, 2))
     return Game(make_mdp(successor, probability), np.asarray(rng.random(5) < 0.5))
 
@@ -31,8 +32,7 @@ def test_bounds_hold_and_close_in():
         gap = np.inf
         for size in (0, 10, 1000, 100_000):
             counts = np.stack([[rng.multinomial(size, p) for p in rows] for rows in probability])
-            found = data_evidence(
-                game, every, np.ones(5, bool), earned, counts, play, 0.8, 0.99)
+            found = data_evidence(game, every, np.ones(5, bool), earned, counts, play, 0.8, 0.99)
             assert (found.secured <= worst + 1e-6).all()
             assert (found.optimal >= optimal - 1e-6).all()
             assert found.num_samples == 10 * size

@@ -16,11 +16,25 @@ from jaxltl.algos import exponential_family as ef
 
 # Each compiled as a whole, which takes much less long than operation by operation.
 whole = SimpleNamespace(
-    **{name: jax.jit(getattr(ef, name)) for name in (
-        "log_density", "mean_parameter", "from_mean_parameter", "sufficient_statistics",
-        "project", "center", "standard_deviation", "_gap", "_shape_of_gap", "_convex_part")},
-    **{name: jax.jit(getattr(ef, name), static_argnums=2) for name in (
-        "sample", "sample_antithetic")},
+    **{
+        name: jax.jit(getattr(ef, name))
+        for name in (
+            "log_density",
+            "mean_parameter",
+            "from_mean_parameter",
+            "sufficient_statistics",
+            "project",
+            "center",
+            "standard_deviation",
+            "_gap",
+            "_shape_of_gap",
+            "_convex_part",
+        )
+    },
+    **{
+        name: jax.jit(getattr(ef, name), static_argnums=2)
+        for name in ("sample", "sample_antithetic")
+    },
 )
 COVARIANCE = np.array([[1.0, 0.3], [0.3, 0.5]])
 MEMBERS = {
@@ -113,8 +127,9 @@ def test_projections_maximise_the_likelihood(name, rate):
         own = weights @ scipy_log_density(name, vector, samples)
         return -rate * own - (1 - rate) * (rate < 1 and mean_log_density(name, vector, family))
 
-    found = optimize.minimize(loss, free_numbers(name, family), method="BFGS",
-                              options={"gtol": 1e-7})
+    found = optimize.minimize(
+        loss, free_numbers(name, family), method="BFGS", options={"gtol": 1e-7}
+    )
     moved = whole.project(family, jnp.asarray(samples), jnp.asarray(5 * weights), rate)
     np.testing.assert_allclose(free_numbers(name, moved), found.x, rtol=1e-4, atol=2e-5)
 
@@ -125,10 +140,15 @@ def test_projections_move_the_mean_parameter(name):
     rng = np.random.default_rng(2)
     family, rate = MEMBERS[name](), 0.37
     samples, weights = rng.gamma(2.0, size=(9, 2)), rng.random(9)
-    moved = whole.mean_parameter(whole.project(
-        family, jnp.asarray(samples), jnp.asarray(weights), rate))
-    parts = zip(moved, whole.sufficient_statistics(family, samples), whole.mean_parameter(family),
-                strict=True)
+    moved = whole.mean_parameter(
+        whole.project(family, jnp.asarray(samples), jnp.asarray(weights), rate)
+    )
+    parts = zip(
+        moved,
+        whole.sufficient_statistics(family, samples),
+        whole.mean_parameter(family),
+        strict=True,
+    )
     for new, gathered, old in parts:
         target = np.tensordot(weights / weights.sum(), gathered, 1)
         np.testing.assert_allclose(new, rate * target + (1 - rate) * old, rtol=1e-11)
@@ -167,7 +187,8 @@ def test_single_precision_keeps_concentrated_gammas():
     start = ef.gamma(jnp.full(1, 9e6, jnp.float32), 3e6)
     moved = whole.project(start, jnp.asarray(samples), jnp.ones(50, jnp.float32), 1.0)
     np.testing.assert_allclose(
-        whole.standard_deviation(moved), np.float64(samples).std(), rtol=1e-3)
+        whole.standard_deviation(moved), np.float64(samples).std(), rtol=1e-3
+    )
 
 
 @pytest.mark.slow
@@ -177,11 +198,15 @@ def test_many_single_precision_steps_stay_positive():
         def step(i, f):
             samples = whole.sample(f, jax.random.fold_in(jax.random.key(0), i), 5)
             return whole.project(f, samples, jnp.ones(5, jnp.float32), 0.5)
+
         return jax.lax.fori_loop(0, 60, step, family)
 
     mean = jnp.asarray([3.0, 1000.0, 1e-3], jnp.float32)
-    for start in (ef.diagonal_gaussian(mean, 1.0), ef.full_gaussian(mean, np.eye(3)),
-                  ef.gamma(mean, 1.0)):
+    for start in (
+        ef.diagonal_gaussian(mean, 1.0),
+        ef.full_gaussian(mean, np.eye(3)),
+        ef.gamma(mean, 1.0),
+    ):
         deviation = whole.standard_deviation(run(start))
         assert (deviation >= 0).all()
         assert (deviation < 0.2 * whole.standard_deviation(start)).all(), "it narrows"
@@ -196,8 +221,9 @@ def test_the_gammas_shape_is_found_everywhere(dtype):
     np.testing.assert_allclose(whole._shape_of_gap(spread), shape, rtol=tolerance)
     for k in (10**3, 10**6):
         exact = Fraction(1, 2 * k) + Fraction(1, 12 * k**2) - Fraction(1, 120 * k**4)
-        np.testing.assert_allclose(whole._gap(jnp.asarray(float(k), dtype)), float(exact),
-                                   rtol=tolerance)
+        np.testing.assert_allclose(
+            whole._gap(jnp.asarray(float(k), dtype)), float(exact), rtol=tolerance
+        )
     np.testing.assert_allclose(whole._gap(jnp.asarray(1.0, dtype)), np.euler_gamma, rtol=tolerance)
 
 
@@ -256,21 +282,32 @@ def test_widening_and_floors_keep_the_mean(name):
     if name == "full":
         least = np.linalg.eigvalsh(np.asarray(floor.factor @ floor.factor.T))
         np.testing.assert_allclose(
-            least, np.maximum(np.linalg.eigvalsh(COVARIANCE), 0.6), rtol=1e-10)
+            least, np.maximum(np.linalg.eigvalsh(COVARIANCE), 0.6), rtol=1e-10
+        )
     else:
         np.testing.assert_allclose(
-            whole.standard_deviation(floor) ** 2, np.maximum(variance, 0.6), rtol=1e-10)
+            whole.standard_deviation(floor) ** 2, np.maximum(variance, 0.6), rtol=1e-10
+        )
 
 
-@pytest.mark.parametrize(("make", "message"), [
-    (lambda: ef.diagonal_gaussian([[0.0]], 1.0), r"mean has shape \(1, 1\); expected one axis"),
-    (lambda: ef.diagonal_gaussian([0.0, 1.0], [1.0]), r"std has shape \(1,\)"),
-    (lambda: ef.diagonal_gaussian([0.0, 1.0], [1.0, 0.0]), r"std\[1\] = 0\.0; it must be positive"),
-    (lambda: ef.full_gaussian([0.0], np.ones((2, 2))), r"covariance has shape \(2, 2\)"),
-    (lambda: ef.full_gaussian([0.0, 0], np.ones((2, 2))), "not symmetric and positive definite"),
-    (lambda: ef.gamma([1.0, -1.0], 1.0), r"shape\[1\] = -1\.0"),
-    (lambda: ef.gamma([1.0], float("nan")), r"rate\[0\] = nan"),
-])
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ef.diagonal_gaussian([[0.0]], 1.0), r"mean has shape \(1, 1\); expected one axis"),
+        (lambda: ef.diagonal_gaussian([0.0, 1.0], [1.0]), r"std has shape \(1,\)"),
+        (
+            lambda: ef.diagonal_gaussian([0.0, 1.0], [1.0, 0.0]),
+            r"std\[1\] = 0\.0; it must be positive",
+        ),
+        (lambda: ef.full_gaussian([0.0], np.ones((2, 2))), r"covariance has shape \(2, 2\)"),
+        (
+            lambda: ef.full_gaussian([0.0, 0], np.ones((2, 2))),
+            "not symmetric and positive definite",
+        ),
+        (lambda: ef.gamma([1.0, -1.0], 1.0), r"shape\[1\] = -1\.0"),
+        (lambda: ef.gamma([1.0], float("nan")), r"rate\[0\] = nan"),
+    ],
+)
 def test_bad_parameters_are_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()

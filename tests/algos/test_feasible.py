@@ -25,8 +25,16 @@ from tests.support import counted_traces
 
 def drn(tmp_path, parameters, states, kind="DTMC"):
     """A parametric model: of each state its reward and label, and of its choices the successors."""
-    lines = [f"@type: {kind}", "@parameters", parameters, "@reward_models", "cost",
-             "@nr_states", str(len(states)), "@model"]
+    lines = [
+        f"@type: {kind}",
+        "@parameters",
+        parameters,
+        "@reward_models",
+        "cost",
+        "@nr_states",
+        str(len(states)),
+        "@model",
+    ]
     for number, (reward, label, *choices) in enumerate(states):
         lines.append(f"state {number} [{reward}] {label}".rstrip())
         for a, successors in enumerate(choices):
@@ -39,9 +47,16 @@ def drn(tmp_path, parameters, states, kind="DTMC"):
 
 def coins(tmp_path):
     """A head, then a tail: p (1 - p), at most a quarter. Each throw costs one."""
-    return drn(tmp_path, "p", [
-        ("1", "init", {1: "p", 3: "1-p"}), ("1", "", {3: "p", 2: "1-p"}),
-        ("0", "goal", {2: "1"}), ("0", "lost", {3: "1"})])
+    return drn(
+        tmp_path,
+        "p",
+        [
+            ("1", "init", {1: "p", 3: "1-p"}),
+            ("1", "", {3: "p", 2: "1-p"}),
+            ("0", "goal", {2: "1"}),
+            ("0", "lost", {3: "1"}),
+        ],
+    )
 
 
 @cache
@@ -52,8 +67,14 @@ def ruin():
     inner = np.stack([np.arange(size - 2), np.arange(2, size)], 1).ravel()
     probability = np.array([1, *[0.5] * (2 * size - 4), 1])
     walk = make_sparse(
-        None, start, [0, *inner, size - 1], probability, initial=np.eye(size)[3],
-        label={"won": [6], "over": [0, 6]}, rewards={"steps": Rewards(state=np.ones(size))})
+        None,
+        start,
+        [0, *inner, size - 1],
+        probability,
+        initial=np.eye(size)[3],
+        label={"won": [6], "over": [0, 6]},
+        rewards={"steps": Rewards(state=np.ones(size))},
+    )
 
     def numbers(x):
         pair = jnp.stack([1 - x[0], x[0]])
@@ -70,8 +91,9 @@ def test_a_quarter_is_the_most_that_a_head_and_a_tail_have(tmp_path):
     p = found.parameters[:, 0]
     assert (p * (1 - p) >= 0.2499).all() and (abs(p - 0.5) <= 0.01 + 1e-9).all()
     exact = [Fraction(x) * (1 - Fraction(x)) for x in p]
-    assert all(low <= x <= high for low, x, high in zip(
-        found.lower, exact, found.upper, strict=True))
+    assert all(
+        low <= x <= high for low, x, high in zip(found.lower, exact, found.upper, strict=True)
+    )
     assert found.valuation() == {"p": p[0]} and found.valuation(3) == {"p": p[3]}
     assert found.num_steps.max() < 60
 
@@ -119,9 +141,17 @@ def test_walks_with_circles():
 @pytest.mark.slow
 def test_what_may_be_passed_before(tmp_path):
     """Not through state 1, so by the other way: of probability (1 - p) p, not 1 - p^2."""
-    model = drn(tmp_path, "p", [
-        ("0", "init", {1: "p", 3: "1-p"}), ("0", "", {2: "1-p", 4: "p"}), ("0", "goal", {2: "1"}),
-        ("0", "", {2: "p", 4: "1-p"}), ("0", "", {4: "1"})]).over(0.01, 0.99)
+    model = drn(
+        tmp_path,
+        "p",
+        [
+            ("0", "init", {1: "p", 3: "1-p"}),
+            ("0", "", {2: "1-p", 4: "p"}),
+            ("0", "goal", {2: "1"}),
+            ("0", "", {2: "p", 4: "1-p"}),
+            ("0", "", {4: "1"}),
+        ],
+    ).over(0.01, 0.99)
     stay = [True, False, True, True, True]
     problem = make_problem(model, "goal", bound=">=", stay=stay)
     lower, upper = certify(problem, [0.25])
@@ -153,8 +183,14 @@ def test_keys_and_starts_decide():
 
 
 FUNCTIONS = (
-    ("p", "1-p"), ("q^2", "1-q^2"), ("p*q", "1-p*q"), ("p/(p+q)", "q/(p+q)"),
-    ("1/3", "2/3"), ("p/2", "1-p/2"), ("(1+q)/3", "(2-q)/3"))
+    ("p", "1-p"),
+    ("q^2", "1-q^2"),
+    ("p*q", "1-p*q"),
+    ("p/(p+q)", "q/(p+q)"),
+    ("1/3", "2/3"),
+    ("p/2", "1-p/2"),
+    ("(1+q)/3", "(2-q)/3"),
+)
 COSTS = ("p+1", "2*q", "1/(1+p)", "0", "3/7")
 
 
@@ -166,8 +202,13 @@ def random_chain(tmp_path, seed):
         f, g = FUNCTIONS[rng.integers(len(FUNCTIONS))]
         a, b = rng.choice(5, 2, replace=False)
         label = "init" if s == 0 else ""
-        states.append((COSTS[rng.integers(len(COSTS))], label, {
-            int(a): f"({f})*2/3", int(b): f"({g})*2/3", 5: "1/3"}))
+        states.append(
+            (
+                COSTS[rng.integers(len(COSTS))],
+                label,
+                {int(a): f"({f})*2/3", int(b): f"({g})*2/3", 5: "1/3"},
+            )
+        )
     states += [("7", "", {4: "1/2", 5: "1/2"}), ("0", "goal", {5: "1"})]
     return drn(tmp_path, "p q", states)
 
@@ -208,18 +249,29 @@ def test_gradients_are_those_of_differences(tmp_path, seed):
         exact = [Fraction(x) for x in point]
         np.testing.assert_allclose(value, float(exact_cost(model, tuple(exact))), rtol=1e-12)
         for d in range(2):
-            ends = [exact_cost(model, tuple(x + s * step * (i == d) for i, x in enumerate(exact)))
-                    for s in (1, -1)]
+            ends = [
+                exact_cost(model, tuple(x + s * step * (i == d) for i, x in enumerate(exact)))
+                for s in (1, -1)
+            ]
             np.testing.assert_allclose(
-                slope[d], float((ends[0] - ends[1]) / (2 * step)), rtol=1e-8, atol=1e-9)
+                slope[d], float((ends[0] - ends[1]) / (2 * step)), rtol=1e-8, atol=1e-9
+            )
 
 
 @pytest.mark.slow
 def test_values_over_policies(tmp_path):
     """Two ways to the goal, of p and of q (1 - p): against the best and the worst of both."""
-    model = drn(tmp_path, "p q", [
-        ("1", "init", {1: "p", 2: "1-p"}, {3: "q", 2: "1-q"}), ("1", "goal", {1: "1"}),
-        ("1", "", {2: "1"}), ("1", "", {1: "1-p", 2: "p"})], kind="MDP").over(0.01, 0.99)
+    model = drn(
+        tmp_path,
+        "p q",
+        [
+            ("1", "init", {1: "p", 2: "1-p"}, {3: "q", 2: "1-q"}),
+            ("1", "goal", {1: "1"}),
+            ("1", "", {2: "1"}),
+            ("1", "", {1: "1-p", 2: "p"}),
+        ],
+        kind="MDP",
+    ).over(0.01, 0.99)
     grid = np.array(list(itertools.product(np.linspace(0.01, 0.99, 99), repeat=2)))
     p, q = grid.T
     for objective, both in (("max", np.maximum), ("min", np.minimum)):
@@ -240,8 +292,12 @@ def test_values_over_policies(tmp_path):
 def simplex():
     """Three parts of a whole, each of which has to come: p q (1 - p - q), at most 1/27."""
     model = make_sparse(
-        None, [0, 2, 4, 6, 7, 8], [1, 4, 2, 4, 3, 4, 3, 4], [0.5] * 6 + [1, 1],
-        initial=[1, 0, 0, 0, 0])
+        None,
+        [0, 2, 4, 6, 7, 8],
+        [1, 4, 2, 4, 3, 4, 3, 4],
+        [0.5] * 6 + [1, 1],
+        initial=[1, 0, 0, 0, 0],
+    )
 
     def numbers(x):
         p, q = x
@@ -259,7 +315,11 @@ def test_points_without_a_model_are_left_again():
     assert (abs(found.parameters - 1 / 3) < 0.04).all() and (found.upper <= 1 / 27 + 1e-9).all()
     stopped = feasible(problem, 0.0369, starts=starts, num_steps=1)
     assert stopped.status.tolist() == [
-        Status.INVALID, Status.CONVERGED, Status.MAX_STEPS, Status.INVALID]
+        Status.INVALID,
+        Status.CONVERGED,
+        Status.MAX_STEPS,
+        Status.INVALID,
+    ]
     assert np.isnan(stopped.parameters[[0, 3]]).all() and not stopped.feasible[[0, 2, 3]].any()
 
 
@@ -315,12 +375,22 @@ def test_a_search_that_is_wrong_claims_nothing(tmp_path):
     found = search._proven(problem, 0.2, said, 1e-6)
     assert found.feasible.tolist() == [True, False, False, False]
     assert found.status.tolist() == [
-        Status.CONVERGED, Status.MAX_STEPS, Status.MAX_STEPS, Status.NONFINITE]
+        Status.CONVERGED,
+        Status.MAX_STEPS,
+        Status.MAX_STEPS,
+        Status.NONFINITE,
+    ]
     assert found.upper[1] < 0.2 and (found.lower[2:] == 0).all() and (found.upper[2:] == 1).all()
     # At the optimum itself bounds cannot tell, as a third and two are no floats.
-    thirds = make_problem(drn(tmp_path, "p", [
-        ("0", "init", {1: "p/3", 2: "1-p/3"}), ("0", "goal", {1: "1"}), ("0", "", {2: "1"})]
-    ).over(0.25, 1.0), "goal", bound=">=")
+    thirds = make_problem(
+        drn(
+            tmp_path,
+            "p",
+            [("0", "init", {1: "p/3", 2: "1-p/3"}), ("0", "goal", {1: "1"}), ("0", "", {2: "1"})],
+        ).over(0.25, 1.0),
+        "goal",
+        bound=">=",
+    )
     said = forged(thirds, jnp.array([[1.0]]), jnp.array([1 / 3]))
     found = search._proven(thirds, 1 / 3, said, 1e-6)
     assert found.status.tolist() == [Status.PRECISION] and not found.feasible.any()
@@ -346,7 +416,8 @@ def test_points_that_are_no_model_after_all_are_told(tmp_path, monkeypatch):
 
     monkeypatch.setattr(search, "certify", refuse)
     found = search._proven(
-        problem, 0.2, forged(problem, jnp.array([[0.5]]), jnp.array([0.25])), 1e-6)
+        problem, 0.2, forged(problem, jnp.array([[0.5]]), jnp.array([0.25])), 1e-6
+    )
     assert found.status.tolist() == [Status.INVALID] and not found.feasible.any()
 
 
@@ -370,33 +441,43 @@ def test_storm_finds_the_same_at_what_was_found(tmp_path):
 # --- what is refused --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("changed", "message"), [
-    ({"bound": ">"}, 'bound=\'>\'; it must be ">=" or "<="'),
-    ({"objective": "best"}, "objective='best'"),
-    ({"target": "gaol"}, "no label 'gaol'; the model has goal"),
-    ({"target": np.zeros(3, bool)}, r"target has shape \(3,\); expected \(4,\)"),
-    ({"reward": "price"}, "no reward 'price'; the model has 'cost'"),
-    ({"reward": "cost"}, "infinite at every point"),
-    ({"stay": np.ones(3, bool)}, r"stay has shape \(3,\)"),
-])
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"bound": ">"}, 'bound=\'>\'; it must be ">=" or "<="'),
+        ({"objective": "best"}, "objective='best'"),
+        ({"target": "gaol"}, "no label 'gaol'; the model has goal"),
+        ({"target": np.zeros(3, bool)}, r"target has shape \(3,\); expected \(4,\)"),
+        ({"reward": "price"}, "no reward 'price'; the model has 'cost'"),
+        ({"reward": "cost"}, "infinite at every point"),
+        ({"stay": np.ones(3, bool)}, r"stay has shape \(3,\)"),
+    ],
+)
 def test_questions_that_are_none(tmp_path, changed, message):
     given = {"target": "goal", "bound": ">=", **changed}
     with pytest.raises(ValueError, match=message):
         make_problem(coins(tmp_path).over(0.1, 0.9), **given)
 
 
-@pytest.mark.parametrize(("threshold", "changed", "message"), [
-    (np.nan, {}, "threshold=nan; give a finite number"),
-    (np.inf, {}, "threshold=inf"),
-    (0.2, {"starts": 0}, "starts=0; it must be at least 1"),
-    (0.2, {"num_steps": 0}, "num_steps=0; it must be"),
-    (0.2, {"enough": 0}, "enough=0; it must be"),
-    (0.2, {"starts": np.array([0.5])}, r"starts has shape \(1,\); expected \(N, 1\)"),
-    (0.2, {"starts": np.array([[0.5], [0.95]])}, r"start 1 has p = 0.95; its interval is \[0.1"),
-    (0.2, {"starts": np.array([[np.nan]])}, "start 0 has p = nan"),
-    (0.2, {"hparams": Hparams(optimizer="lbfgs")}, "leaves the box"),
-    (0.2, {"hparams": Hparams(optimizer="newton")}, "optimizer='newton'; choose one of"),
-])
+@pytest.mark.parametrize(
+    ("threshold", "changed", "message"),
+    [
+        (np.nan, {}, "threshold=nan; give a finite number"),
+        (np.inf, {}, "threshold=inf"),
+        (0.2, {"starts": 0}, "starts=0; it must be at least 1"),
+        (0.2, {"num_steps": 0}, "num_steps=0; it must be"),
+        (0.2, {"enough": 0}, "enough=0; it must be"),
+        (0.2, {"starts": np.array([0.5])}, r"starts has shape \(1,\); expected \(N, 1\)"),
+        (
+            0.2,
+            {"starts": np.array([[0.5], [0.95]])},
+            r"start 1 has p = 0.95; its interval is \[0.1",
+        ),
+        (0.2, {"starts": np.array([[np.nan]])}, "start 0 has p = nan"),
+        (0.2, {"hparams": Hparams(optimizer="lbfgs")}, "leaves the box"),
+        (0.2, {"hparams": Hparams(optimizer="newton")}, "optimizer='newton'; choose one of"),
+    ],
+)
 def test_searches_that_are_none(tmp_path, threshold, changed, message):
     problem = make_problem(coins(tmp_path).over(0.1, 0.9), "goal", bound=">=")
     with pytest.raises(ValueError, match=message):

@@ -26,10 +26,18 @@ NAMES = ("a", "b")
 LEGEND = {".": [], "a": ["a"], "b": ["b"], "c": ["a", "b"]}
 SEEDS = 3
 # Kind of task, which label a step reads, and the optimiser.
-USUAL = (("cosafe", "entry", "lbfgs"), ("safety", "exit", "adam"),
-         ("buchi", "exit", "adam"), ("parity", "entry", "lbfgs"))
-OTHER = (("cosafe", "exit", "adam"), ("safety", "entry", "lbfgs"),
-         ("buchi", "entry", "lbfgs"), ("parity", "exit", "adam"))
+USUAL = (
+    ("cosafe", "entry", "lbfgs"),
+    ("safety", "exit", "adam"),
+    ("buchi", "exit", "adam"),
+    ("parity", "entry", "lbfgs"),
+)
+OTHER = (
+    ("cosafe", "exit", "adam"),
+    ("safety", "entry", "lbfgs"),
+    ("buchi", "entry", "lbfgs"),
+    ("parity", "exit", "adam"),
+)
 
 
 # --- random tasks ------------------------------------------------------------------------------
@@ -54,8 +62,8 @@ def random_world(rng):
         world = random_text_map(rng)
     else:
         world = as_mdp(
-            reference.random_model(rng, S, A, K), label=rng.random((S, 2)) < 0.3,
-            propositions=NAMES)
+            reference.random_model(rng, S, A, K), label=rng.random((S, 2)) < 0.3, propositions=NAMES
+        )
     starts = rng.random(S) < 0.5
     starts[rng.integers(S)] = True
     assert world.successor.shape == (S, A, K)
@@ -79,8 +87,11 @@ def padded(automaton):
     more = Q - len(automaton.delta)
     own = np.arange(Q - more, Q)[:, None].repeat(automaton.delta.shape[1], 1)
     return replace(
-        automaton, state_names=(), delta=np.concatenate([automaton.delta, own]).astype(np.int32),
-        priority=np.pad(automaton.priority, ((0, more), (0, 0)), constant_values=1))
+        automaton,
+        state_names=(),
+        delta=np.concatenate([automaton.delta, own]).astype(np.int32),
+        priority=np.pad(automaton.priority, ((0, more), (0, 0)), constant_values=1),
+    )
 
 
 def walk(rng, model, best, follow):
@@ -121,8 +132,9 @@ def random_task(rng, kind, label_on, num_worlds=1):
     """Products of worlds with one automaton, with their masks; one in which the mask matters."""
     while True:
         automaton = random_automaton(rng, kind)
-        models = [jl.product(random_world(rng), automaton, label_on=label_on)
-                  for _ in range(num_worlds)]
+        models = [
+            jl.product(random_world(rng), automaton, label_on=label_on) for _ in range(num_worlds)
+        ]
         found = [jl.optimal_actions(m) for m in models]
         narrow = (np.asarray(models[0].available) & ~np.asarray(found[0].allowed)).any()
         open_ = (np.asarray(found[0].best.upper) > 0).any()
@@ -180,8 +192,9 @@ def evaluate(model, policy):
 def absorbed(chain, good, bad):
     """The probability to end in `good`, by eliminating states without a subtraction."""
     inner = np.flatnonzero(~good & ~bad)
-    rows = np.column_stack([chain[np.ix_(inner, inner)], chain[inner][:, good].sum(1),
-                            chain[inner][:, bad].sum(1)])
+    rows = np.column_stack(
+        [chain[np.ix_(inner, inner)], chain[inner][:, good].sum(1), chain[inner][:, bad].sum(1)]
+    )
     for n in range(len(inner)):
         rows[n, : n + 1] = 0  # what goes back has been led on
         total = rows[n].sum()
@@ -203,8 +216,12 @@ def test_what_is_attained_by_hand():
     probability = np.zeros((S, A, K)) + np.array([1, 0, 0])
     successor[0, 0], probability[0, 0] = [0, 1, 2], [1, 1e-200, 2e-200]
     world = jl.make_mdp(
-        successor, probability, initial=np.eye(S)[0], label=np.eye(S)[1, :, None] > 0,
-        propositions=["a"])
+        successor,
+        probability,
+        initial=np.eye(S)[0],
+        label=np.eye(S)[1, :, None] > 0,
+        propositions=["a"],
+    )
     model = jl.product(world, padded(jl.to_automaton("F a")))
     value, sure = evaluate(model, np.broadcast_to(np.eye(A)[0], (S, Q, A)))
     start, done = (int(model.initial_memory[s]) for s in (0, 1))
@@ -240,6 +257,7 @@ def shared(model):
 @partial(jax.jit, static_argnames="steps")
 def mlirl_policies(problem, hparams, steps=10):
     """Of every seed, and of weights out of all measure: ``[SEEDS + 1, S, Q, A]``."""
+
     def one(key):
         state, _ = mlirl.train(key, problem, hparams, num_steps=steps)
         return state.parameters
@@ -289,10 +307,12 @@ NETWORK = todirl.RewardNetwork((4,))
 @jax.jit
 def todirl_policies(problem, hparams, model, observation, allowed):
     """Of every seed, in the worlds that it learned in and in another."""
+
     def one(key):
         state, _ = todirl.train(key, problem, hparams, num_steps=10)
         other = todirl.plan(
-            NETWORK, state.best.parameters, model, observation, hparams, allowed=allowed)
+            NETWORK, state.best.parameters, model, observation, hparams, allowed=allowed
+        )
         return todirl.policy(state, problem, hparams), other.policy
 
     return jax.vmap(one)(jax.random.split(jax.random.key(0), SEEDS))
@@ -303,13 +323,14 @@ def check_todirl(rng, kind, label_on, num_worlds):
     seen = [np.eye(4)[np.asarray(m.letter)] for m in models]
     shown = [random_demonstrations(rng, m, f) for m, f in zip(models, found, strict=True)]
     problem = todirl.make_problem(
-        models[:-1], seen[:-1], shown[:-1], network=NETWORK,
-        allowed=[f.allowed for f in found[:-1]])
+        models[:-1], seen[:-1], shown[:-1], network=NETWORK, allowed=[f.allowed for f in found[:-1]]
+    )
     # Predecessors have another shape in every world.
     problem = problem.replace(model=shared(problem.model), predecessors=None)
     hparams = todirl.Hparams(discount=0.9, learning_rate=0.1)
     inside, other = todirl_policies(
-        problem, hparams, shared(models[-1]), seen[-1], found[-1].allowed)
+        problem, hparams, shared(models[-1]), seen[-1], found[-1].allowed
+    )
     for w in range(num_worlds):
         check_policies(models[w], found[w], inside[:, w])
     check_policies(models[-1], found[-1], other)

@@ -11,8 +11,10 @@ import pytest
 from jaxltl import algos
 
 KINDS = {
-    name: kind for name in algos.__all__
-    if (kind := getattr(importlib.import_module(f"jaxltl.algos.{name}"), "Hparams", None))}
+    name: kind
+    for name in algos.__all__
+    if (kind := getattr(importlib.import_module(f"jaxltl.algos.{name}"), "Hparams", None))
+}
 ENTRY = re.compile(r"^  (\w+(?:, \w+)*): (.*(?:\n    .*)*)", re.MULTILINE)
 TOLD = re.compile(r"[Dd]efault\s+(.+?)\.$", re.DOTALL)
 
@@ -31,6 +33,8 @@ def told(kind):
 @pytest.mark.parametrize("name", KINDS)
 def test_the_text_has_the_defaults_of_the_code(name):
     defaults = {
-        field.name: field.default for field in dataclasses.fields(KINDS[name])
-        if field.default is not dataclasses.MISSING}
+        field.name: field.default
+        for field in dataclasses.fields(KINDS[name])
+        if field.default is not dataclasses.MISSING
+    }
     assert defaults and told(KINDS[name]) == defaults

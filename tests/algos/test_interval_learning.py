@@ -117,9 +117,7 @@ def test_every_policy_on_the_way_wins_almost_surely(task):
         for _ in range(10):
             some = np.asarray(problem.model.available) & (rng.random(problem.allowed.shape) < 0.7)
             refused += not wins(problem, some)
-            assert learning.wins_almost_surely(problem, some.astype(float)) == wins(
-                problem, some
-            )
+            assert learning.wins_almost_surely(problem, some.astype(float)) == wins(problem, some)
     assert refused > 3
 
 
@@ -177,8 +175,7 @@ def test_who_may_stay_has_the_value_of_the_best_way_out():
     state, metrics = learning.train(jax.random.key(0), problem, hparams, num_steps=60)
     q = int(problem.model.automaton.initial)
     for value, end in ((state.pessimistic, state.lower), (state.optimistic, state.upper)):
-        np.testing.assert_allclose(
-            np.asarray(value)[:2, q], np.asarray(end)[1, 1, 0], rtol=1e-6)
+        np.testing.assert_allclose(np.asarray(value)[:2, q], np.asarray(end)[1, 1, 0], rtol=1e-6)
     metrics = jax.tree.map(np.asarray, metrics)
     assert 0.6 < metrics.lower[-1] < metrics.upper[-1] < 0.8
     play = learning.policy(state, problem, hparams)

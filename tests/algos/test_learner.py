@@ -80,7 +80,9 @@ def toy_step(state, problem, hparams):
 
 
 TOY = SimpleNamespace(
-    init=toy_init, step=toy_step, policy=lambda state, problem, hparams: state.position,
+    init=toy_init,
+    step=toy_step,
+    policy=lambda state, problem, hparams: state.position,
     **learner.bind(toy_init, toy_step)._asdict(),
 )
 
@@ -90,8 +92,10 @@ def world():
     mdp = jl.make_mdp(
         [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
         [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
-        available=[[True, True], [True, False], [True, False]], initial=[1, 0, 0],
-        label=[[False, False], [True, False], [False, True]], propositions=["g", "r"],
+        available=[[True, True], [True, False], [True, False]],
+        initial=[1, 0, 0],
+        label=[[False, False], [True, False], [False, True]],
+        propositions=["g", "r"],
     )
     runs = [[(0, 1), (0, 0), (1, 0)], [(0, 0), (1, 0)]]
     return mdp, jl.make_trajectories(mdp, runs)
@@ -105,8 +109,10 @@ def mlirl_world():
     mdp, demonstrations = world()
     setting = partial(mlirl.Hparams, optimizer="adam")
     return Case(
-        mlirl, mlirl.make_problem(mdp, numbers(3, 2, 2), demonstrations),
-        setting(discount=0.5), setting(discount=0.4, l2=1e-2, learning_rate=0.01),
+        mlirl,
+        mlirl.make_problem(mdp, numbers(3, 2, 2), demonstrations),
+        setting(discount=0.5),
+        setting(discount=0.4, l2=1e-2, learning_rate=0.01),
     )
 
 
@@ -115,8 +121,10 @@ def mlirl_product():
     lazy = jl.product(mdp, "!r U g")
     features = numbers(*lazy.state_shape, 2, 2)
     return Case(
-        mlirl, mlirl.make_problem(lazy, features, demonstrations),
-        mlirl.Hparams(discount=0.5, mu=0.1), mlirl.Hparams(discount=0.6, mu=1.0, l2=1e-2),
+        mlirl,
+        mlirl.make_problem(lazy, features, demonstrations),
+        mlirl.Hparams(discount=0.5, mu=0.1),
+        mlirl.Hparams(discount=0.6, mu=1.0, l2=1e-2),
     )
 
 
@@ -125,11 +133,16 @@ def task_oriented():
     mdp, demonstrations = world()
     setting = partial(todirl.Hparams, optimizer="sgd")
     problem = todirl.make_problem(
-        jl.product(mdp, "!r U g", label_on="exit"), np.eye(3), demonstrations,
-        network=todirl.RewardNetwork((3,)), held_out=0.5,
+        jl.product(mdp, "!r U g", label_on="exit"),
+        np.eye(3),
+        demonstrations,
+        network=todirl.RewardNetwork((3,)),
+        held_out=0.5,
     )
     return Case(
-        todirl, problem, setting(discount=0.9, patience=3),
+        todirl,
+        problem,
+        setting(discount=0.9, patience=3),
         setting(discount=0.8, l2=0.1, learning_rate=0.05, patience=4),
     )
 
@@ -139,20 +152,29 @@ def alternating_game():
     successor = [[[2, 0], [3, 0]], [[3, 0], [0, 0]], [[0, 1], [1, 0]], [[1, 0], [0, 1]]]
     certain, fair = [[1, 0], [1, 0]], [[0.5, 0.5], [1, 0]]
     mdp = jl.make_mdp(
-        successor, [certain, [[1, 0], [0, 0]], fair, fair],
-        available=[[True, True], [True, False], [True, True], [True, True]])
+        successor,
+        [certain, [[1, 0], [0, 0]], fair, fair],
+        available=[[True, True], [True, False], [True, True], [True, True]],
+    )
     reward = [[1.0, 0.0], [0.3, 0.0], [0.2, 0.0], [0.0, 0.3]]
     return make_game(mdp, [True, True, False, False]), reward
 
 
 def q_learning(method):
     setting = partial(
-        maximin_q.Hparams, step_size=1.0, step_power=0.7, epsilon=0.5, environment_epsilon=0.5,
-        num_chains=3, moves_per_step=5,
+        maximin_q.Hparams,
+        step_size=1.0,
+        step_power=0.7,
+        epsilon=0.5,
+        environment_epsilon=0.5,
+        num_chains=3,
+        moves_per_step=5,
     )
     return Case(
-        maximin_q, maximin_q.make_problem(*alternating_game(), method=method),
-        setting(discount=0.5), setting(discount=0.7, step_size=0.5, restart=0.2, epsilon=0.1),
+        maximin_q,
+        maximin_q.make_problem(*alternating_game(), method=method),
+        setting(discount=0.5),
+        setting(discount=0.7, step_size=0.5, restart=0.2, epsilon=0.1),
     )
 
 
@@ -160,8 +182,10 @@ def pac_learning():
     game, reward = alternating_game()
     setting = partial(rmax.Hparams, known_after=3, epsilon=0.1, reward_bound=1.0, moves_per_step=7)
     return Case(
-        rmax, rmax.make_problem(game, np.arange(4) == 0, reward, start=np.full(4, 0.25)),
-        setting(discount=0.5, restart=0.1), setting(discount=0.6, restart=0.3),
+        rmax,
+        rmax.make_problem(game, np.arange(4) == 0, reward, start=np.full(4, 0.25)),
+        setting(discount=0.5, restart=0.1),
+        setting(discount=0.6, restart=0.3),
     )
 
 
@@ -173,7 +197,9 @@ def cross_entropy():
     problem = cce.make_problem(noisy_quadratic, diagonal_gaussian(jnp.zeros(2), 1.0), limit=1.0)
     setting = partial(cce.Hparams, population=10, elite_reuse=True)
     return Case(
-        cce, problem, setting(rate=cce.Polynomial(0.5, -0.5)),
+        cce,
+        problem,
+        setting(rate=cce.Polynomial(0.5, -0.5)),
         setting(rate=cce.Polynomial(0.9, -0.2), temperature=2.0),
     )
 
@@ -185,8 +211,7 @@ def choice_reset(key):
 def choice_step(world, action, key):
     """A point pushed about; the reward is for being near, the cost is the push."""
     place = world + 0.3 * action
-    return Timestep(
-        place, -jnp.sum(place**2), jnp.abs(place).max() > 4, cost=jnp.sum(action**2))
+    return Timestep(place, -jnp.sum(place**2), jnp.abs(place).max() > 4, cost=jnp.sum(action**2))
 
 
 def choice_observe(world):
@@ -195,14 +220,23 @@ def choice_observe(world):
 
 def trust(method, **networks):
     setting = partial(
-        trust_region.Hparams, method=method, num_trajectories=6, value_hidden=(), cg_steps=3,
-        value_epochs=1, value_batches=2, **networks,
+        trust_region.Hparams,
+        method=method,
+        num_trajectories=6,
+        value_hidden=(),
+        cg_steps=3,
+        value_epochs=1,
+        value_batches=2,
+        **networks,
     )
     world = make_environment(
-        choice_reset, choice_step, choice_observe, actions=make_box(-jnp.inf, jnp.inf, (2,)))
+        choice_reset, choice_step, choice_observe, actions=make_box(-jnp.inf, jnp.inf, (2,))
+    )
     problem = trust_region.make_problem(world, horizon=4, limit=6.0)
     return Case(
-        trust_region, problem, setting(discount=0.9),
+        trust_region,
+        problem,
+        setting(discount=0.9),
         setting(discount=0.8, delta=0.02, cost_discount=0.9, value_rate=0.1),
     )
 
@@ -214,8 +248,9 @@ def corridor_reset(width, key):
 def corridor_step(width, place, action, key):
     """To the end and back, now and then cut off; there and back earns most."""
     place = place + jnp.array([1, -1, 0], jnp.int32)[action]
-    return Timestep(place, reward=place / width, terminated=place < 0,
-                    truncated=jax.random.bernoulli(key, 0.1))
+    return Timestep(
+        place, reward=place / width, terminated=place < 0, truncated=jax.random.bernoulli(key, 0.1)
+    )
 
 
 def corridor_observe(width, place):
@@ -230,29 +265,44 @@ def proximal(squash="clip", **options):
     width = np.array(3.0)
     if squash == "tanh":
         world = make_environment(
-            choice_reset, choice_step, choice_observe, actions=make_box(-1, 1, (2,)))
+            choice_reset, choice_step, choice_observe, actions=make_box(-1, 1, (2,))
+        )
         network = ppo.RecurrentActorCritic(shape=(2,), hidden=(), memory=2)
         problem = ppo.make_problem(world, network=network, memory=np.array([0.1, 0.2]))
     else:
         world = make_environment(
             *(Partial(f, width) for f in (corridor_reset, corridor_step, corridor_observe)),
-            actions=3, allowed=Partial(corridor_allowed, width))
+            actions=3,
+            allowed=Partial(corridor_allowed, width),
+        )
         problem = ppo.make_problem(world, network=ppo.ActorCritic(3, hidden=()))
     setting = partial(
-        ppo.Hparams, num_envs=4, num_steps=6, num_epochs=1, num_minibatches=2, squash=squash,
-        **options)
-    return Case(ppo, problem, setting(discount=0.9, learning_rate=0.01),
-                setting(discount=0.8, learning_rate=0.02, clip=0.1, gae_lambda=0.5))
+        ppo.Hparams,
+        num_envs=4,
+        num_steps=6,
+        num_epochs=1,
+        num_minibatches=2,
+        squash=squash,
+        **options,
+    )
+    return Case(
+        ppo,
+        problem,
+        setting(discount=0.9, learning_rate=0.01),
+        setting(discount=0.8, learning_rate=0.02, clip=0.1, gae_lambda=0.5),
+    )
 
 
 def cloning():
     mdp, demonstrations = world()
     network = behavioral_cloning.DensePolicy(num_actions=2, hidden=(4,))
     problem = behavioral_cloning.make_problem(
-        jl.product(mdp, "!r U g"), jnp.eye(3), demonstrations, held_out=0.5, network=network)
+        jl.product(mdp, "!r U g"), jnp.eye(3), demonstrations, held_out=0.5, network=network
+    )
     setting = partial(behavioral_cloning.Hparams, batch=5)
     return Case(
-        behavioral_cloning, problem, setting(), setting(learning_rate=0.1, l2=0.1, patience=3))
+        behavioral_cloning, problem, setting(), setting(learning_rate=0.1, l2=0.1, patience=3)
+    )
 
 
 def two_throws(x):
@@ -263,7 +313,8 @@ def two_throws(x):
 def parameters():
     """A head, then a tail, of two coins."""
     chain = jl.make_sparse(
-        None, [0, 2, 4, 5, 6], [1, 3, 2, 3, 2, 3], [0.5] * 4 + [1, 1], initial=[1, 0, 0, 0])
+        None, [0, 2, 4, 5, 6], [1, 3, 2, 3, 2, 3], [0.5] * 4 + [1, 1], initial=[1, 0, 0, 0]
+    )
     model = make_parametric(chain, two_throws, [0.1, 0.2], [0.9, 0.8])
     problem = feasible.make_problem(model, np.arange(4) == 2, bound=">=")
     return Case(feasible, problem, feasible.Hparams(), feasible.Hparams(learning_rate=0.01))
@@ -300,8 +351,9 @@ MORE = ("mlirl-world", "ppo-memory")
 
 
 def each(names):
-    return pytest.mark.parametrize("name", [
-        pytest.param(x, marks=pytest.mark.exhaustive) if x in MORE else x for x in names])
+    return pytest.mark.parametrize(
+        "name", [pytest.param(x, marks=pytest.mark.exhaustive) if x in MORE else x for x in names]
+    )
 
 
 by_learner = each(LEARNERS)
@@ -329,8 +381,12 @@ def steps(name: str, state, num_steps, problem=None, hparams=None):
     """A run in two rows, whatever its length: one program serves all."""
     module, own, asked, _ = case(name)
     return module.run(
-        state, own if problem is None else problem, asked if hparams is None else hparams,
-        num_steps=num_steps, max_rows=2)
+        state,
+        own if problem is None else problem,
+        asked if hparams is None else hparams,
+        num_steps=num_steps,
+        max_rows=2,
+    )
 
 
 @cache
@@ -404,9 +460,13 @@ def test_new_numbers_do_not_retrace(name):
 def nudged(tree, dtype=float):
     """The same shapes, and one number a little different."""
     flat, structure = jax.tree.flatten(tree)
-    i = next(i for i, x in enumerate(flat)
-             if np.size(x) and np.issubdtype(getattr(x, "dtype", type(x)), np.floating)
-             and np.isfinite(np.ravel(x)[0]))
+    i = next(
+        i
+        for i, x in enumerate(flat)
+        if np.size(x)
+        and np.issubdtype(getattr(x, "dtype", type(x)), np.floating)
+        and np.isfinite(np.ravel(x)[0])
+    )
     changed = np.array(flat[i], float)
     changed.flat[0] = changed.flat[0] * 0.75 + 0.125
     flat[i] = jnp.asarray(changed, getattr(flat[i], "dtype", None))
@@ -433,7 +493,8 @@ def test_a_saved_state_goes_on_bitwise_and_with_nothing_else(name, tmp_path):
 def test_every_learner_is_called_alike(name):
     module, problem, hparams, _ = case(name)
     for function, arguments in {
-        "init": ["key", "problem", "hparams"], "step": ["state", "problem", "hparams"],
+        "init": ["key", "problem", "hparams"],
+        "step": ["state", "problem", "hparams"],
         "policy": ["state", "problem", "hparams"],
     }.items():
         assert list(inspect.signature(getattr(module, function)).parameters) == arguments
@@ -442,16 +503,24 @@ def test_every_learner_is_called_alike(name):
             assert inspect.isclass(getattr(module, kind))
         assert isinstance(hparams, module.Hparams) and isinstance(problem, module.Problem)
     whole = {"num_steps": inspect.Parameter.empty, "max_rows": 1000}
-    early = {"until": inspect.Parameter.empty, "num_steps": inspect.Parameter.empty,
-             "check_every": 1, "keep": "before" if module is mlirl else "after"}
+    early = {
+        "until": inspect.Parameter.empty,
+        "num_steps": inspect.Parameter.empty,
+        "check_every": 1,
+        "keep": "before" if module is mlirl else "after",
+    }
     for function, first, options, returned in (
-        (module.run, "state", whole, "``Metrics``"), (module.train, "key", whole, "``Metrics``"),
+        (module.run, "state", whole, "``Metrics``"),
+        (module.train, "key", whole, "``Metrics``"),
         (module.run_until, "state", early, "Learned"),
         (module.train_until, "key", early, "Learned"),
     ):
         given = inspect.signature(function).parameters.values()
         assert [x.name for x in given if x.kind == x.POSITIONAL_OR_KEYWORD] == [
-            first, "problem", "hparams"]
+            first,
+            "problem",
+            "hparams",
+        ]
         assert {x.name: x.default for x in given if x.kind == x.KEYWORD_ONLY} == options
         assert f"  {first}: " in function.__doc__
         assert returned in inspect.getdoc(function).split("Returns:")[1]
@@ -469,6 +538,7 @@ def test_every_learner_is_called_alike(name):
 
 def disturbed(tree):
     """The same problem with other numbers wherever there is no action or no successor."""
+
     def model(x):
         if not isinstance(x, MDP):
             return x
@@ -482,8 +552,13 @@ def disturbed(tree):
     return jax.tree.map(model, tree, is_leaf=lambda x: isinstance(x, MDP))
 
 
-REWARDS = {"mlirl-world": "features", "mlirl-product": "features", "rmax": "reward",
-           "q-generalized": "reward", "q-maximin": "reward"}
+REWARDS = {
+    "mlirl-world": "features",
+    "mlirl-product": "features",
+    "rmax": "reward",
+    "q-generalized": "reward",
+    "q-maximin": "reward",
+}
 
 
 @each([*REWARDS, "todirl", "intervals"])
@@ -546,8 +621,9 @@ def test_a_run_ends_with_the_step_that_meets_the_condition():
     found = jl.check(run(until=Partial(reaches, 5), num_steps=20))
     whole, metrics = module.run(start("toy"), problem, hparams, num_steps=6, max_rows=1)
     # Another program, which the compiler may round in another way.
-    for x, y in zip(leaves((found.state, found.metrics.x)), leaves((whole, metrics.x[0])),
-                    strict=True):
+    for x, y in zip(
+        leaves((found.state, found.metrics.x)), leaves((whole, metrics.x[0])), strict=True
+    ):
         np.testing.assert_allclose(x, y, rtol=1e-12)
     assert (found.num_steps, found.metrics.at) == (6, 5)
     with counted_traces() as traced:
@@ -558,16 +634,20 @@ def test_a_run_ends_with_the_step_that_meets_the_condition():
     assert (kept.num_steps, kept.state.step, kept.metrics.at) == (6, 5, 5)
     windows = run(until=lambda before, after, _: after.step >= 4, num_steps=20, check_every=3)
     assert windows.num_steps == 6
-    seen = run(until=lambda before, after, _: after.step - before.step == 3, num_steps=20,
-               check_every=3)
+    seen = run(
+        until=lambda before, after, _: after.step - before.step == 3, num_steps=20, check_every=3
+    )
     assert seen.num_steps == 3
 
 
 def test_lanes_end_each_for_itself():
     module, problem, hparams, _ = case("toy")
     most = jnp.array([3, 50, 7])
-    found = jax.vmap(lambda state, n: module.run_until(
-        state, problem, hparams, until=Partial(reaches, n), num_steps=20))(starts("toy"), most)
+    found = jax.vmap(
+        lambda state, n: module.run_until(
+            state, problem, hparams, until=Partial(reaches, n), num_steps=20
+        )
+    )(starts("toy"), most)
     assert found.num_steps.tolist() == [4, 20, 8]
     assert found.status.tolist() == [0, Status.MAX_STEPS, 0]
     for i, number in enumerate([4, 20, 8]):
@@ -575,21 +655,30 @@ def test_lanes_end_each_for_itself():
         np.testing.assert_allclose(found.state.position[i], alone.position, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    ({"keep": "both"}, "keep='both'; choose"),
-    ({"check_every": 0}, "check_every=0; it must be at least 1"),
-    ({"num_steps": 0}, "num_steps=0; it must be at least 1"),
-    ({"idle": True, "keep": "before"}, "idle=True goes with"),
-])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"keep": "both"}, "keep='both'; choose"),
+        ({"check_every": 0}, "check_every=0; it must be at least 1"),
+        ({"num_steps": 0}, "num_steps=0; it must be at least 1"),
+        ({"idle": True, "keep": "before"}, "idle=True goes with"),
+    ],
+)
 def test_runs_that_make_no_sense_are_refused(options, message):
     module, problem, hparams, _ = case("toy")
     with pytest.raises(ValueError, match=message):
-        learner.run_until(module.step, start("toy"), problem, hparams,
-                          **{"until": Partial(reaches, 1), "num_steps": 3, **options})
+        learner.run_until(
+            module.step,
+            start("toy"),
+            problem,
+            hparams,
+            **{"until": Partial(reaches, 1), "num_steps": 3, **options},
+        )
 
 
 def test_a_loop_of_lanes_is_a_while_loop():
     """Lanes of different lengths; what is given shared or not; nested."""
+
     def active(carry, given):
         return carry["n"] < given["most"]
 
@@ -609,7 +698,8 @@ def test_a_loop_of_lanes_is_a_while_loop():
     found = jax.jit(jax.vmap(inner, (None, 0, 0)))(jnp.int32(1), most, step)
     np.testing.assert_array_equal(found["n"], np.maximum(most, 1))
     np.testing.assert_array_equal(
-        found["sum"][..., 0], (np.maximum(most, 1) - 1) * np.array([[1], [10]]))
+        found["sum"][..., 0], (np.maximum(most, 1) - 1) * np.array([[1], [10]])
+    )
     assert (found["sum"][..., 1] == 0).all()
 
 
@@ -620,7 +710,12 @@ def test_a_run_in_chunks_is_the_run():
     module, problem, hparams, _ = case("toy")
     reports = []
     found = run_in_chunks(
-        module.step, start("toy"), problem, hparams, num_steps=10, chunk=4,
+        module.step,
+        start("toy"),
+        problem,
+        hparams,
+        num_steps=10,
+        chunk=4,
         report=lambda done, row: reports.append((done, int(row.at))),
     )
     whole, metrics = module.run(start("toy"), problem, hparams, num_steps=10)
@@ -638,8 +733,11 @@ def test_runs_side_by_side_in_chunks():
     given = np.array([0.1, 0.2, 0.3])
     chunks = partial(run_in_chunks, module.step, problem=problem, num_steps=9, chunk=4)
     found = chunks(
-        starts("toy"), hparams=given, lanes=True,
-        until=lambda before, after, metrics: metrics.at >= 20 * given[0] + 3 * (after.step == 4))
+        starts("toy"),
+        hparams=given,
+        lanes=True,
+        until=lambda before, after, metrics: metrics.at >= 20 * given[0] + 3 * (after.step == 4),
+    )
     assert found.step.tolist() == [1, 2, 3, 4] and found.done.all()
     assert found.state.step.tolist() == [3, 3, 3]
     for i in range(3):
@@ -648,8 +746,12 @@ def test_runs_side_by_side_in_chunks():
         np.testing.assert_allclose(found.metrics.x[:3, i], metrics.x, rtol=1e-12)
     assert_bitwise(found.metrics.x[2], found.metrics.x[3])
     one = chunks(
-        jax.tree.map(lambda x: x[None], start("toy")), hparams=0.1, lanes=True, keep="before",
-        until=Partial(reaches, 2))
+        jax.tree.map(lambda x: x[None], start("toy")),
+        hparams=0.1,
+        lanes=True,
+        keep="before",
+        until=Partial(reaches, 2),
+    )
     assert one.done.tolist() == [True] and one.state.step.tolist() == [2]
 
 
@@ -663,12 +765,15 @@ def test_an_interrupted_run_resumes_and_ends_bitwise_equal(name, tmp_path):
         seen.append(done)
         raise KeyboardInterrupt
 
-    run = partial(
-        run_in_chunks, module.step, problem=problem, num_steps=6, chunk=3)
+    run = partial(run_in_chunks, module.step, problem=problem, num_steps=6, chunk=3)
     with pytest.raises(KeyboardInterrupt):
         run(state=start(name), hparams=hparams, report=interrupt, checkpoint=path)
-    found = run(state=start(name), hparams=hparams, checkpoint=path,
-                report=lambda done, _: seen.append(done))
+    found = run(
+        state=start(name),
+        hparams=hparams,
+        checkpoint=path,
+        report=lambda done, _: seen.append(done),
+    )
     whole = run(state=start(name), hparams=hparams)
     assert seen == [3, 6]
     assert_bitwise(found, whole)

@@ -29,9 +29,12 @@ TASKS = ("F(a & F b)", "!a U b", "F(a & F c) & F b", "(!c U (b & F c)) & F a")
 
 def way(grid, wanted, avoided):
     """Steps to a wanted cell across cells that are not avoided, from each cell of a torus."""
+
     def nearer(_, far):
-        near = jnp.minimum(jnp.minimum(jnp.roll(far, 1, 0), jnp.roll(far, -1, 0)),
-                           jnp.minimum(jnp.roll(far, 1, 1), jnp.roll(far, -1, 1)))
+        near = jnp.minimum(
+            jnp.minimum(jnp.roll(far, 1, 0), jnp.roll(far, -1, 0)),
+            jnp.minimum(jnp.roll(far, 1, 1), jnp.roll(far, -1, 1)),
+        )
         return jnp.where(wanted, 0.0, jnp.where(avoided, 99.0, jnp.minimum(far, near + 1)))
 
     return jax.lax.fori_loop(0, 16, nearer, jnp.where(wanted, 0.0, 99.0))
@@ -87,7 +90,8 @@ def test_who_follows_what_is_asked_for_does_formulas_that_nobody_trained(verdict
 def test_a_lane_of_stacked_plans_is_the_plan(plans, verdicts):
     agent = many_tasks.sequence_agent(knowing, plans[1], sampled=False)
     alone = jax.jit(lambda keys: episodes(task_environment(WORLD, TASKS[1]), agent, keys))(
-        jax.random.split(jax.random.key(0), 64))
+        jax.random.split(jax.random.key(0), 64)
+    )
     assert (np.asarray(alone.world.verdict[:, -1]) == verdicts[1]).all()
 
 
@@ -123,7 +127,8 @@ def test_names_of_events_have_gone_where_the_network_sees_them(kind):
     parameters = network.init(jax.random.key(0), told(seen, rows))["params"]
     one = many_tasks.trained(network, parameters)(told(seen, rows))
     other = many_tasks.trained(network, parameters)(
-        told(swapped, rows[..., np.concatenate([[0], 1 + order])]))
+        told(swapped, rows[..., np.concatenate([[0], 1 + order])])
+    )
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6), one, other)
     third = many_tasks.trained(network, parameters)(told(swapped, rows))
     assert abs(np.asarray(third[1]) - np.asarray(one[1])) > 1e-6
@@ -142,7 +147,8 @@ def test_without_it_the_events_are_embedded():
 
 def test_both_are_told_where_asked_for():
     network = many_tasks.SequenceNetwork(
-        num_actions=3, hidden=(8,), embedding=5, detailed=2, by_name=True, events_seen=four_places)
+        num_actions=3, hidden=(8,), embedding=5, detailed=2, by_name=True, events_seen=four_places
+    )
     rows = jnp.ones((2, DEPTH, 4), bool)
     seen = SequenceObservation(jnp.ones(2), Sequence(*rows, jnp.int32(2)))
     parameters = network.init(jax.random.key(0), seen)["params"]
@@ -179,8 +185,10 @@ def test_what_is_worth_more_than_the_choice_has_been_is_taken_up():
 
     def said(observation):
         first_is_a = observation.sequence.reach[0, 1]
-        return (jnp.where(first_is_a, jnp.array([5.0, 0.0]), jnp.array([0.0, 5.0])),
-                jnp.where(first_is_a, *observation.world))
+        return (
+            jnp.where(first_is_a, jnp.array([5.0, 0.0]), jnp.array([0.0, 5.0])),
+            jnp.where(first_is_a, *observation.world),
+        )
 
     agent = many_tasks.sequence_agent(said, plan, sampled=False)
     initial = to_automaton("F a & F b").initial
@@ -203,7 +211,8 @@ def test_masks_are_kept():
     seen = SimpleNamespace(world=jnp.zeros(1), memory=jnp.ones(1))
     for sampled in (False, True):
         agent = many_tasks.sequence_agent(
-            lambda observation: (scores, 0.0), one_state_plan(), sampled=sampled)
+            lambda observation: (scores, 0.0), one_state_plan(), sampled=sampled
+        )
         assert int(agent.act(agent.memory, seen, allowed, jax.random.key(0))[0]) == 1
 
 
@@ -232,8 +241,7 @@ def test_boxes_and_finite_actions_do_the_same():
         world = flat_world(discs=scene, start=(-0.8, 0.6), discrete=discrete)
         plan = many_tasks.make_plan("F a & F b", EVENTS, NAMES, depth=DEPTH)
         task = task_environment(world, "F a & F b")
-        agent = many_tasks.sequence_agent(
-            network, plan, actions=world.actions, sampled=False)
+        agent = many_tasks.sequence_agent(network, plan, actions=world.actions, sampled=False)
 
         def go(carry, key, task=task, agent=agent):
             now, memory = carry
@@ -241,9 +249,13 @@ def test_boxes_and_finite_actions_do_the_same():
             found = task.step(now, action, key)
             return (found.world, memory), (found.world.world[0].place, memory, found.world.verdict)
 
-        told.append(jax.jit(lambda keys, go=go, task=task, agent=agent: jax.lax.scan(
-            go, (task.reset(keys[0]), agent.memory), keys)[1])(
-                jax.random.split(jax.random.key(1), 28)))
+        told.append(
+            jax.jit(
+                lambda keys, go=go, task=task, agent=agent: jax.lax.scan(
+                    go, (task.reset(keys[0]), agent.memory), keys
+                )[1]
+            )(jax.random.split(jax.random.key(1), 28))
+        )
     for one, other in zip(*map(jax.tree.leaves, told), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6)
     assert told[0][2][-1] == Verdict.SATISFIED and len(set(told[0][1].state.tolist())) >= 2
@@ -260,11 +272,17 @@ def test_a_network_of_ppo_does_the_same_with_boxes(squash):
         lambda key: jax.random.uniform(key, (3,)),
         lambda place, action, key: Timestep(place + action.sum(), action.sum(), False),
         lambda place: SequenceObservation(place, jax.tree.map(jnp.asarray, sequence)),
-        actions=space)
+        actions=space,
+    )
     problem = ppo.make_problem(world)
     hparams = ppo.Hparams(
-        discount=0.9, num_envs=2, num_steps=4, num_minibatches=1, squash=squash,
-        normalize_observation=True)
+        discount=0.9,
+        num_envs=2,
+        num_steps=4,
+        num_minibatches=1,
+        squash=squash,
+        normalize_observation=True,
+    )
     state, _ = ppo.train(jax.random.key(1), problem, hparams, num_steps=2)
     network = many_tasks.trained(problem.network, state.parameters, state.moments)
     here = jnp.array([0.3, 40.0, -2.0])
@@ -273,11 +291,18 @@ def test_a_network_of_ppo_does_the_same_with_boxes(squash):
     for sampled, of in ((True, ppo.policy), (False, ppo.greedy)):
         own = of(state, problem, hparams)
         other = many_tasks.sequence_agent(
-            network, told, actions=space, squash=squash, sampled=sampled)
-        act = jax.jit(jax.vmap(lambda key, own=own: own.act(
-            own.memory, SequenceObservation(here, sequence), None, key)[0]))
-        same = jax.jit(jax.vmap(
-            lambda key, other=other: other.act(other.memory, seen, None, key)[0]))
+            network, told, actions=space, squash=squash, sampled=sampled
+        )
+        act = jax.jit(
+            jax.vmap(
+                lambda key, own=own: own.act(
+                    own.memory, SequenceObservation(here, sequence), None, key
+                )[0]
+            )
+        )
+        same = jax.jit(
+            jax.vmap(lambda key, other=other: other.act(other.memory, seen, None, key)[0])
+        )
         keys = jax.random.split(jax.random.key(2), 64)
         np.testing.assert_allclose(same(keys), act(keys), rtol=1e-6)
         ends.append(np.asarray(same(keys)))
@@ -303,16 +328,23 @@ def test_stages_follow_when_one_is_mastered():
         return state + 1, Figures(np.array([mean, np.nan]), np.array([3, 0]))
 
     found = many_tasks.train_in_stages(
-        jax.random.key(0), "xyz", None, init=lambda *given: 0, run=run, num_chunks=5,
-        enough=[0.9, 0.8])
+        jax.random.key(0),
+        "xyz",
+        None,
+        init=lambda *given: 0,
+        run=run,
+        num_chunks=5,
+        enough=[0.9, 0.8],
+    )
     assert seen == ["x", "x", "y", "y", "z"] == ["xyz"[i] for i in found.stages]
     assert found.state == 5 and len(found.metrics) == 5 and (np.diff(found.seconds) >= 0).all()
 
 
 def test_bad_input_is_named(plans):
     with pytest.raises(ValueError, match="one threshold fewer"):
-        many_tasks.train_in_stages(jax.random.key(0), "xy", None, init=len, run=len,
-                                   num_chunks=1, enough=[1, 2])
+        many_tasks.train_in_stages(
+            jax.random.key(0), "xy", None, init=len, run=len, num_chunks=1, enough=[1, 2]
+        )
     with pytest.raises(ValueError, match="all of one depth"):
         many_tasks.stack_plans([])
     deeper = many_tasks.make_plan(TASKS[0], EVENTS, NAMES, depth=DEPTH + 1)

@@ -98,8 +98,7 @@ def exact_problem(size: int, **options: Any) -> maximin_q.Problem:
     measured = maximin_q.recurrent_states(problem)
     if problem.method == "maximin":
         measured = measured & safe.part.system
-    return maximin_q.make_problem(
-        safe.part, safe.reward, exact=exact, measured=measured, **options)
+    return maximin_q.make_problem(safe.part, safe.reward, exact=exact, measured=measured, **options)
 
 
 @pytest.mark.slow
@@ -132,7 +131,8 @@ def test_ten_million_moves_stay_in_the_region():
     safe = safe_robots(4)
     start = np.where(safe.region, safe.whole.initial, 0)
     problem = maximin_q.make_problem(
-        safe.whole, diagonal_reward(safe.whole), allowed=safe.mask, start=start / start.sum())
+        safe.whole, diagonal_reward(safe.whole), allowed=safe.mask, start=start / start.sum()
+    )
     hparams = maximin_q.Hparams(discount=0.9, num_chains=4096)
     state, metrics = train(problem, hparams, 40)
     visits, system = np.asarray(state.visits), np.asarray(safe.whole.system)
@@ -180,7 +180,9 @@ def test_restarts_reach_states_without_predecessors():
     safe = safe_robots(3)
     everywhere = np.full(safe.part.num_states, 1 / safe.part.num_states)
     problem = maximin_q.make_problem(
-        safe.part, safe.reward, start=everywhere,
+        safe.part,
+        safe.reward,
+        start=everywhere,
         exact=minimax_value(safe.part, safe.reward, 0.9),
     )
     hparams = maximin_q.Hparams(discount=0.9, num_chains=256, restart=0.05)
@@ -238,7 +240,8 @@ def test_chance_is_averaged_out_by_decaying_steps(method):
     game, reward = random_game(2, width=3, alternating=method == "maximin")
     problem = maximin_q.make_problem(game, reward, method=method)
     hparams = maximin_q.Hparams(
-        discount=0.7, step_size=1.0, step_power=0.65, num_chains=64, moves_per_step=32)
+        discount=0.7, step_size=1.0, step_power=0.65, num_chains=64, moves_per_step=32
+    )
     state, _ = train(problem, hparams, 600)
     exact = minimax_value(game, reward, 0.7)
     learned = np.array(maximin_q.recurrent_states(problem))
@@ -309,7 +312,8 @@ def test_players_are_greedy_when_asked():
     problem = maximin_q.make_problem(game, reward[..., 0])
     system = np.asarray(game.system)
     hparams = maximin_q.Hparams(
-        discount=0.9, num_chains=64, moves_per_step=32, epsilon=1.0, environment_epsilon=1.0)
+        discount=0.9, num_chains=64, moves_per_step=32, epsilon=1.0, environment_epsilon=1.0
+    )
     state, _ = train(problem, hparams, 40)
     before, policy = np.asarray(state.visits), np.asarray(maximin_q.policy(state, problem, hparams))
     # The table has converged, so what is greedy stays so.
@@ -317,8 +321,8 @@ def test_players_are_greedy_when_asked():
     for epsilons, greedy in (((0.0, 1.0), system), ((1.0, 0.0), ~system), ((0.2, 0.2), everyone)):
         mine, theirs = epsilons
         after, _ = maximin_q.run(
-            state, problem, replace(hparams, epsilon=mine, environment_epsilon=theirs),
-            num_steps=40)
+            state, problem, replace(hparams, epsilon=mine, environment_epsilon=theirs), num_steps=40
+        )
         made = np.asarray(after.visits) - before
         chosen = made[np.arange(8), policy] / np.maximum(made.sum(-1), 1)
         often = made.sum(-1) > 2000
@@ -327,15 +331,22 @@ def test_players_are_greedy_when_asked():
         np.testing.assert_allclose(chosen[often & greedy], share[often & greedy], atol=0.05)
         other = often & ~greedy
         np.testing.assert_allclose(
-            chosen[other], 1 / np.asarray(game.available).sum(-1)[other], atol=0.05)
+            chosen[other], 1 / np.asarray(game.available).sum(-1)[other], atol=0.05
+        )
 
 
 def test_epsilon_decays_to_its_least():
     game, reward = random_game(3)
     problem = maximin_q.make_problem(game, reward[..., 0])
     hparams = maximin_q.Hparams(
-        discount=0.9, num_chains=64, moves_per_step=32, epsilon=1.0, environment_epsilon=1.0,
-        epsilon_decay=0.5, epsilon_min=0.0)
+        discount=0.9,
+        num_chains=64,
+        moves_per_step=32,
+        epsilon=1.0,
+        environment_epsilon=1.0,
+        epsilon_decay=0.5,
+        epsilon_min=0.0,
+    )
     state, _ = train(problem, replace(hparams, epsilon_min=1.0), 40)
     policy = np.asarray(maximin_q.policy(state, problem, hparams))
     after, _ = maximin_q.run(state, problem, hparams, num_steps=40)
@@ -346,8 +357,7 @@ def test_epsilon_decays_to_its_least():
 @pytest.mark.exhaustive
 def test_an_adversary_teaches_maximin_too():
     problem = exact_problem(3, method="maximin")
-    hparams = maximin_q.Hparams(
-        discount=0.9, num_chains=256, epsilon=0.5, environment_epsilon=0.5)
+    hparams = maximin_q.Hparams(discount=0.9, num_chains=256, epsilon=0.5, environment_epsilon=0.5)
     state, metrics = train(problem, hparams, 300)
     assert metrics.error[-1] < 1e-3
     assert state.violations == 0
@@ -385,7 +395,8 @@ def test_starts_are_drawn_as_given():
     mdp = make_mdp([[[0]], [[1]], [[2]], [[3]]], np.ones((4, 1, 1)))
     problem = maximin_q.make_problem(mdp, np.zeros((4, 1)), start=[0.0, 0.25, 0.75, 0.0])
     state = maximin_q.init(
-        jax.random.key(0), problem, maximin_q.Hparams(discount=0.9, num_chains=10_000))
+        jax.random.key(0), problem, maximin_q.Hparams(discount=0.9, num_chains=10_000)
+    )
     share = np.bincount(state.position, minlength=4) / 10_000
     np.testing.assert_allclose(share, [0, 0.25, 0.75, 0], atol=0.02)
     assert share[0] == share[3] == 0
@@ -397,10 +408,16 @@ def test_starts_are_drawn_as_given():
 def test_a_run_ends_when_the_value_rests():
     problem = exact_problem(3)
     hparams = maximin_q.Hparams(discount=0.9, num_chains=64, moves_per_step=64)
+
     def stop(tolerance, num_steps):
         return maximin_q.train_until(
-            jax.random.key(0), problem, hparams, check_every=20, num_steps=num_steps,
-            until=maximin_q.value_rests(tolerance))
+            jax.random.key(0),
+            problem,
+            hparams,
+            check_every=20,
+            num_steps=num_steps,
+            until=maximin_q.value_rests(tolerance),
+        )
 
     done = check(stop(1e-5, 2000))
     assert done.status == Status.CONVERGED
@@ -416,8 +433,13 @@ def test_a_run_ends_when_the_value_rests():
     with pytest.raises(NotConverged, match="raise max_steps"):
         check(early)
     again = maximin_q.run_until(
-        early.state, problem, hparams, until=maximin_q.value_rests(1e-5), num_steps=2000,
-        check_every=20)
+        early.state,
+        problem,
+        hparams,
+        until=maximin_q.value_rests(1e-5),
+        num_steps=2000,
+        check_every=20,
+    )
     assert again.status == Status.CONVERGED
     assert again.state.step == again.num_steps + 30
 
@@ -431,7 +453,8 @@ def test_a_rest_before_all_is_seen_does_not_end_the_run():
     problem = maximin_q.make_problem(mdp, reward)
     hparams = maximin_q.Hparams(discount=0.5, num_chains=1, moves_per_step=4)
     done = maximin_q.train_until(
-        jax.random.key(0), problem, hparams, until=maximin_q.value_rests(1e-6), num_steps=100)
+        jax.random.key(0), problem, hparams, until=maximin_q.value_rests(1e-6), num_steps=100
+    )
     assert done.status == Status.CONVERGED
     assert done.num_steps >= length // 4
     assert done.state.value[-1] > 1.9
@@ -442,7 +465,8 @@ def test_values_that_are_not_numbers_are_told():
     problem = maximin_q.make_problem(mdp, [[1.0]])
     hparams = maximin_q.Hparams(discount=float("nan"), num_chains=2, moves_per_step=2)
     done = maximin_q.train_until(
-        jax.random.key(0), problem, hparams, until=maximin_q.value_rests(1e-3), num_steps=100)
+        jax.random.key(0), problem, hparams, until=maximin_q.value_rests(1e-3), num_steps=100
+    )
     assert done.status == Status.NONFINITE
     assert done.num_steps < 100
 
@@ -452,15 +476,17 @@ def test_visits_are_counted_up_to_a_limit():
     game, reward = random_game(1, alternating=True)
     problem = maximin_q.make_problem(game, reward)
     hparams = maximin_q.Hparams(
-        discount=0.8, step_size=1.0, step_power=0.7, num_chains=8, moves_per_step=4)
+        discount=0.8, step_size=1.0, step_power=0.7, num_chains=8, moves_per_step=4
+    )
     state = maximin_q.init(jax.random.key(0), problem, hparams)
     state = state.replace(visits=jnp.full_like(state.visits, 2**30 - 3))
     state, _ = maximin_q.run(state, problem, hparams, num_steps=4)
     assert state.visits.max() == 2**30 and state.visits.min() == 2**30 - 3
     assert jnp.isfinite(state.value).all()
     with pytest.raises(ValueError, match=r"num_chains=65536 times moves_per_step=32768"):
-        maximin_q.init(jax.random.key(0), problem,
-                       hparams.replace(num_chains=2**16, moves_per_step=2**15))
+        maximin_q.init(
+            jax.random.key(0), problem, hparams.replace(num_chains=2**16, moves_per_step=2**15)
+        )
 
 
 @pytest.mark.slow
@@ -496,21 +522,41 @@ def only(*rows):
         (TWO, [[0, 1], [np.inf, 0]], {}, "reward of state 1, action 0 is inf"),
         (TWO, np.zeros((2, 2)), {"allowed": np.ones((2, 2))}, "allowed has dtype float64"),
         (TWO, np.zeros((2, 2)), {"allowed": np.ones((1, 2), bool)}, "allowed has shape"),
-        (TWO, np.zeros((2, 2)), {"allowed": only([1, 0], [0, 0])},
-         "no action is allowed in state 1"),
+        (
+            TWO,
+            np.zeros((2, 2)),
+            {"allowed": only([1, 0], [0, 0])},
+            "no action is allowed in state 1",
+        ),
         (SPLIT, np.zeros((2, 1)), {"start": [1.0, 1.0]}, "start is no distribution"),
         (SPLIT, np.zeros((2, 1)), {"start": [1.0]}, r"start has shape \(1,\)"),
-        (TURNS, np.zeros((2, 2)), {"environment": np.full((2, 2), 0.4)},
-         "environment: the row of state 1"),
+        (
+            TURNS,
+            np.zeros((2, 2)),
+            {"environment": np.full((2, 2), 0.4)},
+            "environment: the row of state 1",
+        ),
         (TURNS, np.zeros((2, 2)), {"environment": np.ones((2, 1))}, "environment has shape"),
         (TURNS, np.zeros((2, 2)), {"exact": [0.0]}, "exact has shape"),
         (TURNS, np.zeros((2, 2)), {"exact": [0.0, 0.0], "measured": [True]}, "measured has shape"),
         (TURNS, np.zeros((2, 2)), {"method": "sarsa"}, 'choose "generalized" or "maximin"'),
-        (TURNS, np.zeros((2, 2)), {"method": "maximin"},
-         "in state 0 action 1 leads to a state of the same player"),
-        (make_game(make_mdp([[[1, 2]], [[0, 0]], [[0, 0]]],
-                            [[[0.5, 0.5]], [[1.0, 0.0]], [[1.0, 0.0]]]), [True, False, False]),
-         np.zeros((3, 1)), {"method": "maximin"}, "in state 0 action 0 has several"),
+        (
+            TURNS,
+            np.zeros((2, 2)),
+            {"method": "maximin"},
+            "in state 0 action 1 leads to a state of the same player",
+        ),
+        (
+            make_game(
+                make_mdp(
+                    [[[1, 2]], [[0, 0]], [[0, 0]]], [[[0.5, 0.5]], [[1.0, 0.0]], [[1.0, 0.0]]]
+                ),
+                [True, False, False],
+            ),
+            np.zeros((3, 1)),
+            {"method": "maximin"},
+            "in state 0 action 0 has several",
+        ),
         (to_dense(TWO), np.zeros((2, 2)), {}, "model is a DenseMDP; learning plays in an explicit"),
     ],
 )

@@ -28,8 +28,14 @@ def grid(slip=0.0):
 def test_pair_counts_by_hand():
     world, demonstrations = grid()
     expected = np.zeros((6, 4))
-    for s, a, count in ((0, RIGHT, 1), (1, DOWN, 2), (4, RIGHT, 1), (0, DOWN, 1), (3, RIGHT, 1),
-                        (4, UP, 1)):
+    for s, a, count in (
+        (0, RIGHT, 1),
+        (1, DOWN, 2),
+        (4, RIGHT, 1),
+        (0, DOWN, 1),
+        (3, RIGHT, 1),
+        (4, UP, 1),
+    ):
         expected[s, a] = count
     np.testing.assert_array_equal(mlirl.pair_counts(world, demonstrations), expected)
 
@@ -47,8 +53,12 @@ def test_pair_counts_in_a_product_follow_the_memory():
     middle = int(lazy.initial_memory[1])
     expected = np.zeros((6, 3, 4))
     for s, q, a, count in (
-        (0, start, RIGHT, 1), (1, middle, DOWN, 2), (4, middle, RIGHT, 1),
-        (0, start, DOWN, 1), (3, start, RIGHT, 1), (4, start, UP, 1),
+        (0, start, RIGHT, 1),
+        (1, middle, DOWN, 2),
+        (4, middle, RIGHT, 1),
+        (0, start, DOWN, 1),
+        (3, start, RIGHT, 1),
+        (4, start, UP, 1),
     ):
         expected[s, q, a] = count
     np.testing.assert_array_equal(counts, expected)
@@ -56,9 +66,7 @@ def test_pair_counts_in_a_product_follow_the_memory():
 
 def test_world_features_by_hand():
     world, demonstrations = grid()
-    found = mlirl.world_features(
-        world, demonstrations, goal=["g"], progress=["c"], avoid=["r"]
-    )
+    found = mlirl.world_features(world, demonstrations, goal=["g"], progress=["c"], avoid=["r"])
     assert found.names == ("demonstrated", "goal", "progress", "avoid", "time")
     expected = np.zeros((6, 4, 5))
     for s, a in ((0, RIGHT), (1, DOWN), (4, RIGHT), (0, DOWN), (3, RIGHT), (4, UP)):
@@ -81,8 +89,14 @@ def test_task_features_by_hand():
     assert mlirl.progress_states(lazy) == (middle,)
     expected = np.zeros((6, 3, 4, 5))
     expected[..., 4] = -1
-    for s, q, a in ((0, start, RIGHT), (1, middle, DOWN), (4, middle, RIGHT), (0, start, DOWN),
-                    (3, start, RIGHT), (4, start, UP)):
+    for s, q, a in (
+        (0, start, RIGHT),
+        (1, middle, DOWN),
+        (4, middle, RIGHT),
+        (0, start, DOWN),
+        (3, start, RIGHT),
+        (4, start, UP),
+    ):
         expected[s, q, a, 0] = 1
     # The goal counts after c only; in the goal's cell itself the memory is done at once.
     for s, a in ((2, DOWN), (4, RIGHT), *((5, a) for a in range(4))):
@@ -135,8 +149,9 @@ def problem_in(place, reward="linear"):
         ("world", "linear", {"policy": "soft"}),
         ("world", "network", {}),
         ("product", "linear", {"mu": 2.0}),
-        pytest.param("product", "linear", {"mu": 2.0, "policy": "soft"},
-                     marks=pytest.mark.exhaustive),
+        pytest.param(
+            "product", "linear", {"mu": 2.0, "policy": "soft"}, marks=pytest.mark.exhaustive
+        ),
         pytest.param("product", "network", {"mu": 2.0}, marks=pytest.mark.exhaustive),
         pytest.param("product", "network", {}, marks=pytest.mark.exhaustive),
     ],
@@ -151,7 +166,8 @@ def test_gradients_of_the_objective(place, reward, options):
         return mlirl.objective(unravel(x["parameters"]), problem, hparams)[0]
 
     assert_gradients(
-        loss, {"parameters": flat + rng.normal(size=flat.size)},
+        loss,
+        {"parameters": flat + rng.normal(size=flat.size)},
         {"parameters": rng.normal(size=flat.size)},
     )
 
@@ -159,8 +175,13 @@ def test_gradients_of_the_objective(place, reward, options):
 def test_the_approximate_gradient_is_another_except_at_zero():
     problem = problem_in("world")
     gradient = {
-        adjoint: jax.jit(jax.grad(lambda p, a=adjoint: mlirl.objective(
-            p, problem, mlirl.Hparams(discount=0.7, adjoint=a))[0]))
+        adjoint: jax.jit(
+            jax.grad(
+                lambda p, a=adjoint: mlirl.objective(
+                    p, problem, mlirl.Hparams(discount=0.7, adjoint=a)
+                )[0]
+            )
+        )
         for adjoint in ("exact", "approximate")
     }
     zero, one = jnp.zeros(5), jnp.array([1.0, 2.0, -1.0, 0.5, 0.3])
@@ -198,8 +219,11 @@ def test_learning_reaches_the_optimum():
     evaluate = jax.jit(jax.value_and_grad(lambda p: mlirl.objective(p, problem, hparams)[0]))
     best = min(
         scipy.optimize.minimize(
-            lambda p: tuple(np.asarray(x) for x in evaluate(p)), np.full(5, start), jac=True,
-            method="BFGS", options={"gtol": 1e-9},
+            lambda p: tuple(np.asarray(x) for x in evaluate(p)),
+            np.full(5, start),
+            jac=True,
+            method="BFGS",
+            options={"gtol": 1e-9},
         ).fun
         for start in (0.0, 1.0, 3.0)
     )
@@ -221,8 +245,7 @@ def test_states_whose_satisfaction_counts():
     assert every.shape == (6, 3)
     assert every.all()
     weights = np.arange(18.0).reshape(6, 3)
-    np.testing.assert_array_equal(
-        problem(satisfaction_over=weights).satisfaction_weight, weights)
+    np.testing.assert_array_equal(problem(satisfaction_over=weights).satisfaction_weight, weights)
 
 
 @pytest.mark.parametrize(
@@ -320,8 +343,7 @@ def test_nearer_is_the_step_that_the_quickest_way_is_shorter_by():
 @pytest.mark.parametrize("task", ["F g", "G F g"])
 def test_what_takes_longer_than_can_be_told_is_said_to_be_left_out(task):
     """By a chance of 1e-20 in each step, which is surely taken some time."""
-    world = jl.from_dense(
-        [[[1.0, 1e-20]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
+    world = jl.from_dense([[[1.0, 1e-20]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
     lazy = jl.product(world, task)
     runs = jl.make_trajectories(world, [[(0, 0)]])
     best = jl.optimal_satisfaction(lazy)
@@ -342,16 +364,24 @@ def masked(reward=mlirl.linear_reward, **options):
     lazy = jl.product(world, f"{TASK} & (!r U g)")
     allowed = jl.optimal_actions(lazy).allowed
     features = mlirl.task_features(lazy, demonstrations).values
-    return lazy, allowed, demonstrations, mlirl.make_problem(
-        lazy, features, demonstrations, allowed=allowed, **options)
+    return (
+        lazy,
+        allowed,
+        demonstrations,
+        mlirl.make_problem(lazy, features, demonstrations, allowed=allowed, **options),
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "mu"), [
-    ("boltzmann", None), ("soft", 0.5),
-    pytest.param("boltzmann", 0.5, marks=pytest.mark.exhaustive),
-    pytest.param("soft", None, marks=pytest.mark.exhaustive),
-])
+@pytest.mark.parametrize(
+    ("kind", "mu"),
+    [
+        ("boltzmann", None),
+        ("soft", 0.5),
+        pytest.param("boltzmann", 0.5, marks=pytest.mark.exhaustive),
+        pytest.param("soft", None, marks=pytest.mark.exhaustive),
+    ],
+)
 def test_inside_a_mask_the_policy_and_the_gradient_are_those_of_a_model_without_the_rest(kind, mu):
     lazy, allowed, _, problem = masked()
     flat = jl.restrict(lazy, np.full(lazy.state_shape, 1 / lazy.num_states), allowed=allowed).model
@@ -362,11 +392,14 @@ def test_inside_a_mask_the_policy_and_the_gradient_are_those_of_a_model_without_
     reward = (problem.features @ weights).reshape(flat.available.shape)
     value = jl.soft_value if kind == "soft" else jl.boltzmann_value
     np.testing.assert_allclose(
-        policy.reshape(reward.shape), value(flat, reward, 0.6).policy, atol=1e-9)
+        policy.reshape(reward.shape), value(flat, reward, 0.6).policy, atol=1e-9
+    )
     direction = np.random.default_rng(1).normal(size=weights.shape)
     assert_gradients(
         lambda x: mlirl.objective(x["weights"], problem, hparams)[0],
-        {"weights": weights}, {"weights": direction})
+        {"weights": weights},
+        {"weights": direction},
+    )
 
 
 def test_steps_outside_the_mask_are_left_out_by_name():

@@ -55,16 +55,22 @@ def assert_as_on_one(name, found, expected):
 
 def mesh_of(*sizes):
     return jax.make_mesh(
-        sizes, ("lanes", "environments")[: len(sizes)], devices=jax.devices()[: np.prod(sizes)],
-        axis_types=(AxisType.Auto,) * len(sizes))
+        sizes,
+        ("lanes", "environments")[: len(sizes)],
+        devices=jax.devices()[: np.prod(sizes)],
+        axis_types=(AxisType.Auto,) * len(sizes),
+    )
 
 
 @cache
 def given(name: str):
     """Keys and settings of eight lanes, of two kinds."""
     _, problem, hparams, other = case(name)
-    return (jax.random.split(jax.random.key(0), LANES), problem,
-            stack([hparams, other] * (LANES // 2)))
+    return (
+        jax.random.split(jax.random.key(0), LANES),
+        problem,
+        stack([hparams, other] * (LANES // 2)),
+    )
 
 
 def four_steps(name: str, mesh: Mesh | None) -> Any:
@@ -77,8 +83,7 @@ def four_steps(name: str, mesh: Mesh | None) -> Any:
         run: Any = jax.jit(jax.vmap(partial(module.run, num_steps=2, max_rows=2), axes))
     else:
         init = jl.vmap_over_mesh(module.init, mesh, in_axes=axes)
-        run = partial(
-            jl.vmap_over_mesh(module.run, mesh, in_axes=axes), num_steps=2, max_rows=2)
+        run = partial(jl.vmap_over_mesh(module.run, mesh, in_axes=axes), num_steps=2, max_rows=2)
     state, first = run(init(keys, problem, hparams), problem, hparams)
     state, second = run(state, problem, hparams)
     return state, first, second
@@ -115,8 +120,7 @@ def test_lanes_end_each_for_itself_on_each_device():
     most = np.array([3, 50, 7, 1, 2, 30, 9])
 
     def until(key, rate, most):
-        return module.train_until(
-            key, problem, rate, until=Partial(reaches, most), num_steps=20)
+        return module.train_until(key, problem, rate, until=Partial(reaches, most), num_steps=20)
 
     keys, rates = jax.random.split(jax.random.key(1), 7), np.linspace(0.1, 0.4, 7)
     found = jl.vmap_over_mesh(until, mesh_of(2))(keys, rates, most)
@@ -132,10 +136,13 @@ def plain():
     width = np.array(3.0)
     world = jl.make_environment(
         *(Partial(f, width) for f in (corridor_reset, corridor_step, corridor_observe)),
-        actions=3, allowed=Partial(corridor_allowed, width))
+        actions=3,
+        allowed=Partial(corridor_allowed, width),
+    )
     problem = ppo.make_problem(world, network=ppo.ActorCritic(3, hidden=()))
     return problem, ppo.Hparams(
-        discount=0.9, num_envs=4, num_steps=3, num_epochs=1, num_minibatches=1, learning_rate=0.01)
+        discount=0.9, num_envs=4, num_steps=3, num_epochs=1, num_minibatches=1, learning_rate=0.01
+    )
 
 
 def normalized():
@@ -188,18 +195,26 @@ def test_seeds_and_their_environments_over_two_axes():
     keys = jax.random.split(jax.random.key(0), 4)
     split = replace(hparams, sharding=over(mesh))
     found = jl.vmap_over_mesh(
-        lambda key, problem: ppo.train(key, problem, split, num_steps=3), mesh, "lanes",
-        in_axes=(0, None))(keys, problem)
+        lambda key, problem: ppo.train(key, problem, split, num_steps=3),
+        mesh,
+        "lanes",
+        in_axes=(0, None),
+    )(keys, problem)
     expected = jax.vmap(lambda key: ppo.train(key, problem, hparams, num_steps=3))(keys)
     assert_near(jl.on_host(found), expected, 1e-10)
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"sharding": "cpu"}, "sharding is .*str; give a jax.sharding.NamedSharding"),
-    ({"num_envs": 3}, "sharding splits over 2 devices, but num_envs is 3; choose a multiple, such "
-                      "as 4"),
-    ({"num_minibatches": 4}, "but the number of rows of a minibatch is 3"),
-])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sharding": "cpu"}, "sharding is .*str; give a jax.sharding.NamedSharding"),
+        (
+            {"num_envs": 3},
+            "sharding splits over 2 devices, but num_envs is 3; choose a multiple, such as 4",
+        ),
+        ({"num_minibatches": 4}, "but the number of rows of a minibatch is 3"),
+    ],
+)
 def test_what_cannot_be_split_is_named(change, message):
     problem, hparams = plain()
     hparams = replace(hparams, **{"sharding": over(mesh_of(1, 2)), **change})
@@ -215,13 +230,21 @@ def test_stages_of_seeds_over_devices_are_those_of_vmap():
 
     def staged(init, run):
         return many_tasks.train_in_stages(
-            keys, [problem, problem], hparams, init=init, run=run, num_chunks=3, num_steps=2,
-            enough=-10.0)
+            keys,
+            [problem, problem],
+            hparams,
+            init=init,
+            run=run,
+            num_chunks=3,
+            num_steps=2,
+            enough=-10.0,
+        )
 
     found = staged(*(jl.vmap_over_mesh(f, mesh, in_axes=axes) for f in (ppo.init, ppo.run)))
     expected = staged(
         jax.vmap(ppo.init, axes),
-        lambda *x, num_steps: jax.vmap(partial(ppo.run, num_steps=num_steps), axes)(*x))
+        lambda *x, num_steps: jax.vmap(partial(ppo.run, num_steps=num_steps), axes)(*x),
+    )
     assert found.stages.tolist() == expected.stages.tolist() == [0, 1, 1]
     assert_near(jl.on_host(found.state), expected.state, 1e-10)
 
@@ -242,7 +265,8 @@ def main(names: str, coordinator: str, process: int, processes: int) -> None:
     jax.config.update("jax_num_cpu_devices", 2)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.distributed.initialize(
-        coordinator_address=coordinator, num_processes=processes, process_id=process)
+        coordinator_address=coordinator, num_processes=processes, process_id=process
+    )
     assert len(jax.devices()) == 2 * processes
     for name in (asked := names.split(",")):
         if name == "environments":
@@ -254,8 +278,14 @@ def main(names: str, coordinator: str, process: int, processes: int) -> None:
         elif name == "episodes":
             problem, _ = plain()
             agent = jl.agent_of(lambda seen, key: jax.random.randint(key, (), 0, 2))
-            run = partial(jl.evaluate, jax.random.key(0), agent, problem.environment,
-                          num_episodes=30, num_steps=9)
+            run = partial(
+                jl.evaluate,
+                jax.random.key(0),
+                agent,
+                problem.environment,
+                num_episodes=30,
+                num_steps=9,
+            )
             assert run(sharding=over(jax.make_mesh((4,), ("environments",)))) == run()
         else:
             found = jl.on_host(four_steps(name, mesh_of(4)))

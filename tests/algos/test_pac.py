@@ -21,8 +21,9 @@ from tests.support import as_mdp, counted_traces
 SINGLE, DOUBLE = np.float32, np.float64
 
 # Compiled as wholes, which takes less long than operation by operation.
-forall_successor, hat_game, hat_strategy, recover_hat_strategy = map(jax.jit, (
-    operators.forall_successor, pac.hat_game, pac.hat_strategy, pac.recover_hat_strategy))
+forall_successor, hat_game, hat_strategy, recover_hat_strategy = map(
+    jax.jit, (operators.forall_successor, pac.hat_game, pac.hat_strategy, pac.recover_hat_strategy)
+)
 
 
 # --- constants -----------------------------------------------------------------------------------
@@ -55,9 +56,12 @@ def random_arguments(rng, count):
     """Log-uniform epsilon, failure, bound and sizes; discounts down to 0.1 and up to 0.999."""
     return [
         (
-            10 ** rng.uniform(-6, -1), 10 ** rng.uniform(-9, -0.1),
-            1 - 10 ** rng.uniform(-3, math.log10(0.9)), 10 ** rng.uniform(-1, 2),
-            int(10 ** rng.uniform(0, 4)), int(10 ** rng.uniform(0, 2)),
+            10 ** rng.uniform(-6, -1),
+            10 ** rng.uniform(-9, -0.1),
+            1 - 10 ** rng.uniform(-3, math.log10(0.9)),
+            10 ** rng.uniform(-1, 2),
+            int(10 ** rng.uniform(0, 4)),
+            int(10 ** rng.uniform(0, 2)),
         )
         for _ in range(count)
     ]
@@ -160,7 +164,8 @@ def test_frequencies_after_so_many_visits(deviation, failure):
     for p in (0.03, 0.2, 0.5, 0.9):
         wrong = sum(
             math.comb(visits, n) * p**n * (1 - p) ** (visits - n)
-            for n in range(visits + 1) if abs(n / visits - p) > deviation
+            for n in range(visits + 1)
+            if abs(n / visits - p) > deviation
         )
         assert wrong <= failure
 
@@ -284,8 +289,14 @@ def test_the_hat_game_is_one_that_may_be_built_and_compiled():
     near = some_near(rng, game)
     hat = pac.hat_game(game, near, 0.25)
     assert hat.num_successors == 2  # of one
-    checked = jl.make_mdp(hat.mdp.successor, hat.mdp.probability, available=hat.available,
-                          initial=hat.initial, label=hat.label, propositions=hat.propositions)
+    checked = jl.make_mdp(
+        hat.mdp.successor,
+        hat.mdp.probability,
+        available=hat.available,
+        initial=hat.initial,
+        label=hat.label,
+        propositions=hat.propositions,
+    )
     assert checked.label[:, 0].tolist() == [False, True] * 6
     for left, right in zip(jax.tree.leaves(checked), jax.tree.leaves(hat.mdp), strict=True):
         np.testing.assert_array_equal(left, right)

@@ -20,5 +20,6 @@ def test_states_are_drawn_by_the_inverse_of_the_cumulative_weights(size):
     found = draw(jnp.asarray(table), jnp.asarray(words))
     np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(
-        jax.vmap(draw, (None, 0))(jnp.asarray(table), jnp.asarray(words)), expected)
+        jax.vmap(draw, (None, 0))(jnp.asarray(table), jnp.asarray(words)), expected
+    )
     assert np.all(weight[expected] > 0)

@@ -53,8 +53,12 @@ def walk_step(world, action, key):
     place = world["place"] + 2 * action.astype(jnp.int32) - 1
     after = {"place": jnp.minimum(place, 3), "time": world["time"] + 1}
     return Timestep(
-        after, reward=place * 0.5 + action, terminated=place == 0,
-        truncated=after["time"] == LIMIT, discount=jnp.where(place == 2, 0.7, 1.0))
+        after,
+        reward=place * 0.5 + action,
+        terminated=place == 0,
+        truncated=after["time"] == LIMIT,
+        discount=jnp.where(place == 2, 0.7, 1.0),
+    )
 
 
 def walk_observe(world):
@@ -120,24 +124,29 @@ def test_advantages_bootstrap_where_an_episode_is_cut_off_and_not_where_it_is_ov
     assert told.episodes == len(sums)
     np.testing.assert_allclose(
         [told.episode_return, told.episode_length, told.reward],
-        [np.mean(sums), np.mean(lengths), reward.mean()], rtol=1e-9)
+        [np.mean(sums), np.mean(lengths), reward.mean()],
+        rtol=1e-9,
+    )
 
 
 @pytest.mark.slow
 def test_many_episodes_cut_off_at_once_are_all_bootstrapped():
     """Every step is the last of its episode: more than are evaluated at a time."""
     once = make_environment(
-        lambda key: jax.random.uniform(key, (3,)), lambda world, action, key: Timestep(
-            world + 1, reward=0.0, terminated=False, truncated=True),
-        lambda world: world, actions=2)
+        lambda key: jax.random.uniform(key, (3,)),
+        lambda world, action, key: Timestep(
+            world + 1, reward=0.0, terminated=False, truncated=True
+        ),
+        lambda world: world,
+        actions=2,
+    )
     problem = ppo.make_problem(once, network=Table(2))
     hparams = ppo.Hparams(discount=0.5, **{**SIZES, "num_steps": 64})
     state, (_, _, rows, told) = collected(problem, hparams)
     assert told.episodes == 256
     worth = np.asarray(state.parameters["worth"])
     seen = np.asarray(rows.observation)
-    np.testing.assert_allclose(
-        rows.advantage, 0.5 * (seen + 1) @ worth - seen @ worth, rtol=1e-9)
+    np.testing.assert_allclose(rows.advantage, 0.5 * (seen + 1) @ worth - seen @ worth, rtol=1e-9)
 
 
 def numbered_step(world, action, key):
@@ -155,8 +164,12 @@ class Numbered(NamedTuple):
 
 NUMBERED = make_environment(
     lambda key: Numbered(
-        jax.random.uniform(key), 1 + 2 * jax.random.randint(key, (), 0, 2), jnp.int32(0), key),
-    numbered_step, lambda world: world.start[None], actions=2)
+        jax.random.uniform(key), 1 + 2 * jax.random.randint(key, (), 0, 2), jnp.int32(0), key
+    ),
+    numbered_step,
+    lambda world: world.start[None],
+    actions=2,
+)
 
 
 @pytest.mark.few(1)
@@ -202,30 +215,39 @@ def wild_allowed(world):
 
 def wild_step(world, action, key):
     return Timestep(
-        jax.random.randint(key, (), 1, 16), reward=1.0 * wild_allowed(world)[action],
-        terminated=world == 7)
+        jax.random.randint(key, (), 1, 16),
+        reward=1.0 * wild_allowed(world)[action],
+        terminated=world == 7,
+    )
 
 
 def test_what_is_forbidden_is_never_done():
     wild = make_environment(
-        lambda key: jax.random.randint(key, (), 1, 16), wild_step, wild_observe, actions=4,
-        allowed=wild_allowed)
+        lambda key: jax.random.randint(key, (), 1, 16),
+        wild_step,
+        wild_observe,
+        actions=4,
+        allowed=wild_allowed,
+    )
     problem = ppo.make_problem(wild, network=Wild())
     hparams = ppo.Hparams(discount=0.9, **{**SIZES, "num_steps": 250})
     state, (_, _, rows, told) = collected(problem, hparams)
     assert told.reward == 1.0 and np.unique(rows.raw).size == 4
     assert np.isfinite(rows.log_density).all()
     for agent in (ppo.policy, ppo.greedy):
-        episode = run_episode(
-            jax.random.key(3), wild, agent(state, problem, hparams), num_steps=60)
+        episode = run_episode(jax.random.key(3), wild, agent(state, problem, hparams), num_steps=60)
         assert (episode.reward == episode.valid).all() and episode.valid.sum() > 1
 
 
 @pytest.mark.slow
 def test_where_nothing_is_allowed_nothing_is_learned_and_it_is_said():
     stuck = make_environment(
-        walk_reset, walk_step, walk_observe, actions=2,
-        allowed=lambda world: jnp.full(2, world["place"] != 3))
+        walk_reset,
+        walk_step,
+        walk_observe,
+        actions=2,
+        allowed=lambda world: jnp.full(2, world["place"] != 3),
+    )
     problem = ppo.make_problem(stuck, network=Table(2))
     hparams = ppo.Hparams(discount=0.9, **SIZES)
     state = ppo.init(jax.random.key(0), problem, hparams)
@@ -243,27 +265,34 @@ def test_densities_and_entropies_are_those_of_distributions():
     np.testing.assert_allclose(found, np.log(mass[[0, 2, 3]]), rtol=1e-9)
     entropy = partial(actions_of.entropy, space, allowed=allowed, squash="clip")
     np.testing.assert_allclose(
-        entropy(logits), -sum(x * np.log(x) for x in mass[mass > 0]), rtol=1e-9)
+        entropy(logits), -sum(x * np.log(x) for x in mass[mass > 0]), rtol=1e-9
+    )
     slope = jax.grad(entropy)(logits)
     assert slope[1] == 0 and np.isfinite(slope).all() and (slope != 0).sum() == 3
     # Of a box: integrals on a fine grid; the second axis has no upper bound.
     space = make_box([-1.0, 0.0], [3.0, np.inf])
     mean, spread = jnp.array([0.4, 1.0]), jnp.log(jnp.array([0.6, 0.5]))
     grid = np.linspace(-12, 12, 200001)
-    normal = np.exp(-((grid - 0.4) / 0.6) ** 2 / 2) / (0.6 * np.sqrt(2 * np.pi))
-    squashed = -np.sum(normal * np.log(np.maximum(normal, 1e-300) / (1 - np.tanh(grid) ** 2))
-                       ) * (grid[1] - grid[0])
+    normal = np.exp(-(((grid - 0.4) / 0.6) ** 2) / 2) / (0.6 * np.sqrt(2 * np.pi))
+    squashed = -np.sum(normal * np.log(np.maximum(normal, 1e-300) / (1 - np.tanh(grid) ** 2))) * (
+        grid[1] - grid[0]
+    )
     plain = np.log(0.5) + (1 + np.log(2 * np.pi)) / 2
     parameters = mean, spread
     np.testing.assert_allclose(
-        actions_of.entropy(space, parameters, None, "tanh"), squashed + plain, atol=2e-3)
+        actions_of.entropy(space, parameters, None, "tanh"), squashed + plain, atol=2e-3
+    )
     np.testing.assert_allclose(
-        actions_of.entropy(space, parameters, None, "clip"), 2 * plain + np.log(1.2), rtol=1e-9)
+        actions_of.entropy(space, parameters, None, "clip"), 2 * plain + np.log(1.2), rtol=1e-9
+    )
     raw = jnp.array([0.1, 1.3])
-    expected = sum(-((x - m) / s) ** 2 / 2 - np.log(s * np.sqrt(2 * np.pi))
-                   for x, m, s in zip([0.1, 1.3], [0.4, 1.0], [0.6, 0.5], strict=True))
+    expected = sum(
+        -(((x - m) / s) ** 2) / 2 - np.log(s * np.sqrt(2 * np.pi))
+        for x, m, s in zip([0.1, 1.3], [0.4, 1.0], [0.6, 0.5], strict=True)
+    )
     np.testing.assert_allclose(
-        actions_of.log_density(space, parameters, None, raw), expected, rtol=1e-9)
+        actions_of.log_density(space, parameters, None, raw), expected, rtol=1e-9
+    )
     for squash, first in (("clip", [0.1, 1.0, -1.0]), ("tanh", np.tanh([0.1, 5.0, -5.0]))):
         raws = jnp.array([[0.1, 1.3], [5.0, -4.0], [-5.0, 0.0]])
         acted = jax.vmap(lambda x, s=squash: actions_of.as_action(space, x, s))(raws)
@@ -300,17 +329,22 @@ def test_the_slope_of_the_loss_is_that_of_a_slow_one():
     raw = np.array([rng.choice(num, p=(a | ~a.any()) / (a | ~a.any()).sum()) for a in allowed])
     allowed[np.arange(size), raw] = True
     rows = {
-        "observation": rng.normal(size=(size, 5)), "start": np.zeros(size, bool),
-        "allowed": allowed, "raw": raw, "log_density": np.log(rng.uniform(0.2, 0.8, size)),
-        "value": rng.normal(size=size), "advantage": rng.normal(size=size)}
+        "observation": rng.normal(size=(size, 5)),
+        "start": np.zeros(size, bool),
+        "allowed": allowed,
+        "raw": raw,
+        "log_density": np.log(rng.uniform(0.2, 0.8, size)),
+        "value": rng.normal(size=size),
+        "advantage": rng.normal(size=size),
+    }
     weights, worth = rng.normal(size=(5, num)), rng.normal(size=5)
     problem = ppo.Problem(WALK.replace(actions=Finite(num)), (), Table(num))
     hparams = ppo.Hparams(discount=0.9, value_weight=0.7, entropy_weight=0.05)
     limits = updating.Limits(0.2, 0.1)
     given = collecting.Rows(**{k: jnp.asarray(v) for k, v in rows.items()})
     found, slope = jax.value_and_grad(
-        lambda p: updating.loss(p, given, (), problem, hparams, limits)[0])(
-            {"scores": jnp.asarray(weights), "worth": jnp.asarray(worth)})
+        lambda p: updating.loss(p, given, (), problem, hparams, limits)[0]
+    )({"scores": jnp.asarray(weights), "worth": jnp.asarray(worth)})
     np.testing.assert_allclose(found, slow_loss(weights, worth, rows, hparams), rtol=1e-9)
     flat = np.concatenate([weights.ravel(), worth])
 
@@ -319,7 +353,8 @@ def test_the_slope_of_the_loss_is_that_of_a_slow_one():
 
     expected = [(at(flat + d) - at(flat - d)) / 2e-6 for d in 1e-6 * np.eye(len(flat))]
     np.testing.assert_allclose(
-        np.concatenate([np.ravel(slope["scores"]), slope["worth"]]), expected, atol=1e-7)
+        np.concatenate([np.ravel(slope["scores"]), slope["worth"]]), expected, atol=1e-7
+    )
 
 
 # --- worlds of a box, memories, scales ------------------------------------------------------------
@@ -331,8 +366,12 @@ def drift_reset(key):
 
 def drift_step(world, action, key):
     after = world + 0.2 * action + 0.01 * jax.random.normal(key, (2,))
-    return Timestep(after, reward=3 - jnp.sum(after**2), terminated=jnp.abs(after).max() > 1.5,
-                    truncated=jax.random.bernoulli(key, 0.1))
+    return Timestep(
+        after,
+        reward=3 - jnp.sum(after**2),
+        terminated=jnp.abs(after).max() > 1.5,
+        truncated=jax.random.bernoulli(key, 0.1),
+    )
 
 
 def drift_observe(world):
@@ -351,8 +390,13 @@ def two_steps(name):
     """Without learning, with all scales."""
     problem = ppo.make_problem(DRIFT, network=DRIFTERS[name])
     hparams = ppo.Hparams(
-        discount=0.9, learning_rate=0.0, normalize_observation=True, normalize_reward=True,
-        squash="tanh", **SIZES)
+        discount=0.9,
+        learning_rate=0.0,
+        normalize_observation=True,
+        normalize_reward=True,
+        squash="tanh",
+        **SIZES,
+    )
     state = ppo.init(jax.random.key(0), problem, hparams)
     return problem, hparams, state, ppo.run(state, problem, hparams, num_steps=2)
 
@@ -388,15 +432,14 @@ def test_scales_are_those_of_all_that_was_seen():
             running = np.where(ended, 0, 0.9 * running)
         if i == 0:  # the second step's policy reads scaled observations, so it differs
             first = jax.tree.map(
-                lambda x, m: updated_moments(m, x), path.observation, state.moments)
+                lambda x, m: updated_moments(m, x), path.observation, state.moments
+            )
             returns = updated_moments(state.return_moments, jnp.asarray(np.stack(sums)))
             state = state.replace(moments=first, return_moments=returns)
     seen = np.concatenate(seen)
     np.testing.assert_allclose(last.moments["place"].mean, seen.mean(0), rtol=1e-9)
-    np.testing.assert_allclose(
-        scale_of(last.moments["place"]), seen.std(0), rtol=1e-9)
-    np.testing.assert_allclose(
-        scale_of(last.return_moments), np.stack(sums).std(), rtol=1e-9)
+    np.testing.assert_allclose(scale_of(last.moments["place"]), seen.std(0), rtol=1e-9)
+    np.testing.assert_allclose(scale_of(last.return_moments), np.stack(sums).std(), rtol=1e-9)
 
 
 @pytest.mark.parametrize("shape", [(6, 3), (3, 6), (4, 4), (1, 5)])
@@ -406,8 +449,10 @@ def test_networks_start_orthogonal(shape):
     drawn = np.asarray(jax.vmap(lambda key: orthogonal(2.0)(key, shape, float))(keys))
     some = drawn if shape[0] <= shape[1] else np.swapaxes(drawn, 1, 2)
     np.testing.assert_allclose(
-        some @ np.swapaxes(some, 1, 2), np.broadcast_to(4 * np.eye(min(shape)),
-                                                        (400, min(shape), min(shape))), atol=1e-12)
+        some @ np.swapaxes(some, 1, 2),
+        np.broadcast_to(4 * np.eye(min(shape)), (400, min(shape), min(shape))),
+        atol=1e-12,
+    )
     length = max(shape)
     error = 4 * np.sqrt(2 * (length - 1) / (length**2 * (length + 2)) / 400)
     assert abs((drawn[:, 0, 0] ** 2).mean() / 4 - 1 / length) < error
@@ -418,8 +463,10 @@ def recall_step(world, action, key):
     """The sign is shown at first and asked for in the third step."""
     sign, time = world
     return Timestep(
-        (sign, time + 1), reward=jnp.where(time == 2, 1.0 * (action == sign), 0.0),
-        terminated=time == 2)
+        (sign, time + 1),
+        reward=jnp.where(time == 2, 1.0 * (action == sign), 0.0),
+        terminated=time == 2,
+    )
 
 
 def recall_observe(world):
@@ -428,22 +475,28 @@ def recall_observe(world):
 
 
 RECALL = make_environment(
-    lambda key: (jax.random.bernoulli(key).astype(jnp.int32), jnp.int32(0)), recall_step,
-    recall_observe, actions=2)
+    lambda key: (jax.random.bernoulli(key).astype(jnp.int32), jnp.int32(0)),
+    recall_step,
+    recall_observe,
+    actions=2,
+)
 
 
 @pytest.mark.slow
 def test_a_memory_remembers():
     """By chance a half."""
     problem = ppo.make_problem(
-        RECALL, network=ppo.RecurrentActorCritic(num_actions=2, hidden=(), memory=8))
+        RECALL, network=ppo.RecurrentActorCritic(num_actions=2, hidden=(), memory=8)
+    )
     hparams = ppo.Hparams(
-        discount=1.0, learning_rate=0.02, num_envs=16, num_steps=12, num_minibatches=2)
+        discount=1.0, learning_rate=0.02, num_envs=16, num_steps=12, num_minibatches=2
+    )
     state, metrics = ppo.train(jax.random.key(0), problem, hparams, num_steps=40)
     assert metrics.episode_return[-5:].mean() > 0.95
     agent = ppo.greedy(state, problem, hparams)
     episodes = jax.jit(jax.vmap(lambda key: run_episode(key, RECALL, agent, num_steps=3)))(
-        jax.random.split(jax.random.key(1), 50))
+        jax.random.split(jax.random.key(1), 50)
+    )
     assert episodes.reward.sum(1).mean() == 1.0
 
 
@@ -451,8 +504,14 @@ def test_a_memory_remembers():
 def test_a_short_walk_is_learned():
     """To the right is worth most: 1.5 + 2 + 2.5 ... against 0 to the left at once."""
     problem = ppo.make_problem(WALK, network=ppo.ActorCritic(2, hidden=(8,)))
-    hparams = ppo.Hparams(discount=0.9, learning_rate=Linear(0.02, 0.0, 30), num_envs=8,
-                          num_steps=20, num_minibatches=4, value_clip=10.0)
+    hparams = ppo.Hparams(
+        discount=0.9,
+        learning_rate=Linear(0.02, 0.0, 30),
+        num_envs=8,
+        num_steps=20,
+        num_minibatches=4,
+        value_clip=10.0,
+    )
     _, metrics = ppo.train(jax.random.key(0), problem, hparams, num_steps=30)
     assert metrics.episode_return[0] < 8 < 11.5 < metrics.episode_return[-1]
     assert metrics.explained_variance[-1] > 0.5
@@ -461,7 +520,8 @@ def test_a_short_walk_is_learned():
     halves = Partial(optax.exponential_decay(0.1, 1, 0.5))
     begun = ppo.init(jax.random.key(0), problem, hparams)
     _, metrics = jax.jit(ppo.step)(
-        begun, problem, hparams.replace(target_kl=1e-9, learning_rate=halves))
+        begun, problem, hparams.replace(target_kl=1e-9, learning_rate=halves)
+    )
     np.testing.assert_allclose(metrics.learning_rate, 0.05, rtol=1e-6)
     assert metrics.updates == 1, "the first minibatch is of the policy that acted"
 
@@ -473,14 +533,17 @@ def test_what_is_not_finite_is_not_learned_from():
         return found._replace(reward=jnp.where(found.world["place"] == 3, jnp.nan, found.reward))
 
     problem = ppo.make_problem(
-        make_environment(walk_reset, step, walk_observe, actions=2), network=Table(2))
+        make_environment(walk_reset, step, walk_observe, actions=2), network=Table(2)
+    )
     hparams = ppo.Hparams(discount=0.9, normalize_observation=True, normalize_reward=True, **SIZES)
     state = ppo.init(jax.random.key(0), problem, hparams)
     after, metrics = jax.jit(ppo.step)(state, problem, hparams)
     assert metrics.status == Status.NONFINITE and metrics.nonfinite == 2 and metrics.updates == 0
     jax.tree.map(
-        np.testing.assert_array_equal, (after.parameters, after.optimizer, after.return_moments),
-        (state.parameters, state.optimizer, state.return_moments))
+        np.testing.assert_array_equal,
+        (after.parameters, after.optimizer, after.return_moments),
+        (state.parameters, state.optimizer, state.return_moments),
+    )
     assert np.isfinite(after.moments.mean).all() and after.step == 1
 
 
@@ -500,35 +563,48 @@ class WithAxis(nn.Module):
         return nn.Dense(2)(observation), nn.Dense(1)(observation)
 
 
-@pytest.mark.parametrize(("make", "message"), [
-    (lambda: ppo.make_problem(walk_step), "environment is function; give one of make_environment"),
-    (lambda: ppo.make_problem(WALK, network=walk_step), "network is function; give a flax"),
-    (lambda: ppo.make_problem(WALK, network=Table(3)), r"\(\(3,\), \(\)\).* expected \(\(2,\)"),
-    (lambda: ppo.make_problem(WALK, network=WithAxis()), r"\(\(2,\), \(1,\)\) for one obs"),
-    (lambda: ppo.make_problem(WALK, network=Counting()), r"keeps \['seen'\] beside its param"),
-    (lambda: ppo.make_problem(WALK.replace(actions=make_box(0, 5, (2,), int))),
-     "box of int64; number"),
-])
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: ppo.make_problem(walk_step),
+            "environment is function; give one of make_environment",
+        ),
+        (lambda: ppo.make_problem(WALK, network=walk_step), "network is function; give a flax"),
+        (lambda: ppo.make_problem(WALK, network=Table(3)), r"\(\(3,\), \(\)\).* expected \(\(2,\)"),
+        (lambda: ppo.make_problem(WALK, network=WithAxis()), r"\(\(2,\), \(1,\)\) for one obs"),
+        (lambda: ppo.make_problem(WALK, network=Counting()), r"keeps \['seen'\] beside its param"),
+        (
+            lambda: ppo.make_problem(WALK.replace(actions=make_box(0, 5, (2,), int))),
+            "box of int64; number",
+        ),
+    ],
+)
 def test_problems_that_cannot_be_are_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    ({"num_envs": 0}, "num_envs=0; it must be at least 1"),
-    ({"num_minibatches": 7}, "num_minibatches=7 does not divide 1024, the number of num_envs"),
-    ({"discount": 1.5}, r"discount=1.5; it must lie in \[0, 1\]"),
-    ({"clip": float("nan")}, "clip=nan; it must lie"),
-    ({"squash": "cut"}, "squash='cut'; choose one of clip, tanh"),
-])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_envs": 0}, "num_envs=0; it must be at least 1"),
+        ({"num_minibatches": 7}, "num_minibatches=7 does not divide 1024, the number of num_envs"),
+        ({"discount": 1.5}, r"discount=1.5; it must lie in \[0, 1\]"),
+        ({"clip": float("nan")}, "clip=nan; it must lie"),
+        ({"squash": "cut"}, "squash='cut'; choose one of clip, tanh"),
+    ],
+)
 def test_settings_that_cannot_be_are_named(options, message):
     with pytest.raises(ValueError, match=message):
-        ppo.init(jax.random.key(0), ppo.make_problem(WALK), ppo.Hparams(
-            **{"discount": 0.9, **options}))
+        ppo.init(
+            jax.random.key(0), ppo.make_problem(WALK), ppo.Hparams(**{"discount": 0.9, **options})
+        )
 
 
 def test_minibatches_of_a_network_with_memory_are_whole_environments():
     problem = ppo.make_problem(WALK, network=ppo.RecurrentActorCritic(2, memory=2))
     with pytest.raises(ValueError, match="does not divide 6, the number of environments"):
-        ppo.init(jax.random.key(0), problem, ppo.Hparams(
-            discount=0.9, num_envs=6, num_minibatches=4))
+        ppo.init(
+            jax.random.key(0), problem, ppo.Hparams(discount=0.9, num_envs=6, num_minibatches=4)
+        )

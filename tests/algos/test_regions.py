@@ -99,7 +99,8 @@ def test_bounds_hold_in_the_whole_box(twice):
             model = twice.at(point)
             assert bounds[0] <= value(*point) <= bounds[1]
             assert reachability_probability(model, chance.target).value[0] == pytest.approx(
-                value(*point))
+                value(*point)
+            )
         bounds = enclose(steps, low, high)
         for point in some:
             of = total_reward(twice.at(point), "steps", steps.target)
@@ -144,8 +145,12 @@ def test_what_cannot_be_asked(twice):
         prove_regions(problem, 0.3, max_boxes=0)
     chain = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
     written = make_parametric(
-        chain, lambda x: np.array([1, 0, 1, 1]) + np.array([-1, 1, 0, 0]) * x[0], low=0.1,
-        high=0.9, parameters=["p"])
+        chain,
+        lambda x: np.array([1, 0, 1, 1]) + np.array([-1, 1, 0, 0]) * x[0],
+        low=0.1,
+        high=0.9,
+        parameters=["p"],
+    )
     problem = make_problem(written, np.array([False, True, False]), bound=">=")
     with pytest.raises(ValueError, match="ranges of this model's functions"):
         enclose(problem)

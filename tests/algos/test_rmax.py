@@ -24,14 +24,16 @@ def example():
 
 
 def settings(**changed):
-    return rmax.Hparams(**{
-        "discount": 0.6, "reward_bound": 1.0, "epsilon": 1e-4, "restart": 1 / 50, **changed})
+    return rmax.Hparams(
+        **{"discount": 0.6, "reward_bound": 1.0, "epsilon": 1e-4, "restart": 1 / 50, **changed}
+    )
 
 
 def learn(key, problem, hparams, moves, num_steps=100_000):
     """Until the strategy has rested for so many moves."""
     return rmax.train_until(
-        key, problem, hparams, until=rmax.strategy_rests(moves), num_steps=num_steps)
+        key, problem, hparams, until=rmax.strategy_rests(moves), num_steps=num_steps
+    )
 
 
 def random_problem(seed, num_states=7, least=2):
@@ -45,8 +47,7 @@ def random_problem(seed, num_states=7, least=2):
         if least <= region.sum() < num_states:
             break
     reward = rng.random(game.mdp.probability.shape)
-    return rmax.make_problem(
-        game, accepting, reward, start=region / region.sum()), rng
+    return rmax.make_problem(game, accepting, reward, start=region / region.sum()), rng
 
 
 def gamble():
@@ -54,7 +55,8 @@ def gamble():
     mdp = jl.make_mdp(
         [[[0, 1], [0, 0]], [[0, 0], [0, 0]]],
         [[[0.5, 0.5], [1, 0]], [[1, 0], [0, 0]]],
-        available=[[True, True], [True, False]], initial=[1, 0],
+        available=[[True, True], [True, False]],
+        initial=[1, 0],
     )
     return mdp, np.array([[0.0, 0.5], [0.0, 0.0]])
 
@@ -72,12 +74,14 @@ class Plain:
         successor = np.asarray(problem.game.mdp.successor)
         used = np.asarray(problem.game.mdp.probability) > 0
         self.edges = {
-            (s, a): successor[s, a][used[s, a]].tolist() for s, a in np.argwhere(self.allowed)}
+            (s, a): successor[s, a][used[s, a]].tolist() for s, a in np.argwhere(self.allowed)
+        }
         bound = hparams.reward_bound / (1 - hparams.discount)
         self.count = {(*pair, t): 0 for pair, ts in self.edges.items() for t in ts}
         self.paid = dict.fromkeys(self.count, bound)
         self.model = {
-            pair: {t: (1 / len(ts), bound) for t in ts} for pair, ts in self.edges.items()}
+            pair: {t: (1 / len(ts), bound) for t in ts} for pair, ts in self.edges.items()
+        }
         self.known = {}
         self.best = self.allowed & self.system[:, None]
         self.moves = 0
@@ -97,12 +101,13 @@ class Plain:
             if self.update == "printed":
                 self.paid[s, a, t] = r
             shares = {x: max(self.count[s, a, x], 1) for x in self.edges[pair]}
-            self.shares = {**getattr(self, "shares", {}), pair: {
-                x: n / sum(shares.values()) for x, n in shares.items()}}
+            self.shares = {
+                **getattr(self, "shares", {}),
+                pair: {x: n / sum(shares.values()) for x, n in shares.items()},
+            }
             news = True
         if pair in self.known and (news or (first and self.update == "every")):
-            self.model[pair] = {
-                x: (p, self.paid[s, a, x]) for x, p in self.shares[pair].items()}
+            self.model[pair] = {x: (p, self.paid[s, a, x]) for x, p in self.shares[pair].items()}
             self.solve()
 
     def solve(self):
@@ -184,6 +189,7 @@ def test_a_walk_and_the_same_moves_observed_come_to_the_same():
 @partial(jax.jit, static_argnames="num_steps")
 def followed(key, problem, hparams, num_steps):
     """Whether every strategy of a run passes the graph check, and how many there were."""
+
     def body(carry, _):
         state, won = carry
         state, _ = rmax.step(state, problem, hparams)
@@ -233,8 +239,11 @@ def test_the_graph_check_refuses_what_does_not_win():
     assert not rmax.wins_almost_surely(problem, uniform.at[first].set(0)), "a state without moves"
     stochastic, _ = random_problem(3)
     allowed = stochastic.allowed & stochastic.game.system[:, None]
-    leaving = stochastic.game.available & ~stochastic.allowed & (
-        stochastic.region & stochastic.game.system)[:, None]
+    leaving = (
+        stochastic.game.available
+        & ~stochastic.allowed
+        & (stochastic.region & stochastic.game.system)[:, None]
+    )
     assert leaving.any()
     assert rmax.wins_almost_surely(stochastic, allowed * 1.0)
     assert not rmax.wins_almost_surely(stochastic, (allowed | leaving) * 1.0)
@@ -258,7 +267,8 @@ def test_with_restarts_nearly_all_states_become_optimal():
         assert np.asarray(found.epsilon_optimal_met)[mine].sum() >= 52
         np.testing.assert_array_equal(
             np.asarray(found.worst.lower) >= np.asarray(found.optimal.upper) - 1e-4,
-            found.epsilon_optimal)
+            found.epsilon_optimal,
+        )
 
 
 @pytest.mark.slow
@@ -320,11 +330,13 @@ def test_a_formula_on_a_markov_decision_process():
 def test_the_adversary_plays_the_minimax_answer():
     found = patrol()
     problem = rmax.make_problem(
-        found.game, found.accepting, found.reward, environment="adversarial", discount=0.6)
+        found.game, found.accepting, found.reward, environment="adversarial", discount=0.6
+    )
     optimal = minimax_value(found.game, found.reward, 0.6)
     theirs = ~np.asarray(found.game.system)
     np.testing.assert_array_equal(
-        np.asarray(problem.environment).argmax(1)[theirs], np.asarray(optimal.policy)[theirs])
+        np.asarray(problem.environment).argmax(1)[theirs], np.asarray(optimal.policy)[theirs]
+    )
     learned = learn(jax.random.key(0), problem, settings(), 5000)
     evidence = rmax.evidence(learned.state, problem, settings())
     mine = np.asarray(evidence.reachable & problem.game.system)
@@ -353,14 +365,22 @@ def test_the_constants_of_the_theorem_are_used():
 def test_lanes_of_different_settings_are_as_if_alone():
     problem, _ = random_problem(5)
     hparams = settings(
-        known_after=jnp.array([2, 8, 30]), epsilon=jnp.array([0.5, 0.1, 0.01]), moves_per_step=10)
+        known_after=jnp.array([2, 8, 30]), epsilon=jnp.array([0.5, 0.1, 0.01]), moves_per_step=10
+    )
     axes = rmax.Hparams(
-        discount=None, reward_bound=None, epsilon=0, failure=None, known_after=0, restart=None,
-        moves_per_step=10)
+        discount=None,
+        reward_bound=None,
+        epsilon=0,
+        failure=None,
+        known_after=0,
+        restart=None,
+        moves_per_step=10,
+    )
     keys = jax.random.split(jax.random.key(0), 2)
     train = partial(rmax.train_until, until=rmax.strategy_rests(200), num_steps=2000)
     nested = jax.jit(jax.vmap(jax.vmap(train, (None, None, axes)), (0, None, None)))(
-        keys, problem, hparams)
+        keys, problem, hparams
+    )
     for i in range(2):
         for j in range(3):
             own = hparams.replace(known_after=hparams.known_after[j], epsilon=hparams.epsilon[j])
@@ -376,8 +396,7 @@ def test_new_numbers_do_not_retrace():
     problem, _ = random_problem(5)
     learn(jax.random.key(0), problem, settings(known_after=3), 50)
     with counted_traces() as traced:
-        learn(
-            jax.random.key(1), problem, settings(known_after=9, epsilon=0.3), 70)
+        learn(jax.random.key(1), problem, settings(known_after=9, epsilon=0.3), 70)
     assert not traced
 
 
@@ -406,8 +425,9 @@ def test_a_run_is_over_when_no_more_moves_can_be_counted():
     problem, hparams = example(), settings()
     most = np.iinfo(np.int32).max
     state = rmax.init(jax.random.key(0), problem, hparams)
-    state, metrics = rmax.run(state.replace(moves=jnp.int32(most - 5)), problem, hparams,
-                              num_steps=9, max_rows=9)
+    state, metrics = rmax.run(
+        state.replace(moves=jnp.int32(most - 5)), problem, hparams, num_steps=9, max_rows=9
+    )
     assert (np.diff(np.asarray(metrics.moves)) >= 0).all() and metrics.moves[-1] == most
     assert metrics.status[-1] == Status.MAX_STEPS and metrics.status[0] == Status.CONVERGED
     again, _ = rmax.run(state, problem, hparams, num_steps=9, max_rows=9)
@@ -419,8 +439,13 @@ def test_a_run_is_over_when_no_more_moves_can_be_counted():
 
 
 def test_a_start_outside_the_region_is_told():
-    mdp = jl.make_mdp([[[1], [2]], [[1], [1]], [[2], [2]]], np.ones((3, 2, 1)),
-                      initial=[0.5, 0, 0.5], label=[[0], [1], [0]], propositions=["goal"])
+    mdp = jl.make_mdp(
+        [[[1], [2]], [[1], [1]], [[2], [2]]],
+        np.ones((3, 2, 1)),
+        initial=[0.5, 0, 0.5],
+        label=[[0], [1], [0]],
+        propositions=["goal"],
+    )
     reward = np.zeros((3, 2))
     with pytest.raises(ValueError, match=r"1 of the states .* region: 2\. .*environment can keep"):
         rmax.make_problem(mdp, np.array([False, True, False]), reward)

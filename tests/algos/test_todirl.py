@@ -22,8 +22,13 @@ TASK = jl.to_automaton(jl.parse_ltl("!r U (c & (!r U g))"), letters=[set(), {"c"
 NUM_MEMORY = TASK.delta.shape[0]
 UP, DOWN, LEFT, RIGHT = range(4)
 # Compiling is what costs here, so what is run a few times is hardly optimised.
-quick = partial(jax.jit, compiler_options={
-    "xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True})
+quick = partial(
+    jax.jit,
+    compiler_options={
+        "xla_backend_optimization_level": 0,
+        "xla_llvm_disable_expensive_passes": True,
+    },
+)
 slope = quick(jax.value_and_grad(todirl.objective, has_aux=True))
 plan = quick(todirl.plan, static_argnums=0)
 MAPS = ("b c r\n. . g", "g . .\nr c b")
@@ -53,8 +58,11 @@ def small(worlds=(0,), *, network=None, label_on="exit", slip=0.2, **options):
     network = todirl.RewardNetwork((3, 3)) if network is None else network
     models = [lazy(i, slip, label_on) for i in worlds]
     return todirl.make_problem(
-        models, [seen(m) for m in models], [demonstrated(i, slip) for i in worlds],
-        network=network, **{"held_out": None, **options},
+        models,
+        [seen(m) for m in models],
+        [demonstrated(i, slip) for i in worlds],
+        network=network,
+        **{"held_out": None, **options},
     )
 
 
@@ -78,21 +86,29 @@ def parameters(problem, seed=0):
 
 
 @pytest.mark.few(2)
-@pytest.mark.parametrize("setting", [
-    pytest.param({}, id="exit"),
-    pytest.param({"worlds": (0, 1), "weight": [1.0, 0.5]}, id="two-worlds",
-                 marks=pytest.mark.exhaustive),
-    pytest.param({"slip": 0.0, "label_on": "entry"}, id="entry", marks=pytest.mark.exhaustive),
-    pytest.param({"horizon": 6}, id="horizon"),
-    pytest.param({"mu": 3.0, "slip": 0.3}, id="mu"),
-    pytest.param({"mu": 3.0, "worlds": (0, 1), "weight": [1.0, 0.5], "label_on": "entry"},
-                 id="mu-two-worlds", marks=pytest.mark.exhaustive),
-])
+@pytest.mark.parametrize(
+    "setting",
+    [
+        pytest.param({}, id="exit"),
+        pytest.param(
+            {"worlds": (0, 1), "weight": [1.0, 0.5]}, id="two-worlds", marks=pytest.mark.exhaustive
+        ),
+        pytest.param({"slip": 0.0, "label_on": "entry"}, id="entry", marks=pytest.mark.exhaustive),
+        pytest.param({"horizon": 6}, id="horizon"),
+        pytest.param({"mu": 3.0, "slip": 0.3}, id="mu"),
+        pytest.param(
+            {"mu": 3.0, "worlds": (0, 1), "weight": [1.0, 0.5], "label_on": "entry"},
+            id="mu-two-worlds",
+            marks=pytest.mark.exhaustive,
+        ),
+    ],
+)
 def test_the_gradient_is_that_of_central_differences(setting):
     mu = setting.get("mu")
     problem = small(**{k: v for k, v in setting.items() if k != "mu"})
     hparams = todirl.Hparams(
-        discount=0.9, l2=0.1, tolerance=1e-12, horizon=setting.get("horizon"), mu=mu)
+        discount=0.9, l2=0.1, tolerance=1e-12, horizon=setting.get("horizon"), mu=mu
+    )
     flat, unravel = ravel_pytree(parameters(problem))
 
     def losses(rows):
@@ -102,15 +118,15 @@ def test_the_gradient_is_that_of_central_differences(setting):
     rng = np.random.default_rng(1)
     directions = rng.normal(size=(4, flat.size)) / np.sqrt(flat.size)
     steps = np.array([-2e-4, -1e-4, 1e-4, 2e-4])[:, None, None]
-    low2, low, high, high2 = losses(
-        (flat + steps * directions).reshape(-1, flat.size)).reshape(4, -1)
+    low2, low, high, high2 = losses((flat + steps * directions).reshape(-1, flat.size)).reshape(
+        4, -1
+    )
     central = (low2 - 8 * low + 8 * high - high2) / (12 * 1e-4)  # of fourth order
     np.testing.assert_allclose(directions @ found, central, rtol=1e-8, atol=1e-8)
 
 
 def check_weighed(worlds, weight):
-    """Less mu times the probability of the task of the policy: the loss, what is told, the score.
-    """
+    """Less mu times the probability of the task of the policy: the loss, what is told, the score."""
     problem = small(worlds, slip=0.3, weight=weight, held_out=0.5)
     start = parameters(problem)
     plain = todirl.Hparams(discount=0.9, tolerance=1e-12)
@@ -154,14 +170,15 @@ def test_the_gradient_is_that_of_the_dense_sensitivity():
     def rewards(x):
         return todirl.reward(problem.network, unravel(x), model, observation)
 
-    policy = np.asarray(plan(
-        problem.network, unravel(flat), model, observation, hparams).policy)
+    policy = np.asarray(plan(problem.network, unravel(flat), model, observation, hparams).policy)
     uniform = np.full(model.state_shape, 1 / model.num_states)
     whole = jl.restrict(model, uniform).model
     expected = reference.likelihood_gradient(
-        np.asarray(jl.to_dense(whole).transition), policy.reshape(-1, 4),
+        np.asarray(jl.to_dense(whole).transition),
+        policy.reshape(-1, 4),
         np.asarray(jax.jit(jax.jacobian(rewards))(flat)).reshape(-1, 4, flat.size),
-        np.asarray(problem.counts[0]).reshape(-1, 4), 0.9,
+        np.asarray(problem.counts[0]).reshape(-1, 4),
+        0.9,
     )
     np.testing.assert_allclose(-np.asarray(found), expected, rtol=1e-9, atol=1e-9)
 
@@ -180,9 +197,11 @@ def test_numbered_states_lead_where_the_model_does(kind):
         np.testing.assert_allclose(after.reshape(mass.shape), expectation(model, value), atol=1e-14)
         lists = predecessors([model])
         flow = jax.tree.map(lambda x: x[0], lists).pushforward(
-            jnp.asarray(mass.reshape(-1, model.num_actions).T.ravel()))
+            jnp.asarray(mass.reshape(-1, model.num_actions).T.ravel())
+        )
         np.testing.assert_allclose(
-            flow.reshape(model.state_shape), pushforward(model, jnp.asarray(mass)), atol=1e-14)
+            flow.reshape(model.state_shape), pushforward(model, jnp.asarray(mass)), atol=1e-14
+        )
 
 
 def test_without_predecessor_lists_the_gradient_is_the_same():
@@ -273,8 +292,7 @@ def test_the_expert_is_recovered_with_the_features_of_its_reward():
 @pytest.mark.slow
 def test_learning_stops_at_the_best_held_out_likelihood():
     problem = small(held_out=0.5)
-    hparams = todirl.Hparams(
-        discount=0.9, l2=0.0, learning_rate=0.1, patience=5, tolerance=1e-12)
+    hparams = todirl.Hparams(discount=0.9, l2=0.0, learning_rate=0.1, patience=5, tolerance=1e-12)
     state, metrics = todirl.train(jax.random.key(0), problem, hparams, num_steps=60)
     at = int(state.best.step)
     assert state.stopped and state.step == 60 and at + 5 < 60
@@ -287,8 +305,9 @@ def test_learning_stops_at_the_best_held_out_likelihood():
     state, metrics = todirl.train(jax.random.key(0), problem, hparams, num_steps=60)
     assert not state.stopped and np.isnan(metrics.held_out).all()
     assert state.best.step == 60 and metrics.loss[-1] < metrics.loss[0] - 1
-    for x, y in zip(jax.tree.leaves(state.parameters), jax.tree.leaves(state.best.parameters),
-                    strict=True):
+    for x, y in zip(
+        jax.tree.leaves(state.parameters), jax.tree.leaves(state.best.parameters), strict=True
+    ):
         np.testing.assert_array_equal(x, y)
 
 
@@ -312,8 +331,16 @@ def test_counts_follow_the_memory_and_the_time():
     timed = np.zeros((5, 6, NUM_MEMORY, 4))
     q0 = int(TASK.initial)
     q1 = int(lazy().next_memory[1, q0])  # after leaving c, cell 1
-    for t, s, q, a in ((0, 0, q0, RIGHT), (1, 1, q0, DOWN), (2, 4, q1, RIGHT), (0, 0, q0, DOWN),
-                       (1, 3, q0, RIGHT), (2, 4, q0, UP), (3, 1, q0, DOWN), (4, 4, q1, RIGHT)):
+    for t, s, q, a in (
+        (0, 0, q0, RIGHT),
+        (1, 1, q0, DOWN),
+        (2, 4, q1, RIGHT),
+        (0, 0, q0, DOWN),
+        (1, 3, q0, RIGHT),
+        (2, 4, q0, UP),
+        (3, 1, q0, DOWN),
+        (4, 4, q1, RIGHT),
+    ):
         timed[t, s, q, a] += 1
     np.testing.assert_array_equal(problem.counts[0], timed)
     np.testing.assert_array_equal(small().counts[0], timed.sum(0))
@@ -352,22 +379,35 @@ def test_bad_problems_are_refused():
             todirl.make_problem(*given, **options)
 
     refused(r"observation has shape \(1, 5, 12\)", model, observation[:5], runs)
-    refused("observation in state 2 is not finite",
-            model, np.where(np.arange(6)[:, None] == 2, np.nan, observation), runs)
+    refused(
+        "observation in state 2 is not finite",
+        model,
+        np.where(np.arange(6)[:, None] == 2, np.nan, observation),
+        runs,
+    )
     jump = runs.replace(state=runs.state.at[0, 1].set(5))
-    refused("demonstrations in world 0: trajectory 0, step 0: .*does not fit the model",
-            model, observation, jump, held_out=0)
-    refused("demonstrations in 1 worlds; expected 2", [model, lazy(1)],
-            [observation] * 2, runs)
+    refused(
+        "demonstrations in world 0: trajectory 0, step 0: .*does not fit the model",
+        model,
+        observation,
+        jump,
+        held_out=0,
+    )
+    refused("demonstrations in 1 worlds; expected 2", [model, lazy(1)], [observation] * 2, runs)
     refused("held_out=1", model, observation, runs, held_out=1.0)
     refused("no pair is left", model, observation, runs, held_out=0.9)
     refused("weight has shape", model, observation, runs, weight=[1.0, 2.0])
     refused("has 5 steps; horizon=4 is shorter", model, observation, runs, horizon=4, held_out=0)
     other = jl.product(jl.gridworld("b c y\n. . g"), "F c", label_on="exit")
-    refused("world 1 does not have the propositions of world 0: it lacks r", [model, other],
-            [observation] * 2, [runs] * 2)
-    refused("world 1 does not have the shapes",
-            [model, lazy(0, 0.0)], [observation] * 2, [runs] * 2)
+    refused(
+        "world 1 does not have the propositions of world 0: it lacks r",
+        [model, other],
+        [observation] * 2,
+        [runs] * 2,
+    )
+    refused(
+        "world 1 does not have the shapes", [model, lazy(0, 0.0)], [observation] * 2, [runs] * 2
+    )
     refused("give a product", [model.mdp], observation, runs)
 
 
@@ -383,8 +423,12 @@ def test_stacked_products_are_taken_as_they_are():
     models = stack([lazy(0), lazy(1)])
     observation = np.stack([seen(lazy(i)) for i in (0, 1)])
     one = todirl.make_problem(
-        models, observation, [demonstrated(0), demonstrated(1)], held_out=None,
-        network=todirl.RewardNetwork((3, 3)))
+        models,
+        observation,
+        [demonstrated(0), demonstrated(1)],
+        held_out=None,
+        network=todirl.RewardNetwork((3, 3)),
+    )
     for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(small((0, 1))), strict=True):
         np.testing.assert_array_equal(x, y)
 
@@ -404,7 +448,8 @@ def test_inside_a_mask_the_plan_and_the_gradient_are_those_of_worlds_without_the
     assert ((policy > 0) == np.stack(masks)).all()
     for i, (model, mask) in enumerate(zip(models, masks, strict=True)):
         new = todirl.plan(
-            problem.network, point, model, jnp.asarray(seen(model)), hparams, allowed=mask)
+            problem.network, point, model, jnp.asarray(seen(model)), hparams, allowed=mask
+        )
         np.testing.assert_allclose(new.policy, policy[i], atol=1e-9)
         anywhere = np.full(model.state_shape, 1 / model.num_states)
         flat = jl.restrict(model, anywhere, allowed=mask).model
@@ -414,15 +459,19 @@ def test_inside_a_mask_the_plan_and_the_gradient_are_those_of_worlds_without_the
     flat, unravel = ravel_pytree(point)
     direction = np.random.default_rng(1).normal(size=flat.shape)
     found = ravel_pytree(gradient(point, problem, hparams))[0] @ direction
-    ahead, behind = (slope(unravel(flat + h * direction), problem, hparams)[0][0]
-                     for h in (1e-5, -1e-5))
+    ahead, behind = (
+        slope(unravel(flat + h * direction), problem, hparams)[0][0] for h in (1e-5, -1e-5)
+    )
     np.testing.assert_allclose(found, (ahead - behind) / 2e-5, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("masks", "message"), [
-    (lambda m: [m], "there are 1 masks for 2 worlds"),
-    (lambda m: [m, m & False], "world 1: allowed: no action is left in state 0 with memory 0"),
-])
+@pytest.mark.parametrize(
+    ("masks", "message"),
+    [
+        (lambda m: [m], "there are 1 masks for 2 worlds"),
+        (lambda m: [m, m & False], "world 1: allowed: no action is left in state 0 with memory 0"),
+    ],
+)
 def test_masks_that_fit_no_world_are_refused(masks, message):
     mask = np.ones((*lazy().state_shape, 4), bool)
     with pytest.raises(ValueError, match=message):

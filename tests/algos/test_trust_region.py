@@ -58,8 +58,7 @@ def circle_step(world, action, key):
 
 def free(reset, step, observe, num_actions):
     """An environment whose actions have no bounds."""
-    return make_environment(
-        reset, step, observe, actions=make_box(-np.inf, np.inf, (num_actions,)))
+    return make_environment(reset, step, observe, actions=make_box(-np.inf, np.inf, (num_actions,)))
 
 
 def circle(limit=5.0):
@@ -125,7 +124,12 @@ def one_choice(limit=None):
 
 
 ONE = Hparams(
-    discount=1.0, num_trajectories=500, hidden=(), value_hidden=(), normalize=False, delta=0.02,
+    discount=1.0,
+    num_trajectories=500,
+    hidden=(),
+    value_hidden=(),
+    normalize=False,
+    delta=0.02,
     value_epochs=1,
 )
 
@@ -149,8 +153,13 @@ def counted(last=3.0, poison=0.0, horizon=5, limit=100.0):
 
 
 SMALL = Hparams(
-    discount=0.9, num_trajectories=40, hidden=(4,), value_hidden=(4,), value_epochs=2,
-    cg_steps=5, value_batches=2,
+    discount=0.9,
+    num_trajectories=40,
+    hidden=(4,),
+    value_hidden=(4,),
+    value_epochs=2,
+    cg_steps=5,
+    value_batches=2,
 )
 
 
@@ -163,9 +172,7 @@ def small():
 
 
 def rollout(state, problem, seed=1):
-    return trust_region.rollout(
-        jax.random.key(seed), state, problem, SMALL, num_trajectories=6
-    )
+    return trust_region.rollout(jax.random.key(seed), state, problem, SMALL, num_trajectories=6)
 
 
 def two_steps(state, problem, hparams=SMALL):
@@ -212,16 +219,23 @@ def by_slsqp(target, b, h, c, delta, start, *, limited=True):
     below = {"type": "ineq", "fun": lambda x: -(c + b @ x), "jac": lambda x: -b}
     size = np.linalg.norm(target)
     found = scipy.optimize.minimize(
-        lambda x: -target @ x / size, start, jac=lambda x: -target / size, method="SLSQP",
+        lambda x: -target @ x / size,
+        start,
+        jac=lambda x: -target / size,
+        method="SLSQP",
         constraints=[inside, below] if limited else [inside],
         options={"maxiter": 500, "ftol": 1e-14},
     )
     return size * -found.fun
 
 
-@pytest.mark.parametrize("count", [
-    150, pytest.param(3000, marks=pytest.mark.exhaustive),
-])
+@pytest.mark.parametrize(
+    "count",
+    [
+        150,
+        pytest.param(3000, marks=pytest.mark.exhaustive),
+    ],
+)
 def test_the_step_is_what_a_generic_solver_finds(count):
     rng = np.random.default_rng(0)
     seen = np.zeros(4, int)
@@ -333,26 +347,29 @@ def test_multipliers_certify_the_step():
         assert trust * abs(size - edge) <= 1e-6 * max(np.sqrt(q), np.sqrt(s)) * edge
 
 
-@pytest.mark.parametrize(("numbers", "case", "weights"), [
-    # No gradient of the cost: kept, or out of reach.
-    ((4.0, 0.0, 0.0, -1.0, 0.5), Case.FREE, (0.5, 0.0)),
-    ((4.0, 0.0, 0.0, 0.0, 0.5), Case.INACTIVE, (0.5, 0.0)),
-    ((4.0, 0.0, 0.0, 1.0, 0.5), Case.RECOVERY, (0.0, 0.0)),
-    # No gradient of the reward: nothing to gain, or just back to the limit.
-    ((0.0, 0.0, 1.0, -0.5, 0.5), Case.INACTIVE, (0.0, 0.0)),
-    ((0.0, 0.0, 1.0, 0.5, 0.5), Case.ACTIVE, (0.0, -0.5)),
-    ((0.0, 0.0, 0.0, -1.0, 0.5), Case.FREE, (0.0, 0.0)),
-    # Parallel gradients, at the limit, inside, and outside.
-    ((4.0, 2.0, 1.0, 0.0, 0.5), Case.ACTIVE, (0.0, 0.0)),
-    ((4.0, 2.0, 1.0, -0.5, 0.5), Case.ACTIVE, (0.0, 0.5)),
-    ((4.0, 2.0, 1.0, 0.5, 0.5), Case.ACTIVE, (0.0, -0.5)),
-    ((4.0, -2.0, 1.0, 0.5, 0.5), Case.INACTIVE, (0.5, 0.0)),
-    # The limit touches the trust region.
-    ((4.0, 0.0, 1.0, 1.0, 0.5), Case.RECOVERY, (0.0, -1.0)),
-    ((4.0, 0.0, 1.0, -1.0, 0.5), Case.FREE, (0.5, 0.0)),
-    ((4.0, 0.0, 1.0, 2.0, 0.5), Case.RECOVERY, (0.0, -1.0)),
-    ((4.0, 1.0, 1.0, -2.0, 0.5), Case.FREE, (0.5, 0.0)),
-])
+@pytest.mark.parametrize(
+    ("numbers", "case", "weights"),
+    [
+        # No gradient of the cost: kept, or out of reach.
+        ((4.0, 0.0, 0.0, -1.0, 0.5), Case.FREE, (0.5, 0.0)),
+        ((4.0, 0.0, 0.0, 0.0, 0.5), Case.INACTIVE, (0.5, 0.0)),
+        ((4.0, 0.0, 0.0, 1.0, 0.5), Case.RECOVERY, (0.0, 0.0)),
+        # No gradient of the reward: nothing to gain, or just back to the limit.
+        ((0.0, 0.0, 1.0, -0.5, 0.5), Case.INACTIVE, (0.0, 0.0)),
+        ((0.0, 0.0, 1.0, 0.5, 0.5), Case.ACTIVE, (0.0, -0.5)),
+        ((0.0, 0.0, 0.0, -1.0, 0.5), Case.FREE, (0.0, 0.0)),
+        # Parallel gradients, at the limit, inside, and outside.
+        ((4.0, 2.0, 1.0, 0.0, 0.5), Case.ACTIVE, (0.0, 0.0)),
+        ((4.0, 2.0, 1.0, -0.5, 0.5), Case.ACTIVE, (0.0, 0.5)),
+        ((4.0, 2.0, 1.0, 0.5, 0.5), Case.ACTIVE, (0.0, -0.5)),
+        ((4.0, -2.0, 1.0, 0.5, 0.5), Case.INACTIVE, (0.5, 0.0)),
+        # The limit touches the trust region.
+        ((4.0, 0.0, 1.0, 1.0, 0.5), Case.RECOVERY, (0.0, -1.0)),
+        ((4.0, 0.0, 1.0, -1.0, 0.5), Case.FREE, (0.5, 0.0)),
+        ((4.0, 0.0, 1.0, 2.0, 0.5), Case.RECOVERY, (0.0, -1.0)),
+        ((4.0, 1.0, 1.0, -2.0, 0.5), Case.FREE, (0.5, 0.0)),
+    ],
+)
 def test_boundary_cases(numbers, case, weights):
     solve = jax.jit(dual_and_weights)
     dual, found = solve(*numbers)
@@ -368,9 +385,13 @@ def test_boundary_cases(numbers, case, weights):
 
 
 def samples_of(state, batch, hparams=SMALL):
-    inputs, action = map(np.asarray, (
-        jax.jit(lambda m, x: nets.normalized(m, hparams, x))(state.moments, batch.observation),
-        batch.action))
+    inputs, action = map(
+        np.asarray,
+        (
+            jax.jit(lambda m, x: nets.normalized(m, hparams, x))(state.moments, batch.observation),
+            batch.action,
+        ),
+    )
     return inputs.reshape(-1, inputs.shape[-1]), action.reshape(-1, action.shape[-1])
 
 
@@ -391,21 +412,23 @@ def test_fisher_products_are_those_of_the_hessian(small):
     hessian = jax.jit(jax.hessian(divergence))(flat)
     np.testing.assert_allclose(products(flat, np.eye(flat.size)), hessian, atol=1e-12)
     # The Fisher matrix as the mean square of the score, in closed form for a Gaussian.
-    slope = jax.jit(jax.jacrev(
-        lambda x: nets.gaussian(unravel(x), SMALL, inputs)[0]))(flat)
+    slope = jax.jit(jax.jacrev(lambda x: nets.gaussian(unravel(x), SMALL, inputs)[0]))(flat)
     spread = np.asarray(old[1])[0]
     fisher = np.einsum("bai,baj,a->ij", slope, slope, spread**-2.0) / len(inputs)
-    where = np.asarray(ravel_pytree({
-        "mean": jax.tree.map(np.zeros_like, state.parameters["mean"]),
-        "log_deviation": np.ones(1)})[0])
+    where = np.asarray(
+        ravel_pytree(
+            {
+                "mean": jax.tree.map(np.zeros_like, state.parameters["mean"]),
+                "log_deviation": np.ones(1),
+            }
+        )[0]
+    )
     np.testing.assert_allclose(hessian, fisher + 2 * np.diag(where), atol=1e-12)
     flat, direction = np.asarray(flat), np.random.default_rng(2).normal(size=flat.shape)
     slope = jax.jit(jax.grad(divergence))
     ahead, behind = (np.asarray(slope(flat + h * direction)) for h in (1e-5, -1e-5))
     change = (ahead - behind) / 2e-5
-    np.testing.assert_allclose(
-        products(flat, direction[None])[0], change, rtol=1e-5, atol=1e-7
-    )
+    np.testing.assert_allclose(products(flat, direction[None])[0], change, rtol=1e-5, atol=1e-7)
 
 
 def test_gradients_of_the_gains_are_finite_differences(small):
@@ -422,8 +445,9 @@ def test_gradients_of_the_gains_are_finite_differences(small):
 
     np.testing.assert_allclose(gains(flat), 0, atol=1e-15)  # but for rounding in sums
     slope = jax.jit(jax.jacrev(gains))(flat)
-    score = jax.jit(jax.jacrev(lambda x: nets.log_density(
-        action, *nets.gaussian(unravel(x), SMALL, inputs))))(flat)
+    score = jax.jit(
+        jax.jacrev(lambda x: nets.log_density(action, *nets.gaussian(unravel(x), SMALL, inputs)))
+    )(flat)
     np.testing.assert_allclose(slope, weighted @ score, rtol=1e-10)
     for key in jax.random.split(jax.random.key(4), 3):
         direction = jax.random.normal(key, flat.shape)
@@ -436,8 +460,10 @@ def test_divergence_and_density_are_those_of_gaussians():
     mean, other = rng.normal(size=(2, 3))
     spread, wide = np.exp(rng.normal(size=(2, 3)))
     x = mean + spread * rng.normal(size=(200_000, 3))
-    one, two = (nets.log_density(jnp.asarray(x), jnp.asarray(m), jnp.asarray(s))
-                for m, s in ((mean, spread), (other, wide)))
+    one, two = (
+        nets.log_density(jnp.asarray(x), jnp.asarray(m), jnp.asarray(s))
+        for m, s in ((mean, spread), (other, wide))
+    )
     found = nets.kl_divergence((mean, spread), (other, wide))
     error = np.std(one - two) / np.sqrt(len(x))
     assert abs(np.mean(one - two) - found) < 4 * error
@@ -463,14 +489,14 @@ def test_advantages_are_their_sums(discount, gae_lambda):
     own = discount * rng.uniform(size=(6, 4))  # each step's
     lengths, after = [6, 1, 3, 0], np.array([2.0, 0.0, -3.0, 5.0])
     valid = np.arange(6)[:, None] < np.array(lengths)
-    one, several = (advantages(
-        jnp.where(valid, signal, 0), jnp.asarray(value), jnp.asarray(valid), *given)
-        for given in ((discount, gae_lambda), (own, gae_lambda, after)))
+    one, several = (
+        advantages(jnp.where(valid, signal, 0), jnp.asarray(value), jnp.asarray(valid), *given)
+        for given in ((discount, gae_lambda), (own, gae_lambda, after))
+    )
     for i, length in enumerate(lengths):
         plain = plain_advantages(signal[:, i], value[:, i], length, [discount] * 6, gae_lambda, 0)
         np.testing.assert_allclose(one[:, i], plain, atol=1e-12)
-        plain = plain_advantages(
-            signal[:, i], value[:, i], length, own[:, i], gae_lambda, after[i])
+        plain = plain_advantages(signal[:, i], value[:, i], length, own[:, i], gae_lambda, after[i])
         np.testing.assert_allclose(several[:, i], plain, atol=1e-12)
 
 
@@ -551,27 +577,33 @@ def tree_observe(world):
 @pytest.mark.slow
 def test_a_policy_runs_as_an_agent_on_trees_within_the_box():
     """Observations become one vector, and actions are those of the box."""
+
     def step(world, action, key):
         counted_step(9.0, 0.0, world, action[0], key)
         out = jnp.abs(action).max() > 0.5
         return Timestep(world.at[0].add(1), -jnp.sum(action), world[0] >= 3, cost=1.0 * out)
 
     world = make_environment(
-        counted_reset, step, tree_observe, actions=make_box([[-0.5], [-0.25]], 0.25), horizon=4)
+        counted_reset, step, tree_observe, actions=make_box([[-0.5], [-0.25]], 0.25), horizon=4
+    )
     problem = trust_region.make_problem(world, limit=1.0)
     assert problem.horizon == 4
     hparams = SMALL.replace(initial_deviation=2.0)
     state = trust_region.init(jax.random.key(0), problem, hparams)
-    batch = jax.tree.map(np.asarray, trust_region.rollout(
-        jax.random.key(1), state, problem, hparams, num_trajectories=6))
+    batch = jax.tree.map(
+        np.asarray,
+        trust_region.rollout(jax.random.key(1), state, problem, hparams, num_trajectories=6),
+    )
     assert batch.observation.shape == (4, 6, 3) and batch.action.shape == (4, 6, 2)
     late, _, time = batch.observation[:, 0].T
     np.testing.assert_array_equal([late, time], [[0, 0, 1, 1], [0, 1, 2, 3]])
     assert np.abs(batch.action).max() > 1 and not batch.cost.any()
     clipped = np.clip(batch.action, [-0.5, -0.25], 0.25)
     np.testing.assert_allclose(batch.reward, -clipped.sum(-1), atol=1e-12)
-    mean, deviation = map(np.asarray, jax.jit(
-        lambda state: trust_region.act(state, hparams, np.array([1.0, 0.0, 2.0])))(state))
+    mean, deviation = map(
+        np.asarray,
+        jax.jit(lambda state: trust_region.act(state, hparams, np.array([1.0, 0.0, 2.0])))(state),
+    )
     now = tree_observe(np.array([2.0, 0.0]))
     keys = jax.random.split(jax.random.key(3), 4000)
     drawn = {}
@@ -582,7 +614,8 @@ def test_a_policy_runs_as_an_agent_on_trees_within_the_box():
         assert drawn[make].shape == (4000, 2, 1)
     fits = np.clip(mean, [-0.5, -0.25], 0.25).reshape(2, 1)
     np.testing.assert_allclose(
-        drawn[trust_region.greedy], np.broadcast_to(fits, (4000, 2, 1)), atol=1e-12)
+        drawn[trust_region.greedy], np.broadcast_to(fits, (4000, 2, 1)), atol=1e-12
+    )
     share = scipy.stats.norm(mean[1], deviation[1]).cdf(-0.25)
     assert abs((drawn[trust_region.policy][:, 1, 0] == -0.25).mean() - share) < 0.04
     episode = jax.jit(partial(run_episode, num_steps=5))(jax.random.key(2), world, agent)
@@ -601,8 +634,7 @@ def ticking_step(world, action, key):
 def ended_step(ends, world, action, key):
     """Pays 1 + the action, costs 2, and is then worth half; `ends` is when it is over, and cut."""
     time = world[0] + 1
-    return Timestep(
-        world + 1, 1.0 + action[0], time >= ends[0], time >= ends[1], 2.0, discount=0.5)
+    return Timestep(world + 1, 1.0 + action[0], time >= ends[0], time >= ends[1], 2.0, discount=0.5)
 
 
 @jax.jit
@@ -617,15 +649,24 @@ def values_of(state, observation, progress):
     return nets.values_at(state.values, SMALL, jnp.append(seen, progress))
 
 
-@pytest.mark.parametrize(("ends", "length", "bootstrapped"), [
-    ((9, 9), 5, False), ((3, 9), 3, False), ((9, 3), 3, True), ((3, 3), 3, False),
-    ((9, 5), 5, True), ((5, 9), 5, False),
-])
+@pytest.mark.parametrize(
+    ("ends", "length", "bootstrapped"),
+    [
+        ((9, 9), 5, False),
+        ((3, 9), 3, False),
+        ((9, 3), 3, True),
+        ((3, 3), 3, False),
+        ((9, 5), 5, True),
+        ((5, 9), 5, False),
+    ],
+)
 def test_truncation_is_bootstrapped_and_termination_and_the_horizon_are_not(
-        ends, length, bootstrapped):
+    ends, length, bootstrapped
+):
     step = Partial(ended_step, np.array(ends))
     problem = trust_region.make_problem(
-        free(ticking_reset, step, identity, 1), horizon=5, limit=9.0)
+        free(ticking_reset, step, identity, 1), horizon=5, limit=9.0
+    )
     state = trust_region.init(jax.random.key(0), problem, SMALL)
     state = state.replace(value_moments=np.array([[3.0, 4.0], [2.0, 5.0]]))
     batch = jax.tree.map(np.asarray, rollout(state, problem))
@@ -650,17 +691,29 @@ def test_truncation_is_bootstrapped_and_termination_and_the_horizon_are_not(
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize(("time_limit", "horizon", "values"), [
-    (None, 4, [15 / 8, 7 / 4, 3 / 2, 1]), (4, None, [2, 2, 2, 2]),
-])
+@pytest.mark.parametrize(
+    ("time_limit", "horizon", "values"),
+    [
+        (None, 4, [15 / 8, 7 / 4, 3 / 2, 1]),
+        (4, None, [2, 2, 2, 2]),
+    ],
+)
 def test_values_of_what_is_cut_off_are_those_of_what_goes_on(time_limit, horizon, values):
     """Of 1 in each step at a discount of 1/2: less than 2 only if there are four."""
     world = free(ticking_reset, ticking_step, identity, 1)
     world = world if time_limit is None else with_time_limit(world, time_limit)
     problem = trust_region.make_problem(world, limit=9.0, horizon=horizon)
     hparams = Hparams(
-        discount=0.5, num_trajectories=16, hidden=(), value_hidden=(16,), value_epochs=20,
-        value_rate=0.02, gae_lambda=0.5, cost_discount=0.5, cost_gae_lambda=1.0)
+        discount=0.5,
+        num_trajectories=16,
+        hidden=(),
+        value_hidden=(16,),
+        value_epochs=20,
+        value_rate=0.02,
+        gae_lambda=0.5,
+        cost_discount=0.5,
+        cost_gae_lambda=1.0,
+    )
     state, metrics = trust_region.train(jax.random.key(0), problem, hparams, num_steps=60)
     inputs = nets.normalized(state.moments, hparams, jnp.arange(4.0)[:, None, None])
     mean, deviation = state.value_moments[..., None, None]
@@ -761,8 +814,13 @@ def lq_gap(hparams, num_steps):
 @pytest.mark.exhaustive
 def test_lq_control_comes_near_the_riccati_optimum():
     hparams = Hparams(
-        discount=1.0, method="trpo", num_trajectories=100, hidden=(), value_hidden=(16,),
-        initial_deviation=0.5, delta=0.03,
+        discount=1.0,
+        method="trpo",
+        num_trajectories=100,
+        hidden=(),
+        value_hidden=(16,),
+        initial_deviation=0.5,
+        delta=0.03,
     )
     before, after = lq_gap(hparams, 50)
     assert before > 2
@@ -791,25 +849,27 @@ def test_a_circle_within_walls():
 def test_a_limit_that_is_far_away_makes_it_the_unconstrained_method():
     problem, key = circle(limit=99.0), jax.random.key(0)
     one, metrics = trust_region.train(key, problem, SMALL, num_steps=5)
-    two, others = trust_region.train(
-        key, problem, SMALL.replace(method="trpo"), num_steps=5
-    )
+    two, others = trust_region.train(key, problem, SMALL.replace(method="trpo"), num_steps=5)
     assert (metrics.case == Case.FREE).all() and (metrics.scale > 0).any()
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-7), one.parameters, two.parameters)
     np.testing.assert_allclose(metrics.trust_multiplier, others.trust_multiplier, rtol=1e-7)
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize(("method", "low", "high", "reward"), [
-    ("cpo", 4, 6, 27), ("trpo", 15, 50, 35),
-])
+@pytest.mark.parametrize(
+    ("method", "low", "high", "reward"),
+    [
+        ("cpo", 4, 6, 27),
+        ("trpo", 15, 50, 35),
+    ],
+)
 def test_a_circle_from_several_seeds(method, low, high, reward):
     hparams = CIRCLE.replace(method=method, num_trajectories=100)
     keys = jax.random.split(jax.random.key(0), 5)
     with jax.enable_x64(False):
-        _, metrics = jax.jit(jax.vmap(
-            partial(trust_region.train, num_steps=100), (0, None, None)
-        ))(keys, circle(), hparams)
+        _, metrics = jax.jit(jax.vmap(partial(trust_region.train, num_steps=100), (0, None, None)))(
+            keys, circle(), hparams
+        )
     cost = metrics.cost[:, -30:].mean(1)
     assert ((cost > low) & (cost < high)).all(), cost
     assert (metrics.reward[:, -1] > reward).all(), metrics.reward[:, -1]
@@ -821,7 +881,8 @@ def test_the_pendulum_swings_up():
     world = free(pendulum_reset, pendulum_step, pendulum_observe, 1)
     problem = trust_region.make_problem(world, horizon=200)
     hparams = Hparams(
-        discount=0.99, method="trpo", num_trajectories=32, delta=0.02, gae_lambda=0.95)
+        discount=0.99, method="trpo", num_trajectories=32, delta=0.02, gae_lambda=0.95
+    )
     with jax.enable_x64(False):
         start = trust_region.init(jax.random.key(0), problem, hparams)
         assert end(start, problem, hparams)[0] < -1000
@@ -836,8 +897,15 @@ def test_new_worlds_limits_and_settings_do_not_retrace():
     start = trust_region.init(jax.random.key(0), counted(), SMALL)
     _, one = two_steps(start, counted())
     other = SMALL.replace(
-        discount=0.8, delta=0.02, gae_lambda=0.5, damping=0.1, backtrack=0.5, value_rate=0.1,
-        cost_discount=0.9, cost_gae_lambda=0.3, initial_deviation=0.5,
+        discount=0.8,
+        delta=0.02,
+        gae_lambda=0.5,
+        damping=0.1,
+        backtrack=0.5,
+        value_rate=0.1,
+        cost_discount=0.9,
+        cost_gae_lambda=0.3,
+        initial_deviation=0.5,
     )
     problem = counted(last=2.0, limit=3.0)
     with counted_traces() as traced:
@@ -847,12 +915,15 @@ def test_new_worlds_limits_and_settings_do_not_retrace():
     assert (two.reward_gain != one.reward_gain).all()
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"method": "ppo"}, r"method='ppo'; choose"),
-    ({"penalty": 1.0}, "CPO finds its own multiplier"),
-    ({"cg_steps": 0}, "cg_steps=0; it must be at least 1"),
-    ({"value_batches": 1000}, "value_batches=1000 of 200 samples"),
-])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"method": "ppo"}, r"method='ppo'; choose"),
+        ({"penalty": 1.0}, "CPO finds its own multiplier"),
+        ({"cg_steps": 0}, "cg_steps=0; it must be at least 1"),
+        ({"value_batches": 1000}, "value_batches=1000 of 200 samples"),
+    ],
+)
 def test_settings_that_do_not_fit_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         trust_region.init(jax.random.key(0), counted(), SMALL.replace(**change))
@@ -863,11 +934,14 @@ def test_a_limit_is_needed():
         trust_region.init(jax.random.key(0), counted(limit=None), SMALL)
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"horizon": 0}, "horizon=0; it must be at least 1"),
-    ({"horizon": None}, "episodes that never end: .* give horizon"),
-    ({"limit": [1.0, 2.0]}, r"limit has shape \(2,\); expected \(\)"),
-])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"horizon": 0}, "horizon=0; it must be at least 1"),
+        ({"horizon": None}, "episodes that never end: .* give horizon"),
+        ({"limit": [1.0, 2.0]}, r"limit has shape \(2,\); expected \(\)"),
+    ],
+)
 def test_problems_that_do_not_fit_are_refused(change, message):
     world = free(lq_reset, lq_step, identity, 1)
     with pytest.raises(ValueError, match=message):

@@ -12,16 +12,22 @@ from jaxltl.core.models.counts import counted_model
 from jaxltl.core.values.data_guarantee import learn_guarantee
 from jaxltl.io.log import read_labels, read_log
 
-LINES = [("hall", "left", "kitchen", 900), ("hall", "left", "pit", 100),
-         ("hall", "right", "kitchen", 40), ("hall", "right", "pit", 10),
-         ("kitchen", "rest", "kitchen", 5), ("pit", "rest", "pit", 5)]
+LINES = [
+    ("hall", "left", "kitchen", 900),
+    ("hall", "left", "pit", 100),
+    ("hall", "right", "kitchen", 40),
+    ("hall", "right", "pit", 10),
+    ("kitchen", "rest", "kitchen", 5),
+    ("pit", "rest", "pit", 5),
+]
 
 
 @pytest.fixture
 def log(tmp_path):
     path = tmp_path / "log.csv"
-    path.write_text("state,action,next,count\n" + "".join(
-        ",".join(map(str, x)) + "\n" for x in LINES))
+    path.write_text(
+        "state,action,next,count\n" + "".join(",".join(map(str, x)) + "\n" for x in LINES)
+    )
     (tmp_path / "labels.csv").write_text("state,label\nkitchen,safe\npit,lost\n")
     return path
 
@@ -31,8 +37,17 @@ def run(*arguments):
 
 
 def certified(log, *more):
-    return run(log, "F safe", "--confidence", 0.95, "--initial", "hall", "--labels",
-               log.parent / "labels.csv", *more)
+    return run(
+        log,
+        "F safe",
+        "--confidence",
+        0.95,
+        "--initial",
+        "hall",
+        "--labels",
+        log.parent / "labels.csv",
+        *more,
+    )
 
 
 def told(printed):
@@ -46,7 +61,8 @@ def test_what_is_guaranteed_is_printed_and_written(log):
     found = certified(log, "--json", "--policy", out)
     assert found.exit_code == 0, found.output
     model, counts = counted_model(
-        read_log(log), initial="hall", labels=read_labels(log.parent / "labels.csv"))
+        read_log(log), initial="hall", labels=read_labels(log.parent / "labels.csv")
+    )
     expected = learn_guarantee(model, counts, "F safe", 0.95)
     result = json.loads(found.stdout.splitlines()[-1])
     assert result["bound"] == expected.bound
@@ -83,8 +99,10 @@ def test_a_curve_is_drawn(log):
 
 def test_a_model_file_has_the_graph(log, tmp_path):
     place = tmp_path / "world.tra"
-    place.write_text("3 4 6\n0 0 1 0.5 left\n0 0 2 0.5 left\n0 1 1 0.5 right\n0 1 2 0.5 right\n"
-                     "1 0 1 1 rest\n2 0 2 1 rest\n")
+    place.write_text(
+        "3 4 6\n0 0 1 0.5 left\n0 0 2 0.5 left\n0 1 1 0.5 right\n0 1 2 0.5 right\n"
+        "1 0 1 1 rest\n2 0 2 1 rest\n"
+    )
     (tmp_path / "world.lab").write_text('0="init" 1="safe"\n0: 0\n1: 1\n')
     numbers = tmp_path / "numbers.csv"
     numbers.write_text("state,action,next\n" + "0,left,1\n" * 9 + "0,left,2\n")
@@ -93,12 +111,15 @@ def test_a_model_file_has_the_graph(log, tmp_path):
     assert 0.4 < json.loads(found.stdout.splitlines()[-1])["bound"] < 0.9
 
 
-@pytest.mark.parametrize(("more", "message"), [
-    (["--confidence", 1.5], "confidence"),
-    (["--initial", "cellar"], "--initial cellar: the log has no such state; it has hall, "),
-    (["--terminal", "hall"], "terminal state 'hall' was left"),
-    (["--curve", "curve.txt"], "--curve curve.txt: the name must end in .svg"),
-])
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--confidence", 1.5], "confidence"),
+        (["--initial", "cellar"], "--initial cellar: the log has no such state; it has hall, "),
+        (["--terminal", "hall"], "terminal state 'hall' was left"),
+        (["--curve", "curve.txt"], "--curve curve.txt: the name must end in .svg"),
+    ],
+)
 def test_mistakes(log, more, message):
     found = certified(log, *more)
     assert found.exit_code == 2

@@ -66,7 +66,8 @@ def check_demonstrated_route(outcome, ending):
     s = int(shown.state[0, 0])
     start = s, int(model.initial_memory[s])
     values, route = likeliest_routes(
-        model, kept_policy(outcome), start, int(shown.length[0]), ending)
+        model, kept_policy(outcome), start, int(shown.length[0]), ending
+    )
     assert route == np.asarray(shown.action)[0].tolist()
     assert values[0] > values[1] + 1
     return np.exp(values)
@@ -81,9 +82,12 @@ def fetched():
 def test_one_demonstration_is_enough(fetched):
     outcome, result = fetched
     assert result["satisfaction"]["minimum"]["lower"] == 1
-    assert ("good", "By the graph: from every initial state the policy does the task with "
-            "probability 1, whatever the numbers. It takes moves that keep that possible, and no "
-            "others.") in remarks(result)
+    assert (
+        "good",
+        "By the graph: from every initial state the policy does the task with "
+        "probability 1, whatever the numbers. It takes moves that keep that possible, and no "
+        "others.",
+    ) in remarks(result)
     *_, sure = bottoms(outcome.setup.model, kept_policy(outcome))
     start = int(outcome.setup.demonstrations.state[0, 0])
     assert sure[start, int(outcome.setup.model.initial_memory[start])]
@@ -156,8 +160,9 @@ def careless_walk(rng, world):
         a = int(straight if rng.random() < 0.5 else rng.integers(4))
         states.append(s)
         actions.append(a)
-        s = int(rng.choice(np.asarray(world.successor)[s, a],
-                           p=np.asarray(world.probability)[s, a]))
+        s = int(
+            rng.choice(np.asarray(world.successor)[s, a], p=np.asarray(world.probability)[s, a])
+        )
     return {"states": states, "actions": actions}
 
 
@@ -189,7 +194,8 @@ def weighed(outcome, weights_of_task):
     hparams = job.settings(job.mlirl.Hparams, setup.task.learner)
     for mu in weights_of_task:
         yield job._trained(
-            setup, names, problem, replace(hparams, mu=float(mu)), (0, 1), None, None)
+            setup, names, problem, replace(hparams, mu=float(mu)), (0, 1), None, None
+        )
 
 
 def check_risky(rng, place, over, weights_of_task):
@@ -204,7 +210,8 @@ def check_risky(rng, place, over, weights_of_task):
     (free,) = weighed(outcome, [0.0])
     # More than was asked for is given only where it makes the demonstrations more likely.
     assert attempt.attained <= asked + WINDOW or (
-        attempt.neg_log_likelihood <= free.neg_log_likelihood[0] * (1 + 1e-9))
+        attempt.neg_log_likelihood <= free.neg_log_likelihood[0] * (1 + 1e-9)
+    )
     assert attempt.attained == pytest.approx(attained, abs=1e-9)
     assert result["guarantee"]["attained"] == attempt.attained
     certified = result["satisfaction"]["mean" if over == "mean" else "minimum"]["lower"]
@@ -214,18 +221,20 @@ def check_risky(rng, place, over, weights_of_task):
         return float(nll + by_itself * np.sum(one.weights[0] ** 2) * 1e-3 / 2)
 
     found = loss(attempt.learned, attempt.neg_log_likelihood)
-    np.testing.assert_allclose(outcome.learned.neg_log_likelihood[outcome.chosen],
-                               attempt.neg_log_likelihood)
+    np.testing.assert_allclose(
+        outcome.learned.neg_log_likelihood[outcome.chosen], attempt.neg_log_likelihood
+    )
     reaching = [
-        loss(one, one.neg_log_likelihood[0]) for one in weighed(outcome, weights_of_task)
+        loss(one, one.neg_log_likelihood[0])
+        for one in weighed(outcome, weights_of_task)
         if at_starts(model, jl.satisfaction_probability(model, one.policy[0]).lower, over)[0]
-        >= asked]
+        >= asked
+    ]
     return attempt, found / min(reaching, default=np.inf) - 1
 
 
 def check_many(count, grid, over, place):
-    """Likelihoods have several maxima, so that a search may end in a lesser one, seldom and near.
-    """
+    """Likelihoods have several maxima, so that a search may end in a lesser one, seldom and near."""
     rng = np.random.default_rng([count, over == "worst"])
     found, excess = zip(*(check_risky(rng, place, over, grid) for _ in range(count)), strict=True)
     assert any(x.weight or x.share for x in found)
@@ -233,28 +242,37 @@ def check_many(count, grid, over, place):
     assert len(worse) <= 1 and max(worse, default=0) < 0.01, excess
 
 
-@pytest.mark.parametrize(("count", "grid"), [
-    pytest.param(3, np.logspace(-2, 2, 4), marks=pytest.mark.slow),
-    pytest.param(50, np.logspace(-3, 5, 64), marks=pytest.mark.exhaustive),
-])
+@pytest.mark.parametrize(
+    ("count", "grid"),
+    [
+        pytest.param(3, np.logspace(-2, 2, 4), marks=pytest.mark.slow),
+        pytest.param(50, np.logspace(-3, 5, 64), marks=pytest.mark.exhaustive),
+    ],
+)
 def test_a_probability_is_reached_and_nothing_given_away(tmp_path, count, grid):
     check_many(count, grid, "mean", tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("count", "grid"), [
-    (1, np.logspace(-2, 2, 4)),
-    pytest.param(8, np.logspace(-3, 5, 64), marks=pytest.mark.exhaustive),
-])
+@pytest.mark.parametrize(
+    ("count", "grid"),
+    [
+        (1, np.logspace(-2, 2, 4)),
+        pytest.param(8, np.logspace(-3, 5, 64), marks=pytest.mark.exhaustive),
+    ],
+)
 def test_a_probability_is_reached_from_the_worst_start(tmp_path, count, grid):
     check_many(count, grid, "worst", tmp_path)
 
 
-@pytest.mark.parametrize(("lower", "upper", "kind", "words"), [
-    (0.5, 0.5 + 1e-9, "good", "certified to lose at most 1.0e-09 on average"),
-    (0.5, 0.6, "warning", "the policy is certified to lose at most 0.1 on average"),
-    (None, 0.6, "warning", "the policy is certified of nothing on average"),
-])
+@pytest.mark.parametrize(
+    ("lower", "upper", "kind", "words"),
+    [
+        (0.5, 0.5 + 1e-9, "good", "certified to lose at most 1.0e-09 on average"),
+        (0.5, 0.6, "warning", "the policy is certified to lose at most 0.1 on average"),
+        (None, 0.6, "warning", "the policy is certified of nothing on average"),
+    ],
+)
 def test_no_more_is_said_than_is_certified(lower, upper, kind, words):
     found, text = _nearly_best(lower, {"value": 0.5, "upper": upper})
     assert found == kind and words in text
@@ -262,10 +280,12 @@ def test_no_more_is_said_than_is_certified(lower, upper, kind, words):
 
 # --- what is refused, left out, said -----------------------------------------------------------
 
-ERRING = {"demonstrations": [
-    {"cells": [[2, 1], [2, 2]], "actions": ["right", "right"]},
-    {"cells": [[2, 1], [2, 2], [1, 2]], "actions": ["right", "up", "right"]},
-]}
+ERRING = {
+    "demonstrations": [
+        {"cells": [[2, 1], [2, 2]], "actions": ["right", "right"]},
+        {"cells": [[2, 1], [2, 2], [1, 2]], "actions": ["right", "up", "right"]},
+    ]
+}
 SLIPPERY = ('absorbing = ["y"]', 'absorbing = ["y"]\nslip = 0.2')
 CORRIDOR = (". . r\nb . y", "r . r\nb . y\nr r r")  # here nothing is sure
 
@@ -287,17 +307,25 @@ def test_demonstrated_steps_that_lose_are_left_out_and_named(write):  # noqa: F8
     start = int(model.initial_memory[4])
     best, _ = evaluate(model, np.eye(4)[np.asarray(setup.guarantee.best.policy)])
     assert lost == {
-        "steps": 2, "of": 5, "demonstration": 2, "step": 2, "state": 4, "row": 2, "column": 2,
+        "steps": 2,
+        "of": 5,
+        "demonstration": 2,
+        "step": 2,
+        "state": 4,
+        "row": 2,
+        "column": 2,
         "from": pytest.approx(best[4, start]),
         # Up, or by a slip to either side, where the goal is.
-        "to": pytest.approx(0.8 * best[1, start] + 0.1 * best[3, start] + 0.1)}
+        "to": pytest.approx(0.8 * best[1, start] + 0.1 * best[3, start] + 0.1),
+    }
     assert lost["from"] > lost["to"] + 0.01
     counts = np.asarray(setup.learning[1].counts)
     assert counts.sum() == 3 and counts[4, start, 0] == 0
     texts = [text for kind, text in remarks(result) if kind == "note"]
     assert texts == [
         "2 of 5 demonstrated steps lower the best probability and were left out; first at row 2, "
-        f"column 2 (demonstration 2, step 2): from {lost['from']:.4f} to {lost['to']:.4f}."]
+        f"column 2 (demonstration 2, step 2): from {lost['from']:.4f} to {lost['to']:.4f}."
+    ]
     (good,) = (text for kind, text in remarks(result) if kind == "good")
     assert good.startswith("By construction no policy does the task with a greater probability")
     value, _ = evaluate(model, kept_policy(outcome))
@@ -318,7 +346,8 @@ def test_a_demonstration_that_only_loses_is_named(write):  # noqa: F811
 
 
 def test_formulas_that_nothing_satisfies_are_refused_before_anything_runs(
-    write, monkeypatch  # noqa: F811
+    write,  # noqa: F811
+    monkeypatch,
 ):
     def never(*_, **__):
         raise AssertionError
@@ -362,16 +391,21 @@ def test_to_ask_for_certainty_is_to_ask_for_the_best(write):  # noqa: F811
 @pytest.mark.slow
 def test_steps_that_lose_nothing_by_themselves_are_left_out_truly_told(write):  # noqa: F811
     """From a, where it may stay for ever, on to b; but back and forth it would fail."""
-    path = write((". . r\nb . y", "a . b"), ('"y"', '"b"'), ("!r & !y", "a"),
-                 ("!r U y", "F G a | F b"),
-                 shown={"demonstrations": [{"cells": [[1, 1], [1, 2]], "actions": ["right"] * 2}]})
+    path = write(
+        (". . r\nb . y", "a . b"),
+        ('"y"', '"b"'),
+        ("!r & !y", "a"),
+        ("!r U y", "F G a | F b"),
+        shown={"demonstrations": [{"cells": [[1, 1], [1, 2]], "actions": ["right"] * 2}]},
+    )
     _, result = learned(path)
     assert result["guarantee"]["left_out"]["to"] == 1
     (text,) = (text for kind, text in remarks(result) if kind == "note")
     assert text == (
         "1 of 2 demonstrated steps leaves what does the task and may come back, which again and "
         "again would fail it, and was left out; first at row 1, column 1 (demonstration 1, step "
-        "1).")
+        "1)."
+    )
     assert result["satisfaction"]["minimum"]["lower"] == 1
 
 

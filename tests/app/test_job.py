@@ -1,5 +1,4 @@
-"""Seeds of a job over the devices of a mesh: the runs that they are on one, saved and gone on from.
-"""
+"""Seeds of a job over the devices of a mesh: the runs that they are on one, saved and gone on from."""
 
 from functools import partial
 
@@ -59,11 +58,28 @@ def test_a_run_goes_on_on_other_devices(seeds, tmp_path):
 
     path = tmp_path / "run.npz"
     with pytest.raises(KeyboardInterrupt):
-        run_seeds(module, (3, 3), problem, hparams, leave, num_steps=6, chunk=2,
-                  checkpoint=path, mesh=mesh_of(3))
+        run_seeds(
+            module,
+            (3, 3),
+            problem,
+            hparams,
+            leave,
+            num_steps=6,
+            chunk=2,
+            checkpoint=path,
+            mesh=mesh_of(3),
+        )
     made = []
     found, _ = run_seeds(
-        module, (3, 3), problem, hparams, lambda step, _: made.append(step), num_steps=6, chunk=2,
-        checkpoint=path, mesh=mesh_of(2))
+        module,
+        (3, 3),
+        problem,
+        hparams,
+        lambda step, _: made.append(step),
+        num_steps=6,
+        chunk=2,
+        checkpoint=path,
+        mesh=mesh_of(2),
+    )
     assert made == [6]
     same(found, seeds()[0])

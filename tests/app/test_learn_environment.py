@@ -18,7 +18,7 @@ from jaxltl.core.values.evaluation import evaluate
 from tests.app.test_report import browser  # noqa: F401
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-WORLD = '''
+WORLD = """
 import jax
 import jax.numpy as jnp
 from jaxltl import Timestep, make_box, make_environment
@@ -64,7 +64,7 @@ def says_nothing():
 
 
 nothing = 3
-'''
+"""
 TASK = """
 [world]
 environment = "own.py:corridor"
@@ -84,10 +84,16 @@ hidden = [8]
 [evaluation]
 episodes = 200
 """
-CCE = ("[ppo]\nnum_envs = 8\nnum_steps = 8\nnum_minibatches = 2\nlearning_rate = [0.01, 0.0]\n"
-       "hidden = [8]", "[cce]\npopulation = 20\nepisodes = 2\nhidden = [4]")
-CPO = (CCE[0], '[cpo]\nlimit = 0.5\ncost = "violation"\nnum_trajectories = 16\nhidden = [4]\n'
-       "value_hidden = [4]\nvalue_batches = 2")
+CCE = (
+    "[ppo]\nnum_envs = 8\nnum_steps = 8\nnum_minibatches = 2\nlearning_rate = [0.01, 0.0]\n"
+    "hidden = [8]",
+    "[cce]\npopulation = 20\nepisodes = 2\nhidden = [4]",
+)
+CPO = (
+    CCE[0],
+    '[cpo]\nlimit = 0.5\ncost = "violation"\nnum_trajectories = 16\nhidden = [4]\n'
+    "value_hidden = [4]\nvalue_batches = 2",
+)
 
 
 @pytest.fixture
@@ -178,8 +184,11 @@ def test_a_written_policy_is_used_without_its_task_file(learned, tmp_path):
     def act(**given):
         _, agent = job.load_policy(here, **given)
         seen = environment.observe(environment.reset(jax.random.key(0)))
-        return np.asarray(jax.vmap(lambda key: agent.act((), seen, None, key)[0])(
-            jax.random.split(jax.random.key(3), 20)))
+        return np.asarray(
+            jax.vmap(lambda key: agent.act((), seen, None, key)[0])(
+                jax.random.split(jax.random.key(3), 20)
+            )
+        )
 
     environment, _ = job.load_policy(out / "policy.npz")
     with pytest.raises(ValueError, match=r"/nowhere/task.toml: \[world\] environment: there is no"):
@@ -189,9 +198,12 @@ def test_a_written_policy_is_used_without_its_task_file(learned, tmp_path):
     shutil.copy(path.parent / "own.py", tmp_path)
     np.testing.assert_array_equal(act(), wanted)
     for given, message in (
-            ({"environment": 3}, "environment is int; give one of make_environment"),
-            ({"environment": load_environment(read_task(path)).replace(propositions=("a", "b"))},
-             r"task.toml: \[task\] formula: .*'goal'")):
+        ({"environment": 3}, "environment is int; give one of make_environment"),
+        (
+            {"environment": load_environment(read_task(path)).replace(propositions=("a", "b"))},
+            r"task.toml: \[task\] formula: .*'goal'",
+        ),
+    ):
         with pytest.raises(ValueError, match=message):
             job.load_policy(here, **given)
     np.savez(here, next_memory=np.zeros(1))
@@ -244,15 +256,26 @@ def test_interrupted_before_it_learns(learned, monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "table", "boxed"), [
-    ("cce", CCE, False),
-    pytest.param("cce", (CCE[0], CCE[1] + '\ncost = "violation"\nlimit = 0.2'), True,
-                 marks=pytest.mark.slow),
-    pytest.param("cpo", CPO, True, marks=pytest.mark.slow),
-])
+@pytest.mark.parametrize(
+    ("method", "table", "boxed"),
+    [
+        ("cce", CCE, False),
+        pytest.param(
+            "cce",
+            (CCE[0], CCE[1] + '\ncost = "violation"\nlimit = 0.2'),
+            True,
+            marks=pytest.mark.slow,
+        ),
+        pytest.param("cpo", CPO, True, marks=pytest.mark.slow),
+    ],
+)
 def test_other_methods(write, tmp_path, method, table, boxed):
-    path = write(table, ('"ppo"', f'"{method}"'), ("steps = 20", "steps = 10"),
-                 *([("boxed = false", "boxed = true")] if boxed else []))
+    path = write(
+        table,
+        ('"ppo"', f'"{method}"'),
+        ("steps = 20", "steps = 10"),
+        *([("boxed = false", "boxed = true")] if boxed else []),
+    )
     told = run("learn", path, "--out", tmp_path / "out")
     assert told.exit_code == 0, told.output
     result = json.loads((tmp_path / "out" / "result.json").read_text())
@@ -276,10 +299,12 @@ def test_tasks_without_end_are_told_by_visits(write, tmp_path):
 def test_check_tells_the_sizes(write):
     told = run("check", write())
     assert told.exit_code == 0, told.output
-    assert ("own.py:corridor: 2 actions, 4 numbers observed, 2 labels; 3 states of the task's "
-            "memory (cosafe); ppo with two networks with hidden layers [8]: 20 steps of at most "
-            "64 simulated steps, 1,280 in all, a seed; judged by 200 fresh episodes of at most 8 "
-            "steps") in told.stdout
+    assert (
+        "own.py:corridor: 2 actions, 4 numbers observed, 2 labels; 3 states of the task's "
+        "memory (cosafe); ppo with two networks with hidden layers [8]: 20 steps of at most "
+        "64 simulated steps, 1,280 in all, a seed; judged by 200 fresh episodes of at most 8 "
+        "steps"
+    ) in told.stdout
 
 
 @pytest.mark.parametrize("name", ["flat_world", "drone"])
@@ -291,37 +316,67 @@ def test_the_examples_are_sound(name):
 WORLD_ = 'environment = "own.py:corridor"'
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    (WORLD_, 'environment = "no.such:thing"', "environment: there is no module 'no.such'"),
-    (WORLD_, 'environment = "none.py:make"', "none.py"),
-    (WORLD_, 'environment = "own.py:make"', "'make' is not there in 'own.py'; its functions are "),
-    (WORLD_, 'environment = "own.py:nothing"', "'nothing' is no function"),
-    (WORLD_, 'environment = "nowhere"', "'nowhere' names no function; write"),
-    (WORLD_ + "\n[world.arguments]\nboxed = false", 'environment = "own.py:number"',
-     "returns a int, no Environment"),
-    (WORLD_ + "\n[world.arguments]\nboxed = false", 'environment = "own.py:breaks"',
-     "'own.py:breaks' raises KeyError: 'no' (own.py, line "),
-    (WORLD_ + "\n[world.arguments]\nboxed = false", 'environment = "own.py:says_nothing"',
-     "'own.py:says_nothing' raises ValueError (own.py, line "),
-    ("boxed = false", "boxes = false", "does not take [world.arguments]: got an unexpected"),
-    ("boxed = false", "ends = false", "[world] the environment's episodes never end"),
-    (WORLD_ + "\n[world.arguments]\nboxed = false", 'environment = "own.py:bare"',
-     "[world] environment 'own.py:bare' has no labels, and the formula mentions goal, pit"),
-    (WORLD_, WORLD_ + '\nlabels = "own.py:at_goal"', "[world] labels and propositions belong"),
-    (WORLD_, WORLD_ + '\nlabels = "own.py:two_labels"\npropositions = ["goal"]',
-     "[world] environment: 'labels': labels returns bool[2]; return bool[1]"),
-    ("!pit U goal", "!pit U gaol", "[task] formula: '!pit U gaol' mentions the proposition 'gaol'"),
-    ("!pit U goal", "goal & !goal", "[task] formula: nothing satisfies it"),
-    ("!pit U goal", "(goal", "[task] formula: "),
-    ('goal"', 'goal"\nreward = "keep"', "[task] "),
-    ("hidden = [8]", "hiden = [8]", "[ppo] has no key 'hiden'; did you mean 'hidden'"),
-    ("num_minibatches = 2", "num_minibatches = 5", "[ppo] num_minibatches=5 does not divide 64"),
-    ("num_envs = 8", "num_envs = 1000000000", "[ppo] a step of the learner would make 8,000"),
-    ("[ppo]", "[cce]", "[cce] "),
-    ('"ppo"', '"dqn"', '[learner] method = \'dqn\'; it must be "ppo" or "cce" or "cpo"'),
-    ("episodes = 200", "episodes = 0", "[evaluation] episodes = 0; it must be a whole number"),
-    ("episodes = 200", "confidence = 1", "[evaluation] confidence = 1; it must be a number"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (WORLD_, 'environment = "no.such:thing"', "environment: there is no module 'no.such'"),
+        (WORLD_, 'environment = "none.py:make"', "none.py"),
+        (
+            WORLD_,
+            'environment = "own.py:make"',
+            "'make' is not there in 'own.py'; its functions are ",
+        ),
+        (WORLD_, 'environment = "own.py:nothing"', "'nothing' is no function"),
+        (WORLD_, 'environment = "nowhere"', "'nowhere' names no function; write"),
+        (
+            WORLD_ + "\n[world.arguments]\nboxed = false",
+            'environment = "own.py:number"',
+            "returns a int, no Environment",
+        ),
+        (
+            WORLD_ + "\n[world.arguments]\nboxed = false",
+            'environment = "own.py:breaks"',
+            "'own.py:breaks' raises KeyError: 'no' (own.py, line ",
+        ),
+        (
+            WORLD_ + "\n[world.arguments]\nboxed = false",
+            'environment = "own.py:says_nothing"',
+            "'own.py:says_nothing' raises ValueError (own.py, line ",
+        ),
+        ("boxed = false", "boxes = false", "does not take [world.arguments]: got an unexpected"),
+        ("boxed = false", "ends = false", "[world] the environment's episodes never end"),
+        (
+            WORLD_ + "\n[world.arguments]\nboxed = false",
+            'environment = "own.py:bare"',
+            "[world] environment 'own.py:bare' has no labels, and the formula mentions goal, pit",
+        ),
+        (WORLD_, WORLD_ + '\nlabels = "own.py:at_goal"', "[world] labels and propositions belong"),
+        (
+            WORLD_,
+            WORLD_ + '\nlabels = "own.py:two_labels"\npropositions = ["goal"]',
+            "[world] environment: 'labels': labels returns bool[2]; return bool[1]",
+        ),
+        (
+            "!pit U goal",
+            "!pit U gaol",
+            "[task] formula: '!pit U gaol' mentions the proposition 'gaol'",
+        ),
+        ("!pit U goal", "goal & !goal", "[task] formula: nothing satisfies it"),
+        ("!pit U goal", "(goal", "[task] formula: "),
+        ('goal"', 'goal"\nreward = "keep"', "[task] "),
+        ("hidden = [8]", "hiden = [8]", "[ppo] has no key 'hiden'; did you mean 'hidden'"),
+        (
+            "num_minibatches = 2",
+            "num_minibatches = 5",
+            "[ppo] num_minibatches=5 does not divide 64",
+        ),
+        ("num_envs = 8", "num_envs = 1000000000", "[ppo] a step of the learner would make 8,000"),
+        ("[ppo]", "[cce]", "[cce] "),
+        ('"ppo"', '"dqn"', '[learner] method = \'dqn\'; it must be "ppo" or "cce" or "cpo"'),
+        ("episodes = 200", "episodes = 0", "[evaluation] episodes = 0; it must be a whole number"),
+        ("episodes = 200", "confidence = 1", "[evaluation] confidence = 1; it must be a number"),
+    ],
+)
 def test_mistakes_are_named_by_file_table_and_key(write, old, new, message):
     path = write((old, new))
     told = failure("check", path)
@@ -334,16 +389,24 @@ def test_mistakes_of_methods(write):
     assert "[cpo] lacks limit" in failure("check", write(*cpo, ("limit = 0.5\n", "")))
     cce = (CCE, ('"ppo"', '"cce"'))
     assert "[cce] limit is that of a cost" in failure(
-        "check", write(*cce, ("[cce]", "[cce]\nlimit = 0.1")))
+        "check", write(*cce, ("[cce]", "[cce]\nlimit = 0.1"))
+    )
     assert "[cce] rho=0.01 of population=20 leaves no elite" in failure(
-        "check", write(*cce, ("[cce]", "[cce]\nrho = 0.01")))
+        "check", write(*cce, ("[cce]", "[cce]\nrho = 0.01"))
+    )
     assert "[cce] a step of the learner would make 16,000,000,000 simulated steps" in failure(
-        "check", write(*cce, ("population = 20", "population = 1000000000")))
+        "check", write(*cce, ("population = 20", "population = 1000000000"))
+    )
 
 
 def test_labels_and_limits_of_the_file(write):
-    path = write((WORLD_, WORLD_ + '\nlabels = "own.py:two_labels"\npropositions = ["goal", "one"]'
-                  "\nhorizon = 5"), ("!pit U goal", "F goal & F one"))
+    path = write(
+        (
+            WORLD_,
+            WORLD_ + '\nlabels = "own.py:two_labels"\npropositions = ["goal", "one"]\nhorizon = 5',
+        ),
+        ("!pit U goal", "F goal & F one"),
+    )
     assert is_environment_task(path)
     found = load_environment(read_task(path))
     assert found.propositions == ("goal", "one") and found.horizon == 5
@@ -362,7 +425,8 @@ def test_the_library_s_worlds_have_pictures(tmp_path):
     path.write_text(
         '[world]\nenvironment = "letter_world"\narguments = { size = 3, letters = 2, copies = 1, '
         'horizon = 6, connected = false }\n[task]\nformula = "F a"\n[learner]\nmethod = "cce"\n'
-        "steps = 1\n[cce]\npopulation = 5\nepisodes = 1\n[evaluation]\nepisodes = 20\n")
+        "steps = 1\n[cce]\npopulation = 5\nepisodes = 1\n[evaluation]\nepisodes = 20\n"
+    )
     told = run("learn", path, "--out", tmp_path / "out")
     assert told.exit_code == 0, told.output
     assert b"<svg" in (tmp_path / "out" / "episodes.svg").read_bytes()
@@ -395,4 +459,8 @@ def test_the_page_in_a_browser(learned, browser, tmp_path, width):  # noqa: F811
     found, said = browser(path, width)
     assert said == [] and found["width"] <= width and found["empty"] == 0
     assert found["headings"] == [
-        "Evaluation", "Learning", "The task as an automaton", "The task file"]
+        "Evaluation",
+        "Learning",
+        "The task as an automaton",
+        "The task file",
+    ]

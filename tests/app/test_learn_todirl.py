@@ -49,9 +49,11 @@ MAPS_LINE = 'maps = ["world.txt", "other.txt"]'
 KINDS = "objects = { o1 = { red = 5, black = 4 }, o2 = { yellow = 5, black = 4 } }"
 OBJECTS = {name: temporal_gridworld.OBJECTS[name] for name in ("o1", "o2")}
 WORLD = temporal_gridworld.make_world(
-    {"o1": [(1, 2)], "o2": [(6, 5)], "ob": [(3, 5)]}, 0, shape=(6, 6), objects=OBJECTS)
+    {"o1": [(1, 2)], "o2": [(6, 5)], "ob": [(3, 5)]}, 0, shape=(6, 6), objects=OBJECTS
+)
 OTHER = temporal_gridworld.make_world(
-    {"o1": [(6, 6)], "o2": [(1, 4)], "ob": [(5, 2)]}, 1, shape=(6, 6), objects=OBJECTS)
+    {"o1": [(6, 6)], "o2": [(1, 4)], "ob": [(5, 2)]}, 1, shape=(6, 6), objects=OBJECTS
+)
 
 PLAIN = '''
 [world]
@@ -85,14 +87,26 @@ memory = "F (a & F b)"
 maps = ["open.txt", "walled.txt", "walled_too.txt"]
 leave_out = ["walled.txt"]
 '''
-MAPS = {"second.txt": ". b\n. r\na .\n", "third.txt": ". b\n. .\na .\n",
-        "open.txt": "b . a\n. . .\n",
-        "walled.txt": "b # a\n. # .\n", "walled_too.txt": "b # a\n. # .\n"}
+MAPS = {
+    "second.txt": ". b\n. r\na .\n",
+    "third.txt": ". b\n. .\na .\n",
+    "open.txt": "b . a\n. . .\n",
+    "walled.txt": "b # a\n. # .\n",
+    "walled_too.txt": "b # a\n. # .\n",
+}
 SHOWN = {
-    "first.json": [{"cells": [[1, 1], [1, 2], [1, 3], [1, 2], [1, 1], [2, 1], [3, 1]],
-                    "actions": ["right", "right", "left", "left", "down", "down"]}],
-    "second.json": [{"cells": [[3, 2], [3, 1], [2, 1], [1, 1], [1, 2]],
-                     "actions": ["left", "up", "up", "right"]}],
+    "first.json": [
+        {
+            "cells": [[1, 1], [1, 2], [1, 3], [1, 2], [1, 1], [2, 1], [3, 1]],
+            "actions": ["right", "right", "left", "left", "down", "down"],
+        }
+    ],
+    "second.json": [
+        {
+            "cells": [[3, 2], [3, 1], [2, 1], [1, 1], [1, 2]],
+            "actions": ["left", "up", "up", "right"],
+        }
+    ],
 }
 
 
@@ -138,10 +152,15 @@ def test_a_task_is_read(write):
 def test_kinds_slip_and_maps_in_the_task_file(write):
     rows = "\n".join(write_world(WORLD).split("\n\n")[1].split())
     path = write(
-        (KINDS, ""), (MAPS_LINE, f'maps = ["""\n{rows}\n"""]\nslip = 0.2\n'
-         "objects = { x = { red = 5, black = 4 }, y = { yellow = 5, black = 4 } }\n"
-         "obstacles = { z = { black = 9 } }"),
-        ("(!o2 & !ob) U (o1 & (!ob U o2))", "!z U (x & (!z U y))"))
+        (KINDS, ""),
+        (
+            MAPS_LINE,
+            f'maps = ["""\n{rows}\n"""]\nslip = 0.2\n'
+            "objects = { x = { red = 5, black = 4 }, y = { yellow = 5, black = 4 } }\n"
+            "obstacles = { z = { black = 9 } }",
+        ),
+        ("(!o2 & !ob) U (o1 & (!ob U o2))", "!z U (x & (!z U y))"),
+    )
     task = read_task(path)
     training, test = load_scenes(task, load_automata(task)[0])
     assert training[0].name == "map 1" and training[0].mdp.propositions == ("x", "y", "z")
@@ -162,49 +181,72 @@ def test_what_is_seen_on_a_text_map():
     assert seen[1].tolist() == [3, 3, 3, 0, 1, 3, 2, 0, 3]
 
 
-@pytest.mark.parametrize(("replacement", "message"), [
-    ((MAPS_LINE, "map = 3"), r"\[world\] has no key 'map'; did you mean 'maps'\?"),
-    ((MAPS_LINE, "maps = []"), r"with at least one of them"),
-    (('"world.txt"', '"gone.txt"'), r"gone\.txt': No such file"),
-    (("[world]", '[world]\nwall = "#"'), r"\[world\] wall belongs to maps with a legend"),
-    ((KINDS, "objects = { o1 = 5 }"), r"a table of kinds and their colours"),
-    (("synthetic = 40", ""), r"either files = \[\.\.\.\] or synthetic = N"),
-    (("discount = 0.9\nlength", "progress = 5\nlength"),
-     r"\[demonstrations\] progress belongs to a demonstrator who maximises a reward; give its"),
-    (("synthetic = 40\ndiscount = 0.9\nlength = 30", 'files = ["a", "b", "c"]'),
-     r"names 3 files for 2 worlds"),
-    (("hidden = [12]", "hidden = [0]"), r"widths of the hidden layers"),
-    (("discount = 0.9\nhidden", "discount = 1\nhidden"), r"discount = 1 needs a horizon"),
-    (("patience = 15", "patience = 15\nheld_out = 0"), r"needs a held_out above 0"),
-    (("patience = 15", 'optimizer = "lbfgs"'), r"learning_rate does not belong"),
-    (('"todirl"', '"todirl"\nmu = 0.1'), r"\[learner\] has no key 'mu'"),
-    (("generate = 2", ""), r"\[test\] must have maps = \[\.\.\.\] or generate = N"),
-    (("generate = 2", 'maps = ["world.txt"]'), r"\[test\] obstacles belongs to generate = N"),
-    (("shape = [6, 6]", "shape = [6]"), r"shape = \[6\]; it must be \[rows, columns\]"),
-])
+@pytest.mark.parametrize(
+    ("replacement", "message"),
+    [
+        ((MAPS_LINE, "map = 3"), r"\[world\] has no key 'map'; did you mean 'maps'\?"),
+        ((MAPS_LINE, "maps = []"), r"with at least one of them"),
+        (('"world.txt"', '"gone.txt"'), r"gone\.txt': No such file"),
+        (("[world]", '[world]\nwall = "#"'), r"\[world\] wall belongs to maps with a legend"),
+        ((KINDS, "objects = { o1 = 5 }"), r"a table of kinds and their colours"),
+        (("synthetic = 40", ""), r"either files = \[\.\.\.\] or synthetic = N"),
+        (
+            ("discount = 0.9\nlength", "progress = 5\nlength"),
+            r"\[demonstrations\] progress belongs to a demonstrator who maximises a reward; give its",
+        ),
+        (
+            ("synthetic = 40\ndiscount = 0.9\nlength = 30", 'files = ["a", "b", "c"]'),
+            r"names 3 files for 2 worlds",
+        ),
+        (("hidden = [12]", "hidden = [0]"), r"widths of the hidden layers"),
+        (("discount = 0.9\nhidden", "discount = 1\nhidden"), r"discount = 1 needs a horizon"),
+        (("patience = 15", "patience = 15\nheld_out = 0"), r"needs a held_out above 0"),
+        (("patience = 15", 'optimizer = "lbfgs"'), r"learning_rate does not belong"),
+        (('"todirl"', '"todirl"\nmu = 0.1'), r"\[learner\] has no key 'mu'"),
+        (("generate = 2", ""), r"\[test\] must have maps = \[\.\.\.\] or generate = N"),
+        (("generate = 2", 'maps = ["world.txt"]'), r"\[test\] obstacles belongs to generate = N"),
+        (("shape = [6, 6]", "shape = [6]"), r"shape = \[6\]; it must be \[rows, columns\]"),
+    ],
+)
 def test_mistakes_in_the_task_file(write, replacement, message):
     with pytest.raises(ValueError, match=message):
         read_task(write(replacement))
 
 
-@pytest.mark.parametrize(("replacement", "message"), [
-    ((MAPS_LINE, 'maps = ["""\nrrr\nrxr\nrrr"""]'),
-     r"\[world\] map 1: map row 2, column 2: 'x' is no colour"),
-    (("patience = 15", "radius = 2"), r"world\.txt: the learner sees 2 cells .* margin of 1"),
-    (("!ob U o2", "!ob U o7"), r"\[task\] formula: .*'o7'"),
-    (("(!o2 & !ob) U (o1 & (!ob U o2))", "G F o1\"\nguarantee = \"none"),
-     r"\[demonstrations\] discount is that of the reward of doing a task that ends"),
-    (("(!o2 & !ob) U (o1 & (!ob U o2))", "F (o1 & ob)"), r"\[task\] formula: nothing satisfies"),
-    (("patience = 15", 'memory = "F o9"'), r"\[learner\] memory: .*'o9'"),
-    (("shape = [6, 6]", "shape = [2, 2]"), r"\[test\] generate: seed 0: in 1000 placements"),
-    (("obstacles = 1", 'leave_out = ["seed 7"]'),
-     r"leave_out names 'seed 7', which is no test world; there are seed 0"),
-    (("[world]", "[world]\nobstacles = { ob = { red = 9 } }"),
-     r"the map says o1, o2, ob by lines of its own, which differ from \[world\] objects"),
-    ((KINDS, ""), r"which kinds of cells are objects"),
-    ((f'other.txt"]\n{KINDS}', 'another.txt"]'),
-     r"another\.txt has other objects and obstacles than world\.txt"),
-])
+@pytest.mark.parametrize(
+    ("replacement", "message"),
+    [
+        (
+            (MAPS_LINE, 'maps = ["""\nrrr\nrxr\nrrr"""]'),
+            r"\[world\] map 1: map row 2, column 2: 'x' is no colour",
+        ),
+        (("patience = 15", "radius = 2"), r"world\.txt: the learner sees 2 cells .* margin of 1"),
+        (("!ob U o2", "!ob U o7"), r"\[task\] formula: .*'o7'"),
+        (
+            ("(!o2 & !ob) U (o1 & (!ob U o2))", 'G F o1"\nguarantee = "none'),
+            r"\[demonstrations\] discount is that of the reward of doing a task that ends",
+        ),
+        (
+            ("(!o2 & !ob) U (o1 & (!ob U o2))", "F (o1 & ob)"),
+            r"\[task\] formula: nothing satisfies",
+        ),
+        (("patience = 15", 'memory = "F o9"'), r"\[learner\] memory: .*'o9'"),
+        (("shape = [6, 6]", "shape = [2, 2]"), r"\[test\] generate: seed 0: in 1000 placements"),
+        (
+            ("obstacles = 1", 'leave_out = ["seed 7"]'),
+            r"leave_out names 'seed 7', which is no test world; there are seed 0",
+        ),
+        (
+            ("[world]", "[world]\nobstacles = { ob = { red = 9 } }"),
+            r"the map says o1, o2, ob by lines of its own, which differ from \[world\] objects",
+        ),
+        ((KINDS, ""), r"which kinds of cells are objects"),
+        (
+            (f'other.txt"]\n{KINDS}', 'another.txt"]'),
+            r"another\.txt has other objects and obstacles than world\.txt",
+        ),
+    ],
+)
 def test_mistakes_in_the_worlds(write, tmp_path, replacement, message):
     (tmp_path / "another.txt").write_text("o1: 9 white\nwwww\nwbbw\nwwww\n")
     task = read_task(write(replacement))
@@ -265,9 +307,19 @@ def test_learning_is_on_record(learned):
 def test_what_is_written(learned):
     place, _, result = learned
     names = {path.name for path in (place / "out").iterdir()}
-    assert names >= {"network.npz", "policy_1.npz", "result.json", "report.html", "task.toml",
-                     "automaton.svg", "learning.svg", "training_2.svg", "training_2_runs.svg",
-                     "test_1.svg", "test_2_runs.svg"}
+    assert names >= {
+        "network.npz",
+        "policy_1.npz",
+        "result.json",
+        "report.html",
+        "task.toml",
+        "automaton.svg",
+        "learning.svg",
+        "training_2.svg",
+        "training_2_runs.svg",
+        "test_1.svg",
+        "test_2_runs.svg",
+    }
     assert not [name for name in names if name.startswith("checkpoint")]
     assert json.loads((place / "out" / "result.json").read_text()) == result
     page = (place / "out" / "report.html").read_text()
@@ -332,16 +384,21 @@ def test_what_must_be_known_before_trusting_the_figures(learned):
     learning.update(stopped_early=False, best_step=learning["steps"] - 1, solver="MAX_STEPS")
     told = " ".join(report_todirl.warnings(result))
     starts = test["worlds"][0]["num_starts"]
-    for words in (f"from 3 of {starts} starts of the test world seed 0; it counts in the mean "
-                  "unless [test] leave_out names it", "seed 1; it is left out.",
-                  "(expert, who knows the task) is known only within its bounds in seed 1",
-                  "soft values ended with MAX_STEPS", "still improving"):
+    for words in (
+        f"from 3 of {starts} starts of the test world seed 0; it counts in the mean "
+        "unless [test] leave_out names it",
+        "seed 1; it is left out.",
+        "(expert, who knows the task) is known only within its bounds in seed 1",
+        "soft values ended with MAX_STEPS",
+        "still improving",
+    ):
         assert words in told
 
 
 def test_text_maps_are_checked(write):
     assert run("check", write(text=PLAIN)).stdout == (
-        "ok: 3 training and 3 test worlds, 3 memory states, 3 demonstrations of 14 pairs\n")
+        "ok: 3 training and 3 test worlds, 3 memory states, 3 demonstrations of 14 pairs\n"
+    )
 
 
 @pytest.mark.exhaustive
@@ -350,10 +407,13 @@ def test_text_maps_files_horizon_and_another_memory(tmp_path):
     write_files(tmp_path)
     result = run("learn", tmp_path / "task.toml", "--out", tmp_path / "out", "--json")
     assert result.exit_code == 0, result.output
-    for words in ("within 9 steps", "in 2 of 3 test worlds",
-                  "warning: No policy can do the task from 4 of 4 starts of the test world "
-                  "walled.txt; it is left out.",
-                  "walled_too.txt; it counts in the mean unless [test] leave_out names it."):
+    for words in (
+        "within 9 steps",
+        "in 2 of 3 test worlds",
+        "warning: No policy can do the task from 4 of 4 starts of the test world "
+        "walled.txt; it is left out.",
+        "walled_too.txt; it counts in the mean unless [test] leave_out names it.",
+    ):
         assert words in result.stdout
     found = json.loads(result.stdout.splitlines()[-1])
     assert found["test"]["infeasible"] == ["walled.txt", "walled_too.txt"]
@@ -361,8 +421,7 @@ def test_text_maps_files_horizon_and_another_memory(tmp_path):
     assert values["walled.txt"] == 0 < values["open.txt"]
     mean = found["test"]["learned"]["mean"]["value"]
     assert mean == pytest.approx((values["open.txt"] + values["walled_too.txt"]) / 2)
-    assert [w["name"] for w in found["training"]["worlds"]] == [
-        "map 1", "second.txt", "third.txt"]
+    assert [w["name"] for w in found["training"]["worlds"]] == ["map 1", "second.txt", "third.txt"]
     assert found["num_memory"] == 3 and found["learning"]["held_out"] is None
     learned = load_reward(tmp_path / "out" / "network.npz")
     assert learned.horizon == 9 and learned.kinds == (".", "a", "b", "r", "#", "off the map")
@@ -370,7 +429,8 @@ def test_text_maps_files_horizon_and_another_memory(tmp_path):
         assert file["policy"].shape == (9, 6, 3, 4)
         np.testing.assert_allclose(file["policy"].sum(axis=-1), 1)
     assert {"memory.svg", "training_3.svg", "test_2.svg"} <= {
-        path.name for path in (tmp_path / "out").iterdir()}
+        path.name for path in (tmp_path / "out").iterdir()
+    }
     page = (tmp_path / "out" / "report.html").read_text()
     data = json.loads(re.search(r'id="data">(.*?)</script>', page)[1])
     # The task decides when a run ends, the learner's memory what is shown.
@@ -381,13 +441,10 @@ def test_text_maps_files_horizon_and_another_memory(tmp_path):
 
 
 def test_the_probability_within_a_horizon():
-    matrix = np.array(
-        [[[0.5, 0.5, 0], [0, 0, 1]], [[0, 0, 1], [1, 0, 0]], [[0, 0, 1], [0, 1, 0]]])
-    mdp = from_dense(
-        matrix, label=[[0], [1], [0]], propositions=["a"], initial=[0.5, 0, 0.5])
+    matrix = np.array([[[0.5, 0.5, 0], [0, 0, 1]], [[0, 0, 1], [1, 0, 0]], [[0, 0, 1], [0, 1, 0]]])
+    mdp = from_dense(matrix, label=[[0], [1], [0]], propositions=["a"], initial=[0.5, 0, 0.5])
     policy = np.random.default_rng(0).dirichlet([1, 1], (1, 4, 3, 2))
-    found = learn_todirl._within_each(
-        stack_products([mdp], "F a"), jnp.asarray(policy))
+    found = learn_todirl._within_each(stack_products([mdp], "F a"), jnp.asarray(policy))
     value = np.zeros(3)  # of being at 1 before, on the way out of it
     for actions in policy[0, ::-1, :, 0]:
         value = np.where([False, True, False], 1, np.einsum("sa,sat,t->s", actions, matrix, value))

@@ -19,68 +19,105 @@ from jaxltl.core.values.soft import soft_value
 from tests import several
 from tests.core.values.test_answer_on_mesh import PROPERTIES, gambler
 
-SLURM = {"SLURM_NTASKS": "3", "SLURM_PROCID": "2", "SLURM_JOB_ID": "5",
-         "SLURM_STEP_NODELIST": "n[1-3]", "SLURM_LOCALID": "0"}
-MPI = {"OMPI_COMM_WORLD_SIZE": "2", "OMPI_COMM_WORLD_RANK": "1",
-       "OMPI_MCA_orte_hnp_uri": "13.0;tcp://10.0.0.1:34911"}
+SLURM = {
+    "SLURM_NTASKS": "3",
+    "SLURM_PROCID": "2",
+    "SLURM_JOB_ID": "5",
+    "SLURM_STEP_NODELIST": "n[1-3]",
+    "SLURM_LOCALID": "0",
+}
+MPI = {
+    "OMPI_COMM_WORLD_SIZE": "2",
+    "OMPI_COMM_WORLD_RANK": "1",
+    "OMPI_MCA_orte_hnp_uri": "13.0;tcp://10.0.0.1:34911",
+}
 MPI_5 = {k: v for k, v in MPI.items() if "orte" not in k}
 HERE = {"coordinator": "node1:77", "process": 1, "processes": 2}
 
 
-@pytest.mark.parametrize(("options", "environment", "expected"), [
-    ({}, {}, Launch()),
-    ({"mesh": None}, SLURM, Launch()),
-    ({}, SLURM, Launch(2, 3)),
-    ({}, MPI, Launch(1, 2)),
-    ({}, {**SLURM, **MPI}, Launch(1, 2)),
-    ({}, {**SLURM, "SLURM_NTASKS": "1", "SLURM_PROCID": "0"}, Launch()),
-    ({"processes": 1}, SLURM, Launch()),
-    (HERE, {}, Launch(1, 2, "node1:77")),
-    (HERE, SLURM, Launch(1, 2, "node1:77")),
-    ({"coordinator": "node1:77"}, MPI_5, Launch(1, 2, "node1:77")),
-    ({}, {**MPI_5, "JAX_COORDINATOR_ADDRESS": "node2:8"}, Launch(1, 2, "node2:8")),
-    ({"coordinator": "[::1]:77", "process": 0, "processes": 2}, {}, Launch(0, 2, "[::1]:77")),
-])
+@pytest.mark.parametrize(
+    ("options", "environment", "expected"),
+    [
+        ({}, {}, Launch()),
+        ({"mesh": None}, SLURM, Launch()),
+        ({}, SLURM, Launch(2, 3)),
+        ({}, MPI, Launch(1, 2)),
+        ({}, {**SLURM, **MPI}, Launch(1, 2)),
+        ({}, {**SLURM, "SLURM_NTASKS": "1", "SLURM_PROCID": "0"}, Launch()),
+        ({"processes": 1}, SLURM, Launch()),
+        (HERE, {}, Launch(1, 2, "node1:77")),
+        (HERE, SLURM, Launch(1, 2, "node1:77")),
+        ({"coordinator": "node1:77"}, MPI_5, Launch(1, 2, "node1:77")),
+        ({}, {**MPI_5, "JAX_COORDINATOR_ADDRESS": "node2:8"}, Launch(1, 2, "node2:8")),
+        ({"coordinator": "[::1]:77", "process": 0, "processes": 2}, {}, Launch(0, 2, "[::1]:77")),
+    ],
+)
 def test_which_process_this_is(options, environment, expected):
     assert launched(Asked(**{"mesh": 0, **options}), environment) == expected
 
 
-@pytest.mark.parametrize(("options", "environment", "message"), [
-    ({"mesh": None, "process": 1}, {}, "--process is of use with --mesh alone"),
-    ({"process": 1, "processes": 2}, {}, "--coordinator is missing, and nobody else says it"),
-    ({"process": 1, "coordinator": "a:1"}, {}, "--processes is missing"),
-    ({"processes": 2, "coordinator": "a:1"}, {}, "--process is missing"),
-    ({**HERE, "process": 2}, {}, "--process 2 is none of 2 processes; number them from 0 to 1"),
-    ({**HERE, "coordinator": "node1"}, {}, "'node1' is no HOST:PORT"),
-    ({**HERE, "coordinator": ":70000"}, {}, "':70000' is no HOST:PORT"),
-    ({}, MPI_5, "--coordinator is missing, and Open MPI does not say where process 0 is"),
-])
+@pytest.mark.parametrize(
+    ("options", "environment", "message"),
+    [
+        ({"mesh": None, "process": 1}, {}, "--process is of use with --mesh alone"),
+        ({"process": 1, "processes": 2}, {}, "--coordinator is missing, and nobody else says it"),
+        ({"process": 1, "coordinator": "a:1"}, {}, "--processes is missing"),
+        ({"processes": 2, "coordinator": "a:1"}, {}, "--process is missing"),
+        ({**HERE, "process": 2}, {}, "--process 2 is none of 2 processes; number them from 0 to 1"),
+        ({**HERE, "coordinator": "node1"}, {}, "'node1' is no HOST:PORT"),
+        ({**HERE, "coordinator": ":70000"}, {}, "':70000' is no HOST:PORT"),
+        ({}, MPI_5, "--coordinator is missing, and Open MPI does not say where process 0 is"),
+    ],
+)
 def test_what_contradicts_itself_or_is_missing_is_named(options, environment, message):
     with pytest.raises(ValueError, match=message):
         launched(Asked(**{"mesh": 0, **options}), environment)
 
 
-FATAL = ("F1122 16:30:07.588292   16822 client.h:80] Terminating process because the JAX "
-         "distributed service detected fatal errors. This most likely indicates that another task "
-         "died; see the other task logs for more details. absl::Status: ")
+FATAL = (
+    "F1122 16:30:07.588292   16822 client.h:80] Terminating process because the JAX "
+    "distributed service detected fatal errors. This most likely indicates that another task "
+    "died; see the other task logs for more details. absl::Status: "
+)
 
 
-@pytest.mark.parametrize(("text", "start"), [
-    ("UNAVAILABLE: The following tasks are unhealthy (stopped sending heartbeats):\n1\nThe tasks",
-     "process 0 stops, for process 1 gives no sign of life any more; what was saved is kept"),
-    ("UNAVAILABLE: The following tasks are unhealthy (stopped sending heartbeats):\n1\n12\nThe",
-     "process 0 stops, for processes 1, 12 give no sign of life any more"),
-    ("DEADLINE_EXCEEDED: Deadline Exceeded\n\nRPC: /xla.coordination.CoordinationService/Register"
-     "Task\n*** Check", "process 0: not all processes have joined in time"),
-    ("ALREADY_EXISTS: Aborted connect attempt as there is a request from a newer incarnation\n\n"
-     "RPC: /xla.coordination.CoordinationService/RegisterTask", "process 0: another process has"),
-    ("UNAVAILABLE: Failed to send RPC to coordination service. Either the leader task was "
-     "preempted\n:UNKNOWN:Error received from peer\n\nRPC: /xla.coordination.CoordinationService/"
-     "PollForError", "process 0 stops, for process 0, which the others meet at, has ended"),
-    ("INTERNAL: Barrier failed\njaxltl ends: process 0 stops, for reasons.\n    @ 0x7f22",
-     "process 0 stops, for reasons."),
-    ("INTERNAL: Shutdown barrier has failed.", "process 0 stops, for another process has ended"),
-])
+@pytest.mark.parametrize(
+    ("text", "start"),
+    [
+        (
+            "UNAVAILABLE: The following tasks are unhealthy (stopped sending heartbeats):\n1\nThe tasks",
+            "process 0 stops, for process 1 gives no sign of life any more; what was saved is kept",
+        ),
+        (
+            "UNAVAILABLE: The following tasks are unhealthy (stopped sending heartbeats):\n1\n12\nThe",
+            "process 0 stops, for processes 1, 12 give no sign of life any more",
+        ),
+        (
+            "DEADLINE_EXCEEDED: Deadline Exceeded\n\nRPC: /xla.coordination.CoordinationService/Register"
+            "Task\n*** Check",
+            "process 0: not all processes have joined in time",
+        ),
+        (
+            "ALREADY_EXISTS: Aborted connect attempt as there is a request from a newer incarnation\n\n"
+            "RPC: /xla.coordination.CoordinationService/RegisterTask",
+            "process 0: another process has",
+        ),
+        (
+            "UNAVAILABLE: Failed to send RPC to coordination service. Either the leader task was "
+            "preempted\n:UNKNOWN:Error received from peer\n\nRPC: /xla.coordination.CoordinationService/"
+            "PollForError",
+            "process 0 stops, for process 0, which the others meet at, has ended",
+        ),
+        (
+            "INTERNAL: Barrier failed\njaxltl ends: process 0 stops, for reasons.\n    @ 0x7f22",
+            "process 0 stops, for reasons.",
+        ),
+        (
+            "INTERNAL: Shutdown barrier has failed.",
+            "process 0 stops, for another process has ended",
+        ),
+    ],
+)
 def test_the_last_words_of_the_runtime_in_a_line(text, start):
     line = told(FATAL + text, 0)
     assert line.startswith(start) and "\n" not in line and line.endswith(".")
@@ -130,8 +167,7 @@ def _like(path):
         given = {}
         hparams = chunks._spread(0.01, states)
         now = chunks._begin(step, states, goal, hparams, several.LANES)
-        rows = jax.tree.map(
-            lambda x: np.zeros((0, *x.shape), x.dtype), (now.count, now.metrics))
+        rows = jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), (now.count, now.metrics))
         given = checkpoint.fingerprint(step=step, problem=goal, hparams=hparams)
     return (now, rows), given
 
@@ -163,9 +199,15 @@ def check_end(others, seconds):
             assert not found.errors
             continue
         assert len(found.errors) == 1 and "Traceback" not in found.err, found
-        assert any(x in found.err for x in (
-            "has ended; what was saved is kept", "no sign of life any more; what was saved is kept",
-            "not all processes have joined", "has not reached process 0")), found
+        assert any(
+            x in found.err
+            for x in (
+                "has ended; what was saved is kept",
+                "no sign of life any more; what was saved is kept",
+                "not all processes have joined",
+                "has not reached process 0",
+            )
+        ), found
         assert seconds < 90
 
 
@@ -200,7 +242,7 @@ def test_solvers_in_two_processes_find_what_the_host_finds(tmp_path):
         assert there["holds"] == here.holds
         assert (np.array(there["lower"]) <= here.upper).all()
         assert (np.array(there["upper"]) >= here.lower).all()
-    for there, solve in zip(told[len(PROPERTIES):], (optimal_value, soft_value), strict=True):
+    for there, solve in zip(told[len(PROPERTIES) :], (optimal_value, soft_value), strict=True):
         here = solve(model, "games", 0.9)
         assert there["status"] == int(here.status)
         np.testing.assert_allclose(there["value"], here.value, rtol=1e-6, atol=1e-9)
@@ -235,8 +277,11 @@ def test_twenty_restarts_after_kills_at_random_end_alike(tmp_path):
 def test_six_solves_go_on_after_kills_at_random(tmp_path):
     """With as many processes to the same bits, with others to a certified answer."""
     (tmp_path / "whole").mkdir()
-    expected, draw, went_on = lines(at_once(tmp_path / "whole", what="solve")[0])["ended"], (
-        random.Random(3)), 0
+    expected, draw, went_on = (
+        lines(at_once(tmp_path / "whole", what="solve")[0])["ended"],
+        (random.Random(3)),
+        0,
+    )
     assert "CONVERGED" in expected
     for i in range(6):
         directory = tmp_path / str(i)

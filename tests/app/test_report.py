@@ -31,12 +31,17 @@ CELLS = parse_map(MAP)
 MODEL = product(gridworld(MAP, slip=0.1, initial="s"), "!r U (a & (!r U b))")
 ROWS, COLUMNS = CELLS.shape
 UP, DOWN, LEFT, RIGHT = range(4)
-SHOWN = make_trajectories(MODEL.mdp, [
-    [(8, UP), (4, UP), (0, RIGHT), (1, RIGHT), (2, RIGHT), (3, DOWN), (7, DOWN)],
-    [(8, RIGHT), (9, LEFT)],
-])
+SHOWN = make_trajectories(
+    MODEL.mdp,
+    [
+        [(8, UP), (4, UP), (0, RIGHT), (1, RIGHT), (2, RIGHT), (3, DOWN), (7, DOWN)],
+        [(8, RIGHT), (9, LEFT)],
+    ],
+)
 RESULT = {
-    "task": "</script><b>a & b", "formula": "a < b", "seconds": 1.0,
+    "task": "</script><b>a & b",
+    "formula": "a < b",
+    "seconds": 1.0,
     "versions": {"jaxltl": "0", "jax": "0"},
 }
 PICTURES = [
@@ -66,7 +71,8 @@ def runs():
 def made(**options):
     options = {"place": CELLS, "actions": ACTIONS, "label": "probability", "size": 12} | options
     return exploring.explorer(
-        "policy", "What it does", "A caption", MODEL.automaton, layers(), runs(), **options)
+        "policy", "What it does", "A caption", MODEL.automaton, layers(), runs(), **options
+    )
 
 
 def page(*parts, remarks=()):
@@ -76,8 +82,11 @@ def page(*parts, remarks=()):
 
 
 def learning():
-    history = {"step": np.arange(1, 31), "loss": np.geomspace(900, 1, 30)[:, None] * [1, 1.5],
-               "satisfaction": np.full((30, 2), np.nan)}
+    history = {
+        "step": np.arange(1, 31),
+        "loss": np.geomspace(900, 1, 30)[:, None] * [1, 1.5],
+        "satisfaction": np.full((30, 2), np.nan),
+    }
     return curves("learning", "Learning", "A caption", history, ("loss", "satisfaction"))
 
 
@@ -122,13 +131,15 @@ def test_what_solvers_fail_at_does_not_stop_the_page():
     assert told.count("<td>unknown</td>") == 2 and told.count('class="plot"') == 1
     started_where_it_is_done = replace(SHOWN, length=np.array([0, 2]))
     assert [run.name for run in demonstrated_runs(MODEL, started_where_it_is_done)] == [
-        "demonstration 2 of 2"]
+        "demonstration 2 of 2"
+    ]
 
 
 def test_pictures_are_whole_and_their_parts_can_be_found():
     part = made(marked=[(9, 1, RIGHT)], marks="Told not to")
     automaton, board = (
-        ElementTree.fromstring(draw(part.drawings[k]).decode()) for k in ("automaton", "map"))
+        ElementTree.fromstring(draw(part.drawings[k]).decode()) for k in ("automaton", "map")
+    )
     states = [g for g in automaton.iter("g") if "state" in (g.get("class") or "").split()]
     assert [g.get("id") for g in states] == [f"policy-q{q}" for q in range(MODEL.num_memory)]
     assert sum("final" in g.get("class") for g in states) == 1
@@ -143,7 +154,10 @@ def test_pictures_are_whole_and_their_parts_can_be_found():
     assert values == [12, 12, 1]
     (marked,) = [g for g in board.iter("g") if g.get("class") == "marked"]
     assert (marked.get("data-state"), marked.get("data-memory"), marked.get("data-action")) == (
-        "9", "1", str(RIGHT))
+        "9",
+        "1",
+        str(RIGHT),
+    )
     assert len([r for r in board.iter("rect") if r.get("class") == "wall"]) == 1
     assert "Told not to:</b> row 3, column 2, memory 1, right" in page(part)
 
@@ -289,10 +303,23 @@ def browser():
 
     def visit(path, width, *options):
         done = subprocess.run(
-            [found, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr",
-             f"--user-data-dir={path.parent / 'profile'}", f"--window-size={width},900",
-             "--virtual-time-budget=20000", "--dump-dom", *options, path.as_uri()],
-            capture_output=True, text=True, check=True, timeout=120,
+            [
+                found,
+                "--headless",
+                "--no-sandbox",
+                "--disable-gpu",
+                "--enable-logging=stderr",
+                f"--user-data-dir={path.parent / 'profile'}",
+                f"--window-size={width},900",
+                "--virtual-time-budget=20000",
+                "--dump-dom",
+                *options,
+                path.as_uri(),
+            ],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=120,
         )
         said = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
         (verdict,) = re.findall(r'<pre id="verdict">(.*?)</pre>', done.stdout, re.S)

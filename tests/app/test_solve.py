@@ -18,13 +18,19 @@ from jaxltl.io.model_files import read_model, write_model
 def gambler():
     """Bold play loses or wins all at once; timid play goes one step. States 0 to 4, from 2."""
     return make_sparse(
-        [0, 1, 3, 5, 7, 8], [0, 1, 3, 5, 7, 9, 11, 13, 14],
-        [0, 0, 2, 0, 2, 1, 3, 0, 4, 2, 4, 2, 4, 4], [1] + 6 * [0.6, 0.4] + [1],
+        [0, 1, 3, 5, 7, 8],
+        [0, 1, 3, 5, 7, 9, 11, 13, 14],
+        [0, 0, 2, 0, 2, 1, 3, 0, 4, 2, 4, 2, 4, 4],
+        [1] + 6 * [0.6, 0.4] + [1],
         initial=[0, 0, 1, 0, 0],
         label={"ruin": [0], "rich": [4], "a b": [1, 3]},
-        rewards={"steps": Rewards(state=[0, 1, 1, 1, 0]), "stake": Rewards(
-            choice=[0, 1, 1, 1, 2, 1, 1, 0])},
-        action=[0, 0, 1, 0, 1, 0, 1, 0], action_names=["timid", "bold"])
+        rewards={
+            "steps": Rewards(state=[0, 1, 1, 1, 0]),
+            "stake": Rewards(choice=[0, 1, 1, 1, 2, 1, 1, 0]),
+        },
+        action=[0, 0, 1, 0, 1, 0, 1, 0],
+        action_names=["timid", "bold"],
+    )
 
 
 @pytest.fixture
@@ -45,10 +51,20 @@ def results(*arguments):
 
 
 def test_the_object_is_as_promised(model_file):
-    found = results(model_file, 'Pmax=? [ F "rich" ]', 'R{"steps"}min=? [ F "rich" ]',
-                    'P>=0.2 [ F "rich" ]', 'Pmax>0.3 [ F "rich" ]', 'Pmax=? [ F<=1 "rich" ]')
+    found = results(
+        model_file,
+        'Pmax=? [ F "rich" ]',
+        'R{"steps"}min=? [ F "rich" ]',
+        'P>=0.2 [ F "rich" ]',
+        'Pmax>0.3 [ F "rich" ]',
+        'Pmax=? [ F<=1 "rich" ]',
+    )
     assert {k: v for k, v in found["model"].items() if k != "seconds"} == {
-        "kind": "mdp", "states": 5, "choices": 8, "transitions": 14}
+        "kind": "mdp",
+        "states": 5,
+        "choices": 8,
+        "transitions": 14,
+    }
     assert found["model"]["seconds"] > 0
     keys = {"property", "value", "lower", "upper", "status", "seconds"}
     assert all(keys <= set(one) for one in found["results"])
@@ -69,18 +85,24 @@ def test_what_people_see(model_file):
     lines = done.stdout.splitlines()
     assert lines[0].startswith("mdp of 5 states, 8 choices, 14 transitions, read in")
     assert lines[2] == '"p1": Pmax=? [ F "rich" ]' and " in [0.4" in lines[3].replace(
-        "in [0.39999", "in [0.4")
+        "in [0.39999", "in [0.4"
+    )
     assert "true: the value is exactly 1.0" in done.stdout
 
 
 def test_files_of_properties(model_file, tmp_path):
     path = tmp_path / "all.props"
-    path.write_text('// what is asked\n"win": Pmax=? [ F "rich" ];\nPmin=? [ F "rich" ]\n\n'
-                    'Pmax=? [\n  (G F "a b") || "ruin" ]; // the last\n')
+    path.write_text(
+        '// what is asked\n"win": Pmax=? [ F "rich" ];\nPmin=? [ F "rich" ]\n\n'
+        'Pmax=? [\n  (G F "a b") || "ruin" ]; // the last\n'
+    )
     found = results(model_file, path, 'Pmax=? [ X "a b" ]')["results"]
     assert [one["property"] for one in found] == [
-        'Pmax=? [ F "rich" ]', 'Pmin=? [ F "rich" ]', 'Pmax=? [\n  (G F "a b") || "ruin" ]',
-        'Pmax=? [ X "a b" ]']
+        'Pmax=? [ F "rich" ]',
+        'Pmin=? [ F "rich" ]',
+        'Pmax=? [\n  (G F "a b") || "ruin" ]',
+        'Pmax=? [ X "a b" ]',
+    ]
     assert found[0]["name"] == "win" and "name" not in found[1]
     assert found[1]["value"] == pytest.approx(0.4 * 0.4 / (1 - 2 * 0.24), abs=1e-6)
     assert found[2]["value"] == 0 and found[3]["value"] == 1
@@ -89,12 +111,26 @@ def test_files_of_properties(model_file, tmp_path):
 
 
 def test_mistakes_do_not_stop_the_others(model_file):
-    done = run(model_file, 'Pmax=? [ F "ritch" ]', 'Pmax=? [ F "rich" ]', "Pmax=? [ F rich ]",
-               'P=? [ F "rich" ]', 'R{"x"}max=? [ C<=3 ]', 'Pmin=? [ X "ruin" ]', "--json")
+    done = run(
+        model_file,
+        'Pmax=? [ F "ritch" ]',
+        'Pmax=? [ F "rich" ]',
+        "Pmax=? [ F rich ]",
+        'P=? [ F "rich" ]',
+        'R{"x"}max=? [ C<=3 ]',
+        'Pmin=? [ X "ruin" ]',
+        "--json",
+    )
     assert done.exit_code == 2 and "Traceback" not in done.output
     found = json.loads(done.stdout.splitlines()[-1])["results"]
     assert [one["status"] for one in found] == [
-        "INVALID", "CONVERGED", "INVALID", "INVALID", "INVALID", "CONVERGED"]
+        "INVALID",
+        "CONVERGED",
+        "INVALID",
+        "INVALID",
+        "INVALID",
+        "CONVERGED",
+    ]
     assert [one["value"] is None for one in found] == [True, False, True, True, True, False]
     assert "ruin, rich, a b" in found[0]["error"] and "Did you mean 'rich'?" in found[0]["error"]
     assert "double quotes" in found[2]["error"] and "Pmax=?" in found[3]["error"]
@@ -111,9 +147,17 @@ def test_nothing_to_solve_is_said_before_the_model_is_read(tmp_path):
 
 def test_undecided_thresholds_are_not_guessed(tmp_path):
     path = tmp_path / "third.umb"
-    write_model(path, make_sparse(
-        None, [0, 3, 4, 5], [0, 1, 2, 1, 2], [0.1, 0.3, 0.6, 1, 1], initial=[1, 0, 0],
-        label={"a": [1]}))
+    write_model(
+        path,
+        make_sparse(
+            None,
+            [0, 3, 4, 5],
+            [0, 1, 2, 1, 2],
+            [0.1, 0.3, 0.6, 1, 1],
+            initial=[1, 0, 0],
+            label={"a": [1]},
+        ),
+    )
     done = run(path, 'P>=1/3 [ F "a" ]', 'P>0.3 [ F "a" ]', "--json")
     assert done.exit_code == 1
     found = json.loads(done.stdout.splitlines()[-1])["results"]
@@ -125,9 +169,17 @@ def test_undecided_thresholds_are_not_guessed(tmp_path):
 
 def test_chains_and_several_initial_states(tmp_path):
     path = tmp_path / "chain.umb"
-    write_model(path, make_sparse(
-        None, [0, 2, 3, 4], [1, 2, 1, 2], [0.25, 0.75, 1, 1], initial=[0.5, 0, 0.5],
-        label={"a": [1]}))
+    write_model(
+        path,
+        make_sparse(
+            None,
+            [0, 2, 3, 4],
+            [1, 2, 1, 2],
+            [0.25, 0.75, 1, 1],
+            initial=[0.5, 0, 0.5],
+            label={"a": [1]},
+        ),
+    )
     found = results(path, 'P=? [ F "a" ]', 'P>0.1 [ G F "a" ]')
     assert found["model"]["kind"] == "chain"
     first = found["results"][0]
@@ -137,14 +189,25 @@ def test_chains_and_several_initial_states(tmp_path):
 
 
 def test_several_objectives(model_file):
-    one = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
-                      initial=[1, 0, 0], label={"a": [1], "b": [2]})
+    one = make_sparse(
+        [0, 2, 3, 4],
+        [0, 1, 2, 3, 4],
+        [1, 2, 1, 2],
+        [1, 1, 1, 1],
+        initial=[1, 0, 0],
+        label={"a": [1], "b": [2]},
+    )
     write_model(model_file, one)
-    done = run(model_file, 'multi(P>=0.5 [ F "a" ], P>=0.25 [ F "b" ])',
-               'multi(Pmax=? [ F "a" ], P>=0.25 [ F "b" ])', '"c": multi(Pmax=? [ F "a" ], '
-               'Pmax=? [ F "b" ])', 'multi(Pmax=? [ F "a" ], P>0.25 [ F "b" ])',
-               'multi(Pmax=? [ F "a" ], P>=1 [ F "a" ], P>=0.25 [ F "b" ])',
-               'multi(P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])', "--json")
+    done = run(
+        model_file,
+        'multi(P>=0.5 [ F "a" ], P>=0.25 [ F "b" ])',
+        'multi(Pmax=? [ F "a" ], P>=0.25 [ F "b" ])',
+        '"c": multi(Pmax=? [ F "a" ], Pmax=? [ F "b" ])',
+        'multi(Pmax=? [ F "a" ], P>0.25 [ F "b" ])',
+        'multi(Pmax=? [ F "a" ], P>=1 [ F "a" ], P>=0.25 [ F "b" ])',
+        'multi(P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])',
+        "--json",
+    )
     assert done.exit_code == 2 and "thresholds can be met: true" in done.stdout
     assert "not decided" in done.stdout and "short of" in done.stdout
     met, best, curve, wrong, never, border = json.loads(done.stdout.splitlines()[-1])["results"]
@@ -163,8 +226,15 @@ def test_several_objectives(model_file):
 
 def test_strategies_attain_the_values(model_file, tmp_path):
     out = tmp_path / "strategy.json"
-    done = run(model_file, 'Pmin=? [ F "rich" ]', '"x": Pmax=? [ (F "a b") & (F "rich") ]',
-               'Pmax=? [ F "none" ]', 'Pmax=? [ F<=3 "rich" ]', "--strategy", out)
+    done = run(
+        model_file,
+        'Pmin=? [ F "rich" ]',
+        '"x": Pmax=? [ (F "a b") & (F "rich") ]',
+        'Pmax=? [ F "none" ]',
+        'Pmax=? [ F<=3 "rich" ]',
+        "--strategy",
+        out,
+    )
     assert done.exit_code == 2  # for the third
     table = json.loads(out.read_text())
     model = read_model(model_file)
@@ -175,9 +245,11 @@ def test_strategies_attain_the_values(model_file, tmp_path):
     assert steps["kind"].startswith("first choice")
     # The strategy with a memory, walked: all probability that is rich after enough steps.
     assert patient["kind"] == "memory"
-    choice = {pair: c for *pair_, c in zip(
-        patient["state"], patient["memory"], patient["choice"], strict=True)
-        for pair in [tuple(pair_)]}
+    choice = {
+        pair: c
+        for *pair_, c in zip(patient["state"], patient["memory"], patient["choice"], strict=True)
+        for pair in [tuple(pair_)]
+    }
     (start,) = map(tuple, patient["initial"])
     mass = {start: 1.0}
     for _ in range(200):
@@ -236,8 +308,10 @@ def test_nothing_is_compiled(model_file):
         "jax._src.compiler.compile_or_get_cached = fail\n"
         "from jaxltl.cli import main\n"
         f"main(['solve', {str(model_file)!r}, 'Pmax=? [ F \"rich\" ]', "
-        "'R{\"steps\"}max=? [ F \"rich\" | \"ruin\" ]', 'Pmin=? [ G F \"a b\" ]'], "
-        "standalone_mode=False)\n")
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
-                          check=False)
+        '\'R{"steps"}max=? [ F "rich" | "ruin" ]\', \'Pmin=? [ G F "a b" ]\'], '
+        "standalone_mode=False)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr

@@ -16,17 +16,25 @@ from jaxltl.io.model_files import write_model
 
 def rover(chain=False):
     """From the base a direct way that may fail, or a detour; past the first state one choice."""
-    rows, starts = ([0, 1, 2, 3, 4], [0, 3, 5, 6, 7]) if chain else (
-        [0, 2, 3, 4, 5], [0, 3, 5, 7, 8, 9])
+    rows, starts = (
+        ([0, 1, 2, 3, 4], [0, 3, 5, 6, 7]) if chain else ([0, 2, 3, 4, 5], [0, 3, 5, 7, 8, 9])
+    )
     target = [1, 2, 3, 0, 2, 2, 3] if chain else [1, 2, 3, 0, 1, 0, 2, 2, 3]
     lower = [0.2, 0.3, 0, 0.1, 0.7, 1, 1] if chain else [0.2, 0.3, 0, 0.4, 0.5, 0.1, 0.7, 1, 1]
     upper = [0.6, 0.6, 0.3, 0.3, 0.9, 1, 1] if chain else [0.6, 0.6, 0.3, 0.5, 0.6, 0.3, 0.9, 1, 1]
     size = len(starts) - 1
     return interval_rows(
-        rows, starts, target, lower, upper, initial=[1, 0, 0, 0],
+        rows,
+        starts,
+        target,
+        lower,
+        upper,
+        initial=[1, 0, 0, 0],
         label={"goal": [2], "lost": [3], "half": [1]},
         rewards={"time": Rewards(choice=np.arange(1, size + 1.0))},
-        action=None if chain else [0, 1, 0, 0, 0], action_names=() if chain else ["go", "round"])
+        action=None if chain else [0, 1, 0, 0, 0],
+        action_names=() if chain else ["go", "round"],
+    )
 
 
 def results(*arguments):
@@ -38,10 +46,19 @@ def results(*arguments):
 @pytest.mark.parametrize("name", ["m.umb", "m.drn", "m.tra", "m.pexp", "m.npz"])
 def test_any_file_is_solved(name, tmp_path):
     write_model(tmp_path / name, rover())
-    found = results(tmp_path / name, 'Pmaxmin=? [ F "goal" ]', 'P<=0.5 [ X "half" ]',
-                    'Pmaxmin=? [ !"half" U<=3 "goal" ]', 'R{"time"}minmax=? [ F "goal"|"lost" ]')
+    found = results(
+        tmp_path / name,
+        'Pmaxmin=? [ F "goal" ]',
+        'P<=0.5 [ X "half" ]',
+        'Pmaxmin=? [ !"half" U<=3 "goal" ]',
+        'R{"time"}minmax=? [ F "goal"|"lost" ]',
+    )
     assert {k: v for k, v in found["model"].items() if k != "seconds"} == {
-        "kind": "imdp", "states": 4, "choices": 5, "transitions": 9}
+        "kind": "imdp",
+        "states": 4,
+        "choices": 5,
+        "transitions": 9,
+    }
     values = found["results"]
     # Round about, again and again, nothing is lost.
     assert values[0]["lower"] == values[0]["upper"] == 1
@@ -52,8 +69,9 @@ def test_any_file_is_solved(name, tmp_path):
 
 def test_chains_have_one_direction(tmp_path):
     write_model(tmp_path / "m.drn", rover(chain=True))
-    found = results(tmp_path / "m.drn", 'Pmin=? [ F "goal" ]', 'Pmax=? [ F "goal" ]',
-                    'P>=0.6 [ F "goal" ]')
+    found = results(
+        tmp_path / "m.drn", 'Pmin=? [ F "goal" ]', 'Pmax=? [ F "goal" ]', 'P>=0.6 [ F "goal" ]'
+    )
     assert found["model"]["kind"] == "idtmc"
     low, high, holds = found["results"]
     # From half-way one is back with .1 to .3, else at the goal: x = .4 (.7 + .3 x) + .3 at worst.
@@ -64,10 +82,11 @@ def test_chains_have_one_direction(tmp_path):
 def test_mistakes_are_named(tmp_path):
     path = tmp_path / "m.drn"
     write_model(path, rover())
-    done = CliRunner().invoke(main, ["solve", str(path), 'P=? [ F "goal" ]', '--json'])
+    done = CliRunner().invoke(main, ["solve", str(path), 'P=? [ F "goal" ]', "--json"])
     assert done.exit_code == 2 and "ask for Pmaxmin=?, Pmaxmax=?" in done.output
-    done = CliRunner().invoke(main, ["solve", str(path), 'multi(Pmax=? [ F "goal" ], '
-                                     'P>=0.5 [ F "half" ])'])
+    done = CliRunner().invoke(
+        main, ["solve", str(path), 'multi(Pmax=? [ F "goal" ], P>=0.5 [ F "half" ])']
+    )
     assert done.exit_code == 2 and "several objectives are not solved for" in done.output
     text = path.read_text().replace("[0.2, 0.6]", "[0.6, 0.2]")
     path.write_text(text)
@@ -104,10 +123,16 @@ def test_choices_and_what_nature_picks_attain_the_value(policy, nature, chain, t
     goal, stay = (np.asarray(model.states_where(x)) for x in ("goal", "half"))
     value = goal.astype(float)
     for _ in range(2000):
-        value = np.array([
-            1.0 if goal[s] else 0.0 if stay[s] else sum(
-                p * value[int(t)] for t, p in choices[strategy["choice"][s]].items())
-            for s, choices in enumerate(strategy["nature"])])
+        value = np.array(
+            [
+                1.0
+                if goal[s]
+                else 0.0
+                if stay[s]
+                else sum(p * value[int(t)] for t, p in choices[strategy["choice"][s]].items())
+                for s, choices in enumerate(strategy["nature"])
+            ]
+        )
     assert value[0] == pytest.approx(found["value"], abs=1e-6)
 
 
@@ -116,8 +141,10 @@ def test_with_a_memory_both_are_told_by_pairs(tmp_path):
     prop = 'Pmaxmin=? [ (!"half" U "goal") | F ("half" & X "goal") ]'
     found, strategy = written(tmp_path, model, prop)
     assert strategy["kind"] == "memory" and strategy["letter_of"] == "the state that is left"
-    pairs = {(s, q): i for i, (s, q) in enumerate(
-        zip(strategy["state"], strategy["memory"], strict=True))}
+    pairs = {
+        (s, q): i
+        for i, (s, q) in enumerate(zip(strategy["state"], strategy["memory"], strict=True))
+    }
     mass, start = {}, strategy["initial"][0]
     mass[tuple(start)] = 1.0
     for _ in range(200):
@@ -143,14 +170,21 @@ def test_with_a_memory_both_are_told_by_pairs(tmp_path):
 
 def test_nothing_is_compiled(tmp_path):
     write_model(tmp_path / "m.umb", rover())
-    asked = ['Pmaxmin=? [ F "goal" ]', 'Pminmax=? [ G F "half" ]', 'Pmaxmin=? [ G !"lost" ]',
-             'R{"time"}minmax=? [ F "goal"|"lost" ]', 'Pmaxmin=? [ F<=7 "goal" ]']
+    asked = [
+        'Pmaxmin=? [ F "goal" ]',
+        'Pminmax=? [ G F "half" ]',
+        'Pmaxmin=? [ G !"lost" ]',
+        'R{"time"}minmax=? [ F "goal"|"lost" ]',
+        'Pmaxmin=? [ F<=7 "goal" ]',
+    ]
     program = (
         "import jax\n"
         "def fail(*a, **k): raise AssertionError('compiled')\n"
         "jax._src.compiler.compile_or_get_cached = fail\n"
         "from jaxltl.cli import main\n"
-        f"main({['solve', str(tmp_path / 'm.umb'), *asked]!r}, standalone_mode=False)\n")
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True,
-                          check=False)
+        f"main({['solve', str(tmp_path / 'm.umb'), *asked]!r}, standalone_mode=False)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr

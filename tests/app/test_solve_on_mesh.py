@@ -1,5 +1,4 @@
-"""Solving over a mesh, left and gone on from: to the same bits there, to as good bounds elsewhere.
-"""
+"""Solving over a mesh, left and gone on from: to the same bits there, to as good bounds elsewhere."""
 
 import json
 
@@ -28,8 +27,14 @@ def place_of(devices):
 def solved(devices, directory, text=PROPERTY):
     place = place_of(devices)
     (result,) = solve_on_mesh.solve_in(
-        place, solve_on_mesh.on_mesh(walk(16), place), {}, asked_for([text]), 1e-6, directory,
-        [text])
+        place,
+        solve_on_mesh.on_mesh(walk(16), place),
+        {},
+        asked_for([text]),
+        1e-6,
+        directory,
+        [text],
+    )
     return result
 
 
@@ -93,10 +98,11 @@ def test_from_the_command_line(tmp_path):
     assert result["lower"] <= 0.4 <= result["upper"] <= result["lower"] + 1e-6
     assert result["method"] == "interval iteration on the mesh"
     for options, message in (
-            (["--mesh", "99"], "--mesh 99: there are 4 (cpu); give fewer, or --mesh alone for all"),
-            (["--mesh", "--strategy", "x.json"], "--strategy goes without --mesh alone"),
-            (bounds, "--checkpoint goes with --mesh alone"),
-            (["--mesh", "two"], "--mesh two: give a number of devices, or all"),
-            (["--process", "1"], "--process is of use with --mesh alone")):
+        (["--mesh", "99"], "--mesh 99: there are 4 (cpu); give fewer, or --mesh alone for all"),
+        (["--mesh", "--strategy", "x.json"], "--strategy goes without --mesh alone"),
+        (bounds, "--checkpoint goes with --mesh alone"),
+        (["--mesh", "two"], "--mesh two: give a number of devices, or all"),
+        (["--process", "1"], "--process is of use with --mesh alone"),
+    ):
         wrong = CliRunner().invoke(main, ["solve", model, PROPERTY, *options])
         assert wrong.exit_code == 2 and f"error: {message}" in wrong.stderr

@@ -106,8 +106,14 @@ def test_a_maximal_strategy_and_its_evidence(won):
 def test_the_files_of_a_strategy(won):
     _, result, out = won
     assert {path.name for path in out.iterdir()} == {
-        "game.toml", "strategy.npz", "result.json", "report.html", "automaton.svg",
-        "region.svg", "moves.svg"}
+        "game.toml",
+        "strategy.npz",
+        "result.json",
+        "report.html",
+        "automaton.svg",
+        "region.svg",
+        "moves.svg",
+    }
     assert json.loads((out / "result.json").read_text()) == result
     with np.load(out / "strategy.npz") as file:
         found = dict(file)
@@ -159,7 +165,12 @@ def test_an_unrealizable_task_is_an_answer(lost):
     assert result["strategy"] is None and result["region"]["initial_states"] == 0
     assert len(result["region"]["lost_initial_states"]) == 6
     assert {path.name for path in out.iterdir()} == {
-        "game.toml", "counter_strategy.npz", "result.json", "report.html", "region.svg"}
+        "game.toml",
+        "counter_strategy.npz",
+        "result.json",
+        "report.html",
+        "region.svg",
+    }
 
 
 def test_the_play_obeys_the_rules_and_ends_in_failure(lost):
@@ -194,15 +205,17 @@ def test_the_counter_strategy_beats_every_system(lost):
 
 
 def test_a_repeating_play_names_the_guarantee_that_is_missed(tmp_path):
-    text = SQUARE.replace('formula = "G !collision"',
-                          'guarantees = ["system_a", "system_b"]\nsafe = "!collision"')
+    text = SQUARE.replace(
+        'formula = "G !collision"', 'guarantees = ["system_a", "system_b"]\nsafe = "!collision"'
+    )
     printed, result, out = finished(tmp_path, text)
     assert result["task"] == "G (!collision) & G F (system_a) & G F (system_b)"
     assert "repeat for ever, and never meet system_a" in printed
     play = result["play"]
     first, last = play["steps"][play["repeats_from"]], play["steps"][-1]
     assert [first[k] for k in ("system", "environment")] == [
-        last[k] for k in ("system", "environment")]
+        last[k] for k in ("system", "environment")
+    ]
     with np.load(out / "counter_strategy.npz") as file:
         assert file["counter_action"].shape[1:] == (1,) and file["assumptions"].shape[0] == 1
 
@@ -214,23 +227,35 @@ def test_some_initial_states_are_won_and_others_lost(arrays, tmp_path):
     found = json.loads(result.stdout.splitlines()[-1])
     assert found["outcome"] == "partly realizable"
     assert "the environment wins from 1, for example: state 2" in result.stdout
-    assert found["play"] == {"steps": [{"mover": "start", "move": "", "state": 2}],
-                             "repeats_from": None, "failed": True, "by_chance": False}
+    assert found["play"] == {
+        "steps": [{"mover": "start", "move": "", "state": 2}],
+        "repeats_from": None,
+        "failed": True,
+        "by_chance": False,
+    }
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "game.toml", "strategy.npz", "counter_strategy.npz", "result.json", "report.html",
-        "automaton.svg"}
+        "game.toml",
+        "strategy.npz",
+        "counter_strategy.npz",
+        "result.json",
+        "report.html",
+        "automaton.svg",
+    }
     with np.load(tmp_path / "out" / "strategy.npz") as file:
         assert file["world_state"].tolist() == [0, 1]
         assert file["mask"].tolist() == [[True, False], [True, False]]
     assert "the game has no map" in failure(
-        "synthesize", path, "--out", tmp_path / "out", "--environment", 1, 1)
+        "synthesize", path, "--out", tmp_path / "out", "--environment", 1, 1
+    )
 
 
 def test_chance_may_be_an_adversary(arrays, tmp_path):
     # The system's only move reaches the goal at last, unless chance is malign.
     path = arrays(
-        "F bad", successor=[[[0, 2]], [[0, 0]], [[2, 0]]],
-        probability=[[[0.5, 0.5]], [[1.0, 0.0]], [[1.0, 0.0]]], actions=["try"],
+        "F bad",
+        successor=[[[0, 2]], [[0, 0]], [[2, 0]]],
+        probability=[[[0.5, 0.5]], [[1.0, 0.0]], [[1.0, 0.0]]],
+        actions=["try"],
     )
     found = synthesis.synthesize(read_game(path))
     result = report.summary(found, 0.0)
@@ -282,7 +307,8 @@ def test_a_play_of_the_strategy_is_one(tmp_path):
     for (here, _, action), (there, _, _) in itertools.pairwise(run.steps):
         assert not collides[here] and there in successor[here, action % count]
         assert part.actions[action].endswith(
-            "(system)" if bool(np.asarray(game.system)[here]) else "(environment)")
+            "(system)" if bool(np.asarray(game.system)[here]) else "(environment)"
+        )
         assert found.world.describe(here) == part.places[here] and len(part.cells[here]) == 2
 
 
@@ -302,8 +328,11 @@ def test_the_examples_are_sound():
 
 
 def test_a_picture_for_each_memory_of_a_strategy(tmp_path):
-    text = SQUARE.replace('formula = "G !collision"', 'guarantees = ["system_a", "system_b"]\n'
-                          'assumptions = ["environment_a & !system_b", "environment_b"]')
+    text = SQUARE.replace(
+        'formula = "G !collision"',
+        'guarantees = ["system_a", "system_b"]\n'
+        'assumptions = ["environment_a & !system_b", "environment_b"]',
+    )
     (tmp_path / "game.toml").write_text(text)
     found = synthesis.synthesize(read_game(tmp_path / "game.toml"))
     assert found.strategy is not None and not found.strategy.maximal
@@ -318,8 +347,9 @@ def test_large_maps_show_some_places(monkeypatch, tmp_path):
     monkeypatch.setattr(report, "MOST_MAPS", 2)
     shown = []
     real = plot.game_region
-    monkeypatch.setattr(plot, "game_region",
-                        lambda *a, **k: shown.append(k["environment"]) or real(*a, **k))
+    monkeypatch.setattr(
+        plot, "game_region", lambda *a, **k: shown.append(k["environment"]) or real(*a, **k)
+    )
     report.pictures(synthesis.synthesize(read_game(tmp_path / "game.toml")))
     assert shown == [[0, 1, 2]]
 
@@ -327,38 +357,55 @@ def test_large_maps_show_some_places(monkeypatch, tmp_path):
 # --- mistakes -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("replacement", "message"), [
-    (("[task]", "[task"), r"this is not TOML: "),
-    (("[task]", "[tasc]"), r"game.toml: has no key 'tasc'; did you mean 'task'?"),
-    (("map =", "mapp ="), r"[game] has no key 'mapp'; did you mean 'map'?"),
-    (("formula", "formul"), r"[task] has no key 'formul'; did you mean 'formula'?"),
-    (("[task]", "[strategy]\nbond = 3\n[task]"), r"has no key 'bond'; did you mean 'bound'?"),
-    (("[task]", "[strategy]\nbound = 0\n[task]"), r"bound = 0; it must be a whole number"),
-    (("[task]", '[strategy]\nmethod = "all"\n[task]'), r"it must be "
-     '"auto" or "stay" or "rank" or "counter" or "parity"'),
-    (("[task]", "slip = 2\n[task]"), r"slip = 2; it must be a finite number in [0, 1]"),
-    (("[task]", "system_stays = 1\n[task]"), r"system_stays = 1; it must be true or false"),
-    (("[task]", 'model = "m.npz"\n[task]'), r"[game] must have either a map or a model"),
-    (("[task]", 'initial = "a"\n[task]'), r"[game] initial belongs to a model"),
-    (("[task]", "system_start = [3, 1]\n[task]"),
-     r"[game] system_start = [3, 1] is off the map, which has rows 1 to 2 and columns 1 to 2"),
-    (("[task]", "system_start = [1]\n[task]"), r"or a cell as [row, column], from 1"),
-    (("a.\n.b", "a#\n#b"), r"[game] the environment has no move from the cell"),
-    (("a.\n.b", "ab\nb"), r"[game] map row 2 has 1 cells, row 1 has 2"),
-    (('formula = "G !collision"', ""), r"[task] lacks what the system is to achieve"),
-    (('formula = "G !collision"', 'assumptions = ["system_a"]'), r"lacks what the system"),
-    (('formula = "G !collision"', 'safe = "true"\nassumptions = ["system_a"]'),
-     r"[task] has assumptions but no guarantees"),
-    (('formula = "G !collision"', 'guarantees = "system_a"'), r"it must be a list of Boolean"),
-    (("formula", 'safe = "true"\nformula'), r"[task] has both formula and safe"),
-    (("!collision", "!colision"), r"[task] the task mentions the proposition 'colision', which"),
-    (("!collision", "!colision"), r"Did you mean 'collision'?"),
-    (("G !collision", "G (!collision"), r"[task] "),
-    (('formula = "G !collision"', 'guarantees = ["system_a", "F system_b"]'),
-     r"[task] guarantees[1]: 'F system_b' is not Boolean"),
-    (('formula = "G !collision"', 'guarantees = ["system_a"]\nassumptions = ["system_c"]'),
-     r"[task] assumptions[0]: 'system_c' mentions the proposition 'system_c'"),
-])
+@pytest.mark.parametrize(
+    ("replacement", "message"),
+    [
+        (("[task]", "[task"), r"this is not TOML: "),
+        (("[task]", "[tasc]"), r"game.toml: has no key 'tasc'; did you mean 'task'?"),
+        (("map =", "mapp ="), r"[game] has no key 'mapp'; did you mean 'map'?"),
+        (("formula", "formul"), r"[task] has no key 'formul'; did you mean 'formula'?"),
+        (("[task]", "[strategy]\nbond = 3\n[task]"), r"has no key 'bond'; did you mean 'bound'?"),
+        (("[task]", "[strategy]\nbound = 0\n[task]"), r"bound = 0; it must be a whole number"),
+        (
+            ("[task]", '[strategy]\nmethod = "all"\n[task]'),
+            r"it must be "
+            '"auto" or "stay" or "rank" or "counter" or "parity"',
+        ),
+        (("[task]", "slip = 2\n[task]"), r"slip = 2; it must be a finite number in [0, 1]"),
+        (("[task]", "system_stays = 1\n[task]"), r"system_stays = 1; it must be true or false"),
+        (("[task]", 'model = "m.npz"\n[task]'), r"[game] must have either a map or a model"),
+        (("[task]", 'initial = "a"\n[task]'), r"[game] initial belongs to a model"),
+        (
+            ("[task]", "system_start = [3, 1]\n[task]"),
+            r"[game] system_start = [3, 1] is off the map, which has rows 1 to 2 and columns 1 to 2",
+        ),
+        (("[task]", "system_start = [1]\n[task]"), r"or a cell as [row, column], from 1"),
+        (("a.\n.b", "a#\n#b"), r"[game] the environment has no move from the cell"),
+        (("a.\n.b", "ab\nb"), r"[game] map row 2 has 1 cells, row 1 has 2"),
+        (('formula = "G !collision"', ""), r"[task] lacks what the system is to achieve"),
+        (('formula = "G !collision"', 'assumptions = ["system_a"]'), r"lacks what the system"),
+        (
+            ('formula = "G !collision"', 'safe = "true"\nassumptions = ["system_a"]'),
+            r"[task] has assumptions but no guarantees",
+        ),
+        (('formula = "G !collision"', 'guarantees = "system_a"'), r"it must be a list of Boolean"),
+        (("formula", 'safe = "true"\nformula'), r"[task] has both formula and safe"),
+        (
+            ("!collision", "!colision"),
+            r"[task] the task mentions the proposition 'colision', which",
+        ),
+        (("!collision", "!colision"), r"Did you mean 'collision'?"),
+        (("G !collision", "G (!collision"), r"[task] "),
+        (
+            ('formula = "G !collision"', 'guarantees = ["system_a", "F system_b"]'),
+            r"[task] guarantees[1]: 'F system_b' is not Boolean",
+        ),
+        (
+            ('formula = "G !collision"', 'guarantees = ["system_a"]\nassumptions = ["system_c"]'),
+            r"[task] assumptions[0]: 'system_c' mentions the proposition 'system_c'",
+        ),
+    ],
+)
 def test_mistakes_in_the_file(write, tmp_path, replacement, message):
     assert message in failure("synthesize", write(replacement), "--out", tmp_path / "out")
 
@@ -369,19 +416,26 @@ def test_a_start_in_a_wall(write, tmp_path):
     assert "[game] environment_start = [3, 2] is a wall of the map" in message
 
 
-@pytest.mark.parametrize(("changed", "message"), [
-    ({"system": [True, False]}, "State 2 has no owner."),
-    ({"system": [1.0, 0.0, np.nan]}, "state 2 has no owner: system is nan there"),
-    ({"system": np.array([True, False, None])}, "array 'system' holds Python objects"),
-    ({"system": None}, "lacks the array system: for each state True where the system moves"),
-    ({"probability": [[[1.0], [1.0]], [[1.0], [0.0]], [[0.0], [0.0]]]},
-     "state 2 has no available action; give it one"),
-    ({"available": np.zeros((3, 2), bool)}, "state 0 has no available action; give it one"),
-    ({"probability": [[[0.7], [1.0]], [[1.0], [0.0]], [[1.0], [0.0]]]},
-     "state 0, action 0: the probabilities sum to 0.7"),
-    ({"owner": [1, 0, 0]}, "holds an array 'owner'; it may hold "),
-    ({"label": [[0], [0]]}, "label has shape"),
-])
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"system": [True, False]}, "State 2 has no owner."),
+        ({"system": [1.0, 0.0, np.nan]}, "state 2 has no owner: system is nan there"),
+        ({"system": np.array([True, False, None])}, "array 'system' holds Python objects"),
+        ({"system": None}, "lacks the array system: for each state True where the system moves"),
+        (
+            {"probability": [[[1.0], [1.0]], [[1.0], [0.0]], [[0.0], [0.0]]]},
+            "state 2 has no available action; give it one",
+        ),
+        ({"available": np.zeros((3, 2), bool)}, "state 0 has no available action; give it one"),
+        (
+            {"probability": [[[0.7], [1.0]], [[1.0], [0.0]], [[1.0], [0.0]]]},
+            "state 0, action 0: the probabilities sum to 0.7",
+        ),
+        ({"owner": [1, 0, 0]}, "holds an array 'owner'; it may hold "),
+        ({"label": [[0], [0]]}, "label has shape"),
+    ],
+)
 def test_mistakes_in_arrays(arrays, tmp_path, changed, message):
     found = failure("synthesize", arrays(**changed), "--out", tmp_path / "out")
     assert "game.npz'" in found and message in found
@@ -404,9 +458,10 @@ def test_a_strategy_that_is_demanded_and_does_not_exist(tmp_path):
     (tmp_path / "game.toml").write_text(CORRIDOR + "[strategy]\n")
     result = run("synthesize", tmp_path / "game.toml", "--out", tmp_path / "out")
     assert result.exit_code == 2 and "a play that the environment wins" in result.stdout
-    assert ("game.toml: [strategy] demands a strategy, but the task is unrealizable: the "
-            "environment wins from every initial state, for example: system in row 1, column 2"
-            ) in result.stderr
+    assert (
+        "game.toml: [strategy] demands a strategy, but the task is unrealizable: the "
+        "environment wins from every initial state, for example: system in row 1, column 2"
+    ) in result.stderr
     assert (tmp_path / "out" / "counter_strategy.npz").exists()
 
 
@@ -421,10 +476,16 @@ def test_methods_that_do_not_fit(arrays, tmp_path):
     assert '[strategy] method="counter" is for Buchi' in message("G !bad", 'method = "counter"')
     back = {"successor": [[[1], [2]], [[0], [0]], [[0], [0]]]}
     assert '[strategy] method="stay": some run' in message("G F bad", 'method = "stay"', **back)
-    assert "[strategy] method=\"counter\" needs bound=m" in message(
-        "G F bad", 'method = "counter"', **back)
-    far = {"successor": [[[1], [1]], [[2], [2]], [[3], [3]], [[0], [0]]],
-           "probability": np.ones((4, 2, 1)), "system": [True] * 4, "initial": [1, 0, 0, 0],
-           "label": [[0], [0], [0], [1]]}
+    assert '[strategy] method="counter" needs bound=m' in message(
+        "G F bad", 'method = "counter"', **back
+    )
+    far = {
+        "successor": [[[1], [1]], [[2], [2]], [[3], [3]], [[0], [0]]],
+        "probability": np.ones((4, 2, 1)),
+        "system": [True] * 4,
+        "initial": [1, 0, 0, 0],
+        "label": [[0], [0], [0], [1]],
+    }
     assert "[strategy] bound=2 is too small: the system wins, but not surely within it" in message(
-        "G F bad", 'method = "counter"\nbound = 2', **far)
+        "G F bad", 'method = "counter"\nbound = 2', **far
+    )

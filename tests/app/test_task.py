@@ -71,9 +71,14 @@ def test_states_and_action_numbers_from_zero(write):
 
 def test_a_map_and_legend_from_a_file(write, tmp_path):
     (tmp_path / "map.txt").write_text("a b\nb a\n")
-    task = read_task(write(
-        ("map = '''\n. . r\nb . y\n'''", 'map = { file = "map.txt" }\n'
-         'legend = { a = [], b = ["r", "y"] }\nslip = 0.2')))
+    task = read_task(
+        write(
+            (
+                "map = '''\n. . r\nb . y\n'''",
+                'map = { file = "map.txt" }\nlegend = { a = [], b = ["r", "y"] }\nslip = 0.2',
+            )
+        )
+    )
     mdp = load_world(task).mdp
     assert mdp.propositions == ("r", "y") and mdp.num_successors == 3
     assert np.asarray(mdp.initial).tolist() == [0.5, 0, 0, 0.5]
@@ -87,51 +92,70 @@ def test_the_digest_covers_named_files(write):
     assert read_task(write()).digest == first
 
 
-@pytest.mark.parametrize(("replacement", "message"), [
-    (("discount = 0.9", "discount = "), r"task\.toml: this is not TOML: .*line 18"),
-    (("[learner]", "[learnt]"), r"has no key 'learnt'; did you mean 'learner'\?"),
-    (("discount", "discnt"), r"\[learner\] has no key 'discnt'; did you mean 'discount'\?"),
-    (("absorbing", "absorb"), r"\[world\] has no key 'absorb'; did you mean 'absorbing'\?"),
-    (("discount = 0.9", ""), r"\[learner\] lacks discount, a finite number in \[0, 1\)"),
-    (("discount = 0.9", "discount = 1.0"), r"discount = 1\.0; it must be a finite number in"),
-    (("discount = 0.9", "discount = true"), r"discount = True; it must be"),
-    (("discount = 0.9", "discount = nan"), r"discount = nan; it must be a finite number"),
-    (("discount = 0.9", "discount = 0.9\nsteps = 0"), r"steps = 0; it must be a whole number"),
-    (("discount = 0.9", "discount = 0.9\nmu = -1"), r"must be a finite number of at least 0"),
-    (("discount = 0.9", "discount = 0.9\nmu = inf"),
-     r"mu = inf; it must be a finite number of at least 0"),
-    (("discount = 0.9", "discount = 0.9\nl2 = nan"), r"l2 = nan; it must be a finite number"),
-    (("discount = 0.9", "discount = 0.9\nmu = 1" + 400 * "0"), r"it must be a finite number"),
-    (("discount = 0.9", "discount = 0.9\nstart = [1, inf]"), r"a list of finite numbers, one per"),
-    (("discount = 0.9", "discount = 0.9\nlearning_rate = 0.1"),
-     r'learning_rate belongs to optimizer = "adam" or "sgd"; "lbfgs", the default, searches'),
-    (("discount = 0.9", 'discount = 0.9\noptimizer = "lbfgs"\nlearning_rate = 0.1'),
-     r"learning_rate belongs to optimizer"),
-    (("[task]", "[task]\nguarantee = nan"), r"a probability in \(0, 1\]"),
-    (("discount = 0.9", 'discount = 0.9\nin = "world"'), r"lacks goal"),
-    (("discount = 0.9", 'discount = 0.9\nin = "world"\ngoal = ["y"]\nmu = 1'), r"mu weighs"),
-    (("discount = 0.9", 'discount = 0.9\ngoal = ["y"]'), r'goal belongs to in = "world"'),
-    (("discount = 0.9", 'discount = 0.9\nprogress = ["y"]'), r"a list of automaton states"),
-    (('"mlirl"', '"irl"'), r'method = \'irl\'; it must be "mlirl"'),
-    (('formula = "!r U y"', ""), r"\[task\] lacks formula"),
-    (("[task]", "[tsk]"), r"has no key 'tsk'; did you mean 'task'\?"),
-    (('file = "shown.json"', ""), r"either file"),
-    (("[task]", '[task]\nguarantee = "all"'), r'"best", "none" or a probability in \(0, 1\]'),
-    (("[task]", '[task]\nguarantee = 0'), r"a probability in \(0, 1\]"),
-    (("[task]", '[task]\nover = "worst"'), r"over belongs to a guarantee that is a probability"),
-    (('file = "shown.json"', 'file = "shown.json"\nlength = 3'), r"length belongs to synthetic"),
-    (('file = "shown.json"', 'file = "gone.json"'), r"gone\.json': No such file"),
-    (("map = '''\n. . r\nb . y\n'''", ""), r"\[world\] must have either a map, a model"),
-    (("map = '''\n. . r\nb . y\n'''", 'model = "m.npz"'), r"absorbing belongs to a map"),
-    (("map = '''\n. . r\nb . y\n'''", "map = { name = 'x' }"), r'or \{ file = "map\.txt" \}'),
-])
+@pytest.mark.parametrize(
+    ("replacement", "message"),
+    [
+        (("discount = 0.9", "discount = "), r"task\.toml: this is not TOML: .*line 18"),
+        (("[learner]", "[learnt]"), r"has no key 'learnt'; did you mean 'learner'\?"),
+        (("discount", "discnt"), r"\[learner\] has no key 'discnt'; did you mean 'discount'\?"),
+        (("absorbing", "absorb"), r"\[world\] has no key 'absorb'; did you mean 'absorbing'\?"),
+        (("discount = 0.9", ""), r"\[learner\] lacks discount, a finite number in \[0, 1\)"),
+        (("discount = 0.9", "discount = 1.0"), r"discount = 1\.0; it must be a finite number in"),
+        (("discount = 0.9", "discount = true"), r"discount = True; it must be"),
+        (("discount = 0.9", "discount = nan"), r"discount = nan; it must be a finite number"),
+        (("discount = 0.9", "discount = 0.9\nsteps = 0"), r"steps = 0; it must be a whole number"),
+        (("discount = 0.9", "discount = 0.9\nmu = -1"), r"must be a finite number of at least 0"),
+        (
+            ("discount = 0.9", "discount = 0.9\nmu = inf"),
+            r"mu = inf; it must be a finite number of at least 0",
+        ),
+        (("discount = 0.9", "discount = 0.9\nl2 = nan"), r"l2 = nan; it must be a finite number"),
+        (("discount = 0.9", "discount = 0.9\nmu = 1" + 400 * "0"), r"it must be a finite number"),
+        (
+            ("discount = 0.9", "discount = 0.9\nstart = [1, inf]"),
+            r"a list of finite numbers, one per",
+        ),
+        (
+            ("discount = 0.9", "discount = 0.9\nlearning_rate = 0.1"),
+            r'learning_rate belongs to optimizer = "adam" or "sgd"; "lbfgs", the default, searches',
+        ),
+        (
+            ("discount = 0.9", 'discount = 0.9\noptimizer = "lbfgs"\nlearning_rate = 0.1'),
+            r"learning_rate belongs to optimizer",
+        ),
+        (("[task]", "[task]\nguarantee = nan"), r"a probability in \(0, 1\]"),
+        (("discount = 0.9", 'discount = 0.9\nin = "world"'), r"lacks goal"),
+        (("discount = 0.9", 'discount = 0.9\nin = "world"\ngoal = ["y"]\nmu = 1'), r"mu weighs"),
+        (("discount = 0.9", 'discount = 0.9\ngoal = ["y"]'), r'goal belongs to in = "world"'),
+        (("discount = 0.9", 'discount = 0.9\nprogress = ["y"]'), r"a list of automaton states"),
+        (('"mlirl"', '"irl"'), r'method = \'irl\'; it must be "mlirl"'),
+        (('formula = "!r U y"', ""), r"\[task\] lacks formula"),
+        (("[task]", "[tsk]"), r"has no key 'tsk'; did you mean 'task'\?"),
+        (('file = "shown.json"', ""), r"either file"),
+        (("[task]", '[task]\nguarantee = "all"'), r'"best", "none" or a probability in \(0, 1\]'),
+        (("[task]", "[task]\nguarantee = 0"), r"a probability in \(0, 1\]"),
+        (
+            ("[task]", '[task]\nover = "worst"'),
+            r"over belongs to a guarantee that is a probability",
+        ),
+        (
+            ('file = "shown.json"', 'file = "shown.json"\nlength = 3'),
+            r"length belongs to synthetic",
+        ),
+        (('file = "shown.json"', 'file = "gone.json"'), r"gone\.json': No such file"),
+        (("map = '''\n. . r\nb . y\n'''", ""), r"\[world\] must have either a map, a model"),
+        (("map = '''\n. . r\nb . y\n'''", 'model = "m.npz"'), r"absorbing belongs to a map"),
+        (("map = '''\n. . r\nb . y\n'''", "map = { name = 'x' }"), r'or \{ file = "map\.txt" \}'),
+    ],
+)
 def test_mistakes_in_the_task_file(write, replacement, message):
     with pytest.raises(ValueError, match=message):
         read_task(write(replacement))
 
 
 @pytest.mark.parametrize(
-    "name", ["../../evil", "/tmp/evil", "a/b", "a\\\\b", ".hidden", "..", " a", "", "a\\nb", "a:b"])
+    "name", ["../../evil", "/tmp/evil", "a/b", "a\\\\b", ".hidden", "..", " a", "", "a\\nb", "a:b"]
+)
 def test_names_are_plain(write, name):
     with pytest.raises(ValueError, match=r"name = .*; it must be a plain name of letters, digits"):
         read_task(write(("\n[world]", f'name = "{name}"\n[world]')))
@@ -152,38 +176,62 @@ def test_a_missing_task_file(tmp_path):
         read_task(tmp_path / "none.toml")
 
 
-@pytest.mark.parametrize(("replacement", "message"), [
-    ((". . r\n", ". . .\n"), r"\[world\] initial: .* mentions the proposition 'r'"),
-    (("b . y", "b y"), r"\[world\] map row 2 has 2 cells, row 1 has 3"),
-    (('absorbing = ["y"]', "slip = 0.1\nlegend = { b = [] }"), r"\(row 1, column 1\) is not in"),
-])
+@pytest.mark.parametrize(
+    ("replacement", "message"),
+    [
+        ((". . r\n", ". . .\n"), r"\[world\] initial: .* mentions the proposition 'r'"),
+        (("b . y", "b y"), r"\[world\] map row 2 has 2 cells, row 1 has 3"),
+        (
+            ('absorbing = ["y"]', "slip = 0.1\nlegend = { b = [] }"),
+            r"\(row 1, column 1\) is not in",
+        ),
+    ],
+)
 def test_mistakes_in_the_world(write, replacement, message):
     with pytest.raises(ValueError, match=message):
         load_world(read_task(write(replacement)))
 
 
-@pytest.mark.parametrize(("shown", "message"), [
-    ("{", r"shown\.json: this is not JSON: .*line 1 column 2"),
-    ([], r"expected \{\"demonstrations\": \[\.\.\.\]\}"),
-    ({"demonstrations": []}, r"at least one demonstration"),
-    ({"demonstrations": [[1, 2]]}, r"demonstration 1: expected .* got \[1, 2\]"),
-    ({"demonstrations": [{"cells": [[1, 1]], "action": []}]}, r"it has 'action', 'cells'"),
-    ({"demonstrations": [{"cells": [[1, 1]], "actions": []}]}, r"at least one action"),
-    ({"demonstrations": [{"cells": [[1, 1]], "actions": ["up"] * 3}]}, r"1 cells and 3 actions"),
-    ({"demonstrations": [*SHOWN["demonstrations"], {"cells": [[2, 1], [1, 2]],
-      "actions": ["right", "up"]}]},
-     r"demonstration 2, step 1: 'right' in row 2, column 1 cannot lead to row 1, column 2, "
-     r"which comes next; it leads to row 2, column 2\."),
-    ({"demonstrations": [{"cells": [[2, 1], [2, 3]], "actions": ["right"]}]},
-     r"demonstration 1, step 1: .* cannot lead to row 2, column 3"),
-    ({"demonstrations": [{"cells": [[2, 1], [3, 1]], "actions": ["up", "up"]}]},
-     r"demonstration 1, step 2: the cell \[3, 1\] is off the map, which has rows 1 to 2"),
-    ({"demonstrations": [{"cells": [[2, 0]], "actions": ["up"]}]}, r"\[2, 0\] is off the map"),
-    ({"demonstrations": [{"cells": [[2]], "actions": ["up"]}]}, r"must be \[row, column\]"),
-    ({"demonstrations": [{"cells": [[2, 1]], "actions": ["jump"]}]},
-     r"step 1: the action 'jump' is unknown; the actions are up, down, left, right"),
-    ({"demonstrations": [{"states": [6], "actions": [0]}]}, r"state is 6; states are 0 to 5"),
-])
+@pytest.mark.parametrize(
+    ("shown", "message"),
+    [
+        ("{", r"shown\.json: this is not JSON: .*line 1 column 2"),
+        ([], r"expected \{\"demonstrations\": \[\.\.\.\]\}"),
+        ({"demonstrations": []}, r"at least one demonstration"),
+        ({"demonstrations": [[1, 2]]}, r"demonstration 1: expected .* got \[1, 2\]"),
+        ({"demonstrations": [{"cells": [[1, 1]], "action": []}]}, r"it has 'action', 'cells'"),
+        ({"demonstrations": [{"cells": [[1, 1]], "actions": []}]}, r"at least one action"),
+        (
+            {"demonstrations": [{"cells": [[1, 1]], "actions": ["up"] * 3}]},
+            r"1 cells and 3 actions",
+        ),
+        (
+            {
+                "demonstrations": [
+                    *SHOWN["demonstrations"],
+                    {"cells": [[2, 1], [1, 2]], "actions": ["right", "up"]},
+                ]
+            },
+            r"demonstration 2, step 1: 'right' in row 2, column 1 cannot lead to row 1, column 2, "
+            r"which comes next; it leads to row 2, column 2\.",
+        ),
+        (
+            {"demonstrations": [{"cells": [[2, 1], [2, 3]], "actions": ["right"]}]},
+            r"demonstration 1, step 1: .* cannot lead to row 2, column 3",
+        ),
+        (
+            {"demonstrations": [{"cells": [[2, 1], [3, 1]], "actions": ["up", "up"]}]},
+            r"demonstration 1, step 2: the cell \[3, 1\] is off the map, which has rows 1 to 2",
+        ),
+        ({"demonstrations": [{"cells": [[2, 0]], "actions": ["up"]}]}, r"\[2, 0\] is off the map"),
+        ({"demonstrations": [{"cells": [[2]], "actions": ["up"]}]}, r"must be \[row, column\]"),
+        (
+            {"demonstrations": [{"cells": [[2, 1]], "actions": ["jump"]}]},
+            r"step 1: the action 'jump' is unknown; the actions are up, down, left, right",
+        ),
+        ({"demonstrations": [{"states": [6], "actions": [0]}]}, r"state is 6; states are 0 to 5"),
+    ],
+)
 def test_mistakes_in_demonstrations(write, shown, message):
     task = read_task(write(shown=shown))
     with pytest.raises(ValueError, match=message):
@@ -191,8 +239,11 @@ def test_mistakes_in_demonstrations(write, shown, message):
 
 
 def _model_task(write, *more, **arrays):
-    path = write(("map = '''\n. . r\nb . y\n'''", 'model = "m.npz"'),
-                 ('absorbing = ["y"]\ninitial = "!r & !y"', ""), *more)
+    path = write(
+        ("map = '''\n. . r\nb . y\n'''", 'model = "m.npz"'),
+        ('absorbing = ["y"]\ninitial = "!r & !y"', ""),
+        *more,
+    )
     np.savez(path.parent / "m.npz", **arrays)
     return read_task(path)
 
@@ -220,23 +271,32 @@ def test_a_model_from_arrays(write):
 
 def test_a_model_from_successor_lists_with_initial_formula(write):
     task = _model_task(
-        write, ("[task]", 'initial = "!y"\n[task]'), successor=[[[0, 1]], [[1, 0]]],
-        probability=[[[0.5, 0.5]], [[1.0, 0]]], label=[[False], [True]], propositions=["y"],
+        write,
+        ("[task]", 'initial = "!y"\n[task]'),
+        successor=[[[0, 1]], [[1, 0]]],
+        probability=[[[0.5, 0.5]], [[1.0, 0]]],
+        label=[[False], [True]],
+        propositions=["y"],
     )
     world = load_world(task)
     assert np.asarray(world.mdp.initial).tolist() == [1, 0]
     assert world.actions == ("action 0",)
 
 
-@pytest.mark.parametrize(("arrays", "message"), [
-    ({"transition": CHAIN * 1.1}, r"m\.npz': state 0, action 0: the probabilities sum to 1\.1"),
-    ({"transition": CHAIN, "labels": [1]}, r"holds an array 'labels'; it may hold"),
-    ({"successor": [[[0]]]}, r"needs the array transition, or successor and probability"),
-    ({"transition": CHAIN, "actions": ["a"]}, r"1 distinct names; the model has 2 actions"),
-    ({"successor": [[[2]]], "probability": [[[1.0]]]}, r"successor 2 is out of range"),
-    ({"transition": CHAIN, "propositions": ["y"]},
-     r"m\.npz': there are propositions \('y',\) but no label, .*; give label as bool\[2, 1\]"),
-])
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"transition": CHAIN * 1.1}, r"m\.npz': state 0, action 0: the probabilities sum to 1\.1"),
+        ({"transition": CHAIN, "labels": [1]}, r"holds an array 'labels'; it may hold"),
+        ({"successor": [[[0]]]}, r"needs the array transition, or successor and probability"),
+        ({"transition": CHAIN, "actions": ["a"]}, r"1 distinct names; the model has 2 actions"),
+        ({"successor": [[[2]]], "probability": [[[1.0]]]}, r"successor 2 is out of range"),
+        (
+            {"transition": CHAIN, "propositions": ["y"]},
+            r"m\.npz': there are propositions \('y',\) but no label, .*; give label as bool\[2, 1\]",
+        ),
+    ],
+)
 def test_mistakes_in_a_model(write, arrays, message):
     with pytest.raises(ValueError, match=message):
         load_world(_model_task(write, **arrays))
@@ -259,14 +319,17 @@ def _broken(name, good):
     return file.getvalue()
 
 
-@pytest.mark.parametrize(("name", "message"), [
-    ("nonsense", "it is damaged, or not written by numpy"),
-    ("cut", "it is damaged, or not written by numpy"),
-    ("no array", "its array 'transition' is damaged, or not"),
-    ("header", "its array 'transition' is damaged, or not"),
-    ("single", "it holds a single array; numpy.savez"),
-    ("objects", "its array 'transition' holds Python objects, such as None; save numbers"),
-])
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("nonsense", "it is damaged, or not written by numpy"),
+        ("cut", "it is damaged, or not written by numpy"),
+        ("no array", "its array 'transition' is damaged, or not"),
+        ("header", "its array 'transition' is damaged, or not"),
+        ("single", "it holds a single array; numpy.savez"),
+        ("objects", "its array 'transition' holds Python objects, such as None; save numbers"),
+    ],
+)
 def test_a_model_that_is_no_npz(write, tmp_path, name, message):
     task = _model_task(write, transition=CHAIN)
     path = tmp_path / "m.npz"
@@ -290,7 +353,8 @@ def test_synthetic_demonstrations_do_the_task(write, discount):
     world = load_world(task)
     model = product(world.mdp, task.formula)
     shown, dropped = synthetic_demonstrations(
-        task, model, jax.random.key(0), optimal_satisfaction(model))
+        task, model, jax.random.key(0), optimal_satisfaction(model)
+    )
     lengths = np.asarray(shown.length)
     assert len(lengths) + dropped == 5 and dropped == 0
     for states, actions, n in zip(shown.state, shown.action, lengths, strict=True):
@@ -310,8 +374,7 @@ def test_synthetic_demonstrations_need_a_task_that_can_be_done(write):
         synthetic_demonstrations(task, safety, jax.random.key(0), optimal_satisfaction(safety))
 
 
-@pytest.mark.parametrize(
-    "runs", ["synthetic = 2000000000", "synthetic = 20\nlength = 2000000000"])
+@pytest.mark.parametrize("runs", ["synthetic = 2000000000", "synthetic = 20\nlength = 2000000000"])
 def test_more_runs_than_memory_holds_are_refused(write, runs):
     task = read_task(write(('file = "shown.json"', runs)))
     model = product(load_world(task).mdp, task.formula)
@@ -321,11 +384,16 @@ def test_more_runs_than_memory_holds_are_refused(write, runs):
 
 def test_synthetic_runs_of_a_task_without_end(write):
     """They have the asked length, and what they have to visit they visit again and again."""
-    task = read_task(write(('file = "shown.json"', "synthetic = 4\nlength = 12"),
-                           ('absorbing = ["y"]', "absorbing = []")))
+    task = read_task(
+        write(
+            ('file = "shown.json"', "synthetic = 4\nlength = 12"),
+            ('absorbing = ["y"]', "absorbing = []"),
+        )
+    )
     model = product(load_world(task).mdp, "G F b & G F y & G !r")
     shown, dropped = synthetic_demonstrations(
-        task, model, jax.random.key(0), optimal_satisfaction(model))
+        task, model, jax.random.key(0), optimal_satisfaction(model)
+    )
     assert dropped + len(shown.length) == 4 and (np.asarray(shown.length) == 12).all()
     for states in np.asarray(shown.state):
         assert 2 not in states and {3, 5} <= set(states.tolist())

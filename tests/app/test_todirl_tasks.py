@@ -76,8 +76,7 @@ def prepared(path, seed=0):
 
 def own(setup, w):
     """The product of a world without padding."""
-    return jl.product(
-        setup.worlds.scenes[w].mdp, setup.judge, label_on=setup.task.label_on)
+    return jl.product(setup.worlds.scenes[w].mdp, setup.judge, label_on=setup.task.label_on)
 
 
 # --- tasks without end -------------------------------------------------------------------------
@@ -89,7 +88,8 @@ def test_a_task_without_end_is_learned_and_done_in_worlds_never_seen(write, tmp_
     result = run("learn", path, "--out", tmp_path / "out", "--json")
     assert result.exit_code == 0, result.output
     assert "warning: No policy can do the task from 6 of 6 starts of the test world map 2" in (
-        result.stdout)
+        result.stdout
+    )
     found = json.loads(result.stdout.splitlines()[-1])
     assert (found["acceptance"], found["expert"]) == ("buchi", "quickest")
     assert found["demonstrations"]["number"] == [10] and found["demonstrations"]["dropped"] == 0
@@ -103,7 +103,8 @@ def test_a_task_without_end_is_learned_and_done_in_worlds_never_seen(write, tmp_
     runs = json.loads(re.search(r'id="data">(.*?)</script>', page)[1])[0]["runs"]
     assert max(len(played["steps"]) for played in runs) > 100  # on and on
     assert {"automaton.svg", "training_1.svg", "test_2.svg", "learning.svg"} <= {
-        file.name for file in (tmp_path / "out").iterdir()}
+        file.name for file in (tmp_path / "out").iterdir()
+    }
     # What is in the file plans the same in a world that is given to it.
     learned, setup = load_reward(tmp_path / "out" / "network.npz"), prepared(path)
     for w in (0, 1):
@@ -115,9 +116,15 @@ def test_a_task_without_end_is_learned_and_done_in_worlds_never_seen(write, tmp_
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize(("formula", "kind"), [
-    ("G F a & G F b & G !c", "buchi"), ("F G !a | G F b", "parity"), ("G !c & !b", "safety"),
-    ("!c U (a & (!c U b))", "cosafe")])
+@pytest.mark.parametrize(
+    ("formula", "kind"),
+    [
+        ("G F a & G F b & G !c", "buchi"),
+        ("F G !a | G F b", "parity"),
+        ("G !c & !b", "safety"),
+        ("!c U (a & (!c U b))", "cosafe"),
+    ],
+)
 def test_the_expert_is_the_quickest_of_the_best_and_demonstrates(write, formula, kind):
     setup = prepared(write((FORMULA, f'formula = "{formula}"')), seed=3)
     assert setup.judge.acceptance == kind and not setup.soft
@@ -125,20 +132,21 @@ def test_the_expert_is_the_quickest_of_the_best_and_demonstrates(write, formula,
     for w, scene in enumerate(setup.worlds.scenes):
         model, size = own(setup, w), scene.mdp.num_states
         best = jl.optimal_satisfaction(model)
-        np.testing.assert_array_equal(
-            setup.expert[w, :size], np.eye(4)[np.asarray(best.policy)])
+        np.testing.assert_array_equal(setup.expert[w, :size], np.eye(4)[np.asarray(best.policy)])
         value, _ = evaluate(model, setup.expert[w, :size])
         memory = np.asarray(model.initial_memory)
         np.testing.assert_allclose(found[w, :size], value[np.arange(size), memory], atol=1e-12)
         starts = np.asarray(scene.mdp.initial) > 0
         never = np.asarray(infeasible_starts(part_of(setup.worlds.judged, w)))
         np.testing.assert_array_equal(
-            never[:size][starts], value[np.arange(size), memory][starts] == 0)
+            never[:size][starts], value[np.arange(size), memory][starts] == 0
+        )
     (shown,) = setup.demonstrations
     model = own(setup, 0)
     best = np.asarray(jl.optimal_satisfaction(model).policy)
-    for states, actions, length in zip(*map(
-            np.asarray, (shown.state, shown.action, shown.length)), strict=True):
+    for states, actions, length in zip(
+        *map(np.asarray, (shown.state, shown.action, shown.length)), strict=True
+    ):
         q = int(model.initial_memory[states[0]])
         for s, a in zip(states[:length], actions[:length], strict=True):
             assert a == best[s, q]
@@ -148,8 +156,10 @@ def test_the_expert_is_the_quickest_of_the_best_and_demonstrates(write, formula,
 
 def test_the_learner_is_given_what_the_task_is_not(write):
     """Judged by a task without end, whatever the learner remembers."""
-    path = write(("[task]", '[task]\nguarantee = "none"'),
-                 ("discount = 0.9", 'discount = 0.9\nmemory = "F a"'))
+    path = write(
+        ("[task]", '[task]\nguarantee = "none"'),
+        ("discount = 0.9", 'discount = 0.9\nmemory = "F a"'),
+    )
     setup = prepared(path)
     policy = np.full((3, 9, len(setup.memory.delta), 4), 0.25)
     policy[:] = np.random.default_rng(0).dirichlet(np.ones(4), policy.shape[:-1])
@@ -161,7 +171,8 @@ def test_the_learner_is_given_what_the_task_is_not(write):
         model = part_of(setup.worlds.judged, w)
         value, _ = evaluate(model, lifted[w])
         np.testing.assert_allclose(
-            found.value[w], value[np.arange(9), np.asarray(model.initial_memory)], atol=1e-12)
+            found.value[w], value[np.arange(9), np.asarray(model.initial_memory)], atol=1e-12
+        )
 
 
 def test_a_horizon_is_for_tasks_that_are_decided_within_it(write):
@@ -227,12 +238,18 @@ s r b
 """]
 leave_out = ["map 3"]
 '''
-CARELESS = {"demonstrations": [
-    {"cells": [[4, 1], [3, 1], [3, 2], [3, 3], [3, 4], [3, 5]],
-     "actions": ["up", "right", "right", "right", "right", "down"]},
-    {"cells": [[4, 1], [4, 2], [3, 2], [3, 3], [3, 4], [4, 4]],
-     "actions": ["right", "up", "right", "right", "down", "right"]},
-]}
+CARELESS = {
+    "demonstrations": [
+        {
+            "cells": [[4, 1], [3, 1], [3, 2], [3, 3], [3, 4], [3, 5]],
+            "actions": ["up", "right", "right", "right", "right", "down"],
+        },
+        {
+            "cells": [[4, 1], [4, 2], [3, 2], [3, 3], [3, 4], [4, 4]],
+            "actions": ["right", "up", "right", "right", "down", "right"],
+        },
+    ]
+}
 
 
 def learned(path, seed=0):
@@ -272,7 +289,8 @@ def test_a_probability_is_reached_in_every_world(write, tmp_path):
     least = min(world["attained"] for world in counted)
     assert text.startswith(
         "Asked for 0.8500 in every world, new ones too, on average over its starts; certified at "
-        f"least {least:.4f} here: the task is weighed by mu = ")
+        f"least {least:.4f} here: the task is weighed by mu = "
+    )
     assert result["test"]["worlds"][2]["share"] == 1  # where it cannot be had
     # What is written plans the same in worlds that it is given.
     save_reward(tmp_path / "network.npz", job.learned_reward(outcome))
@@ -281,7 +299,8 @@ def test_a_probability_is_reached_in_every_world(write, tmp_path):
     scene = outcome.setup.worlds.scenes[1]
     _, solution = plan_in(reward, scene.mdp, scene.observation)
     np.testing.assert_allclose(
-        solution.policy, outcome.test.policy[0][: scene.mdp.num_states], atol=1e-6)
+        solution.policy, outcome.test.policy[0][: scene.mdp.num_states], atol=1e-6
+    )
     scene = outcome.setup.worlds.scenes[3]
     with pytest.raises(ValueError, match=r"guarantee = 0.85: the best .* is 0 .*least from state"):
         plan_in(reward, scene.mdp, scene.observation)
@@ -293,8 +312,7 @@ def test_a_probability_is_reached_in_every_world(write, tmp_path):
 def test_probabilities_are_reached_from_the_worst_start_too(write, tmp_path, asked, over):
     (tmp_path / "shown.json").write_text(json.dumps(CARELESS))
     worst = '\nover = "worst"' if over == "worst" else ""
-    outcome, _ = learned(write(
-        ("guarantee = 0.85", f"guarantee = {asked}{worst}"), text=RISKY))
+    outcome, _ = learned(write(("guarantee = 0.85", f"guarantee = {asked}{worst}"), text=RISKY))
     mixed = check_reached(outcome, asked, over)
     assert asked > 0.5 or (mixed, outcome.learned.weight) == (0, 0)
     # Nothing that was learned with another weight makes the demonstrations likelier.
@@ -305,8 +323,11 @@ def test_probabilities_are_reached_from_the_worst_start_too(write, tmp_path, ask
 @pytest.mark.slow
 def test_a_task_without_end_has_its_probability_by_moves_that_lose_nothing(write):
     """Any share of others would fail it in the end, and no weight changes that."""
-    outcome, result = learned(write(("[task]", "[task]\nguarantee = 0.7"),
-                                    ("\n[test]", '\n[test]\nleave_out = ["map 2"]')))
+    outcome, result = learned(
+        write(
+            ("[task]", "[task]\nguarantee = 0.7"), ("\n[test]", '\n[test]\nleave_out = ["map 2"]')
+        )
+    )
     assert outcome.learned.weight == 0
     for world in result["training"]["worlds"] + result["test"]["worlds"][:1]:
         assert (world["share"], world["attained"]) == (1, 1)
@@ -317,9 +338,13 @@ def test_what_no_policy_has_in_a_world_is_refused_with_what_is_possible(write, t
     (tmp_path / "shown.json").write_text(json.dumps(CARELESS))
     best = jl.optimal_satisfaction(own(prepared(write(text=RISKY)), 2))
     assert float(jnp.sum(best.value[0])) > 0
-    with pytest.raises(ValueError, match=(
+    with pytest.raises(
+        ValueError,
+        match=(
             r"\[task\] in the test world map 3: guarantee = 0.85: the best that can be achieved is "
-            r"0 on average .*least from row 1, column 1.*Or name it in \[test\] leave_out")):
+            r"0 on average .*least from row 1, column 1.*Or name it in \[test\] leave_out"
+        ),
+    ):
         prepared(write(('leave_out = ["map 3"]', ""), text=RISKY))
     narrow = (". . a . .", ". r a . .")
     with pytest.raises(ValueError, match=r"in the training world map 1: guarantee = 0.999: the be"):

@@ -52,9 +52,14 @@ def made():
     automaton = jl.to_automaton("!r U y")
     product = jl.product(world, automaton)
     coin = jl.make_sparse(
-        [0, 2, 3, 4], [0, 2, 4, 5, 6], [0, 1, 0, 2, 1, 2], [0.5, 0.5, 0.9, 0.1, 1.0, 1.0],
-        initial=[1, 0, 0], label={"done": [1, 2], "lost": [2]},
-        rewards={"steps": jl.Rewards(state=np.array([1.0, 0, 0]))})
+        [0, 2, 3, 4],
+        [0, 2, 4, 5, 6],
+        [0, 1, 0, 2, 1, 2],
+        [0.5, 0.5, 0.9, 0.1, 1.0, 1.0],
+        initial=[1, 0, 0],
+        label={"done": [1, 2], "lost": [2]},
+        rewards={"steps": jl.Rewards(state=np.array([1.0, 0, 0]))},
+    )
     rough = jl.make_interval(coin, [0.4, 0.4, 0.8, 0.0, 1, 1], [0.6, 0.6, 1.0, 0.2, 1, 1])
     solution = jl.reachability_probability(coin, coin.states_where("lost"))
     counts = jl.make_counts([0, 1, 0], [0, 0, 0], [1, 1, 0], [880, 5, 120], states=["dock", "bay"])
@@ -63,41 +68,127 @@ def made():
     objective = jl.Parity(np.zeros(32, np.int32), region, ~region, 2)
     estimate = jl.Estimate(0.5, 0.25, 0.75, 0.01, "exact")
     evaluation = jl.Evaluation(
-        estimate, None, None, estimate, None, estimate, estimate, None, None, 900, 100, 0, 1000, 50,
-        0.95, 0.5, None, None, jl.Status.MAX_STEPS)
+        estimate,
+        None,
+        None,
+        estimate,
+        None,
+        estimate,
+        estimate,
+        None,
+        None,
+        900,
+        100,
+        0,
+        1000,
+        50,
+        0.95,
+        0.5,
+        None,
+        None,
+        jl.Status.MAX_STEPS,
+    )
     box = jl.make_box(-1.0, [1.0, 2.0])
     environment = jl.make_environment(
-        partial(_start), partial(_step), partial(_see), actions=3, observations=box,
-        propositions=(), horizon=7)
+        partial(_start),
+        partial(_step),
+        partial(_see),
+        actions=3,
+        observations=box,
+        propositions=(),
+        horizon=7,
+    )
     satisfaction = jl.sparse_satisfaction(coin, "F lost")
     sure = jl.ConfidenceSets(
-        np.zeros(3), np.array([0.5, 0.25, 1]), np.zeros(3), None, np.zeros(2), np.array([6, 9]), 3,
-        0.95, "anytime")
+        np.zeros(3),
+        np.array([0.5, 0.25, 1]),
+        np.zeros(3),
+        None,
+        np.zeros(2),
+        np.array([6, 9]),
+        3,
+        0.95,
+        "anytime",
+    )
     found = [
-        world, jl.to_dense(world), automaton, product, coin, coin.rewards["steps"], rough, solution,
-        counts, game, objective, estimate, evaluation, box, environment, satisfaction, sure,
-        jl.make_monitor(automaton), jl.make_trajectories(world, [[(15, 0), (10, 0)], [(15, 3)]]),
-        jl.FiniteMemoryPolicy(np.zeros((20, 3), np.int32), np.zeros(20, np.int32),
-                              np.zeros((20, 3), np.int32)),
+        world,
+        jl.to_dense(world),
+        automaton,
+        product,
+        coin,
+        coin.rewards["steps"],
+        rough,
+        solution,
+        counts,
+        game,
+        objective,
+        estimate,
+        evaluation,
+        box,
+        environment,
+        satisfaction,
+        sure,
+        jl.make_monitor(automaton),
+        jl.make_trajectories(world, [[(15, 0), (10, 0)], [(15, 3)]]),
+        jl.FiniteMemoryPolicy(
+            np.zeros((20, 3), np.int32), np.zeros(20, np.int32), np.zeros((20, 3), np.int32)
+        ),
         jl.GR1(np.ones((2, 32), bool), np.ones((3, 32), bool), ~region),
         jl.Winning(game, objective, region, np.zeros(32, np.int32), np.zeros(32, np.int32)),
-        jl.Permissive(game, region, np.ones((32, 5), bool), np.arange(32), np.zeros(32), True,
-                      "maximal: it includes all"),
+        jl.Permissive(
+            game,
+            region,
+            np.ones((32, 5), bool),
+            np.arange(32),
+            np.zeros(32),
+            True,
+            "maximal: it includes all",
+        ),
         jl.Verification(False, True, "state 3 loses"),
-        jl.Answer(np.array([0]), np.array([0.5]), np.array([0.5]), np.array([0.5001]), [None],
-                  jl.Status.PRECISION, "levels", None),
-        jl.OptimalActions(np.ones((20, 3, 4), bool), np.ones((20, 3, 4)), solution, solution,
-                          np.float32(1e-7), np.int32(0)),
-        jl.OptimalityGap(np.arange(2), np.ones(2), solution, solution, np.zeros(2),
-                         np.array([0, 0.1]), (0.0, 0.05), (0.9, 0.9), (0.9, 0.95), "keyless"),
+        jl.Answer(
+            np.array([0]),
+            np.array([0.5]),
+            np.array([0.5]),
+            np.array([0.5001]),
+            [None],
+            jl.Status.PRECISION,
+            "levels",
+            None,
+        ),
+        jl.OptimalActions(
+            np.ones((20, 3, 4), bool),
+            np.ones((20, 3, 4)),
+            solution,
+            solution,
+            np.float32(1e-7),
+            np.int32(0),
+        ),
+        jl.OptimalityGap(
+            np.arange(2),
+            np.ones(2),
+            solution,
+            solution,
+            np.zeros(2),
+            np.array([0, 0.1]),
+            (0.0, 0.05),
+            (0.9, 0.9),
+            (0.9, 0.95),
+            "keyless",
+        ),
         jl.DataGuarantee(0.9, 0.95, 0.99, satisfaction, rough, sure, np.zeros(4)),
         jl.Table(coin, np.arange(3), np.zeros(1, int), np.zeros(3, bool), np.ones(3, bool), 9),
         jl.ParametricMDP(coin, None, np.zeros(2), np.ones(2), np.ones(2) / 2, ("p", "q")),
-        jl.Objective(formula="F a", threshold=0.5), jl.parse_property('P>=0.5 [ F "a" ]'),
+        jl.Objective(formula="F a", threshold=0.5),
+        jl.parse_property('P>=0.5 [ F "a" ]'),
         jl.ModelPart(np.arange(3), np.zeros(2, int), np.ones(2), rewards={"cost": np.ones(2)}),
         jl.TaskWorld(np.zeros(2), np.int32(1), np.int32(2), np.bool_(True), np.int32(3)),
-        jl.Episode(*[np.zeros((4, 5))] * 6, np.tri(4, 5, 1, bool), np.ones(4, bool),
-                   np.zeros(4, bool), np.ones((4, 5))),
+        jl.Episode(
+            *[np.zeros((4, 5))] * 6,
+            np.tri(4, 5, 1, bool),
+            np.ones(4, bool),
+            np.zeros(4, bool),
+            np.ones((4, 5)),
+        ),
     ]
     return {type(x).__name__: x for x in found}
 
@@ -178,7 +269,8 @@ def brief_classes():
             importlib.import_module(module.name)
     return {
         f"{found.__module__}.{found.__qualname__}": found
-        for name, module in list(sys.modules.items()) if name.startswith("jaxltl.")
+        for name, module in list(sys.modules.items())
+        if name.startswith("jaxltl.")
         for found in vars(module).values()
         if isinstance(found, type) and "_brief_facts" in vars(found)
     }
@@ -198,8 +290,12 @@ def test_every_public_type_shows_itself():
 
 HUGE = np.broadcast_to(np.float32(0.5), (10**6, 10**6))
 STRANGE = {
-    "too large to be read": HUGE, "abstract": jax.ShapeDtypeStruct((4, 3, 2), np.float32),
-    "none": None, "a text": "word " * 1000, "an object": object(), "a tree": {"a": [np.ones(3)]},
+    "too large to be read": HUGE,
+    "abstract": jax.ShapeDtypeStruct((4, 3, 2), np.float32),
+    "none": None,
+    "a text": "word " * 1000,
+    "an object": object(),
+    "a tree": {"a": [np.ones(3)]},
     "many lines": SimpleNamespace(text="\n" * 50),
 }
 
@@ -225,8 +321,12 @@ def test_formulas_are_cut_off():
 
 
 def trees():
-    return [x for x in made().values() if not jax.tree.all(jax.tree.map(lambda _: False, x)) and
-            all(isinstance(leaf, np.ndarray | jax.Array) for leaf in jax.tree.leaves(x))]
+    return [
+        x
+        for x in made().values()
+        if not jax.tree.all(jax.tree.map(lambda _: False, x))
+        and all(isinstance(leaf, np.ndarray | jax.Array) for leaf in jax.tree.leaves(x))
+    ]
 
 
 def test_traced_ones_are_told_by_their_shapes():
@@ -250,7 +350,8 @@ def test_lanes_are_counted_with_their_statuses():
     one = made()["Solution"]
     four = jax.tree.map(lambda x: np.stack([np.asarray(x)] * 4), one)
     four = four.replace(
-        status=np.array([0, 3, 0, 0]), upper=np.where(np.arange(4)[:, None] == 2, np.inf, 1.0))
+        status=np.array([0, 3, 0, 0]), upper=np.where(np.arange(4)[:, None] == 2, np.inf, 1.0)
+    )
     text = told(four)
     assert "4 lanes: 3 CONVERGED, 1 MAX_STEPS" in text
     assert "bounds at most 1 apart, none for 3 of 12" in text
@@ -282,7 +383,8 @@ def test_they_are_the_same_in_another_process_and_after_a_walk_over_the_tree():
 
 def test_settings_are_told_as_they_are():
     assert repr(behavioral_cloning.Hparams()) == (
-        "Hparams(learning_rate=0.003, l2=0.0, patience=500, batch=128)")
+        "Hparams(learning_rate=0.003, l2=0.0, patience=500, batch=128)"
+    )
     many = mlirl.Hparams(discount=np.linspace(0, 0.9, 20))
     assert "discount=float64[20] from 0 to 0.9, mu=None" in told(many)
     changing = cce.Hparams(rate=Linear(1.0, 0.1, 100))
@@ -293,18 +395,23 @@ def test_settings_are_told_as_they_are():
 def test_a_state_tells_its_steps_and_its_figures():
     state = mlirl.State(jax.random.key(0), np.int32(20), {"w": np.ones(8)}, np.ones((20, 3)), ())
     assert told(state) == (
-        "State(step=20, parameters=1 array of 8 numbers, value=float64[20, 3] all 1, optimizer=())")
+        "State(step=20, parameters=1 array of 8 numbers, value=float64[20, 3] all 1, optimizer=())"
+    )
     lanes = state.replace(step=np.array([20, 20]), key=jax.random.key(0))
     assert told(lanes).startswith("State( 2 lanes, step=[20, 20]")
 
 
 def test_rows_of_figures_are_told_by_the_last():
     rows = behavioral_cloning.Metrics(
-        loss=np.array([3.0, 2.0, 0.25]), held_out=np.array([1, 1, np.nan]),
-        gradient_norm=np.ones(3), status=np.array([0, 0, 4]))
+        loss=np.array([3.0, 2.0, 0.25]),
+        held_out=np.array([1, 1, np.nan]),
+        gradient_norm=np.ones(3),
+        status=np.array([0, 0, 4]),
+    )
     assert told(rows) == (
         "Metrics( the last of 3 rows, loss=0.25, held_out=nan, gradient_norm=1, "
-        "status=2 CONVERGED, 1 NONFINITE)")
+        "status=2 CONVERGED, 1 NONFINITE)"
+    )
     seeds = jax.tree.map(lambda x: np.stack([x, 2 * x]), rows)
     assert "the last of 2 x 3 rows, loss=[0.25, 0.5]" in told(seeds)
     learned = learner.Learned(seeds, rows, np.array([3, 2]), np.array([0, 3]))
@@ -313,8 +420,17 @@ def test_rows_of_figures_are_told_by_the_last():
 
 # --- pictures ------------------------------------------------------------------------------------
 
-DRAWN = ("MDP", "DenseMDP", "Automaton", "Product", "SparseMDP", "Solution", "Game", "Winning",
-         "Permissive")
+DRAWN = (
+    "MDP",
+    "DenseMDP",
+    "Automaton",
+    "Product",
+    "SparseMDP",
+    "Solution",
+    "Game",
+    "Winning",
+    "Permissive",
+)
 
 
 @pytest.mark.parametrize("name", DRAWN)

@@ -11,8 +11,13 @@ NAMES = ("aqua", "blue", "green", "magenta", "orange", "red", "yellow")
 
 
 def colors_at(place):
-    return [any(name == color and np.hypot(place[0] - x, place[1] - y) < radius
-                for color, x, y, radius in DISCS) for name in NAMES]
+    return [
+        any(
+            name == color and np.hypot(place[0] - x, place[1] - y) < radius
+            for color, x, y, radius in DISCS
+        )
+        for name in NAMES
+    ]
 
 
 def test_steps_and_colours_are_the_slow_worlds():
@@ -52,14 +57,23 @@ def test_episodes_begin_anywhere_outside_of_the_discs():
     assert (np.abs(places) <= 2).all() and not any(any(colors_at(x)) for x in places)
     random = np.random.default_rng(4).uniform(-2, 2, (20_000, 2))
     free = random[[not any(colors_at(x)) for x in random]]
-    for one, other in zip(np.histogram2d(*places.T, bins=4, range=[(-2, 2)] * 2)[0].ravel(),
-                          np.histogram2d(*free.T, bins=4, range=[(-2, 2)] * 2)[0].ravel(),
-                          strict=True):
+    for one, other in zip(
+        np.histogram2d(*places.T, bins=4, range=[(-2, 2)] * 2)[0].ravel(),
+        np.histogram2d(*free.T, bins=4, range=[(-2, 2)] * 2)[0].ravel(),
+        strict=True,
+    ):
         expected = other * 4000 / len(free)
         assert abs(one - expected) < 6 * np.sqrt(expected + 4)
     at = flat_world(start=(0.5, 0.7), horizon=None)
     assert at.labels(at.reset(jax.random.key(0))).tolist() == [
-        False, False, True, False, False, False, False]
+        False,
+        False,
+        True,
+        False,
+        False,
+        False,
+        False,
+    ]
 
 
 def test_nine_directions():
@@ -74,7 +88,8 @@ def test_nine_directions():
 def test_events_around_a_place_are_those_of_the_slow_world():
     world, radii = flat_world(), (0.3, 1.1)
     events = np.unique(
-        [colors_at(x) for x in np.random.default_rng(5).uniform(-2, 2, (5000, 2))], axis=0)
+        [colors_at(x) for x in np.random.default_rng(5).uniform(-2, 2, (5000, 2))], axis=0
+    )
     look = events_around(world, events, radii=radii, directions=6)
     assert look == events_around(world, events, radii=radii, directions=6) and hash(look)
     places = np.random.default_rng(6).uniform(-2, 2, (40, 2)).astype(np.float32)
@@ -82,8 +97,10 @@ def test_events_around_a_place_are_those_of_the_slow_world():
     assert found.shape == (40, 13, len(events))
     turn = np.arange(6) * np.pi / 3
     for place, seen in zip(places, found, strict=True):
-        there = [place, *(place + r * np.array([np.cos(t), np.sin(t)])
-                          for r in radii for t in turn)]
+        there = [
+            place,
+            *(place + r * np.array([np.cos(t), np.sin(t)]) for r in radii for t in turn),
+        ]
         for x, row in zip(there, seen, strict=True):
             if (np.abs(x) > 2).any():
                 assert not row.any()
@@ -93,24 +110,30 @@ def test_events_around_a_place_are_those_of_the_slow_world():
     assert met > 50
 
 
-@pytest.mark.parametrize(("options", "said"), [
-    ({"discs": []}, "at least one"),
-    ({"discs": [("red", 0, 0, 0)]}, "radii above zero"),
-    ({"time_step": 0}, "must be positive"),
-    ({"start": (3, 0)}, "within 2.0 of the middle"),
-    ({"discs": [("red", 0, 0, 9)]}, "hardly leave a place"),
-    ({"num_starts": 0}, "num_starts=0"),
-])
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"discs": []}, "at least one"),
+        ({"discs": [("red", 0, 0, 0)]}, "radii above zero"),
+        ({"time_step": 0}, "must be positive"),
+        ({"start": (3, 0)}, "within 2.0 of the middle"),
+        ({"discs": [("red", 0, 0, 9)]}, "hardly leave a place"),
+        ({"num_starts": 0}, "num_starts=0"),
+    ],
+)
 def test_what_does_not_fit_is_named(options, said):
     with pytest.raises(ValueError, match=said):
         flat_world(**options)
 
 
-@pytest.mark.parametrize(("options", "said"), [
-    ({"events": [[True]]}, "a column for each colour"),
-    ({"radii": [0.1, -1]}, "all positive"),
-    ({"directions": 0}, "directions=0"),
-])
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"events": [[True]]}, "a column for each colour"),
+        ({"radii": [0.1, -1]}, "all positive"),
+        ({"directions": 0}, "directions=0"),
+    ],
+)
 def test_what_cannot_be_seen_around_is_named(options, said):
     with pytest.raises(ValueError, match=said):
         events_around(flat_world(), **{"events": np.eye(7, dtype=bool), **options})

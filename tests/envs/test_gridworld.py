@@ -11,10 +11,13 @@ UP, DOWN, LEFT, RIGHT = range(4)
 
 
 def test_moves_walls_and_absorbing_cells():
-    world = jl.gridworld("""
+    world = jl.gridworld(
+        """
         b . #
         . y g
-    """, absorbing=["y"])
+    """,
+        absorbing=["y"],
+    )
     assert ACTIONS == ("up", "down", "left", "right")
     assert world.successor[:, :, 0].tolist() == [
         [0, 3, 0, 1],  # b
@@ -26,8 +29,12 @@ def test_moves_walls_and_absorbing_cells():
     ]
     assert world.propositions == ("b", "g", "y")
     assert world.label.tolist() == [
-        [True, False, False], [False] * 3, [False] * 3, [False] * 3,
-        [False, False, True], [False, True, False],
+        [True, False, False],
+        [False] * 3,
+        [False] * 3,
+        [False] * 3,
+        [False, False, True],
+        [False, True, False],
     ]
     np.testing.assert_allclose(world.initial, [0.2, 0.2, 0, 0.2, 0.2, 0.2])
 
@@ -50,9 +57,7 @@ def test_certain_slipping():
 
 
 def test_a_legend_names_propositions():
-    world = jl.gridworld(
-        "s#x", legend={"s": ["start", "safe"], "x": []}, initial="start & safe"
-    )
+    world = jl.gridworld("s#x", legend={"s": ["start", "safe"], "x": []}, initial="start & safe")
     assert world.propositions == ("safe", "start")
     assert world.label.tolist() == [[True, True], [False, False], [False, False]]
     assert world.initial.tolist() == [1, 0, 0]
@@ -66,8 +71,12 @@ def test_another_wall():
 
 @pytest.mark.parametrize(
     ("initial", "expected"),
-    [("b", [1, 0, 0, 0]), ("!b & !y", [0, 0.5, 0.5, 0]), ("true", [0.25] * 4),
-     ([0, 0, 0, 1], [0, 0, 0, 1])],
+    [
+        ("b", [1, 0, 0, 0]),
+        ("!b & !y", [0, 0.5, 0.5, 0]),
+        ("true", [0.25] * 4),
+        ([0, 0, 0, 1], [0, 0, 0, 1]),
+    ],
 )
 def test_initial_cells(initial, expected):
     assert jl.gridworld("b..y", initial=initial).initial.tolist() == expected

@@ -103,15 +103,19 @@ def test_an_episode_is_truncated_after_75_steps():
         return found.world, found
 
     _, found = jax.lax.scan(
-        move, world().reset(jax.random.key(4)), jax.random.split(jax.random.key(5), 75))
+        move, world().reset(jax.random.key(4)), jax.random.split(jax.random.key(5), 75)
+    )
     assert found.truncated.tolist() == [False] * 74 + [True]
 
 
 def test_a_given_map_and_where_it_is_begun():
     text = letter_world(layout=MAP, letters=3, horizon=None, flat=True)
     array = letter_world(
-        layout=[[0, -1, 1], [-1, -1, -1], [2, -1, 0]], letters=["a", "b", "c"], horizon=None,
-        start=3)
+        layout=[[0, -1, 1], [-1, -1, -1], [2, -1, 0]],
+        letters=["a", "b", "c"],
+        horizon=None,
+        start=3,
+    )
     assert text.observations.shape == (36,) and array.observations.shape == (3, 3, 4)
     keys = jax.random.split(jax.random.key(0), 200)
     drawn = jax.vmap(text.reset)(keys)
@@ -135,17 +139,20 @@ def test_maps_without_ways_are_uniform():
     assert (jax.vmap(free.labels)(drawn) == False).all()  # noqa: E712
 
 
-@pytest.mark.parametrize(("options", "said"), [
-    ({"size": 3}, "do not fit on 3 x 3 cells"),
-    ({"letters": 0}, "letters=0; it must be 1 to 26"),
-    ({"size": 4, "letters": 5, "copies": 3}, "too rare"),
-    ({"layout": "a b c"}, "1 x 3 cells; it must be square"),
-    ({"layout": "a z\nb .", "letters": 3}, "'z' is none of the letters"),
-    ({"layout": [[0, 9], [0, 0]], "letters": 3}, "integers .* from -1 to 2"),
-    ({"layout": "a a\na a"}, "no cell is empty"),
-    ({"layout": "a a\na .", "start": 4}, "start=4; it must be at most 3"),
-    ({"start": 4}, "for a given layout"),
-])
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"size": 3}, "do not fit on 3 x 3 cells"),
+        ({"letters": 0}, "letters=0; it must be 1 to 26"),
+        ({"size": 4, "letters": 5, "copies": 3}, "too rare"),
+        ({"layout": "a b c"}, "1 x 3 cells; it must be square"),
+        ({"layout": "a z\nb .", "letters": 3}, "'z' is none of the letters"),
+        ({"layout": [[0, 9], [0, 0]], "letters": 3}, "integers .* from -1 to 2"),
+        ({"layout": "a a\na a"}, "no cell is empty"),
+        ({"layout": "a a\na .", "start": 4}, "start=4; it must be at most 3"),
+        ({"start": 4}, "for a given layout"),
+    ],
+)
 def test_what_does_not_fit_is_named(options, said):
     with pytest.raises(ValueError, match=said):
         letter_world(**options)

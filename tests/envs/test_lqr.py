@@ -20,9 +20,14 @@ NETWORKS = ["2-2-1", "2-10-1", "2-10-10-1", "2-50-1"]
 def other_world():
     """Three states and two controls, with bounds of their own."""
     return lqr(
-        [[1, 0.5, 0], [0, 0.9, 0.2], [0.1, 0, 1]], [[0, 1], [1, 0], [0.3, 0.4]],
-        state_cost=[[2, 0.5, 0], [0.5, 1, 0], [0, 0, 0.5]], control_cost=[[0.4, 0.1], [0.1, 0.3]],
-        low=[-0.3, -0.1], high=[0.2, 0.5], start=[1, -2, 0.5], horizon=7,
+        [[1, 0.5, 0], [0, 0.9, 0.2], [0.1, 0, 1]],
+        [[0, 1], [1, 0], [0.3, 0.4]],
+        state_cost=[[2, 0.5, 0], [0.5, 1, 0], [0, 0, 0.5]],
+        control_cost=[[0.4, 0.1], [0.1, 0.3]],
+        low=[-0.3, -0.1],
+        high=[0.2, 0.5],
+        start=[1, -2, 0.5],
+        horizon=7,
     )
 
 
@@ -52,7 +57,8 @@ def test_runs_against_a_plain_simulation(spec):
     parameters = jnp.asarray(0.3 * RNG.normal(size=network.num_parameters))
     run = simulate(world, network, parameters)
     total, violation, controls = plainly(
-        world, lambda _, x: apply(network, parameters, jnp.asarray(x)))
+        world, lambda _, x: apply(network, parameters, jnp.asarray(x))
+    )
     np.testing.assert_allclose(run.control, controls, rtol=1e-9)
     np.testing.assert_allclose((run.total, run.violation), (total, violation), rtol=1e-9)
     objective, cost = evaluator(world, network)(parameters, None)
@@ -71,8 +77,7 @@ def test_doing_nothing_is_the_scale():
     assert lqr(scale=3.0).scale == 3
 
 
-@pytest.mark.parametrize(
-    "spec", ["2-2-1", pytest.param("2-10-10-1", marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("spec", ["2-2-1", pytest.param("2-10-10-1", marks=pytest.mark.exhaustive)])
 def test_batches_are_single_evaluations(spec):
     evaluate = evaluator(lqr(), spec)
     parameters = jnp.asarray(0.4 * RNG.normal(size=(3, 2, 4, make_network(spec).num_parameters)))
@@ -105,7 +110,8 @@ def test_batches_of_worlds():
     paired = jax.jit(jax.vmap(lambda w, p: evaluator(w, "2-2-1")(p, None)))(both, parameters[:2])
     for i, world in enumerate(worlds):
         np.testing.assert_allclose(
-            [x[i] for x in found], population(world, parameters), rtol=1e-9, atol=1e-12)
+            [x[i] for x in found], population(world, parameters), rtol=1e-9, atol=1e-12
+        )
         np.testing.assert_allclose([x[i] for x in paired], [x[i, i] for x in found], rtol=1e-9)
 
 
@@ -137,7 +143,14 @@ def test_the_published_optimum():
     assert abs(best.total - BEST) < 1e-11
     assert best.residual < 1e-12
     expected = [0.2] * 7 + [
-        -0.09154264, -0.2, -0.10532896, -0.01603342, 0.00645174, 0.00514323, 0.00155198]
+        -0.09154264,
+        -0.2,
+        -0.10532896,
+        -0.01603342,
+        0.00645174,
+        0.00514323,
+        0.00155198,
+    ]
     np.testing.assert_allclose(best.control[:14, 0], expected, atol=5e-9)
 
 
@@ -155,8 +168,9 @@ def test_the_optimum_by_its_states_and_controls(world):
 
     def cost(z):
         x, u = split(z)
-        gradient = np.concatenate([2 * (x @ world.state_cost).ravel(),
-                                   2 * (u @ world.control_cost).ravel()])
+        gradient = np.concatenate(
+            [2 * (x @ world.state_cost).ravel(), 2 * (u @ world.control_cost).ravel()]
+        )
         return gradient @ z / 2, gradient
 
     def defect(z):
@@ -167,9 +181,14 @@ def test_the_optimum_by_its_states_and_controls(world):
     zero = np.zeros(horizon * (n + m))
     jacobian = np.stack([defect(e) - defect(zero) for e in np.eye(len(zero))], axis=1)
     bounds = [(None, None)] * (horizon * n) + list(
-        zip(np.tile(world.low, horizon), np.tile(world.high, horizon), strict=True))
+        zip(np.tile(world.low, horizon), np.tile(world.high, horizon), strict=True)
+    )
     found = minimize(
-        cost, zero, jac=True, method="SLSQP", bounds=bounds,
+        cost,
+        zero,
+        jac=True,
+        method="SLSQP",
+        bounds=bounds,
         constraints={"type": "eq", "fun": defect, "jac": lambda z: jacobian},
         options={"ftol": 1e-15, "maxiter": 500},
     )
@@ -197,8 +216,9 @@ def test_the_optimum_meets_its_conditions_and_is_the_least():
     assert (np.abs(slope)[~(at_low | at_high)] < 1e-9).all()
     assert (slope[at_low] >= -1e-9).all() and (slope[at_high] <= 1e-9).all()
     for _ in range(50):
-        other = np.clip(best.control + 0.1 * RNG.normal(size=best.control.shape), world.low,
-                        world.high)
+        other = np.clip(
+            best.control + 0.1 * RNG.normal(size=best.control.shape), world.low, world.high
+        )
         assert total(jnp.asarray(other)) > best.total
 
 
@@ -263,7 +283,8 @@ def test_the_environment_is_the_run(world):
     np.testing.assert_allclose(reward / world.scale, objective, rtol=1e-9)
     np.testing.assert_allclose(cost, violation, rtol=1e-9)
     episode = run_episode(
-        jax.random.key(0), environment, agent(parameters[0]), num_steps=world.horizon + 2)
+        jax.random.key(0), environment, agent(parameters[0]), num_steps=world.horizon + 2
+    )
     run = simulate(world, network, parameters[0])
     assert episode.valid.sum() == world.horizon and episode.terminated
     np.testing.assert_allclose(episode.world.state[: world.horizon + 1], run.state, rtol=1e-9)

@@ -17,18 +17,29 @@ WORLD = navigation()
 NETWORK = policy_network(WORLD)
 
 observe, labels, obstacle_distance, reward, move = map(
-    jax.jit, (nav.observe, nav.labels, nav.obstacle_distance, nav.reward, nav.move))
+    jax.jit, (nav.observe, nav.labels, nav.obstacle_distance, nav.reward, nav.move)
+)
 scores = jax.jit(nav.scores, static_argnums=2)
-act = jax.jit(lambda world, network, parameters, state: apply(
-    network, parameters, nav.observe(world, state)))
+act = jax.jit(
+    lambda world, network, parameters, state: apply(network, parameters, nav.observe(world, state))
+)
 
 
 def crowded():
     """Another map, on which random policies meet everything; a short horizon."""
     return navigation(
-        goal=[(-1, -1), (1, 0.5)], obstacle=[(-2.5, 0.7), (2, 1.5)], bounds=[(-3, -2), (3, 2)],
-        start=[(-2, -1.5), (2, 1.8)], speed=1.5, turn=0.9, time_step=0.4, radii=(0.4, 1.1),
-        num_directions=5, strip=(-1.8, -1.0), weight=7.0, horizon=8,
+        goal=[(-1, -1), (1, 0.5)],
+        obstacle=[(-2.5, 0.7), (2, 1.5)],
+        bounds=[(-3, -2), (3, 2)],
+        start=[(-2, -1.5), (2, 1.8)],
+        speed=1.5,
+        turn=0.9,
+        time_step=0.4,
+        radii=(0.4, 1.1),
+        num_directions=5,
+        strip=(-1.8, -1.0),
+        weight=7.0,
+        horizon=8,
     )
 
 
@@ -77,8 +88,10 @@ def judge(world, states, task):
     goal = [is_in(world.goal, x, y) for x, y, _ in states]
     crash = [is_in(world.obstacle, x, y) for x, y, _ in states]
     strip = [world.strip[0] <= y <= world.strip[1] for _, y, _ in states]
-    earned = [1 if g else 2 * abs(s[1]) if inside else 0
-              for g, s, inside in zip(goal, states, strip, strict=True)]
+    earned = [
+        1 if g else 2 * abs(s[1]) if inside else 0
+        for g, s, inside in zip(goal, states, strip, strict=True)
+    ]
     nearest = world.weight * min(distance(world.obstacle, x, y) for x, y, _ in states)
     objective = sum(earned) if task in (1, 4) else nearest
     cost = {1: -any(goal), 2: -any(goal), 3: -sum(goal), 4: -(any(goal) and not any(crash))}
@@ -97,7 +110,9 @@ def random_policy(network, size=()):
 
 @pytest.mark.parametrize(
     ("world", "radii", "count"),
-    [(WORLD, (0.5, 1, 1.5, 2, 2.5), 12), (crowded(), (0.4, 1.1), 5)], ids=["default", "crowded"])
+    [(WORLD, (0.5, 1, 1.5, 2, 2.5), 12), (crowded(), (0.4, 1.1), 5)],
+    ids=["default", "crowded"],
+)
 def test_the_sensor_against_every_point(world, radii, count):
     states = random_states(world, 300)
     seen = np.asarray(observe(world, states))
@@ -146,11 +161,18 @@ def test_runs_against_a_plain_simulation(world, absorbing):
     stayed = turned = 0
     for seed in range(5):
         parameters = random_policy(network)
-        run = simulate(world, network, parameters, jax.random.key(seed), num_trajectories=6,
-                       absorbing=absorbing)
+        run = simulate(
+            world,
+            network,
+            parameters,
+            jax.random.key(seed),
+            num_trajectories=6,
+            absorbing=absorbing,
+        )
         assert run.state.x.shape == (6, world.horizon)
         np.testing.assert_allclose(
-            run.action, act(world, network, parameters, run.state), atol=1e-9)
+            run.action, act(world, network, parameters, run.state), atol=1e-9
+        )
         found = np.stack(run.state, axis=-1)
         for states, actions in zip(found, np.asarray(run.action), strict=True):
             expected = follow(world, states[0], actions, absorbing)
@@ -230,7 +252,8 @@ def test_the_key_decides():
     parameters = random_policy(network)
     one, again, other = (
         simulate(world, network, parameters, jax.random.key(s), num_trajectories=6)
-        for s in (0, 0, 1))
+        for s in (0, 0, 1)
+    )
     np.testing.assert_array_equal(np.stack(one.state), np.stack(again.state))
     assert (np.stack(one.state) != np.stack(other.state)).any(0).all()
 
@@ -274,8 +297,7 @@ def test_evaluations_are_differentiable_in_the_parameters():
     objective = jax.jit(jax.value_and_grad(lambda p: evaluate(p, jax.random.key(0))[0]))
 
     step = 1e-6
-    (more, _), (less, _), (_, slope) = (
-        objective(parameters + t * way) for t in (step, -step, 0.0))
+    (more, _), (less, _), (_, slope) = (objective(parameters + t * way) for t in (step, -step, 0.0))
     np.testing.assert_allclose(slope @ way, (more - less) / (2 * step), rtol=1e-5)
 
 

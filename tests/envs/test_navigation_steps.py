@@ -14,8 +14,14 @@ from jaxltl.envs.navigation_steps import as_environment
 from jaxltl.envs.networks import network_agent
 
 WORLD = nav.navigation(
-    goal=[(-1, -1), (1, 0.5)], obstacle=[(-2.5, 0.7), (2, 1.5)], bounds=[(-3, -2), (3, 2)],
-    start=[(-2, -1.5), (2, 1.8)], speed=1.5, turn=0.9, horizon=8)
+    goal=[(-1, -1), (1, 0.5)],
+    obstacle=[(-2.5, 0.7), (2, 1.5)],
+    bounds=[(-3, -2), (3, 2)],
+    start=[(-2, -1.5), (2, 1.8)],
+    speed=1.5,
+    turn=0.9,
+    horizon=8,
+)
 NETWORK = nav.policy_network(WORLD, (4,))
 PARAMETERS = 0.7 * jax.random.normal(jax.random.key(5), (3, NETWORK.num_parameters))
 
@@ -39,13 +45,20 @@ def test_episodes_are_trajectories(task):
     assert len(set(seen)) > 1
     episode = jax.jit(lambda: run_episode(own, environment, agent(parameters), num_steps=9))()
     assert episode.terminated and episode.valid.sum() == 8
-    run = nav.simulate(WORLD, NETWORK, parameters, jax.random.split(own)[0], num_trajectories=1,
-                       absorbing=task == 1)
+    run = nav.simulate(
+        WORLD,
+        NETWORK,
+        parameters,
+        jax.random.split(own)[0],
+        num_trajectories=1,
+        absorbing=task == 1,
+    )
     for x, y in zip(episode.world.state, run.state, strict=True):
         np.testing.assert_allclose(x[:8], y[0], atol=1e-9)
     np.testing.assert_allclose(episode.action[:8], run.action[0], atol=1e-9)
-    np.testing.assert_array_equal(episode.label[:8], nav.labels(
-        WORLD, jax.tree.map(lambda x: x[0], run.state)))
+    np.testing.assert_array_equal(
+        episode.label[:8], nav.labels(WORLD, jax.tree.map(lambda x: x[0], run.state))
+    )
 
 
 @pytest.mark.slow
@@ -59,10 +72,15 @@ def test_a_formula_is_judged_on_it():
         return agent.act(memory, observation.world, allowed, key)
 
     found = evaluate(
-        jax.random.key(0), agent.replace(act=read_the_world), task, num_episodes=200, batch=200)
-    runs = jax.jit(jax.vmap(lambda i: run_episode(
-        jax.random.fold_in(jax.random.key(0), i), environment, agent, num_steps=8)))(
-            jnp.arange(200))
+        jax.random.key(0), agent.replace(act=read_the_world), task, num_episodes=200, batch=200
+    )
+    runs = jax.jit(
+        jax.vmap(
+            lambda i: run_episode(
+                jax.random.fold_in(jax.random.key(0), i), environment, agent, num_steps=8
+            )
+        )
+    )(jnp.arange(200))
     goal, obstacle = np.moveaxis(np.asarray(runs.label), -1, 0)
     won = goal.any(1) & ~obstacle.any(1)
     assert found.success.mean == won.mean() and 0 < won.mean() < 1

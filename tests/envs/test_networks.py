@@ -30,8 +30,9 @@ def slowly(network, parameters, inputs):
         bias = [next(numbers) for _ in range(m)] if network.biases else [0.0] * m
         last = i == len(network.sizes) - 2
         activation = PLAIN[network.output if last else network.hidden]
-        inputs = [activation(sum(weight[k][j] * inputs[k] for k in range(n)) + bias[j])
-                  for j in range(m)]
+        inputs = [
+            activation(sum(weight[k][j] * inputs[k] for k in range(n)) + bias[j]) for j in range(m)
+        ]
     assert next(numbers, None) is None
     return inputs
 
@@ -49,8 +50,9 @@ CASES = [
 def test_networks_against_a_plain_loop(network):
     parameters = RNG.normal(size=(6, network.num_parameters))
     inputs = RNG.normal(size=(6, 3, network.sizes[0]))
-    expected = [[slowly(network, p, x) for x in rows]
-                for p, rows in zip(parameters, inputs, strict=True)]
+    expected = [
+        [slowly(network, p, x) for x in rows] for p, rows in zip(parameters, inputs, strict=True)
+    ]
     one = jax.jit(apply)
     alone = [one(network, p, x) for p, x in zip(parameters, inputs, strict=True)]
     np.testing.assert_allclose(alone, expected, rtol=1e-12, atol=1e-12)
@@ -74,8 +76,11 @@ def test_lanes_may_have_several_axes_or_none():
 def test_written_out_sums(count):
     weight, inputs = RNG.normal(size=(count, 4, 5)), RNG.normal(size=(count, 5))
     np.testing.assert_allclose(
-        weighted(jnp.asarray(weight), jnp.asarray(inputs)), np.einsum("iol,il->ol", weight, inputs),
-        rtol=1e-12, atol=1e-12)
+        weighted(jnp.asarray(weight), jnp.asarray(inputs)),
+        np.einsum("iol,il->ol", weight, inputs),
+        rtol=1e-12,
+        atol=1e-12,
+    )
 
 
 def test_the_numbers_of_parameters():
@@ -115,8 +120,12 @@ def test_shapes_that_do_not_fit_are_refused():
 
 def world_of(actions, **more):
     return make_environment(
-        lambda key: jnp.zeros(2), lambda world, action, key: Timestep(world, 0.0, False),
-        lambda world: {"a": world, "b": world > 0}, actions=actions, **more)
+        lambda key: jnp.zeros(2),
+        lambda world, action, key: Timestep(world, 0.0, False),
+        lambda world: {"a": world, "b": world > 0},
+        actions=actions,
+        **more,
+    )
 
 
 def test_networks_act():
@@ -133,7 +142,9 @@ def test_networks_act():
     agent = network_agent(network, world_of(4))(parameters)
     assert agent.act((), seen, None, None)[0] == said.argmax()
     allowed = np.arange(4) != said.argmax()
-    assert agent.act((), seen, jnp.asarray(allowed), None)[0] == np.where(
-        allowed, said, -np.inf).argmax()
+    assert (
+        agent.act((), seen, jnp.asarray(allowed), None)[0]
+        == np.where(allowed, said, -np.inf).argmax()
+    )
     with pytest.raises(ValueError, match="4 observations, its inputs, and its actions take 3"):
         network_agent(network, world_of(3))

@@ -18,10 +18,14 @@ from jaxltl.envs.post_offices import ACTIONS, patrol, patrol_reward, post_office
 DISCOUNT = 0.6
 STEPS = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
 DANGER = {  # by the light: the block, and the moves round it that are paid
-    1: ({(0, 0), (0, 1), (1, 0), (1, 1)},
-        {(0, 0): "down", (1, 0): "right", (1, 1): "up", (0, 1): "left"}),
-    0: ({(1, 1), (1, 2), (2, 1), (2, 2)},
-        {(1, 1): "right", (1, 2): "down", (2, 2): "left", (2, 1): "up"}),
+    1: (
+        {(0, 0), (0, 1), (1, 0), (1, 1)},
+        {(0, 0): "down", (1, 0): "right", (1, 1): "up", (0, 1): "left"},
+    ),
+    0: (
+        {(1, 1), (1, 2), (2, 1), (2, 2)},
+        {(1, 1): "right", (1, 2): "down", (2, 2): "left", (2, 1): "up"},
+    ),
 }
 P1, P2 = (0, 2), (2, 0)
 
@@ -77,10 +81,15 @@ def test_the_world_by_a_plain_reading():
         assert bool(game.system[state]) == bool(turn)
         assert game.label[state].tolist() == [cell == P1, cell == P2]
         assert game.initial[state] == pytest.approx(turn / 18)
-        assert_moves(game, reward, state, {
-            action: (number(*target), paid)
-            for action, (*target, paid) in plain_moves(cell, light, turn).items()
-        })
+        assert_moves(
+            game,
+            reward,
+            state,
+            {
+                action: (number(*target), paid)
+                for action, (*target, paid) in plain_moves(cell, light, turn).items()
+            },
+        )
 
 
 def test_what_is_learned_by_a_plain_reading():
@@ -90,15 +99,23 @@ def test_what_is_learned_by_a_plain_reading():
     for (cell, light, turn), memory in pairs(STATES, range(4)):
         state = number(cell, light, turn, memory, 4)
         assert (model.cell[state], model.light[state], model.memory[state]) == (
-            3 * cell[0] + cell[1], light, memory)
+            3 * cell[0] + cell[1],
+            light,
+            memory,
+        )
         assert bool(model.accepting[state]) == (memory == 3)
         assert bool(game.system[state]) == bool(turn)
         assert game.initial[state] == pytest.approx((turn and memory == 0) / 18)
         then = plain_memory(memory, cell)
-        assert_moves(game, model.reward, state, {
-            action: (number(*target, then, 4), paid)
-            for action, (*target, paid) in plain_moves(cell, light, turn).items()
-        })
+        assert_moves(
+            game,
+            model.reward,
+            state,
+            {
+                action: (number(*target, then, 4), paid)
+                for action, (*target, paid) in plain_moves(cell, light, turn).items()
+            },
+        )
 
 
 def test_the_automaton_says_what_the_formula_says():

@@ -23,8 +23,12 @@ from jaxltl.envs.robots import (
 from jaxltl.envs.text_map import parse_map
 
 STEPS = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1), "stay": (0, 0)}
-SIDES = {"up": ("left", "right"), "down": ("left", "right"),
-         "left": ("up", "down"), "right": ("up", "down")}
+SIDES = {
+    "up": ("left", "right"),
+    "down": ("left", "right"),
+    "left": ("up", "down"),
+    "right": ("up", "down"),
+}
 UNAVAILABLE = {}
 
 
@@ -60,6 +64,7 @@ def host(game):
 
 def plain_moves(place, cell, *, stays, slip):
     """Where a robot's moves lead: for each action, a probability for each cell."""
+
     def ahead(move):
         target = (cell[0] + STEPS[move][0], cell[1] + STEPS[move][1])
         return target if target in place else cell
@@ -96,9 +101,9 @@ def assert_is(game, place, *, system_stays=True, environment_stays=False, slip=0
                 assert moves(game, first, a) == {
                     number(index[c], y, 1, count): p for c, p in to_move[a].items()
                 }
-                assert moves(game, second, a) == pytest.approx({
-                    number(e, index[c], 0, count): p for c, p in own[a].items()
-                })
+                assert moves(game, second, a) == pytest.approx(
+                    {number(e, index[c], 0, count): p for c, p in own[a].items()}
+                )
 
 
 # --- robots --------------------------------------------------------------------------------------
@@ -106,8 +111,14 @@ def assert_is(game, place, *, system_stays=True, environment_stays=False, slip=0
 
 @pytest.mark.parametrize(
     ("size", "states", "system_states"),
-    [(3, 120, 72), (4, 432, 240), (5, 1120, 600), (6, 2400, 1260), (8, 7840, 4032),
-     (10, 19440, 9900)],
+    [
+        (3, 120, 72),
+        (4, 432, 240),
+        (5, 1120, 600),
+        (6, 2400, 1260),
+        (8, 7840, 4032),
+        (10, 19440, 9900),
+    ],
 )
 def test_the_safe_part_has_the_published_size(size, states, system_states):
     game = safe_part(robots(size))
@@ -155,8 +166,11 @@ def test_labels_and_starts_of_robots():
                 expected |= {f"system_{name}"} if y == cell else set()
             for turn in (0, 1):
                 state = number(e, y, turn, count)
-                shown = {p for p, holds in zip(game.propositions, game.label[state], strict=True)
-                         if holds}
+                shown = {
+                    p
+                    for p, holds in zip(game.propositions, game.label[state], strict=True)
+                    if holds
+                }
                 assert shown == expected | ({"system_turn"} if turn else set())
                 start = 1 / (count * (count - 1)) if turn and e != y else 0
                 assert game.initial[state] == pytest.approx(start)
@@ -189,11 +203,14 @@ def test_the_reward_is_for_the_systems_moves_to_a_diagonal(make):
 
 
 def test_the_reward_of_a_slipping_robot_is_a_chance():
-    game = grid_game("""
+    game = grid_game(
+        """
         . . .
         . . .
         . . .
-    """, slip=0.2)
+    """,
+        slip=0.2,
+    )
     reward = diagonal_reward(game)
     # The environment above the middle; the system, left of it, is diagonal in the middle's left
     # cell (1, 0) and in (1, 2). Downwards from (0, 0) it arrives in (1, 0), or slips to stay or
@@ -256,8 +273,12 @@ MAP = """
 def test_maps_move_as_a_plain_reading_says(slip, system_stays, environment_stays):
     stays = {"system_stays": system_stays, "environment_stays": environment_stays}
     game = grid_game(MAP, slip=slip, **stays)
-    place = [(r, c) for r, row in enumerate(parse_map(MAP).tolist())
-             for c, kind in enumerate(row) if kind != "#"]
+    place = [
+        (r, c)
+        for r, row in enumerate(parse_map(MAP).tolist())
+        for c, kind in enumerate(row)
+        if kind != "#"
+    ]
     assert places(MAP).tolist() == [list(cell) for cell in place]
     assert_is(game, place, slip=slip, **stays)
     assert is_deterministic(game) == (slip == 0)
@@ -281,8 +302,15 @@ def test_a_map_without_walls_is_the_game_of_robots_upside_down():
 def test_labels_of_a_map():
     game = host(grid_game("s#x\nxx.", legend={"s": ["home", "base"], "x": ["goal"], ".": []}))
     assert game.propositions == (
-        "collision", "diagonal", "system_turn", "environment_base", "environment_goal",
-        "environment_home", "system_base", "system_goal", "system_home",
+        "collision",
+        "diagonal",
+        "system_turn",
+        "environment_base",
+        "environment_goal",
+        "environment_home",
+        "system_base",
+        "system_goal",
+        "system_home",
     )
     shown = [["base", "home"], ["goal"], ["goal"], ["goal"], []]  # in reading order, no wall
     where = places("s#x\nxx.")
@@ -327,10 +355,16 @@ def test_another_wall():
         ("##", {}, "holds in no cell of the map"),
         ("a?", {"legend": {"a": []}}, r"cell '\?' \(row 1, column 2\) is not in the legend"),
         ("..", {"slip": 1.5}, "slip=1.5; it must be a probability"),
-        (".#\n..", {"system_start": (0, 1)},
-         r"system_start=\(0, 1\) is a wall \(row 1, column 2 of the map\)"),
-        ("..", {"environment_start": (1, 0)},
-         r"environment_start=\(1, 0\) is off the map, whose rows are 0 to 0 and columns 0 to 1"),
+        (
+            ".#\n..",
+            {"system_start": (0, 1)},
+            r"system_start=\(0, 1\) is a wall \(row 1, column 2 of the map\)",
+        ),
+        (
+            "..",
+            {"environment_start": (1, 0)},
+            r"environment_start=\(1, 0\) is off the map, whose rows are 0 to 0 and columns 0 to 1",
+        ),
         ("..", {"environment_start": (0, -1)}, r"environment_start=\(0, -1\) is off the map"),
         ("..", {"system_start": (0, 1, 2)}, "give a formula .* or a cell's row and column"),
         ("..", {"system_start": (0.0, 1.0)}, "give a formula .* or a cell's row and column"),
@@ -338,10 +372,17 @@ def test_another_wall():
         ("ab", {"system_start": "a & b"}, "system_start='a & b' holds in no cell"),
         ("ab", {"system_start": "F a"}, "system_start: 'F a' is not Boolean"),
         ("ab", {"system_start": "a", "environment_start": "a"}, "one and the same cell"),
-        ("..#.", {}, "the environment has no move from the cell in row 1, column 4, which walls "
-                     "enclose; .* set environment_stays=True"),
-        ("..#.", {"environment_stays": True, "system_stays": False},
-         "the system has no move from the cell in row 1, column 4"),
+        (
+            "..#.",
+            {},
+            "the environment has no move from the cell in row 1, column 4, which walls "
+            "enclose; .* set environment_stays=True",
+        ),
+        (
+            "..#.",
+            {"environment_stays": True, "system_stays": False},
+            "the system has no move from the cell in row 1, column 4",
+        ),
         ("ab", {"legend": {"a": ["turn"], "b": []}}, "'turn' is a proposition of the map"),
     ],
 )

@@ -15,7 +15,9 @@ from jaxltl.io.colored_world import load_world, read_world, save_world
 from tests import support
 
 PLAN = {
-    "o1": [(1, 7)], "o2": [(7, 1)], "o3": [(10, 10)],
+    "o1": [(1, 7)],
+    "o2": [(7, 1)],
+    "o3": [(10, 10)],
     "ob": [(4, 4), (4, 5), (4, 6), (4, 7), (10, 7)],
 }
 KINDS = {**tg.OBJECTS, **tg.OBSTACLES}
@@ -64,8 +66,10 @@ def test_colours_follow_the_seed_and_inner_ones_not_the_margin():
     np.testing.assert_array_equal(world.colors, tg.training_world(3).colors)
     np.testing.assert_array_equal(world.colors, tg.training_world(3, margin=2).colors[1:-1, 1:-1])
     assert (np.asarray(world.colors) != np.asarray(tg.training_world(4).colors)).any()
-    shares = np.bincount(np.concatenate(
-        [np.asarray(tg.training_world(i).colors)[0, :6] for i in range(40)]), minlength=5)
+    shares = np.bincount(
+        np.concatenate([np.asarray(tg.training_world(i).colors)[0, :6] for i in range(40)]),
+        minlength=5,
+    )
     assert shares.sum() == 240 and (shares > 25).all()  # free cells have all colours
 
 
@@ -132,7 +136,13 @@ def test_random_worlds_of_other_sizes_objects_and_tasks():
     objects = many_objects(5)
     task = "!ob U (o5 & (!ob U o4))"
     world = tg.random_world(
-        2, task, shape=(12, 17), objects=objects, num_obstacles=9, min_distance=5, margin=2,
+        2,
+        task,
+        shape=(12, 17),
+        objects=objects,
+        num_obstacles=9,
+        min_distance=5,
+        margin=2,
         slip=0.1,
     )
     check_random(world, {**objects, **tg.OBSTACLES}, 9, 5)
@@ -151,8 +161,13 @@ def test_random_worlds_for_tasks_without_end(task):
 
 
 def test_random_worlds_are_drawn_until_a_task_without_end_can_be_done():
-    options = {"shape": (5, 5), "objects": {"o1": tg.OBJECTS["o1"]}, "num_obstacles": 5,
-               "obstacle_distance": 1}
+    options = {
+        "shape": (5, 5),
+        "objects": {"o1": tg.OBJECTS["o1"]},
+        "num_obstacles": 5,
+        "obstacle_distance": 1,
+    }
+
     def failing(worlds, task):
         return [infeasible_starts(exit_product(world, task)).any() for world in worlds]
 
@@ -188,47 +203,75 @@ def test_starts_without_a_way_are_found():
     assert not infeasible_starts(exit_product(world, "F (o1 & F o2)")).any()
 
 
-@pytest.mark.parametrize("task, slip, label_on", [
-    ("!ob U (o1 & (!ob U o2))", 0.0, "exit"),
-    ("!ob U (o1 & (!ob U o2))", 0.2, "entry"),
-    ("F (o1 & X o1)", 0.2, "exit"),
-    ("(!o2 U o1) & F o2", 0.0, "entry"),
-])
+@pytest.mark.parametrize(
+    "task, slip, label_on",
+    [
+        ("!ob U (o1 & (!ob U o2))", 0.0, "exit"),
+        ("!ob U (o1 & (!ob U o2))", 0.2, "entry"),
+        ("F (o1 & X o1)", 0.2, "exit"),
+        ("(!o2 U o1) & F o2", 0.0, "entry"),
+    ],
+)
 def test_feasibility_agrees_with_the_attractor(task, slip, label_on):
     world = tg.make_world(WALLED, 0, shape=(7, 6), slip=slip)
     model = jl.product(world.mdp, task, label_on=label_on)
     can = np.asarray(jl.attractor(model, model.final, model.available).region)
     if label_on == "exit":  # as the generator reads
-        found = tg._can_finish(*(
-            np.asarray(x) for x in (world.mdp.successor, model.next_memory, model.automaton.final)))
+        found = tg._can_finish(
+            *(
+                np.asarray(x)
+                for x in (world.mdp.successor, model.next_memory, model.automaton.final)
+            )
+        )
         np.testing.assert_array_equal(found, can)
     expected = ~can[np.arange(42), np.asarray(model.initial_memory)]
     expected &= np.asarray(world.mdp.initial) > 0
     np.testing.assert_array_equal(infeasible_starts(model), expected)
 
 
-@pytest.mark.parametrize("make, message", [
-    (lambda: tg.random_world(5, "F o4"), r"'o4', which the world does not have"),
-    (lambda: tg.random_world(5, "F (o1 & o2)", max_tries=3), r"seed 5: in 3 placements on 10 x 10"),
-    (lambda: tg.random_world(5, shape=(3, 3), max_tries=3), "the objects had no room"),
-    (lambda: tg.random_world(5, num_obstacles=-1), "num_obstacles=-1; give 0 or more"),
-    (lambda: tg.random_world(5, shape=(0, 3)), r"shape=\(0, 3\)"),
-    (lambda: tg.make_world({"o9": [(1, 1)]}, 0), "'o9' is no kind of cell; there are o1, o2"),
-    (lambda: tg.make_world({"o1": [(0, 3)]}, 0), r"o1 in cell \(0, 3\) is outside"),
-    (lambda: tg.make_world({"o1": [(2, 3)], "o2": [(2, 3)]}, 0), r"cell \(2, 3\) is used twice"),
-    (lambda: tg.make_world({"o1": [(2, 3)], "o2": [(4, 4)]}, 0), r"patch of o2 in cell \(4, 4\)"),
-    (lambda: tg.make_world({"ob": [(2, 3), (2, 5)]}, 0), r"cell \(2, 4\) would be ob"),
-    (lambda: tg.make_world({"ob": [(1, 1)]}, 0, shape=(1, 1)), "no cell is a distractor"),
-    (lambda: tg.make_world({}, 0, margin=0), "margin=0"),
-    (lambda: tg.make_world({}, 0, slip=1.5), "slip=1.5"),
-    (lambda: tg.make_world({}, 0, objects={"a": {"red": 4}}), "are 4 cells; a patch has 9"),
-    (lambda: tg.make_world({}, 0, objects={"a": {"blue": 9}}), "'blue' is no colour; use red"),
-    (lambda: tg.make_world({}, 0, objects={"a": {"red": 10, "black": -1}}), "-1 cells of black"),
-    (lambda: tg.make_world({}, 0, objects={"a": {"black": 9}}), "a and ob have the same colours"),
-    (lambda: tg.make_world({}, 0, objects={"ob": {"red": 9}}), "both an object and an obstacle"),
-    (lambda: tg.categories(np.zeros((3, 3))), "type float64; pass integers"),
-    (lambda: tg.categories([[0, 1, 2], [0, 5, 0], [0, 0, 0]]), r"colors\[1, 1\] = 5"),
-])
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: tg.random_world(5, "F o4"), r"'o4', which the world does not have"),
+        (
+            lambda: tg.random_world(5, "F (o1 & o2)", max_tries=3),
+            r"seed 5: in 3 placements on 10 x 10",
+        ),
+        (lambda: tg.random_world(5, shape=(3, 3), max_tries=3), "the objects had no room"),
+        (lambda: tg.random_world(5, num_obstacles=-1), "num_obstacles=-1; give 0 or more"),
+        (lambda: tg.random_world(5, shape=(0, 3)), r"shape=\(0, 3\)"),
+        (lambda: tg.make_world({"o9": [(1, 1)]}, 0), "'o9' is no kind of cell; there are o1, o2"),
+        (lambda: tg.make_world({"o1": [(0, 3)]}, 0), r"o1 in cell \(0, 3\) is outside"),
+        (
+            lambda: tg.make_world({"o1": [(2, 3)], "o2": [(2, 3)]}, 0),
+            r"cell \(2, 3\) is used twice",
+        ),
+        (
+            lambda: tg.make_world({"o1": [(2, 3)], "o2": [(4, 4)]}, 0),
+            r"patch of o2 in cell \(4, 4\)",
+        ),
+        (lambda: tg.make_world({"ob": [(2, 3), (2, 5)]}, 0), r"cell \(2, 4\) would be ob"),
+        (lambda: tg.make_world({"ob": [(1, 1)]}, 0, shape=(1, 1)), "no cell is a distractor"),
+        (lambda: tg.make_world({}, 0, margin=0), "margin=0"),
+        (lambda: tg.make_world({}, 0, slip=1.5), "slip=1.5"),
+        (lambda: tg.make_world({}, 0, objects={"a": {"red": 4}}), "are 4 cells; a patch has 9"),
+        (lambda: tg.make_world({}, 0, objects={"a": {"blue": 9}}), "'blue' is no colour; use red"),
+        (
+            lambda: tg.make_world({}, 0, objects={"a": {"red": 10, "black": -1}}),
+            "-1 cells of black",
+        ),
+        (
+            lambda: tg.make_world({}, 0, objects={"a": {"black": 9}}),
+            "a and ob have the same colours",
+        ),
+        (
+            lambda: tg.make_world({}, 0, objects={"ob": {"red": 9}}),
+            "both an object and an obstacle",
+        ),
+        (lambda: tg.categories(np.zeros((3, 3))), "type float64; pass integers"),
+        (lambda: tg.categories([[0, 1, 2], [0, 5, 0], [0, 0, 0]]), r"colors\[1, 1\] = 5"),
+    ],
+)
 def test_bad_worlds_are_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()
@@ -301,9 +344,7 @@ def test_demonstrations_end_where_the_task_is_decided():
 
 
 def test_worlds_survive_a_file(tmp_path):
-    world = tg.random_world(
-        1, "F o5", shape=(9, 12), objects=many_objects(5), margin=2, slip=0.15
-    )
+    world = tg.random_world(1, "F o5", shape=(9, 12), objects=many_objects(5), margin=2, slip=0.15)
     path = tmp_path / "world.txt"
     path.write_text("old")
     save_world(path, world)
@@ -321,17 +362,20 @@ def test_a_map_alone_has_the_dissertations_kinds():
     assert dict(tg.training_world().kinds) == dict(world.kinds)
 
 
-@pytest.mark.parametrize("text, message", [
-    ("", "the map is empty"),
-    ("rrr\nrxr\nrrr", "map row 2, column 2: 'x' is no colour; use r "),
-    ("rrr\nrrrr\nrrr", "map row 2 has 4 cells, row 1 has 3"),
-    ("rrr\nrrr", r"colors have shape \(2, 3\)"),
-    ("margin: two\n\nrrr\nrrr\nrrr", "line 1: margin is 'two', which is no number"),
-    ("margin: 1\nmargn: 2\nrrr\nrrr\nrrr", "line 2: margn: '2'; write it as"),
-    ("o1: 9 red\no1: 9 black\nrrr", "line 2: o1 is given twice"),
-    ("o1: five red, 4 black\nrrr", "line 1: o1 is 'five', which is no number"),
-    ("slip: 2\nrrr\nrrr\nrrr", "slip=2.0"),
-])
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("", "the map is empty"),
+        ("rrr\nrxr\nrrr", "map row 2, column 2: 'x' is no colour; use r "),
+        ("rrr\nrrrr\nrrr", "map row 2 has 4 cells, row 1 has 3"),
+        ("rrr\nrrr", r"colors have shape \(2, 3\)"),
+        ("margin: two\n\nrrr\nrrr\nrrr", "line 1: margin is 'two', which is no number"),
+        ("margin: 1\nmargn: 2\nrrr\nrrr\nrrr", "line 2: margn: '2'; write it as"),
+        ("o1: 9 red\no1: 9 black\nrrr", "line 2: o1 is given twice"),
+        ("o1: five red, 4 black\nrrr", "line 1: o1 is 'five', which is no number"),
+        ("slip: 2\nrrr\nrrr\nrrr", "slip=2.0"),
+    ],
+)
 def test_bad_texts_are_named(text, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         read_world(text)

@@ -12,8 +12,9 @@ MASS = 4 / 3 * np.pi * 0.1**3 + 0.1**3
 
 def state(place, heading=0.0, velocity=(0, 0), zone=None):
     zone = np.full((4, 2, 2), 9.0) if zone is None else zone
-    return ZoneState(*(jnp.asarray(x, jnp.float32) for x in (
-        place, velocity, heading, (0, 0), 0, zone)))
+    return ZoneState(
+        *(jnp.asarray(x, jnp.float32) for x in (place, velocity, heading, (0, 0), 0, zone))
+    )
 
 
 def world():
@@ -75,18 +76,31 @@ def test_what_the_robot_sees():
         return found, jax.vmap(made.observe)(found), jax.vmap(made.labels)(found)
 
     found, seen, labels = jax.tree.map(
-        np.asarray, moved(keys, jax.random.uniform(keys[0], (40, 2), minval=-1)))
+        np.asarray, moved(keys, jax.random.uniform(keys[0], (40, 2), minval=-1))
+    )
     for i in range(40):
         one = jax.tree.map(lambda x, i=i: np.asarray(x[i], float), found)
         lidar = [slow_lidar(one.place, one.heading, zones) for zones in one.zone]
         np.testing.assert_allclose(seen[i][:64].reshape(4, 16), lidar, atol=1e-4)
-        back = np.array([[np.cos(one.heading), np.sin(one.heading)],
-                         [-np.sin(one.heading), np.cos(one.heading)]])
-        walls = np.exp(-0.5 * np.array([
-            2.5 - one.place[0], 2.5 - one.place[1], 2.5 + one.place[0], 2.5 + one.place[1]]))
-        np.testing.assert_allclose(seen[i][64:], np.concatenate([
-            back @ one.acceleration, back @ one.velocity, [one.turning], back[0], walls]),
-            atol=1e-4)
+        back = np.array(
+            [
+                [np.cos(one.heading), np.sin(one.heading)],
+                [-np.sin(one.heading), np.cos(one.heading)],
+            ]
+        )
+        walls = np.exp(
+            -0.5
+            * np.array(
+                [2.5 - one.place[0], 2.5 - one.place[1], 2.5 + one.place[0], 2.5 + one.place[1]]
+            )
+        )
+        np.testing.assert_allclose(
+            seen[i][64:],
+            np.concatenate(
+                [back @ one.acceleration, back @ one.velocity, [one.turning], back[0], walls]
+            ),
+            atol=1e-4,
+        )
         apart = np.linalg.norm(one.zone - one.place, axis=-1)
         assert labels[i].tolist() == (apart <= 0.4).any(axis=1).tolist()
     inside = state((0, 0), zone=np.array([[[9, 9], [0.3, 0]], [[0.3, 0.3], [9, 9]]] * 2))
@@ -97,8 +111,9 @@ def test_what_the_robot_sees():
 def test_zones_and_robot_are_apart():
     places = draw_places(8, 2.5, 50)
     states = jax.vmap(world().reset)(jax.random.split(jax.random.key(2), 300))
-    drawn = np.concatenate([np.asarray(states.zone).reshape(300, 8, 2),
-                            np.asarray(states.place)[:, None]], axis=1)
+    drawn = np.concatenate(
+        [np.asarray(states.zone).reshape(300, 8, 2), np.asarray(states.place)[:, None]], axis=1
+    )
     for some in (places, drawn):
         gaps = np.linalg.norm(some[:, :, None] - some[:, None], axis=-1)
         gaps += 9 * np.eye(9)
@@ -111,14 +126,17 @@ def test_zones_and_robot_are_apart():
     assert world().propositions == COLORS
 
 
-@pytest.mark.parametrize(("options", "said"), [
-    ({"radius": 0}, "radius=0; it must be positive"),
-    ({"colors": ()}, "colors=0"),
-    ({"zones": 9}, "hardly fit"),
-    ({"zones": 4}, "hardly fit"),
-    ({"extent": 0.5}, "hardly fit"),
-    ({"colors": ("red", "red")}, "'red' is no name, or is given twice"),
-])
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"radius": 0}, "radius=0; it must be positive"),
+        ({"colors": ()}, "colors=0"),
+        ({"zones": 9}, "hardly fit"),
+        ({"zones": 4}, "hardly fit"),
+        ({"extent": 0.5}, "hardly fit"),
+        ({"colors": ("red", "red")}, "'red' is no name, or is given twice"),
+    ],
+)
 def test_what_does_not_fit_is_named(options, said):
     with pytest.raises(ValueError, match=said):
         zone_world(**{"num_maps": 8} | options)

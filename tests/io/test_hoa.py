@@ -263,7 +263,7 @@ def test_marks_of_a_state_are_on_all_its_edges_beside_their_own():
         for letter in [*prefix, *list(cycle) * 6]:
             steps.append((state, "a" in letter))
             state = 1 if state == 0 else 0 if "a" in letter else 1
-        late = steps[len(prefix) + 2 * len(cycle):]
+        late = steps[len(prefix) + 2 * len(cycle) :]
         expected = (0, True) in late and any(q == 1 for q, _ in late)
         assert accepts_lasso(automaton, prefix, cycle) == expected
 
@@ -357,7 +357,8 @@ def distributed(style, parity, count):
     order = list(range(count) if style == "min" else range(count)[::-1])
     parts = [
         " & ".join([*(f"Fin({j})" for j in order[:k]), f"Inf({i})"])
-        for k, i in enumerate(order) if i % 2 == (parity == "odd")
+        for k, i in enumerate(order)
+        if i % 2 == (parity == "odd")
     ]
     return " | ".join(f"({part})" for part in parts) or None
 
@@ -438,7 +439,7 @@ def test_any_condition_agrees_with_its_definition():
                 marks.append(None if step is None else step[1])
                 state = None if step is None else step[0]
             # After `states` laps the states repeat lap by lap, at most every `states` laps.
-            late = marks[len(prefix) + (states + 1) * len(cycle):]
+            late = marks[len(prefix) + (states + 1) * len(cycle) :]
             expected = None not in late and value(
                 set().union(*late), {s for s in range(sets) if any(s not in m for m in late)}
             )
@@ -718,7 +719,7 @@ def test_priorities_out_of_proportion_are_refused():
 def test_damaged_texts_are_read_or_refused():
     rng = random.Random(3)
     texts = [text for text, _ in READ.values()] + [write_hoa(to_automaton("F (a & X b)"))]
-    pieces = [*"0123456789[](){}&|!@\"\\/* \ntfé:-", "HOA:", "Start:", "--END--", "--ABORT--", "/*"]
+    pieces = [*'0123456789[](){}&|!@"\\/* \ntfé:-', "HOA:", "Start:", "--END--", "--ABORT--", "/*"]
     refused = 0
     for _ in range(600):
         text = rng.choice(texts)

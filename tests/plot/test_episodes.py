@@ -59,8 +59,11 @@ def test_letters_across_a_side():
     assert sorted(scene.letters) == [(0, 0, "a"), (1, 2, "c"), (2, 0, "b")]
     lines = _segments(scene._replace(cells=0))
     assert [x.round(9).tolist() for x in lines] == [
-        [[1.5, 0.5], [1.5, -0.05]], [[1.5, 3.05], [1.5, 2.5]],
-        [[1.5, 2.5], [1.5, 1.5], [1.5, 0.5], [1.5, -0.05]], [[1.5, 3.05], [1.5, 2.5]]]
+        [[1.5, 0.5], [1.5, -0.05]],
+        [[1.5, 3.05], [1.5, 2.5]],
+        [[1.5, 2.5], [1.5, 1.5], [1.5, 0.5], [1.5, -0.05]],
+        [[1.5, 3.05], [1.5, 2.5]],
+    ]
     assert draw_episode(world, run).axes[0].get_title(loc="left") == "c → c"
     page = play_episode(world, run, title="<up>")
     assert "<h1>&lt;up&gt;</h1>" in page and frames(page)["shown"] == scene.shown
@@ -71,7 +74,8 @@ def test_letters_across_a_side():
 def test_a_task_is_looked_through_and_what_comes_after_the_end_is_not_shown():
     world = task_environment(letters(), "F c")
     run = run_episode(
-        KEY, world, Agent(lambda memory, seen, allowed, key: (jnp.int32(1), memory)), num_steps=6)
+        KEY, world, Agent(lambda memory, seen, allowed, key: (jnp.int32(1), memory)), num_steps=6
+    )
     scene = scene_of(world, run)
     assert scene.track.tolist() == [[1.5, 0.5], [1.5, 1.5], [1.5, 2.5]]
     assert "ends after 2 steps" in to_bytes(draw_episode(world, run)).decode()
@@ -104,14 +108,20 @@ def test_a_world_with_a_place_is_a_line_with_marks_where_something_begins_to_hol
         return Step({"place": place}, 0.0, False)
 
     far = make_environment(
-        lambda key: {"place": jnp.zeros(2)}, walk, lambda world: world["place"], actions=1,
-        labels=lambda world: world["place"][:1] > 1.5, propositions=["far"])
+        lambda key: {"place": jnp.zeros(2)},
+        walk,
+        lambda world: world["place"],
+        actions=1,
+        labels=lambda world: world["place"][:1] > 1.5,
+        propositions=["far"],
+    )
     scene = scene_of(far, episode(far, jnp.int32(0), 4))
     assert scene.size == pytest.approx(4 * 1.16)
     middle = scene.size / 2
     np.testing.assert_allclose(
-        scene.track - middle, [[-2, 1], [-1, 0.5], [0, 0], [1, -0.5], [2, -1]], atol=1e-6)
-    (x, y, _, name), = scene.discs
+        scene.track - middle, [[-2, 1], [-1, 0.5], [0, 0], [1, -0.5], [2, -1]], atol=1e-6
+    )
+    ((x, y, _, name),) = scene.discs
     assert (x, y) == pytest.approx((middle, middle)) and name == "far"
     both = draw_episodes(far, [episode(far, jnp.int32(0), 4)] * 2, titles=["one", "two"])
     assert [axes.get_title("left") or axes.get_title() for axes in both.axes] == ["one", "two"]
@@ -121,12 +131,13 @@ def test_a_world_with_a_place_is_a_line_with_marks_where_something_begins_to_hol
 
 def test_what_has_no_picture_is_named():
     other = make_environment(
-        lambda key: jnp.int32(0), lambda x, a, key: Step(x, 0.0, False), lambda x: x / 2, actions=1)
+        lambda key: jnp.int32(0), lambda x, a, key: Step(x, 0.0, False), lambda x: x / 2, actions=1
+    )
     with pytest.raises(ValueError, match="has no picture; give an episode of a letter_world"):
         draw_episode(other, episode(other, jnp.int32(0)))
     world = letters()
-    many = jax.vmap(lambda key: run_episode(
-        key, world, agent_of(lambda seen, key: jnp.int32(0)), num_steps=2))(
-            jax.random.split(KEY, 2))
+    many = jax.vmap(
+        lambda key: run_episode(key, world, agent_of(lambda seen, key: jnp.int32(0)), num_steps=2)
+    )(jax.random.split(KEY, 2))
     with pytest.raises(ValueError, match="take one trajectory of many"):
         play_episode(world, many)

@@ -18,8 +18,9 @@ STEP = {0: (0, -1), 1: (0, 1), 2: (-1, 0), 3: (1, 0)}  # up, down, left, right: 
 
 def parts(text, tag, kind):
     """The elements of a tag and a class, in order."""
-    return [x for x in ElementTree.fromstring(text).iter(tag)
-            if kind in (x.get("class") or "").split()]
+    return [
+        x for x in ElementTree.fromstring(text).iter(tag) if kind in (x.get("class") or "").split()
+    ]
 
 
 def points(path):
@@ -51,8 +52,14 @@ def test_an_arrow_can_be_seen_on_what_is_beneath_it():
 
 
 def test_a_map_shows_its_kinds_walls_layers_and_runs():
-    text = live_map(CELLS, "m", {"0": (np.zeros(6), None), "1": (np.ones(6), None)},
-                    runs=[[0, 1, 4], [5]], marked=[(4, 1, 3)], pieces=2)
+    text = live_map(
+        CELLS,
+        "m",
+        {"0": (np.zeros(6), None), "1": (np.ones(6), None)},
+        runs=[[0, 1, 4], [5]],
+        marked=[(4, 1, 3)],
+        pieces=2,
+    )
     assert [x.text for x in parts(text, "text", "name")] == ["a", "b"]
     assert [x.get("x") for x in parts(text, "rect", "wall")] == [str(2 * CELL)]
     fills = [{x.get("fill") for x in group.iter("rect")} for group in parts(text, "g", "layer")]
@@ -86,16 +93,22 @@ def test_a_large_map_names_less_and_counts_in_strides():
     assert [x.text for x in parts(text, "text", "number")][:3] == ["1", "4", "7"]
 
 
-@pytest.mark.parametrize(("formula", "marks"), [
-    ("F a", set()), ("G F a", {"●"}), ("F G a & G F b | F G c", set("01234")),
-])
+@pytest.mark.parametrize(
+    ("formula", "marks"),
+    [
+        ("F a", set()),
+        ("G F a", {"●"}),
+        ("F G a & G F b | F G c", set("01234")),
+    ],
+)
 def test_an_automaton_shows_its_acceptance(formula, marks):
     automaton = to_automaton(formula)
     text = live_automaton(automaton, "x")
     assert {x.text for x in parts(text, "tspan", "mark")} <= marks
     assert bool(marks) == bool(parts(text, "tspan", "mark"))
     assert [x.get("id") for x in parts(text, "g", "state")] == [
-        f"x-q{q}" for q in range(len(automaton.delta))]
+        f"x-q{q}" for q in range(len(automaton.delta))
+    ]
     for edge in parts(text, "g", "edge"):
         if source := edge.get("data-from"):
             assert int(edge.get("data-to")) in np.asarray(automaton.delta)[int(source)]

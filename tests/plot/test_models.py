@@ -15,8 +15,9 @@ MAPS = ["b.#y", "a\nb\n.", "ab.\n.#c\n..d\n#..", "..\n..", ". goal_left\n. #"]
 
 
 def solved(value, policy, **options):
-    return jl.Solution(value, policy, value, value, np.float64(0), np.int32(1), np.int32(0),
-                       Method(), **options)
+    return jl.Solution(
+        value, policy, value, value, np.float64(0), np.int32(1), np.int32(0), Method(), **options
+    )
 
 
 @pytest.mark.parametrize("slip", [0.0, 0.1, 0.6])
@@ -80,13 +81,19 @@ def test_a_solution_lies_on_the_map_of_its_model():
     assert len(titles) == product.num_memory - 1 and titles[0] == "memory 0: F (a & F b)"
     one = plot.solution(solved(table, np.zeros(table.shape, np.int32)), product, memories=[1])
     np.testing.assert_allclose(
-        one.axes[0].images[0].get_array().filled(-1).ravel()[[0, 1, 3]], table[[0, 1, 3], 1])
+        one.axes[0].images[0].get_array().filled(-1).ravel()[[0, 1, 3]], table[[0, 1, 3], 1]
+    )
 
 
 def coin():
     return jl.make_sparse(
-        [0, 2, 3, 4], [0, 2, 4, 5, 6], [0, 1, 0, 2, 1, 2], [0.5, 0.5, 0.9, 0.1, 1.0, 1.0],
-        initial=[1, 0, 0], label={"done": [1, 2], "lost": [2]})
+        [0, 2, 3, 4],
+        [0, 2, 4, 5, 6],
+        [0, 1, 0, 2, 1, 2],
+        [0.5, 0.5, 0.9, 0.1, 1.0, 1.0],
+        initial=[1, 0, 0],
+        label={"done": [1, 2], "lost": [2]},
+    )
 
 
 def test_a_graph_has_its_choices_and_what_holds():
@@ -114,15 +121,27 @@ def test_values_alone_are_sorted_with_their_bounds():
     np.testing.assert_array_equal(line, [1, 2, 3, np.nan])
 
 
-@pytest.mark.parametrize("call, message", [
-    (lambda: plot.model(jl.make_sparse(None, np.arange(18), np.zeros(17, int), np.ones(17))),
-     "it has 17 states and its moves lie on no map; graphs have up to 16"),
-    (lambda: plot.solution(solved(np.zeros(5), np.zeros(5, int)), coin()),
-     r"its value has shape \(5,\), the model's states \(3,\)"),
-    (lambda: plot.solution(solved(np.zeros((4, 2)), np.zeros((4, 2), int)),
-                           jl.product(jl.gridworld("..\n.a"), "F a"), memories=[2]),
-     r"memories=\[2\]; give some of 0 to 1"),
-])
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (
+            lambda: plot.model(jl.make_sparse(None, np.arange(18), np.zeros(17, int), np.ones(17))),
+            "it has 17 states and its moves lie on no map; graphs have up to 16",
+        ),
+        (
+            lambda: plot.solution(solved(np.zeros(5), np.zeros(5, int)), coin()),
+            r"its value has shape \(5,\), the model's states \(3,\)",
+        ),
+        (
+            lambda: plot.solution(
+                solved(np.zeros((4, 2)), np.zeros((4, 2), int)),
+                jl.product(jl.gridworld("..\n.a"), "F a"),
+                memories=[2],
+            ),
+            r"memories=\[2\]; give some of 0 to 1",
+        ),
+    ],
+)
 def test_what_cannot_be_drawn_is_said(call, message):
     with pytest.raises(ValueError, match=message):
         call()

@@ -59,8 +59,9 @@ def colors(figure):
 def marks(figure):
     """The fill of each circle that is no state, from top to bottom and left to right."""
     found = [x for x in figure.axes[0].patches if isinstance(x, Circle) and x.get_radius() < 0.1]
-    return [to_hex(x.get_facecolor())
-            for x in sorted(found, key=lambda x: (-x.center[1], x.center[0]))]
+    return [
+        to_hex(x.get_facecolor()) for x in sorted(found, key=lambda x: (-x.center[1], x.center[0]))
+    ]
 
 
 @pytest.mark.few(7)
@@ -124,7 +125,10 @@ def test_priorities_stand_before_their_guards():
 def test_no_mark_counts_on_the_way_to_a_rejecting_state():
     # Reading b, or a in the last state, has an even number and leads nowhere good.
     table = make_automaton(
-        [[0, 1, 1], [1, 1, 1]], 0, [[True, False], [False, True], [False, False]], ["a", "b"],
+        [[0, 1, 1], [1, 1, 1]],
+        0,
+        [[True, False], [False, True], [False, False]],
+        ["a", "b"],
         priority=[[2, 0, 1], [1, 3, 3]],
     )
     texts = edge_texts(table, drawing.rejecting(table))
@@ -166,8 +170,11 @@ def test_graphviz_may_place_the_states(monkeypatch, tmp_path):
     table = to_automaton('G F "say \\"a\\"" & G F b')
 
     def centers(layout):
-        circles = [x for x in plot.automaton(table, layout=layout).axes[0].patches
-                   if isinstance(x, Circle) and x.get_radius() == drawing.RADIUS]
+        circles = [
+            x
+            for x in plot.automaton(table, layout=layout).axes[0].patches
+            if isinstance(x, Circle) and x.get_radius() == drawing.RADIUS
+        ]
         return np.array([x.center for x in circles])
 
     np.testing.assert_allclose(np.diff(centers("auto"), axis=0), [[4, 1]])
@@ -201,11 +208,14 @@ def test_the_same_picture_has_the_same_bytes():
     assert len(first) == len(second)
 
 
-@pytest.mark.parametrize("draw", [
-    lambda: plot.grid(MAP, np.linspace(0, 1, 6), np.full((6, 4), 0.25), titles="memory 0"),
-    lambda: plot.curves({"loss": np.linspace(1, 0, 5)}),
-    lambda: plot.automaton(to_automaton("F a")),
-])
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda: plot.grid(MAP, np.linspace(0, 1, 6), np.full((6, 4), 0.25), titles="memory 0"),
+        lambda: plot.curves({"loss": np.linspace(1, 0, 5)}),
+        lambda: plot.automaton(to_automaton("F a")),
+    ],
+)
 def test_a_picture_is_what_matplotlib_saves(draw):
     """Drawn once, not twice; but for names that are made up anew each time."""
     figure, saved = draw(), io.BytesIO()
@@ -231,18 +241,24 @@ def test_a_grid_with_values_and_policy():
 
 def test_a_blank_and_a_large_map():
     large = "\n".join(["." * 30] * 25)
-    figures = [plot.grid(MAP), plot.grid(large, np.full(750, np.nan)),
-               plot.grid(MAP, np.arange(6.0), limits=None)]
+    figures = [
+        plot.grid(MAP),
+        plot.grid(large, np.full(750, np.nan)),
+        plot.grid(MAP, np.arange(6.0), limits=None),
+    ]
     for figure in figures:
         assert b"</svg>" in plot.to_bytes(figure)
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    ({"values": np.zeros(5)}, r"values have shape \(5,\); the map has 6 cells"),
-    ({"policy": np.zeros((6, 3))}, r"policy has shape \(6, 3\)"),
-    ({"values": np.zeros((2, 6)), "policy": np.zeros((3, 6, 4))}, r"2 panels and the policy 3"),
-    ({"policy": np.zeros((6, 1)), "actions": ["jump"]}, r"action 'jump' has no direction"),
-])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"values": np.zeros(5)}, r"values have shape \(5,\); the map has 6 cells"),
+        ({"policy": np.zeros((6, 3))}, r"policy has shape \(6, 3\)"),
+        ({"values": np.zeros((2, 6)), "policy": np.zeros((3, 6, 4))}, r"2 panels and the policy 3"),
+        ({"policy": np.zeros((6, 1)), "actions": ["jump"]}, r"action 'jump' has no direction"),
+    ],
+)
 def test_grid_misfits(options, message):
     with pytest.raises(ValueError, match=message):
         plot.grid(MAP, **options)
@@ -264,8 +280,10 @@ def arrows(axes, base=0.2):
     found = [x.get_xy() for x in axes.patches if not isinstance(x, Circle | Rectangle)]
     wide = [float(np.abs(xy[0] - xy[2]).sum()) > base for xy in found]
     tips = [tuple(np.round(xy[1], 2)) for xy in found]
-    return (sorted(t for t, big in zip(tips, wide, strict=True) if big),
-            sorted(t for t, big in zip(tips, wide, strict=True) if not big))
+    return (
+        sorted(t for t, big in zip(tips, wide, strict=True) if big),
+        sorted(t for t, big in zip(tips, wide, strict=True) if not big),
+    )
 
 
 def test_rare_moves_have_small_arrows():
@@ -288,7 +306,11 @@ def test_rare_moves_have_small_arrows():
     assert fills[1][0, 0] == NEVER and fills[1][1, 1] == WALL
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["one", "two"]
     assert [t.get_text() for t in figure.legends[0].texts] == [
-        "good", "never reached", "often", "seldom"]
+        "good",
+        "never reached",
+        "often",
+        "seldom",
+    ]
     assert {t.get_text() for t in first.texts} == {"b", "r", "y"}
     assert b"</svg>" in plot.to_bytes(figure)
     single = plot.strategies(MAP, play[0], seldom=1e-7)
@@ -297,11 +319,20 @@ def test_rare_moves_have_small_arrows():
     assert len(plot.strategies(MAP, play[[0] * 5], across=3).axes) == 6
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    ({"play": np.zeros((6, 3))}, r"play has shape \(6, 3\); the map has 6 cells and there are 4"),
-    ({"play": np.zeros((6, 4)), "marked": np.zeros((2, 6))}, r"marked has shape \(2, 6\); play"),
-    ({"play": np.zeros((6, 1)), "actions": ["jump"]}, r"action 'jump' has no direction"),
-])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"play": np.zeros((6, 3))},
+            r"play has shape \(6, 3\); the map has 6 cells and there are 4",
+        ),
+        (
+            {"play": np.zeros((6, 4)), "marked": np.zeros((2, 6))},
+            r"marked has shape \(2, 6\); play",
+        ),
+        ({"play": np.zeros((6, 1)), "actions": ["jump"]}, r"action 'jump' has no direction"),
+    ],
+)
 def test_misfits_of_strategies(options, message):
     with pytest.raises(ValueError, match=message):
         plot.strategies(MAP, **options)
@@ -322,12 +353,15 @@ def test_values_are_compared_state_by_state():
     assert b"</svg>" in plot.to_bytes(plot.compare({"alone": best}))
 
 
-@pytest.mark.parametrize(("values", "groups", "message"), [
-    ({}, None, "compare needs values of the same states; it has none"),
-    ({"a": []}, None, "it has a: 0"),
-    ({"a": [1.0], "b": [1.0, 2.0]}, None, "it has a: 1, b: 2"),
-    ({"a": [1.0]}, ["x", "y"], "groups has 2 names; there are 1 states"),
-])
+@pytest.mark.parametrize(
+    ("values", "groups", "message"),
+    [
+        ({}, None, "compare needs values of the same states; it has none"),
+        ({"a": []}, None, "it has a: 0"),
+        ({"a": [1.0], "b": [1.0, 2.0]}, None, "it has a: 1, b: 2"),
+        ({"a": [1.0]}, ["x", "y"], "groups has 2 names; there are 1 states"),
+    ],
+)
 def test_misfits_of_values_to_compare(values, groups, message):
     with pytest.raises(ValueError, match=message):
         plot.compare(values, groups=groups)
@@ -377,8 +411,10 @@ def marks_of_moves(axes):
     """Where the filled triangles and dots of a map lie, as the places that they point to."""
     ink = to_hex(INK)
     return sorted(
-        tuple(x.center if isinstance(x, Circle) else x.get_xy()[1]) for x in axes.patches
-        if not isinstance(x, Rectangle) and x.get_facecolor()[3] > 0
+        tuple(x.center if isinstance(x, Circle) else x.get_xy()[1])
+        for x in axes.patches
+        if not isinstance(x, Rectangle)
+        and x.get_facecolor()[3] > 0
         and to_hex(x.get_facecolor()) == ink
     )
 
@@ -390,15 +426,26 @@ def test_moves_point_where_they_lead():
     allowed[:, states(3, 1, 2), 0] = True  # while the environment is elsewhere
     allowed[:, states(3, 0, 2, turn=0), 1] = True
     available = allowed[0] | allowed[1]
-    figure = plot.game_moves(allowed, "a#\n.b", 0, available=available, titles=["one", "two"],
-                             region=available.any(-1), system=2)
+    figure = plot.game_moves(
+        allowed,
+        "a#\n.b",
+        0,
+        available=available,
+        titles=["one", "two"],
+        region=available.any(-1),
+        system=2,
+    )
     first, second = figure.axes
     np.testing.assert_allclose(marks_of_moves(first), [(1.08, 1.5), (1.5, 1.5)])
     np.testing.assert_allclose(marks_of_moves(second), [(0.92, 1.5)])
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["one", "two"]
     assert [t.get_text() for t in figure.legends[0].texts] == [
-        "the system wins", "the environment wins", "the environment's robot", "allowed",
-        "not allowed"]
+        "the system wins",
+        "the environment wins",
+        "the environment's robot",
+        "allowed",
+        "not allowed",
+    ]
     assert b"</svg>" in plot.to_bytes(figure)
 
 
@@ -411,18 +458,33 @@ def test_a_policy_over_the_values_of_a_game():
     assert [len(marks_of_moves(axes)) for axes in several.axes[:4]] == [0, 0, 1, 0]
 
 
-@pytest.mark.parametrize(("draw", "message"), [
-    (lambda: plot.game_values(np.zeros(31), 2),
-     r"values has shape \(31,\); the board has 4 places, so that the game has 2 \* 4\*\*2 = 32"),
-    (lambda: plot.game_values(np.zeros(32), 2, policy=np.zeros(4, int)), r"policy has shape \(4,"),
-    (lambda: plot.game_region(np.zeros(32, bool), "..#"), r"region has shape .* 2 places"),
-    (lambda: plot.game_moves(np.zeros((32, 1), bool), 2, 0, actions=["jump"]),
-     r"action 'jump' has no direction; use up, down, left, right, stay"),
-    (lambda: plot.game_values(np.zeros(32), 2, policy=np.zeros(32, int), actions=["hop"]),
-     r"action 'hop' has no direction"),
-    (lambda: plot.game_moves(np.zeros((32, 5), bool), 2, 4), r"environment 4 .* places are 0 to 3"),
-    (lambda: plot.game_values(np.zeros(32), 2, environment=[-1]), r"environment -1 "),
-])
+@pytest.mark.parametrize(
+    ("draw", "message"),
+    [
+        (
+            lambda: plot.game_values(np.zeros(31), 2),
+            r"values has shape \(31,\); the board has 4 places, so that the game has 2 \* 4\*\*2 = 32",
+        ),
+        (
+            lambda: plot.game_values(np.zeros(32), 2, policy=np.zeros(4, int)),
+            r"policy has shape \(4,",
+        ),
+        (lambda: plot.game_region(np.zeros(32, bool), "..#"), r"region has shape .* 2 places"),
+        (
+            lambda: plot.game_moves(np.zeros((32, 1), bool), 2, 0, actions=["jump"]),
+            r"action 'jump' has no direction; use up, down, left, right, stay",
+        ),
+        (
+            lambda: plot.game_values(np.zeros(32), 2, policy=np.zeros(32, int), actions=["hop"]),
+            r"action 'hop' has no direction",
+        ),
+        (
+            lambda: plot.game_moves(np.zeros((32, 5), bool), 2, 4),
+            r"environment 4 .* places are 0 to 3",
+        ),
+        (lambda: plot.game_values(np.zeros(32), 2, environment=[-1]), r"environment -1 "),
+    ],
+)
 def test_game_misfits(draw, message):
     with pytest.raises(ValueError, match=message):
         draw()
@@ -434,9 +496,12 @@ def test_game_misfits(draw, message):
 def test_bands_have_means_spreads_and_limits():
     x, mean, spread = [1, 2, 3], [1.0, 2.0, 4.0], [0.5, 0.5, 1.0]
     figure = plot.bands(
-        {"one": {"cost": {"a": (x, mean, spread), "b": (x, mean, spread)}},
-         "two": {"cost": {"b": (x, mean, spread)}}},
-        limits={"two": {"cost": 3.0}}, label="trajectories",
+        {
+            "one": {"cost": {"a": (x, mean, spread), "b": (x, mean, spread)}},
+            "two": {"cost": {"b": (x, mean, spread)}},
+        },
+        limits={"two": {"cost": 3.0}},
+        label="trajectories",
     )
     first, second = figure.axes
     assert [len(axes.get_lines()) for axes in (first, second)] == [2, 2]
@@ -461,13 +526,16 @@ def test_a_sweep_has_means_over_seeds_and_their_spread():
             told = column[~np.isnan(column)]
             assert drawn == pytest.approx(told.mean()) if told.size else np.isnan(drawn)
     edge = axes.collections[0].get_paths()[0].vertices
-    for drawn in (loss[0, :, 0].mean() + loss[0, :, 0].std(), loss[0, [0, 2], 2].mean()
-                  - loss[0, [0, 2], 2].std()):
+    for drawn in (
+        loss[0, :, 0].mean() + loss[0, :, 0].std(),
+        loss[0, [0, 2], 2].mean() - loss[0, [0, 2], 2].std(),
+    ):
         assert np.isclose(edge[:, 1], drawn).any()
     for rows, names, message in (
-            (loss[0], ["a", "b"], r"loss has shape \[3, 4\]; give \[2, N, T\]"),
-            (loss, ["a"], r"loss has shape \[2, 3, 4\]; give \[1, N, T\]"),
-            (loss, list("abcdefg"), "7 settings; show at most 6")):
+        (loss[0], ["a", "b"], r"loss has shape \[3, 4\]; give \[2, N, T\]"),
+        (loss, ["a"], r"loss has shape \[2, 3, 4\]; give \[1, N, T\]"),
+        (loss, list("abcdefg"), "7 settings; show at most 6"),
+    ):
         with pytest.raises(ValueError, match=message):
             plot.sweep({"loss": rows}, names)
 
@@ -475,7 +543,8 @@ def test_a_sweep_has_means_over_seeds_and_their_spread():
 def test_lines_beside_a_reference():
     figure = plot.lines(
         {"net": {"state": (np.zeros((5, 4)), np.ones(4)), "gap": ([[1.0, 2.0]], None)}},
-        labels=("time", "seed"))
+        labels=("time", "seed"),
+    )
     assert [len(axes.get_lines()) for axes in figure.axes] == [6, 1]
     assert [axes.get_xlabel() for axes in figure.axes] == ["time", "seed"]
 
@@ -484,7 +553,10 @@ def test_paths_on_a_map():
     place = np.array([[0.0, 1.0, 2.0], [0.0, 0.0, -1.0]])
     figure = plot.paths(
         {"first": (place, place), "second": (place, -place), "third": (place, place)},
-        {"goal": ((1, 1), (2, 2))}, bounds=((-3, -3), (3, 3)), columns=2)
+        {"goal": ((1, 1), (2, 2))},
+        bounds=((-3, -3), (3, 3)),
+        columns=2,
+    )
     assert len(figure.axes) == 4 and figure.axes[1].get_title(loc="left") == "second"
     drawn = figure.axes[1].get_lines()
     np.testing.assert_allclose(drawn[0].get_ydata(), -place[0])
@@ -493,11 +565,15 @@ def test_paths_on_a_map():
     assert (goal.get_xy(), goal.get_width()) == ((1.0, 1.0), 1.0)
 
 
-@pytest.mark.parametrize("draw", [
-    lambda: plot.bands({}), lambda: plot.sweep({"loss": np.full((1, 2, 3), np.nan)}, ["a"]),
-    lambda: plot.lines({"net": {}}),
-    lambda: plot.paths({}, {}, bounds=((0, 0), (1, 1))),
-])
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda: plot.bands({}),
+        lambda: plot.sweep({"loss": np.full((1, 2, 3), np.nan)}, ["a"]),
+        lambda: plot.lines({"net": {}}),
+        lambda: plot.paths({}, {}, bounds=((0, 0), (1, 1))),
+    ],
+)
 def test_nothing_to_show_of_a_search(draw):
     with pytest.raises(ValueError, match="nothing to show"):
         draw()
@@ -512,7 +588,8 @@ def test_a_coloured_world_is_drawn_with_all_that_is_in_it():
     policy[:, 1] = [0, 0, 0, 1]
     runs = make_trajectories(world.mdp, [[(0, 3), (1, 3), (2, 1)], [(99, 0)]])
     figure = plot.temporal_gridworld(
-        world, policy, [0, 1], runs, value, title=["first", "second"], label="worth")
+        world, policy, [0, 1], runs, value, title=["first", "second"], label="worth"
+    )
     first, second, low, _, bar = figure.axes
     assert [a.get_title(loc="left") for a in (first, second)] == ["first", "second"]
     assert first.get_xlim() == (-2, 12) and bar.get_ylabel() == "worth"
@@ -541,14 +618,22 @@ def test_a_large_coloured_world_names_only_what_is_rare():
     assert not figure.legends
 
 
-@pytest.mark.parametrize("options, message", [
-    ({"policy": np.zeros((99, 4))}, r"policy has shape \(99, 4\); .* 100 cells, .*100, memory, 4"),
-    ({"policy": np.zeros((100, 2, 4)), "memory": 2}, r"memory 2 does not exist; .* 0 to 1"),
-    ({"value": np.zeros((100, 2, 4))}, r"value has shape \(100, 2, 4\)"),
-    ({"policy": np.zeros((100, 1)), "actions": ["hop"]}, "action 'hop' has no direction"),
-    ({"trajectories": Trajectories(np.array([[100]]), np.array([[0]]), np.array([1]))},
-     "trajectories have states 100 to 100; the world's cells are 0 to 99"),
-])
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (
+            {"policy": np.zeros((99, 4))},
+            r"policy has shape \(99, 4\); .* 100 cells, .*100, memory, 4",
+        ),
+        ({"policy": np.zeros((100, 2, 4)), "memory": 2}, r"memory 2 does not exist; .* 0 to 1"),
+        ({"value": np.zeros((100, 2, 4))}, r"value has shape \(100, 2, 4\)"),
+        ({"policy": np.zeros((100, 1)), "actions": ["hop"]}, "action 'hop' has no direction"),
+        (
+            {"trajectories": Trajectories(np.array([[100]]), np.array([[0]]), np.array([1]))},
+            "trajectories have states 100 to 100; the world's cells are 0 to 99",
+        ),
+    ],
+)
 def test_what_does_not_fit_a_coloured_world(options, message):
     with pytest.raises(ValueError, match=message):
         plot.temporal_gridworld(training_world(), **options)

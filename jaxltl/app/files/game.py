@@ -75,7 +75,8 @@ class World:
         return {
             name: {"row": int(row) + 1, "column": int(column) + 1}
             for name, (row, column) in (
-                ("system", self.places[system]), ("environment", self.places[environment])
+                ("system", self.places[system]),
+                ("environment", self.places[environment]),
             )
         }
 
@@ -133,32 +134,53 @@ def read_game(path: str | Path) -> GameFile:
     game = data["game"]
     tables.check_source(path, "game", game, [k for k in game if k not in ("model", "initial")])
     if "map" in game:
-        tables.refuse(path, "game", game, ("initial",), (
-            "a model; on a map give system_start and environment_start"))
+        tables.refuse(
+            path,
+            "game",
+            game,
+            ("initial",),
+            ("a model; on a map give system_start and environment_start"),
+        )
     _check_task(path, data["task"])
     return GameFile(
-        path=path, name=data.get("name", path.stem), game=game, task=data["task"],
-        strategy=data.get("strategy", {}), demanded="strategy" in data,
+        path=path,
+        name=data.get("name", path.stem),
+        game=game,
+        task=data["task"],
+        strategy=data.get("strategy", {}),
+        demanded="strategy" in data,
     )
 
 
 def _check_task(path: Path, task: Mapping[str, Any]) -> None:
     lists = [k for k in ("assumptions", "guarantees", "safe") if k in task]
-    tables.reject(path, "task", (
-        ("formula" in task and bool(lists),
-         f"has both formula and {''.join(lists[:1])}; give either a formula, or guarantees with "
-         "assumptions and safe where needed"),
-        ("parity" in task and ("formula" in task or bool(lists)),
-         'has parity = "model", the condition in the file of a parity game, and another one; keep '
-         "one of them"),
-        (not {"formula", "guarantees", "safe", "parity"} & set(task),
-         'lacks what the system is to achieve: formula = "...", or guarantees = ["..."], each to '
-         'be met again and again, or safe = "...", to hold for ever, or parity = "model", of a '
-         "parity game from a file"),
-        ("assumptions" in task and "guarantees" not in task,
-         "has assumptions but no guarantees, so that they assume in vain; add guarantees or leave "
-         "them out"),
-    ))
+    tables.reject(
+        path,
+        "task",
+        (
+            (
+                "formula" in task and bool(lists),
+                f"has both formula and {''.join(lists[:1])}; give either a formula, or guarantees with "
+                "assumptions and safe where needed",
+            ),
+            (
+                "parity" in task and ("formula" in task or bool(lists)),
+                'has parity = "model", the condition in the file of a parity game, and another one; keep '
+                "one of them",
+            ),
+            (
+                not {"formula", "guarantees", "safe", "parity"} & set(task),
+                'lacks what the system is to achieve: formula = "...", or guarantees = ["..."], each to '
+                'be met again and again, or safe = "...", to hold for ever, or parity = "model", of a '
+                "parity game from a file",
+            ),
+            (
+                "assumptions" in task and "guarantees" not in task,
+                "has assumptions but no guarantees, so that they assume in vain; add guarantees or leave "
+                "them out",
+            ),
+        ),
+    )
 
 
 def load_game(file: GameFile) -> World:
@@ -218,8 +240,10 @@ def load_objective(file: GameFile, world: World) -> tuple[Game, Parity | GR1]:
             return task_game(game, task["formula"])
         if "parity" in task:
             if world.objective is None:
-                raise ValueError('parity = "model" takes the file of a parity game (PGSolver, '
-                                 "extended HOA); this game has no condition of its own.")
+                raise ValueError(
+                    'parity = "model" takes the file of a parity game (PGSolver, '
+                    "extended HOA); this game has no condition of its own."
+                )
             return game, world.objective
         safe = task.get("safe", "true")
         if "guarantees" not in task:

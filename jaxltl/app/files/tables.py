@@ -32,6 +32,7 @@ def is_number(value: Any) -> bool:
 
 def number_in(low: float, high: float = math.inf, *, below: bool = False) -> Rule:
     """A finite number in ``[low, high]``, or below `high`."""
+
     def holds(value: Any) -> bool:
         return is_number(value) and low <= value <= high and not (below and value == high)
 
@@ -70,8 +71,10 @@ TRUTH = Rule(lambda v: isinstance(v, bool), "true or false")
 TABLE = Rule(lambda v: isinstance(v, dict), "a table")
 NAMES = Rule(lambda v: is_list(v, str), 'a list of propositions, such as ["r"]')
 MAP = Rule(
-    lambda v: isinstance(v, str)
-    or (isinstance(v, dict) and set(v) == {"file"} and isinstance(v["file"], str)),
+    lambda v: (
+        isinstance(v, str)
+        or (isinstance(v, dict) and set(v) == {"file"} and isinstance(v["file"], str))
+    ),
     'the rows as a text, or { file = "map.txt" }',
 )
 LEGEND = Rule(
@@ -90,8 +93,11 @@ def errors_in(place: str) -> Iterator[None]:
 
 
 def read_tables(
-    path: Path, what: str, known: Mapping[str, Mapping[str, Rule]],
-    required: Mapping[str, Sequence[str]], raw: bytes | None = None,
+    path: Path,
+    what: str,
+    known: Mapping[str, Mapping[str, Rule]],
+    required: Mapping[str, Sequence[str]],
+    raw: bytes | None = None,
 ) -> tuple[dict[str, Any], bytes]:
     """The tables of a TOML file, all of known keys whose values obey their rules, and its bytes.
 
@@ -112,9 +118,7 @@ def read_tables(
     return data, raw
 
 
-def read_toml(
-    path: Path, what: str, raw: bytes | None = None
-) -> tuple[dict[str, Any], bytes]:
+def read_toml(path: Path, what: str, raw: bytes | None = None) -> tuple[dict[str, Any], bytes]:
     """The tables of a TOML file, and its bytes, which are read unless they are given.
 
     Raises:
@@ -175,7 +179,10 @@ def reject(path: Path, table: str, faults: Iterable[tuple[bool, str]]) -> None:
 
 
 def check_source(
-    path: Path, table: str, data: Mapping[str, Any], of_map: Iterable[str],
+    path: Path,
+    table: str,
+    data: Mapping[str, Any],
+    of_map: Iterable[str],
     of_log: Iterable[str] | None = None,
 ) -> None:
     """Raises a ValueError unless there is a map, a model, or a log where one is taken.
@@ -206,7 +213,10 @@ def check_demonstrations(
 
 
 def check_table(
-    path: Path, table: str, data: Mapping[str, Any], known: Mapping[str, Rule],
+    path: Path,
+    table: str,
+    data: Mapping[str, Any],
+    known: Mapping[str, Rule],
     required: Sequence[str] = (),
 ) -> None:
     """Raises a ValueError for the first key of a table that is unknown, wrong or missing.

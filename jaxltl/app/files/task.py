@@ -82,11 +82,17 @@ def make_task(
 ) -> Task:
     """A task of a file's checked tables and bytes, the files that it names, and a default."""
     return Task(
-        path=path, name=data.get("name", path.stem), world=data["world"],
-        formula=data["task"]["formula"], label_on=data["task"].get("label_on", label_on),
-        demonstrations=data["demonstrations"], learner=data["learner"],
-        digest=tables.digest(path, raw, named), test=data.get("test", {}),
-        guarantee=_guarantee(path, data), over=data["task"].get("over", "mean"),
+        path=path,
+        name=data.get("name", path.stem),
+        world=data["world"],
+        formula=data["task"]["formula"],
+        label_on=data["task"].get("label_on", label_on),
+        demonstrations=data["demonstrations"],
+        learner=data["learner"],
+        digest=tables.digest(path, raw, named),
+        test=data.get("test", {}),
+        guarantee=_guarantee(path, data),
+        over=data["task"].get("over", "mean"),
     )
 
 
@@ -97,14 +103,22 @@ def _guarantee(path: Path, data: Mapping[str, Any]) -> str | float:
     blind += ['in = "world"'] if learner.get("in") == "world" else []
     asked: str | float = task.get("guarantee", "none" if blind else "best")
     number = not isinstance(asked, str)
-    tables.reject(path, "task", (
-        (bool(blind) and asked != "none",
-         f"guarantee = {asked!r} needs a learner that sees the task and has the time for it: leave "
-         f"out {''.join(blind[:1])}"),
-        ("over" in task and not number, "over belongs to a guarantee that is a probability"),
-        (number and "mu" in learner,
-         f"guarantee = {asked} finds the weight mu that reaches it: leave mu out of [learner]"),
-    ))
+    tables.reject(
+        path,
+        "task",
+        (
+            (
+                bool(blind) and asked != "none",
+                f"guarantee = {asked!r} needs a learner that sees the task and has the time for it: leave "
+                f"out {''.join(blind[:1])}",
+            ),
+            ("over" in task and not number, "over belongs to a guarantee that is a probability"),
+            (
+                number and "mu" in learner,
+                f"guarantee = {asked} finds the weight mu that reaches it: leave mu out of [learner]",
+            ),
+        ),
+    )
     return asked
 
 
@@ -142,8 +156,7 @@ def where(state: int, shape: Sequence[int] | None) -> dict[str, Any]:
 
 
 def place(where: Mapping[str, Any]) -> str:
-    """A state as people name it: row and column from 1 on a map, else its name, or number from 0.
-    """
+    """A state as people name it: row and column from 1 on a map, else its name, or number from 0."""
     if "row" in where:
         return f"row {where['row']}, column {where['column']}"
     return f"state {where.get('name', where['state'])}"
@@ -159,14 +172,19 @@ def many(number: int, what: str) -> str:
 
 # Of task files of any method.
 WORLD = {
-    "legend": tables.LEGEND, "wall": TEXT, "slip": number_in(0, 1), "absorbing": NAMES,
+    "legend": tables.LEGEND,
+    "wall": TEXT,
+    "slip": number_in(0, 1),
+    "absorbing": NAMES,
     "initial": TEXT,
 }
 TASK = {
-    "formula": TEXT, "label_on": choice("entry", "exit"),
+    "formula": TEXT,
+    "label_on": choice("entry", "exit"),
     "guarantee": Rule(
         lambda v: v in ("best", "none") or (is_number(v) and 0 < v <= 1),
-        '"best", "none" or a probability in (0, 1]'),
+        '"best", "none" or a probability in (0, 1]',
+    ),
     "over": choice("mean", "worst"),
 }
 SYNTHETIC = {"synthetic": COUNT, "discount": number_in(0, 1, below=True), "length": COUNT}
@@ -179,7 +197,8 @@ REQUIRED: dict[str, Sequence[str]] = {
 _NAMES_OF_STATES = Rule(lambda v: is_list(v, str) and bool(v), "a list of names of states")
 _OF_LOG: dict[str, Rule] = {
     "confidence": Rule(
-        lambda v: is_number(v) and 0 < v < 1, "a number between 0 and 1, such as 0.95"),
+        lambda v: is_number(v) and 0 < v < 1, "a number between 0 and 1, such as 0.95"
+    ),
     "labels": TEXT,
     "terminal": _NAMES_OF_STATES,
     "graph": choice("seen", "complete"),
@@ -187,10 +206,15 @@ _OF_LOG: dict[str, Rule] = {
 }
 _KEYS: dict[str, dict[str, Rule]] = {
     "world": {
-        "map": tables.MAP, **WORLD, "model": TEXT, "transitions": TEXT, **_OF_LOG,
+        "map": tables.MAP,
+        **WORLD,
+        "model": TEXT,
+        "transitions": TEXT,
+        **_OF_LOG,
         "initial": Rule(
             lambda v: TEXT.holds(v) or _NAMES_OF_STATES.holds(v),
-            "a text; of a log, the name of a state or a list of names"),
+            "a text; of a log, the name of a state or a list of names",
+        ),
     },
     "task": TASK,
     "demonstrations": {"file": TEXT, **SYNTHETIC},
@@ -207,7 +231,8 @@ _KEYS: dict[str, dict[str, Rule]] = {
         "tolerance": number_in(0),
         "start": Rule(
             lambda v: isinstance(v, list) and all(map(is_number, v)),
-            "a list of finite numbers, one per feature"),
+            "a list of finite numbers, one per feature",
+        ),
         "start_scale": number_in(0),
         "satisfaction_over": choice("initial", "all"),
         "avoid": NAMES,
@@ -241,14 +266,24 @@ def read_task(path: str | Path) -> Task:
     data, raw = tables.read_tables(path, "the task file", _KEYS, REQUIRED)
     world, shown = data["world"], data["demonstrations"]
     tables.check_source(path, "world", world, ("legend", "wall", "slip", "absorbing"), _OF_LOG)
-    tables.reject(path, "world", (
-        ("transitions" in world and "confidence" not in world,
-         "lacks confidence, with which the log is to guarantee something, such as 0.95"),
-        ("transitions" in world and "initial" not in world,
-         "lacks initial, the name of the state in which runs start, or a list of names"),
-        ("transitions" not in world and isinstance(world.get("initial"), list),
-         "initial is a list of names of states, which a log has; here it must be a text"),
-    ))
+    tables.reject(
+        path,
+        "world",
+        (
+            (
+                "transitions" in world and "confidence" not in world,
+                "lacks confidence, with which the log is to guarantee something, such as 0.95",
+            ),
+            (
+                "transitions" in world and "initial" not in world,
+                "lacks initial, the name of the state in which runs start, or a list of names",
+            ),
+            (
+                "transitions" not in world and isinstance(world.get("initial"), list),
+                "initial is a list of names of states, which a log has; here it must be a text",
+            ),
+        ),
+    )
     tables.check_demonstrations(path, shown, "file", 'file = "..."', ("discount", "length"))
     _check_learner(path, data["learner"])
     text = world.get("map")
@@ -264,19 +299,31 @@ def _check_learner(path: Path, learner: Mapping[str, Any]) -> None:
     in_world, progress = learner.get("in", "product") == "world", learner.get("progress", ())
     kind: type = str if in_world else int
     wanted = "propositions" if in_world else "automaton states (or left out)"
-    tables.reject(path, "learner", (
-        (in_world and "goal" not in learner,
-         'lacks goal, the propositions of the goal cells, which in = "world" needs since the '
-         "learner does not see the formula"),
-        (in_world and "mu" in learner,
-         'mu weighs the probability of doing the task; it needs in = "product"'),
-        (not in_world and "goal" in learner, 'goal belongs to in = "world"'),
-        ("learning_rate" in learner and learner.get("optimizer", "lbfgs") == "lbfgs",
-         'learning_rate belongs to optimizer = "adam" or "sgd"; "lbfgs", the default, searches for '
-         "its own"),
-        (any(not isinstance(x, kind) for x in progress),
-         f"progress = {progress!r}; it must be a list of {wanted}"),
-    ))
+    tables.reject(
+        path,
+        "learner",
+        (
+            (
+                in_world and "goal" not in learner,
+                'lacks goal, the propositions of the goal cells, which in = "world" needs since the '
+                "learner does not see the formula",
+            ),
+            (
+                in_world and "mu" in learner,
+                'mu weighs the probability of doing the task; it needs in = "product"',
+            ),
+            (not in_world and "goal" in learner, 'goal belongs to in = "world"'),
+            (
+                "learning_rate" in learner and learner.get("optimizer", "lbfgs") == "lbfgs",
+                'learning_rate belongs to optimizer = "adam" or "sgd"; "lbfgs", the default, searches for '
+                "its own",
+            ),
+            (
+                any(not isinstance(x, kind) for x in progress),
+                f"progress = {progress!r}; it must be a list of {wanted}",
+            ),
+        ),
+    )
 
 
 # --- the world ------------------------------------------------------------------------------
@@ -367,12 +414,12 @@ def _read_demonstration(one: Any, world: World) -> list[tuple[int, int]]:
         found = f"it has {', '.join(map(repr, sorted(keys)))}" if keys else f"got {one!r:.60}"
         raise ValueError(
             f': expected {{"cells": [[row, column], ...], "actions": [...]}}, or "states" in place '
-            f"of \"cells\"; {found}."
+            f'of "cells"; {found}.'
         )
     kind = "cells" if "cells" in keys else "states"
     places, names = one[kind], one["actions"]
     if not isinstance(places, list) or not isinstance(names, list) or not names:
-        raise ValueError(f': {kind} and actions must be lists, with at least one action.')
+        raise ValueError(f": {kind} and actions must be lists, with at least one action.")
     if len(places) - len(names) not in (0, 1):
         raise ValueError(
             f": {len(places)} {kind} and {len(names)} actions; give one action for each of the "
@@ -489,8 +536,13 @@ def synthetic_demonstrations(
     stop = model.final if ends else jax.numpy.asarray(np.asarray(best.upper) <= 0)
     # One step more than asked tells a run that has just arrived from one that has not.
     runs = rollout(
-        model, _demonstrator(task, model, best), key, num_trajectories=asked,
-        num_steps=length + 1, stop=stop)
+        model,
+        _demonstrator(task, model, best),
+        key,
+        num_trajectories=asked,
+        num_steps=length + 1,
+        stop=stop,
+    )
     runs = project_trajectories(model, runs)
     states, actions, lengths = (np.asarray(x) for x in (runs.state, runs.action, runs.length))
     kept = [
@@ -524,4 +576,5 @@ def require_end(task: Task, automaton: Automaton) -> None:
     if "discount" in task.demonstrations and automaton.acceptance != "cosafe":
         raise ValueError(
             f"{task.path}: [demonstrations] discount is that of the reward of doing a task that "
-            "ends, which takes a co-safe formula; leave it out for runs of the quickest policy.")
+            "ends, which takes a co-safe formula; leave it out for runs of the quickest policy."
+        )

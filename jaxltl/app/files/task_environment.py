@@ -58,63 +58,120 @@ class EnvironmentTask:
 
 _UNIT = number_in(0, 1)
 _ABOVE = number_in(0)
-_OPEN = Rule(
-    lambda v: tables.is_number(v) and 0 < v < 1, "a number between 0 and 1, such as 0.95")
+_OPEN = Rule(lambda v: tables.is_number(v) and 0 < v < 1, "a number between 0 and 1, such as 0.95")
 _SCHEDULE = Rule(
-    lambda v: _ABOVE.holds(v) or (isinstance(v, list) and len(v) == 2 and all(
-        map(_ABOVE.holds, v))),
-    "a number of at least 0, or [first, last], which goes in a straight line over all steps")
+    lambda v: (
+        _ABOVE.holds(v) or (isinstance(v, list) and len(v) == 2 and all(map(_ABOVE.holds, v)))
+    ),
+    "a number of at least 0, or [first, last], which goes in a straight line over all steps",
+)
 _WIDTHS = Rule(
     lambda v: isinstance(v, list) and all(map(COUNT.holds, v)),
-    "a list of the widths of hidden layers, such as [64, 64]")
+    "a list of the widths of hidden layers, such as [64, 64]",
+)
 _SCORES = (*SUMS, *OF_TASKS)
 
 _PPO: dict[str, Rule] = {
-    "discount": _UNIT, "gae_lambda": _UNIT, "learning_rate": _SCHEDULE, "clip": _SCHEDULE,
-    "value_clip": _SCHEDULE, "value_weight": _ABOVE, "entropy_weight": _ABOVE,
-    "max_gradient_norm": _ABOVE, "target_kl": _ABOVE, "adam_epsilon": _ABOVE, "num_envs": COUNT,
-    "num_steps": COUNT, "num_epochs": COUNT, "num_minibatches": COUNT,
-    "normalize_advantage": TRUTH, "normalize_observation": TRUTH, "normalize_reward": TRUTH,
+    "discount": _UNIT,
+    "gae_lambda": _UNIT,
+    "learning_rate": _SCHEDULE,
+    "clip": _SCHEDULE,
+    "value_clip": _SCHEDULE,
+    "value_weight": _ABOVE,
+    "entropy_weight": _ABOVE,
+    "max_gradient_norm": _ABOVE,
+    "target_kl": _ABOVE,
+    "adam_epsilon": _ABOVE,
+    "num_envs": COUNT,
+    "num_steps": COUNT,
+    "num_epochs": COUNT,
+    "num_minibatches": COUNT,
+    "normalize_advantage": TRUTH,
+    "normalize_observation": TRUTH,
+    "normalize_reward": TRUTH,
     "squash": choice("clip", "tanh"),
     "num_resets": Rule(lambda v: v == 0 or COUNT.holds(v), "a whole number of at least 0"),
-    "hidden": _WIDTHS, "activation": choice("tanh", "relu", "gelu", "silu"),
+    "hidden": _WIDTHS,
+    "activation": choice("tanh", "relu", "gelu", "silu"),
     "initial_deviation": _ABOVE,
 }
 _CCE: dict[str, Rule] = {
-    "rate": _SCHEDULE, "temperature": _ABOVE, "margin": NUMBER, "population": COUNT, "rho": _OPEN,
-    "weighting": choice("until_feasible", "literal", "uniform"), "elite_reuse": TRUTH,
-    "antithetic": TRUTH, "variance_floor": _ABOVE, "noise": _SCHEDULE, "restart_below": _ABOVE,
-    "hidden": _WIDTHS, "activation": choice("tanh", "relu"), "deviation": _ABOVE,
-    "objective": choice(*_SCORES), "cost": choice(*_SCORES), "limit": NUMBER, "episodes": COUNT,
+    "rate": _SCHEDULE,
+    "temperature": _ABOVE,
+    "margin": NUMBER,
+    "population": COUNT,
+    "rho": _OPEN,
+    "weighting": choice("until_feasible", "literal", "uniform"),
+    "elite_reuse": TRUTH,
+    "antithetic": TRUTH,
+    "variance_floor": _ABOVE,
+    "noise": _SCHEDULE,
+    "restart_below": _ABOVE,
+    "hidden": _WIDTHS,
+    "activation": choice("tanh", "relu"),
+    "deviation": _ABOVE,
+    "objective": choice(*_SCORES),
+    "cost": choice(*_SCORES),
+    "limit": NUMBER,
+    "episodes": COUNT,
 }
 _CPO: dict[str, Rule] = {
-    "discount": _UNIT, "cost_discount": _UNIT, "gae_lambda": _UNIT, "cost_gae_lambda": _UNIT,
-    "delta": _ABOVE, "damping": _ABOVE, "initial_deviation": _ABOVE, "backtrack": _UNIT,
-    "value_rate": _ABOVE, "num_trajectories": COUNT, "hidden": _WIDTHS, "value_hidden": _WIDTHS,
-    "normalize": TRUTH, "cg_steps": COUNT, "search_steps": COUNT, "fisher_stride": COUNT,
-    "value_epochs": COUNT, "value_batches": COUNT, "limit": NUMBER,
+    "discount": _UNIT,
+    "cost_discount": _UNIT,
+    "gae_lambda": _UNIT,
+    "cost_gae_lambda": _UNIT,
+    "delta": _ABOVE,
+    "damping": _ABOVE,
+    "initial_deviation": _ABOVE,
+    "backtrack": _UNIT,
+    "value_rate": _ABOVE,
+    "num_trajectories": COUNT,
+    "hidden": _WIDTHS,
+    "value_hidden": _WIDTHS,
+    "normalize": TRUTH,
+    "cg_steps": COUNT,
+    "search_steps": COUNT,
+    "fisher_stride": COUNT,
+    "value_epochs": COUNT,
+    "value_batches": COUNT,
+    "limit": NUMBER,
     "cost": choice("world", "violation"),
 }
 _KEYS: dict[str, Mapping[str, Rule]] = {
     "world": {
-        "environment": TEXT, "arguments": tables.TABLE, "labels": TEXT,
+        "environment": TEXT,
+        "arguments": tables.TABLE,
+        "labels": TEXT,
         "propositions": Rule(lambda v: is_list(v, str), 'a list of names, such as ["goal"]'),
         "horizon": COUNT,
     },
     "task": {
-        "formula": TEXT, "reward": choice(*REWARDS), "discount": _UNIT, "ratio": _UNIT,
-        "shaping": choice("distance"), "ending": choice(*ENDINGS),
+        "formula": TEXT,
+        "reward": choice(*REWARDS),
+        "discount": _UNIT,
+        "ratio": _UNIT,
+        "shaping": choice("distance"),
+        "ending": choice(*ENDINGS),
     },
     "learner": {"method": choice(*METHODS), "steps": COUNT},
-    "ppo": _PPO, "cce": _CCE, "cpo": _CPO,
+    "ppo": _PPO,
+    "cce": _CCE,
+    "cpo": _CPO,
     "evaluation": {
-        "episodes": COUNT, "steps": COUNT, "confidence": _OPEN, "threshold": _OPEN,
-        "discount": _OPEN, "policy": choice("drawn", "likeliest"),
+        "episodes": COUNT,
+        "steps": COUNT,
+        "confidence": _OPEN,
+        "threshold": _OPEN,
+        "discount": _OPEN,
+        "policy": choice("drawn", "likeliest"),
     },
 }
 _REQUIRED = {
-    "": ("world", "task", "learner"), "world": ("environment",), "task": ("formula",),
-    "learner": ("method", "steps"), "cpo": ("limit",),
+    "": ("world", "task", "learner"),
+    "world": ("environment",),
+    "task": ("formula",),
+    "learner": ("method", "steps"),
+    "cpo": ("limit",),
 }
 
 
@@ -146,11 +203,17 @@ def read_task(path: str | Path, raw: bytes | None = None) -> EnvironmentTask:
     world, task, method = data["world"], dict(data["task"]), data["learner"]["method"]
     _check_method(path, data, method)
     return EnvironmentTask(
-        path=path, name=data.get("name", path.stem), world=world, formula=task.pop("formula"),
-        reward=task, learner=data["learner"], settings=data.get(method, {}),
+        path=path,
+        name=data.get("name", path.stem),
+        world=world,
+        formula=task.pop("formula"),
+        reward=task,
+        learner=data["learner"],
+        settings=data.get(method, {}),
         evaluation=data.get("evaluation", {}),
         digest=tables.digest(path, found, named_files(world)) if raw is None else "",
-        text=found.decode())
+        text=found.decode(),
+    )
 
 
 def named_files(world: Mapping[str, Any]) -> list[str]:
@@ -162,21 +225,58 @@ def named_files(world: Mapping[str, Any]) -> list[str]:
 def _check_method(path: Path, data: Mapping[str, Any], method: str) -> None:
     settings, world = data.get(method, {}), data["world"]
     for other in METHODS:
-        tables.reject(path, other, [(
-            other != method and other in data,
-            f'is for method = "{other}", and [learner] says "{method}": leave one of them out')])
-    tables.reject(path, "cpo", [(
-        method == "cpo" and "limit" not in settings,
-        "lacks limit, which the expected cost of an episode is to keep to")])
-    tables.reject(path, "cce", [
-        (method == "cce" and "limit" in settings and "cost" not in settings,
-         'limit is that of a cost: give cost = "failure", "violation" or another score'),
-        (method == "cce" and "cost" in settings and "limit" not in settings,
-         "cost needs a limit, which it is to keep to")])
-    tables.reject(path, "world", [(
-        ("labels" in world) != ("propositions" in world),
-        "labels and propositions belong together: a function and the names of what it returns")])
+        tables.reject(
+            path,
+            other,
+            [
+                (
+                    other != method and other in data,
+                    f'is for method = "{other}", and [learner] says "{method}": leave one of them out',
+                )
+            ],
+        )
+    tables.reject(
+        path,
+        "cpo",
+        [
+            (
+                method == "cpo" and "limit" not in settings,
+                "lacks limit, which the expected cost of an episode is to keep to",
+            )
+        ],
+    )
+    tables.reject(
+        path,
+        "cce",
+        [
+            (
+                method == "cce" and "limit" in settings and "cost" not in settings,
+                'limit is that of a cost: give cost = "failure", "violation" or another score',
+            ),
+            (
+                method == "cce" and "cost" in settings and "limit" not in settings,
+                "cost needs a limit, which it is to keep to",
+            ),
+        ],
+    )
+    tables.reject(
+        path,
+        "world",
+        [
+            (
+                ("labels" in world) != ("propositions" in world),
+                "labels and propositions belong together: a function and the names of what it returns",
+            )
+        ],
+    )
     judged = data.get("evaluation", {})
-    tables.reject(path, "evaluation", [(
-        method == "cce" and "policy" in judged,
-        'policy is for methods whose policies draw their actions; that of "cce" draws none')])
+    tables.reject(
+        path,
+        "evaluation",
+        [
+            (
+                method == "cce" and "policy" in judged,
+                'policy is for methods whose policies draw their actions; that of "cce" draws none',
+            )
+        ],
+    )

@@ -80,13 +80,15 @@ _MAPS = Rule(
 _COLORED = {"objects": _COUNTS, "obstacles": _COUNTS, "margin": COUNT}
 _REWARDS = ("progress", "failure", "step", "won", "lost")
 _GENERATED = {
-    "obstacles": _WHOLE, "min_distance": COUNT,
+    "obstacles": _WHOLE,
+    "min_distance": COUNT,
     "shape": Rule(lambda v: is_list(v, int) and len(v) == 2 and min(v) >= 1, "[rows, columns]"),
     "seed": _WHOLE,
 }
 _NO_LOG = Rule(
     lambda v: False,
-    'left out: a log has no cells for a network to look around in; "mlirl" learns from logs')
+    'left out: a log has no cells for a network to look around in; "mlirl" learns from logs',
+)
 _KEYS: dict[str, dict[str, Rule]] = {
     "world": {"maps": _MAPS, **_COLORED, **tasks.WORLD, "transitions": _NO_LOG},
     "task": tasks.TASK,
@@ -138,17 +140,30 @@ def read_task(path: str | Path) -> Task:
     of_synthetic = ("discount", "length", *_REWARDS)
     tables.check_demonstrations(path, shown, "files", "files = [...]", of_synthetic)
     rewards = [key for key in _REWARDS if key in shown]
-    tables.reject(path, "demonstrations", [
-        (bool(rewards) and "discount" not in shown,
-         f"{''.join(rewards[:1])} belongs to a demonstrator who maximises a reward; give its "
-         "discount too, for example 0.95, or leave it out for runs of the quickest of the best "
-         "policies"),
-    ])
+    tables.reject(
+        path,
+        "demonstrations",
+        [
+            (
+                bool(rewards) and "discount" not in shown,
+                f"{''.join(rewards[:1])} belongs to a demonstrator who maximises a reward; give its "
+                "discount too, for example 0.95, or leave it out for runs of the quickest of the best "
+                "policies",
+            ),
+        ],
+    )
     files, number = shown.get("files", world["maps"]), len(world["maps"])
-    tables.reject(path, "demonstrations", [
-        (len(files) != number, f"names {len(files)} files for {number} worlds; give one for each "
-         "of [world] maps, in their order"),
-    ])
+    tables.reject(
+        path,
+        "demonstrations",
+        [
+            (
+                len(files) != number,
+                f"names {len(files)} files for {number} worlds; give one for each "
+                "of [world] maps, in their order",
+            ),
+        ],
+    )
     _check_learner(path, data["learner"])
     if "test" in data:
         _check_test(path, test, "legend" in world)
@@ -157,24 +172,42 @@ def read_task(path: str | Path) -> Task:
 
 
 def _check_learner(path: Path, learner: Mapping[str, Any]) -> None:
-    tables.reject(path, "learner", (
-        (learner["discount"] == 1 and "horizon" not in learner,
-         "discount = 1 needs a horizon, the number of steps of a run; or choose a discount below "
-         "1, such as 0.95"),
-        (learner.get("optimizer") == "lbfgs" and "learning_rate" in learner,
-         'learning_rate does not belong to optimizer = "lbfgs", which searches for its own'),
-        (learner.get("held_out") == 0 and "patience" in learner,
-         "patience waits for a better held-out likelihood; it needs a held_out above 0"),
-    ))
+    tables.reject(
+        path,
+        "learner",
+        (
+            (
+                learner["discount"] == 1 and "horizon" not in learner,
+                "discount = 1 needs a horizon, the number of steps of a run; or choose a discount below "
+                "1, such as 0.95",
+            ),
+            (
+                learner.get("optimizer") == "lbfgs" and "learning_rate" in learner,
+                'learning_rate does not belong to optimizer = "lbfgs", which searches for its own',
+            ),
+            (
+                learner.get("held_out") == 0 and "patience" in learner,
+                "patience waits for a better held-out likelihood; it needs a held_out above 0",
+            ),
+        ),
+    )
 
 
 def _check_test(path: Path, test: Mapping[str, Any], plain: bool) -> None:
-    tables.reject(path, "test", (
-        ("maps" not in test and "generate" not in test,
-         "must have maps = [...] or generate = N, or both"),
-        ("generate" in test and plain,
-         "generate makes coloured worlds; where [world] has a legend, give maps = [...]"),
-    ))
+    tables.reject(
+        path,
+        "test",
+        (
+            (
+                "maps" not in test and "generate" not in test,
+                "must have maps = [...] or generate = N, or both",
+            ),
+            (
+                "generate" in test and plain,
+                "generate makes coloured worlds; where [world] has a legend, give maps = [...]",
+            ),
+        ),
+    )
     if "generate" not in test:
         tables.refuse(path, "test", test, _GENERATED, "generate = N")
 
@@ -260,7 +293,8 @@ def _gives_kinds(world: Mapping[str, Any]) -> bool:
 
 def _counts(world: Mapping[str, Any], key: str) -> list[tuple[str, Mapping[str, int]]]:
     default = {
-        "objects": temporal_gridworld.OBJECTS, "obstacles": temporal_gridworld.OBSTACLES,
+        "objects": temporal_gridworld.OBJECTS,
+        "obstacles": temporal_gridworld.OBSTACLES,
     }
     return list(world.get(key, default[key]).items())
 
@@ -270,8 +304,7 @@ def _colored_scene(name: str, text: str, world: Mapping[str, Any], radius: int) 
     if _gives_kinds(world):
         given = dict([*_counts(world, "objects"), *_counts(world, "obstacles")])
         own = {
-            kind: {c: n for c, n in zip(COLORS, row, strict=True) if n}
-            for kind, row in found.kinds
+            kind: {c: n for c, n in zip(COLORS, row, strict=True) if n} for kind, row in found.kinds
         }
         if own != {k: {c: n for c, n in row.items() if n} for k, row in given.items()}:
             raise ValueError(
@@ -342,9 +375,15 @@ def _generate(task: Task, first: Scene, judge: Automaton) -> list[Scene]:
     seeds = range(spec.get("seed", 0), spec.get("seed", 0) + spec["generate"])
     with tables.errors_in(f"{task.path}: [test] generate: "):
         made = temporal_gridworld.random_worlds(
-            seeds, judge, shape=tuple(spec.get("shape", first.shape)), objects=objects,
-            obstacles=obstacles, num_obstacles=spec.get("obstacles", max(shown, default=0)),
-            min_distance=spec.get("min_distance", 3), margin=first.colored.margin, slip=slip,
+            seeds,
+            judge,
+            shape=tuple(spec.get("shape", first.shape)),
+            objects=objects,
+            obstacles=obstacles,
+            num_obstacles=spec.get("obstacles", max(shown, default=0)),
+            min_distance=spec.get("min_distance", 3),
+            margin=first.colored.margin,
+            slip=slip,
         )
     return [
         _of_world(f"seed {seed}", world, task.radius)

@@ -40,8 +40,11 @@ def page(result: Mapping[str, Any], *shown: Any) -> str:
 def _told(result: Mapping[str, Any]) -> list[str]:
     """What stands after the policies."""
     return [
-        f"<h2>Probability of doing the task{_by_frequencies(result)}</h2>", _evidence_table(result),
-        "<h2>Weights</h2>", _weights_table(result), _seeds(result),
+        f"<h2>Probability of doing the task{_by_frequencies(result)}</h2>",
+        _evidence_table(result),
+        "<h2>Weights</h2>",
+        _weights_table(result),
+        _seeds(result),
     ]
 
 
@@ -54,35 +57,56 @@ def remarks(result: Mapping[str, Any]) -> list[Remark]:
 
 def _of_log(data: Mapping[str, Any]) -> list[Remark]:
     """What a log guarantees, what another policy could have, and where more of it would help."""
-    found: list[Remark] = [("good" if data["guaranteed"] > 0 else "warning", (
-        f"{_guaranteed(data)}. That is what the log guarantees of this policy, whatever the "
-        "probabilities are that it leaves possible; other figures are by the log's frequencies, "
-        "as if they were the truth. The best that could be guaranteed by this log is "
-        f"{probability(data['best_guaranteed'])}, by the policy of jaxltl certify; no policy has "
-        f"more than {probability(data['optimistic'])}, with the same confidence."))]
+    found: list[Remark] = [
+        (
+            "good" if data["guaranteed"] > 0 else "warning",
+            (
+                f"{_guaranteed(data)}. That is what the log guarantees of this policy, whatever the "
+                "probabilities are that it leaves possible; other figures are by the log's frequencies, "
+                "as if they were the truth. The best that could be guaranteed by this log is "
+                f"{probability(data['best_guaranteed'])}, by the policy of jaxltl certify; no policy has "
+                f"more than {probability(data['optimistic'])}, with the same confidence."
+            ),
+        )
+    ]
     if data["status"] != "CONVERGED":
-        found.append(("warning", (
-            f"The solver for what the log guarantees ended with {data['status']}; it holds, and "
-            "may be less than could be shown.")))
+        found.append(
+            (
+                "warning",
+                (
+                    f"The solver for what the log guarantees ended with {data['status']}; it holds, and "
+                    "may be less than could be shown."
+                ),
+            )
+        )
     if data["sample_next"]:
         first = data["sample_next"][0]
-        found.append(("note", (
-            f"More samples of {first['action']} in {first['state']} ({first['samples']} so far) "
-            "would raise what can be guaranteed most, by up to "
-            f"{probability(first['gain'])}.")))
+        found.append(
+            (
+                "note",
+                (
+                    f"More samples of {first['action']} in {first['state']} ({first['samples']} so far) "
+                    "would raise what can be guaranteed most, by up to "
+                    f"{probability(first['gain'])}."
+                ),
+            )
+        )
     return found
 
 
 def _guaranteed(data: Mapping[str, Any]) -> str:
-    return (f"P >= {math.floor(data['guaranteed'] * 1e4) / 1e4:.4f} with confidence "
-            f"{data['confidence']:g}, from {many(data['samples'], 'logged transition')}")
+    return (
+        f"P >= {math.floor(data['guaranteed'] * 1e4) / 1e4:.4f} with confidence "
+        f"{data['confidence']:g}, from {many(data['samples'], 'logged transition')}"
+    )
 
 
 def _if_true(said: Remark) -> Remark:
     """What is proven of a log's frequencies is proven of nothing else."""
     kind, text = said
     return "note" if kind == "good" else kind, (
-        f"If the log's frequencies were the truth: {text[0].lower()}{text[1:]}")
+        f"If the log's frequencies were the truth: {text[0].lower()}{text[1:]}"
+    )
 
 
 def _by_frequencies(result: Mapping[str, Any]) -> str:
@@ -95,12 +119,18 @@ def _notes(result: Mapping[str, Any]) -> list[Remark]:
     asked, logged = result["guarantee"]["asked"], "data" in result
     if asked == "best":
         if learned["minimum"]["lower"] == 1:
-            graph = ("By the graph, which is what the log showed" if logged else "By the graph")
-            found.append(("note" if logged else "good", (
-                f"{graph}: from every initial state the policy does the task with probability "
-                "1, whatever the numbers"
-                + (", if no move leads where the log never saw it lead" if logged else "")
-                + ". It takes moves that keep that possible, and no others.")))
+            graph = "By the graph, which is what the log showed" if logged else "By the graph"
+            found.append(
+                (
+                    "note" if logged else "good",
+                    (
+                        f"{graph}: from every initial state the policy does the task with probability "
+                        "1, whatever the numbers"
+                        + (", if no move leads where the log never saw it lead" if logged else "")
+                        + ". It takes moves that keep that possible, and no others."
+                    ),
+                )
+            )
         else:
             said = _nearly_best(learned["mean"]["lower"], best["mean"])
             found.append(_if_true(said) if logged else said)
@@ -116,16 +146,21 @@ def _notes(result: Mapping[str, Any]) -> list[Remark]:
 def _left_out(lost: Mapping[str, Any]) -> str:
     """Which demonstrated steps were not learned from, and why not."""
     one = lost["steps"] == 1
-    why, figures = f"{'lowers' if one else 'lower'} the best probability", (
-        f": from {probability(lost['from'])} to {probability(lost['to'])}")
+    why, figures = (
+        f"{'lowers' if one else 'lower'} the best probability",
+        (f": from {probability(lost['from'])} to {probability(lost['to'])}"),
+    )
     if lost["from"] - lost["to"] < 1e-9:  # by itself it loses nothing
-        why = (f"{'leaves' if one else 'leave'} what does the task and may come back, which again "
-               "and again would fail it,")
+        why = (
+            f"{'leaves' if one else 'leave'} what does the task and may come back, which again "
+            "and again would fail it,"
+        )
         figures = ""
     return (
         f"{lost['steps']} of {lost['of']} demonstrated steps {why} and {'was' if one else 'were'} "
         f"left out; first at {place(lost)} (demonstration {lost['demonstration']}, step "
-        f"{lost['step']}){figures}.")
+        f"{lost['step']}){figures}."
+    )
 
 
 def _nearly_best(lower: float | None, best: Mapping[str, Any]) -> Remark:
@@ -135,18 +170,22 @@ def _nearly_best(lower: float | None, best: Mapping[str, Any]) -> Remark:
         how = f"to lose at most {number(gap)}" if math.isfinite(gap) else "of nothing"
         return "warning", (
             "Bounds do not tell the moves that preserve the best probability from others that are "
-            f"near to it: the policy is certified {how} on average.")
+            f"near to it: the policy is certified {how} on average."
+        )
     return "good", (
         "By construction no policy does the task with a greater probability: this one takes moves "
         f"that preserve the best one ({probability(best['value'])} on average), and no others. "
-        f"It is certified to lose at most {number(max(gap, 0.0))} on average.")
+        f"It is certified to lose at most {number(max(gap, 0.0))} on average."
+    )
 
 
 def _asked(guarantee: Mapping[str, Any]) -> str:
     """How a probability that was asked for was reached."""
     over = "on average" if guarantee["over"] == "mean" else "from the worst initial state"
-    text = (f"Asked for {probability(guarantee['asked'])} {over}, certified "
-            f"{probability(guarantee['attained'])}: ")
+    text = (
+        f"Asked for {probability(guarantee['asked'])} {over}, certified "
+        f"{probability(guarantee['attained'])}: "
+    )
     share, weight = guarantee["share"], guarantee["weight"]
     if share:
         other = "moves that lose nothing" if weight is None else f"the policy of mu = {weight:.3g}"
@@ -184,8 +223,10 @@ def table(result: Mapping[str, Any]) -> str:
         "",
         f"negative log-likelihood  {number(result['neg_log_likelihood'])}",
         "weights",
-        *(f"  {name:{width}} {number(weight):>9}  {meaning(name, weight)}"
-          for name, weight in weights.items()),
+        *(
+            f"  {name:{width}} {number(weight):>9}  {meaning(name, weight)}"
+            for name, weight in weights.items()
+        ),
     ]
     if training["converged"]:
         lines.append(
@@ -221,14 +262,16 @@ def warnings(result: Mapping[str, Any]) -> list[str]:
     if learned["value"] < (1 - _SHORT) * best["value"]:
         found.append(
             f"The policy does the task with probability {probability(learned['value'])} where "
-            f"{probability(best['value'])} is possible. " + _remedy(result))
+            f"{probability(best['value'])} is possible. " + _remedy(result)
+        )
     steps = result["expected_steps"] or {"quickest": None}
     if steps["quickest"] and (steps["learned"] or math.inf) > _LONG * steps["quickest"]:
         much = f"{number(steps['learned'])}" if steps["learned"] else "more than can be told"
         found.append(
             f"The policy takes {much} steps on average where {number(steps['quickest'])} would "
             "do: it goes round where it earns what was shown again and again. A smaller discount "
-            "in [learner] helps; with 0 each action counts for itself.")
+            "in [learner] helps; with 0 each action counts for itself."
+        )
     starts, total = result["impossible_starts"], result["satisfaction"]["num_starts"]
     if starts:
         listed = "; ".join(place(s) for s in starts[:5]) + ("; ..." if len(starts) > 5 else "")
@@ -245,8 +288,10 @@ def warnings(result: Mapping[str, Any]) -> list[str]:
             f"Learning did not converge in {training['steps']} steps ({reason}): raise steps, "
             "loosen tolerance, or choose another optimizer."
         )
-    for key, what in (("satisfaction", "the policy's probability"),
-                      ("best_achievable", "the best achievable probability")):
+    for key, what in (
+        ("satisfaction", "the policy's probability"),
+        ("best_achievable", "the best achievable probability"),
+    ):
         if result[key]["status"] != "CONVERGED":
             found.append(
                 f"The solver for {what} ended with {result[key]['status']}; only its bounds hold."
@@ -260,31 +305,50 @@ def _remedy(result: Mapping[str, Any]) -> str:
     if (tried := result["guarantee"].get("remedy")) is not None:
         return (
             'With guarantee = "best" in [task] it is certified to be at least '
-            f"{probability(tried)}: tried.")
+            f"{probability(tried)}: tried."
+        )
     return 'guarantee = "best" in [task] attains it.'
 
 
 def _tiles(result: Mapping[str, Any]) -> str:
     learned, best = result["satisfaction"], result["best_achievable"]
     training = result["training"]
-    how = ("<span class=good>converged</span>" if training["converged"]
-           else "<span class=bad>not converged</span>")
+    how = (
+        "<span class=good>converged</span>"
+        if training["converged"]
+        else "<span class=bad>not converged</span>"
+    )
     data = result.get("data")
-    sure = [] if data is None else [(
-        probability(math.floor(data["guaranteed"] * 1e4) / 1e4),
-        f"guaranteed with confidence {data['confidence']:g}, from "
-        f"{many(data['samples'], 'logged transition')}")]
+    sure = (
+        []
+        if data is None
+        else [
+            (
+                probability(math.floor(data["guaranteed"] * 1e4) / 1e4),
+                f"guaranteed with confidence {data['confidence']:g}, from "
+                f"{many(data['samples'], 'logged transition')}",
+            )
+        ]
+    )
     by = _by_frequencies(result)
-    return tiles([
-        *sure,
-        (probability(learned["mean"]["value"]),
-         f"mean probability{by} over {many(learned['num_starts'], 'initial state')}"),
-        (probability(learned["minimum"]["value"]),
-         f"minimum, from {html.escape(place(learned['minimum']))}"),
-        (probability(best["mean"]["value"]), f"best achievable mean{by}"),
-        (number(result["neg_log_likelihood"]),
-         f"negative log-likelihood; {how} in {training['steps']} steps"),
-    ])
+    return tiles(
+        [
+            *sure,
+            (
+                probability(learned["mean"]["value"]),
+                f"mean probability{by} over {many(learned['num_starts'], 'initial state')}",
+            ),
+            (
+                probability(learned["minimum"]["value"]),
+                f"minimum, from {html.escape(place(learned['minimum']))}",
+            ),
+            (probability(best["mean"]["value"]), f"best achievable mean{by}"),
+            (
+                number(result["neg_log_likelihood"]),
+                f"negative log-likelihood; {how} in {training['steps']} steps",
+            ),
+        ]
+    )
 
 
 def _evidence(result: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
@@ -293,13 +357,20 @@ def _evidence(result: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
         for what in ("mean", "minimum"):
             entry = result[key][what]
             where = place(entry) if what == "minimum" else ""
-            yield (title, what, probability(entry["value"]), certified(entry), where,
-                   result[key]["status"].lower())
+            yield (
+                title,
+                what,
+                probability(entry["value"]),
+                certified(entry),
+                where,
+                result[key]["status"].lower(),
+            )
 
 
 def _evidence_table(result: Mapping[str, Any]) -> str:
-    lines = [(f"{title}, {what}", *map(html.escape, rest))
-             for title, what, *rest in _evidence(result)]
+    lines = [
+        (f"{title}, {what}", *map(html.escape, rest)) for title, what, *rest in _evidence(result)
+    ]
     true = "The probability" if "data" in result else "The true probability"
     return rows(("policy", "probability", "certified", "where", "solver"), lines) + (
         f"<p class=muted>{true}{_by_frequencies(result)} is certified to be that close.</p>"
@@ -307,8 +378,10 @@ def _evidence_table(result: Mapping[str, Any]) -> str:
 
 
 def _weights_table(result: Mapping[str, Any]) -> str:
-    lines = [(html.escape(name), number(weight), meaning(name, weight))
-             for name, weight in result["weights"].items()]
+    lines = [
+        (html.escape(name), number(weight), meaning(name, weight))
+        for name, weight in result["weights"].items()
+    ]
     return rows(("feature", "weight", "what it says"), lines)
 
 

@@ -20,12 +20,14 @@ from jaxltl.app.reports.page import (
 )
 
 _WHO = {
-    "learned": "learned reward", "expert": "expert, who knows the task", "random": "random moves",
+    "learned": "learned reward",
+    "expert": "expert, who knows the task",
+    "random": "random moves",
 }
 _EXPERT = {
     "soft": "The expert knows the task and is soft-optimal for it.",
     "quickest": "The expert knows the task: no policy does it with a greater probability, and of "
-                "those that do it as well it is the quickest.",
+    "those that do it as well it is the quickest.",
 }
 _ROWS = 20  # worlds in a table
 
@@ -43,8 +45,10 @@ def page(result: Mapping[str, Any], *shown: Any) -> str:
 
 def _told(result: Mapping[str, Any]) -> list[str]:
     """What stands after the policies."""
-    told = [f"<h2>Mean probability of doing the task{_within(result)}</h2>",
-            _evidence_table(result)]
+    told = [
+        f"<h2>Mean probability of doing the task{_within(result)}</h2>",
+        _evidence_table(result),
+    ]
     for key, title in (("test", "Test worlds"), ("training", "Training worlds")):
         if result[key]:
             told += [f"<h2>{title}</h2>", _worlds_table(result[key])]
@@ -55,10 +59,16 @@ def remarks(result: Mapping[str, Any]) -> list[Remark]:
     """What the page says first."""
     found = [("warning", text) for text in warnings(result)]
     if result["guarantee"]["asked"] == "best":
-        found.append(("good", (
-            "By construction: in every world, new ones too, the policy takes moves that lose "
-            "nothing of the task, and no others; what was learned decides how. Taken alike, they "
-            f"are certified to lose at most {number(result['guarantee']['loss'])} here.")))
+        found.append(
+            (
+                "good",
+                (
+                    "By construction: in every world, new ones too, the policy takes moves that lose "
+                    "nothing of the task, and no others; what was learned decides how. Taken alike, they "
+                    f"are certified to lose at most {number(result['guarantee']['loss'])} here."
+                ),
+            )
+        )
     elif result["guarantee"]["asked"] != "none":
         found.append(("good", _asked(result)))
     if result["trivial"]:
@@ -73,20 +83,30 @@ def _asked(result: Mapping[str, Any]) -> str:
     asked = result["guarantee"]
     over = "on average over its starts" if asked["over"] == "mean" else "from its worst start"
     worlds = [
-        world for key in ("training", "test") if result[key] for world in result[key]["worlds"]
-        if world["name"] not in result[key]["left_out"]]
+        world
+        for key in ("training", "test")
+        if result[key]
+        for world in result[key]["worlds"]
+        if world["name"] not in result[key]["left_out"]
+    ]
     least = min(world["attained"] for world in worlds)
-    how = ("the likeliest reward is taken as it is" if not asked["weight"] else
-           f"the task is weighed by mu = {asked['weight']:.3g} in learning")
+    how = (
+        "the likeliest reward is taken as it is"
+        if not asked["weight"]
+        else f"the task is weighed by mu = {asked['weight']:.3g} in learning"
+    )
     mixed = [world["share"] for world in worlds if world["share"]]
     more = ""
     if mixed:
         shares = number(mixed[0]) if len(mixed) == 1 else f"{min(mixed):.3g} to {max(mixed):.3g}"
-        more = (f", and in {len(mixed)} of {len(worlds)} worlds a share of {shares} of moves that "
-                "lose nothing is mixed in")
+        more = (
+            f", and in {len(mixed)} of {len(worlds)} worlds a share of {shares} of moves that "
+            "lose nothing is mixed in"
+        )
     return (
         f"Asked for {probability(asked['asked'])} in every world, new ones too, {over}; certified "
-        f"at least {probability(least)} here: {how}{more}.")
+        f"at least {probability(least)} here: {how}{more}."
+    )
 
 
 def table(result: Mapping[str, Any]) -> str:
@@ -104,16 +124,15 @@ def table(result: Mapping[str, Any]) -> str:
         lines.append(f"  in {_number_of_worlds(about)} {key} world{_s(about['num_counted'])}")
         for who, title in _WHO.items():
             one = about[who]
-            worst = (f"worst {probability(one['worst_world']['value'])} in "
-                     f"{one['worst_world']['name']}")
+            worst = (
+                f"worst {probability(one['worst_world']['value'])} in {one['worst_world']['name']}"
+            )
             lines.append(
                 f"    {title:27} {probability(one['mean']['value']):>8}   certified "
                 f"{certified(one['mean']):15} {worst if about['num_counted'] > 1 else ''}".rstrip()
             )
         one = about["learned"]
-        lines.append(
-            f"    {'from the worst start':27} {probability(one['worst_start']):>8}"
-        )
+        lines.append(f"    {'from the worst start':27} {probability(one['worst_start']):>8}")
     lines += ["", f"learning  {_how_it_ended(result)}"]
     if learning["held_out"] is not None:
         lines.append(
@@ -141,8 +160,11 @@ def warnings(result: Mapping[str, Any]) -> list[str]:
         for name in about["infeasible"]:
             world = worlds[name]
             counted = "it is left out" if name in about["left_out"] else "it counts in the mean"
-            fix = (' unless [test] leave_out names it'
-                   if key == "test" and name not in about["left_out"] else "")
+            fix = (
+                " unless [test] leave_out names it"
+                if key == "test" and name not in about["left_out"]
+                else ""
+            )
             found.append(
                 f"No policy can do the task from {world['infeasible_starts']} of "
                 f"{world['num_starts']} starts of the {key} world {name}; {counted}{fix}."
@@ -223,25 +245,37 @@ def _how_it_ended(result: Mapping[str, Any]) -> str:
 
 def _tiles(result: Mapping[str, Any]) -> str:
     training, test, learning = result["training"], result["test"], result["learning"]
-    figures = [(
-        probability(training["learned"]["mean"]["value"]),
-        f"mean probability in {training['num_counted']} training world"
-        f"{_s(training['num_counted'])}",
-    )]
+    figures = [
+        (
+            probability(training["learned"]["mean"]["value"]),
+            f"mean probability in {training['num_counted']} training world"
+            f"{_s(training['num_counted'])}",
+        )
+    ]
     if test:
         one = test["learned"]
         figures = [
-            (probability(one["mean"]["value"]),
-             f"mean probability in {_number_of_worlds(test)} test worlds"),
-            (probability(one["worst_world"]["value"]),
-             f"in the worst test world, {html.escape(one['worst_world']['name'])}"),
+            (
+                probability(one["mean"]["value"]),
+                f"mean probability in {_number_of_worlds(test)} test worlds",
+            ),
+            (
+                probability(one["worst_world"]["value"]),
+                f"in the worst test world, {html.escape(one['worst_world']['name'])}",
+            ),
             *figures,
         ]
-    figures.append((
-        number(learning["held_out"] if learning["held_out"] is not None else learning["loss"]),
-        ("negative log-likelihood of a held-out pair; " if learning["held_out"] is not None
-         else "loss; ") + html.escape(_how_it_ended(result)),
-    ))
+    figures.append(
+        (
+            number(learning["held_out"] if learning["held_out"] is not None else learning["loss"]),
+            (
+                "negative log-likelihood of a held-out pair; "
+                if learning["held_out"] is not None
+                else "loss; "
+            )
+            + html.escape(_how_it_ended(result)),
+        )
+    )
     return tiles(figures)
 
 
@@ -253,13 +287,17 @@ def _evidence_table(result: Mapping[str, Any]) -> str:
             continue
         for who in _WHO:
             one = about[who]
-            lines.append((
-                f"{key}, {who}", probability(one["mean"]["value"]), certified(one["mean"]),
-                number(one["std"]) if about["num_counted"] > 1 else "",
-                f"{probability(one['worst_world']['value'])}, "
-                f"{html.escape(one['worst_world']['name'])}",
-                probability(one["worst_start"]),
-            ))
+            lines.append(
+                (
+                    f"{key}, {who}",
+                    probability(one["mean"]["value"]),
+                    certified(one["mean"]),
+                    number(one["std"]) if about["num_counted"] > 1 else "",
+                    f"{probability(one['worst_world']['value'])}, "
+                    f"{html.escape(one['worst_world']['name'])}",
+                    probability(one["worst_start"]),
+                )
+            )
     header = ("who", "mean", "certified", "deviation", "worst world", "worst start")
     return rows(header, lines) + (
         "<p class=muted>The true mean over worlds and starts is certified to be that close. The "
@@ -278,16 +316,22 @@ def _worlds_table(about: Mapping[str, Any]) -> str:
             name += " (left out)"
         if world["infeasible_starts"]:
             name += f"<br><span class=bad>{world['infeasible_starts']} infeasible starts</span>"
-        lines.append((
-            name, probability(world["mean"]["value"]),
-            certified(world["mean"]), f"{probability(least['value'])}, from {place(least)}",
-            probability(world["expert"]), probability(world["random"]),
-        ))
+        lines.append(
+            (
+                name,
+                probability(world["mean"]["value"]),
+                certified(world["mean"]),
+                f"{probability(least['value'])}, from {place(least)}",
+                probability(world["expert"]),
+                probability(world["random"]),
+            )
+        )
     header = ("world", "mean", "certified", "worst start", "expert", "random")
     more = len(worlds) - len(lines)
     return rows(header, lines) + (
         f"<p class=muted>The worst {len(lines)}; the other {more} are in result.json.</p>"
-        if more > 0 else ""
+        if more > 0
+        else ""
     )
 
 

@@ -52,8 +52,11 @@ class Said(NamedTuple):
 
 
 def live_page(
-    result: Mapping[str, Any], said: Said, parts: Sequence[Part],
-    pictures: Iterable[tuple[Picture, bytes]], task_text: str,
+    result: Mapping[str, Any],
+    said: Said,
+    parts: Sequence[Part],
+    pictures: Iterable[tuple[Picture, bytes]],
+    task_text: str,
 ) -> str:
     """A page that needs no other file and no network.
 
@@ -71,7 +74,8 @@ def live_page(
     body = [
         f"<h1>{name}</h1><p class=muted>{said.sentence}</p>"
         f"<p class=formula><code>{html.escape(result['formula'])}</code></p>",
-        _remarks(said.remarks), said.tiles,
+        _remarks(said.remarks),
+        said.tiles,
         *(section(*part) for part in parts if not isinstance(part[0], Curves)),
         *said.told,
         *(section(*part) for part in parts if isinstance(part[0], Curves)),
@@ -83,7 +87,10 @@ def live_page(
     moving = [data(part) for part, _ in parts if isinstance(part, Explorer)]
     known = json.dumps(moving, separators=(",", ":"), allow_nan=False)
     return Template(_file("page.html")).substitute(
-        title=name, style=_file("page.css"), script=_file("page.js"), body="\n".join(body),
+        title=name,
+        style=_file("page.css"),
+        script=_file("page.js"),
+        body="\n".join(body),
         # Nothing in it may end the script that it stands in.
         data=known.replace("<", "\\u003c"),
     )
@@ -95,8 +102,9 @@ def _file(name: str) -> str:
 
 def _remarks(told: Iterable[Remark]) -> str:
     said = {"warning": "<b>Warning:</b> "}
-    items = [f'<li class="{kind}">{said.get(kind, "")}{html.escape(text)}</li>'
-             for kind, text in told]
+    items = [
+        f'<li class="{kind}">{said.get(kind, "")}{html.escape(text)}</li>' for kind, text in told
+    ]
     return f'<ul class="remarks">{"".join(items)}</ul>' if items else ""
 
 
@@ -120,16 +128,22 @@ def section(part: Explorer | Curves | TooLarge, drawn: Mapping[str, str]) -> str
 
 def data(part: Explorer) -> dict[str, Any]:
     """What the page's script must know of an explorer."""
+
     def listed(array: np.ndarray | None) -> Any:
         if array is None:
             return None
         return [_finite(x) for x in array] if array.ndim == 1 else [listed(x) for x in array]
 
     return {
-        "name": part.name, "label": part.label, "actions": part.actions,
-        "rows": part.shape and part.shape[0], "columns": part.shape and part.shape[1],
-        "first": next(iter(part.layers), None), "told": _told(part),
-        "cells": part.cells, "places": part.places,
+        "name": part.name,
+        "label": part.label,
+        "actions": part.actions,
+        "rows": part.shape and part.shape[0],
+        "columns": part.shape and part.shape[1],
+        "first": next(iter(part.layers), None),
+        "told": _told(part),
+        "cells": part.cells,
+        "places": part.places,
         "layers": {
             key: {"value": listed(layer.value), "policy": listed(layer.policy)}
             for key, layer in part.layers.items()
@@ -158,7 +172,8 @@ def _told(part: Explorer) -> dict[str, str]:
 
 def _verdict(verdict: int, goal: str) -> str:
     return {Verdict.SATISFIED: f"{goal} is done", Verdict.VIOLATED: f"{goal} has failed"}.get(
-        Verdict(int(verdict)), "")
+        Verdict(int(verdict)), ""
+    )
 
 
 def _explorer(part: Explorer, drawn: Mapping[str, str]) -> str:
@@ -178,13 +193,19 @@ def _explorer(part: Explorer, drawn: Mapping[str, str]) -> str:
     if part.shape is not None:
         narrow = part.shape[1] <= _NARROW and part.automaton is not None
         colored = any(layer.value is not None for layer in part.layers.values())
-        scale = ('<p class="scale"><span>0</span><i></i><span>1</span> '
-                 f"<span>{html.escape(part.label)}</span></p>") if colored else ""
+        scale = (
+            (
+                '<p class="scale"><span>0</span><i></i><span>1</span> '
+                f"<span>{html.escape(part.label)}</span></p>"
+            )
+            if colored
+            else ""
+        )
         hint = "Point at a cell of the map, choose a state of the automaton, or play a run."
         panes = (
             '<div><h3>The map</h3><div class="scroll board" tabindex="0" role="group" '
             'aria-label="Map; the arrow keys go from cell to cell">'
-            f'{drawn["map"]}</div>{scale}</div>{panes}'
+            f"{drawn['map']}</div>{scale}</div>{panes}"
         )
     return (
         f'<section class="explorer" id="{part.name}"><h2>{html.escape(part.title)}</h2>'
@@ -221,15 +242,18 @@ def _choice(part: Explorer) -> str:
         f'title="{html.escape(layer.name)}">{"starts" if key == START else key}</button>'
         for key, layer in part.layers.items()
     )
-    return (f'<div class="choose" role="group" aria-label="Memory that is shown">'
-            f"<span>Memory</span>{buttons}</div>")
+    return (
+        f'<div class="choose" role="group" aria-label="Memory that is shown">'
+        f"<span>Memory</span>{buttons}</div>"
+    )
 
 
 def _player(part: Explorer) -> str:
     if not part.runs:
         return ""
-    options = "".join(f'<option value="{i}">{html.escape(run.name)}</option>'
-                      for i, run in enumerate(part.runs))
+    options = "".join(
+        f'<option value="{i}">{html.escape(run.name)}</option>' for i, run in enumerate(part.runs)
+    )
     return (
         f'<div class="player" role="group" aria-label="Runs"><select aria-label="Run">{options}'
         '</select><button type="button" class="back" aria-label="One step back">‹</button>'
@@ -258,8 +282,12 @@ def _layer_table(part: Explorer, key: str) -> str:
     if layer.policy is None:
         caption = f"<caption>{html.escape(layer.name)}: {html.escape(part.label)}</caption>"
     if part.shape is None:
-        return rows(("state", "figures"), [(str(s), text) for s, text in enumerate(texts)],
-                    caption, f'data-memory="{key}"')
+        return rows(
+            ("state", "figures"),
+            [(str(s), text) for s, text in enumerate(texts)],
+            caption,
+            f'data-memory="{key}"',
+        )
     down, across = part.shape
     lines = [(str(r + 1), *texts[r * across : (r + 1) * across]) for r in range(down)]
     header = ("row", *(str(c + 1) for c in range(across)))
@@ -276,20 +304,29 @@ def _automaton_table(automaton: Automaton, goal: str) -> str:
         kind = _verdict(verdict, goal)
         if q == int(automaton.initial):
             kind = "first" + (f"; {kind}" if kind else "")
-        lines.append((str(q), kind, f"<code>{html.escape(names[q])}</code>",
-                      "<br>".join(moves.get(q, ()))))
+        lines.append(
+            (str(q), kind, f"<code>{html.escape(names[q])}</code>", "<br>".join(moves.get(q, ())))
+        )
     return rows(("state", "verdict", "left to satisfy", "goes on"), lines, "", 'class="told"')
 
 
 def _run_table(part: Explorer, number: int) -> str:
     run = part.runs[number]
     lines = [
-        (str(t), html.escape(part.places.get(state, place(where(state, part.shape)))), str(memory),
-         "" if action is None else html.escape(part.actions[action]))
+        (
+            str(t),
+            html.escape(part.places.get(state, place(where(state, part.shape)))),
+            str(memory),
+            "" if action is None else html.escape(part.actions[action]),
+        )
         for t, (state, memory, action) in enumerate(run.steps)
     ]
-    return rows(("step", "where", "memory", "action"), lines,
-                f"<caption>{html.escape(run.name)}</caption>", f'class="told" data-run="{number}"')
+    return rows(
+        ("step", "where", "memory", "action"),
+        lines,
+        f"<caption>{html.escape(run.name)}</caption>",
+        f'class="told" data-run="{number}"',
+    )
 
 
 def _curves(part: Curves, drawn: Mapping[str, str]) -> str:
@@ -318,4 +355,3 @@ def _median(values: np.ndarray) -> float | None:
 def _spread(count: int) -> Sequence[int]:
     """Some of so many rows, the first and the last among them."""
     return sorted({int(t) for t in np.linspace(0, count - 1, min(count, _MOST_ROWS))})
-

@@ -35,17 +35,18 @@ def rows(
         f'<tr><th scope="row">{first}</th>' + "".join(f"<td>{x}</td>" for x in rest) + "</tr>"
         for first, *rest in lines
     )
-    return (
-        f'<div class="scroll"><table {more}>{caption}{head}'
-        f"<tbody>{body}</tbody></table></div>"
-    )
+    return f'<div class="scroll"><table {more}>{caption}{head}<tbody>{body}</tbody></table></div>'
 
 
 def tiles(figures: Iterable[tuple[str, str]]) -> str:
     """Figures to see first, each with its text, which is HTML."""
-    return "<div class=tiles>" + "".join(
-        f"<div class=tile><b>{value}</b><small>{text}</small></div>" for value, text in figures
-    ) + "</div>"
+    return (
+        "<div class=tiles>"
+        + "".join(
+            f"<div class=tile><b>{value}</b><small>{text}</small></div>" for value, text in figures
+        )
+        + "</div>"
+    )
 
 
 def spread(values: Iterable[float | None]) -> str:

@@ -25,8 +25,7 @@ def summary(found: Synthesis, seconds: float) -> dict[str, Any]:
     file, world = found.file, found.world
     wins, starts = found.wins, found.starts
     won = int(wins[starts].sum())
-    outcome = ("realizable" if won == starts.size else
-               "partly realizable" if won else "unrealizable")
+    outcome = "realizable" if won == starts.size else "partly realizable" if won else "unrealizable"
     automaton = found.nodes.automaton
     result = {
         "game": file.name,
@@ -74,8 +73,11 @@ def _about_play(found: Synthesis) -> dict[str, Any] | None:
         return None
     return {
         "steps": [
-            {"mover": step.mover, "move": step.action,
-             **found.world.where(int(found.nodes.world_state[step.node]))}
+            {
+                "mover": step.mover,
+                "move": step.action,
+                **found.world.where(int(found.nodes.world_state[step.node])),
+            }
             for step in found.play.steps
         ],
         "repeats_from": found.play.repeats_from,
@@ -116,8 +118,9 @@ def table(result: Mapping[str, Any], found: Synthesis) -> str:
     if strategy:
         lines += [
             "",
-            *textwrap.wrap(f"permissive strategy, {strategy['reason']}", 96,
-                           subsequent_indent="  "),
+            *textwrap.wrap(
+                f"permissive strategy, {strategy['reason']}", 96, subsequent_indent="  "
+            ),
             f"  restricted game   {strategy['num_states']} states "
             f"({strategy['num_system_states']} of the system), {strategy['num_moves']} moves "
             f"({strategy['num_system_moves']} of the system)",
@@ -135,7 +138,8 @@ def verdict(result: Mapping[str, Any]) -> str:
     """What the independent check says."""
     if is_confirmed(result):
         what = "both players' strategies" + (
-            " and the permissive strategy" if result["strategy"] else "")
+            " and the permissive strategy" if result["strategy"] else ""
+        )
         return f"independent check: confirmed, {what}"
     reasons = [result["verdict"]["reason"], (result["strategy"] or {}).get("refuted_by", "")]
     return f"independent check: REFUTED: {' '.join(r for r in reasons if r)}"
@@ -189,7 +193,7 @@ def _missed(play: Play, found: Synthesis) -> str:
     guarantees = found.file.task.get("guarantees", ())
     if not isinstance(objective, GR1):
         return ""
-    loop = [step.node for step in play.steps[play.repeats_from:]]
+    loop = [step.node for step in play.steps[play.repeats_from :]]
     met = [bool(np.asarray(row)[loop].any()) for row in objective.guarantees]
     never = [g for g, m in zip(guarantees, met, strict=True) if not m]
     return f"never meet {' nor '.join(never)}" if never else ""
@@ -247,8 +251,14 @@ def _arrays(found: Synthesis, game: Game, node: np.ndarray) -> dict[str, Any]:
     }
 
 
-FILES = ("strategy.npz", "counter_strategy.npz", "automaton.svg", "region.svg", "moves.svg",
-         "report.html")
+FILES = (
+    "strategy.npz",
+    "counter_strategy.npz",
+    "automaton.svg",
+    "region.svg",
+    "moves.svg",
+    "report.html",
+)
 MOST_MAPS = 36  # of the environment's places
 MOST_PANELS = 6  # of a strategy's memory
 
@@ -271,8 +281,12 @@ def pictures(found: Synthesis, environment: int | None = None) -> list[tuple[str
     if world.text is not None and world.places is not None:
         count = len(world.places)
         few = None if count <= MOST_MAPS else _most_lost(found, count)
-        made.append(("region.svg", plot.game_region(
-            found.wins, world.text, environment=few, wall=world.wall)))
+        made.append(
+            (
+                "region.svg",
+                plot.game_region(found.wins, world.text, environment=few, wall=world.wall),
+            )
+        )
         if found.strategy is not None:
             made.append(("moves.svg", _moves_picture(found, environment)))
     return [(name, plot.to_bytes(figure)) for name, figure in made]
@@ -309,7 +323,10 @@ def _moves_picture(found: Synthesis, environment: int | None) -> Any:
     from jaxltl import plot
 
     world, nodes, strategy, restricted = (
-        found.world, found.nodes, found.strategy, found.restricted
+        found.world,
+        found.nodes,
+        found.strategy,
+        found.restricted,
     )
     assert strategy is not None and restricted is not None and world.places is not None
     count = len(world.places)
@@ -330,7 +347,8 @@ def _moves_picture(found: Synthesis, environment: int | None) -> Any:
     shown = np.sort(np.argsort(-size, kind="stable")[:MOST_PANELS])
     size_a = world.game.num_actions
     mask = np.asarray(strategy.allowed).reshape(
-        nodes.game.num_states, -1, strategy.allowed.shape[-1])
+        nodes.game.num_states, -1, strategy.allowed.shape[-1]
+    )
     region = np.asarray(strategy.region).reshape(nodes.game.num_states, -1)
     allowed = np.zeros((len(shown), world.game.num_states, size_a), bool)
     wins = np.zeros((len(shown), world.game.num_states), bool)
@@ -339,8 +357,14 @@ def _moves_picture(found: Synthesis, environment: int | None) -> Any:
         allowed[panel, nodes.world_state[node]] = mask[node, m, :size_a]
         wins[panel, nodes.world_state[node]] = region[node, m]
     return plot.game_moves(
-        allowed, world.text or "", environment, region=wins, available=can, actions=world.actions,
-        titles=[_title(found, int(q), int(m), pairs) for q, m in pairs[shown]], wall=world.wall,
+        allowed,
+        world.text or "",
+        environment,
+        region=wins,
+        available=can,
+        actions=world.actions,
+        titles=[_title(found, int(q), int(m), pairs) for q, m in pairs[shown]],
+        wall=world.wall,
     )
 
 

@@ -22,8 +22,11 @@ def _facts(automaton: Any) -> Iterator[str]:
     *more, count, width = automaton.delta.shape
     yield automaton.acceptance
     yield lanes(more)
-    yield extent_text(automaton) if not more else (
-        f"{count} states, {width} letters {over(automaton.propositions)}")
+    yield (
+        extent_text(automaton)
+        if not more
+        else (f"{count} states, {width} letters {over(automaton.propositions)}")
+    )
     start = readable(automaton.initial)
     if automaton.state_names and start is not None and not start.ndim:
         yield f"for {cut(automaton.state_names[int(start)])}"

@@ -4,7 +4,6 @@ A language is the set of the infinite words that an automaton accepts. Every ans
 every answer that a word can prove comes with one: a lasso, which is prefix·cycle^ω.
 """
 
-
 from __future__ import annotations
 
 from typing import Any
@@ -217,9 +216,7 @@ def _combine(a: Task, b: Task, connective: str) -> Automaton:
             "Combine automata with fewer, such as simplified ones."
         )
     condition = (connective, accepted_by_a, accepted_by_b)
-    delta, priority, initial, base = to_parity(
-        runs.delta, colors_of_a | colors_of_b, 0, condition
-    )
+    delta, priority, initial, base = to_parity(runs.delta, colors_of_a | colors_of_b, 0, condition)
     names: list[str] = []
     if a.state_names and b.state_names:
         sign = {"and": "&", "or": "|"}[connective]

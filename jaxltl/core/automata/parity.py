@@ -228,9 +228,7 @@ def _early(table: Table) -> Table:
     """
     component = components(table)
     inside = component[table.delta] == component[:, None]
-    good, bad = (
-        (inside & (table.priority % 2 == parity)).any(axis=1) for parity in (0, 1)
-    )
+    good, bad = ((inside & (table.priority % 2 == parity)).any(axis=1) for parity in (0, 1))
     reach = _reach(table.delta)
     universal, live = ~(reach & bad).any(axis=1), (reach & good).any(axis=1)
     if (good <= universal).all():
@@ -351,6 +349,5 @@ class _Pairs:
         left, right = self.left_priority[reached], self.right_priority[reached]
         first = place[start]
         return not (
-            _distinguished(follow, left, right)[first]
-            or _distinguished(follow, right, left)[first]
+            _distinguished(follow, left, right)[first] or _distinguished(follow, right, left)[first]
         )

@@ -173,9 +173,7 @@ def joint_runs(automata: Sequence[Automaton]) -> Runs:
     return Runs(number[successors(tuples)], priorities, states)
 
 
-def find_lasso(
-    automata: Sequence[Automaton], wanted: Sequence[tuple[int, ...]]
-) -> Lasso | None:
+def find_lasso(automata: Sequence[Automaton], wanted: Sequence[tuple[int, ...]]) -> Lasso | None:
     """A word on which the least recurring priorities have one of the wanted parities."""
     runs = joint_runs(automata)
 

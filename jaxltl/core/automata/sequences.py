@@ -103,8 +103,10 @@ def reach_avoid_sequences(
       >>> found.avoid[0, 0].astype(int).tolist()
       [[0, 1, 0, 0], [0, 0, 0, 0]]
     """
-    depth, most = (given.whole(name, number, least=1, most=2**16)
-                   for name, number in (("depth", depth), ("most", most)))
+    depth, most = (
+        given.whole(name, number, least=1, most=2**16)
+        for name, number in (("depth", depth), ("most", most))
+    )
     given.instance("automaton", automaton, Automaton, "one of to_automaton")
     propositions = given.names("propositions", propositions)
     delta, priority = _on_events(automaton, events, propositions)

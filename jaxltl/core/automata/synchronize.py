@@ -13,9 +13,7 @@ from jaxltl.core.automata.translate import Task, as_automaton
 from jaxltl.core.logic.ltl import Letter
 
 
-def synchronize(
-    memory: Task, task: Task, *, alphabet: Iterable[Letter] | None = None
-) -> Automaton:
+def synchronize(memory: Task, task: Task, *, alphabet: Iterable[Letter] | None = None) -> Automaton:
     """An automaton that runs two others side by side and accepts as the second does.
 
     So a policy with the memory of one automaton is judged by the task of another: make
@@ -52,11 +50,20 @@ def synchronize(
     if second.acceptance in ("cosafe", "safety"):
         final = np.tile(np.asarray(second.final), num1)
         return make_automaton(
-            delta, initial, second.letters, second.propositions, final=final,
-            acceptance=second.acceptance, state_names=state_names,
+            delta,
+            initial,
+            second.letters,
+            second.propositions,
+            final=final,
+            acceptance=second.acceptance,
+            state_names=state_names,
         )
     made = make_automaton(
-        delta, initial, second.letters, second.propositions, state_names=state_names,
+        delta,
+        initial,
+        second.letters,
+        second.propositions,
+        state_names=state_names,
         priority=np.tile(np.asarray(second.priority), (num1, 1)),
     )
     return replace(made, acceptance=second.acceptance)

@@ -295,9 +295,7 @@ def _tracked(
     max_nodes: int,
 ) -> tuple[Table, NDArray[np.intp]]:
     """The reduced parity automaton of trackers, over classes of letters `[L]`."""
-    delta, colors, condition, class_of = track(
-        parts, alphabet, propositions, max_states, max_nodes
-    )
+    delta, colors, condition, class_of = track(parts, alphabet, propositions, max_states, max_nodes)
     try:
         table = to_parity(delta, colors, 0, condition, max_states)[:3]
     except ValueError:

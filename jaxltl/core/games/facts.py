@@ -40,7 +40,7 @@ def winning(value: Any) -> Iterator[str]:
     initial = readable(value.game.initial)
     if region is not None and initial is not None and initial.shape == region.shape:
         yield "realizable" if (region | (initial <= 0)).all() else "not realizable"
-    memories = value.action.shape[len(value.region.shape):]
+    memories = value.action.shape[len(value.region.shape) :]
     if memories:
         yield f"strategies with {memories[0]} and {value.counter_action.shape[-1]} memories"
     yield head(value.objective, _INNER)

@@ -139,8 +139,11 @@ def _waiting(arena: _Arena, i: int, inside: Any, allowed: Any, near: Any, found:
     """Where assumption i fails for as long as the play is not near to a set `found`."""
     missed = inside & ~near
     forced = attract(
-        arena.graph, ~inside | (missed & arena.objective.assumptions[i]),
-        allowed & ~_near(arena, found), rule=~arena.system, among=missed,
+        arena.graph,
+        ~inside | (missed & arena.objective.assumptions[i]),
+        allowed & ~_near(arena, found),
+        rule=~arena.system,
+        among=missed,
     )
     return inside & ~forced.region
 
@@ -185,10 +188,12 @@ def gr1_layers(graph: Graph, system: Any, objective: GR1) -> Layers:
             leads = allowed & graph.exists(found)
             some, all_ = graph.first(leads)[0], ~graph.first(allowed & ~leads)[0]
             near = goal | (region & xp.where(system, some, all_))
-            covered = xp.stack([
-                _waiting(arena, i, region, allowed, near, found)
-                for i in range(len(objective.assumptions))
-            ])
+            covered = xp.stack(
+                [
+                    _waiting(arena, i, region, allowed, near, found)
+                    for i in range(len(objective.assumptions))
+                ]
+            )
             rounds = xp.where(covered & (rounds == NEVER), n, rounds)
             grown = found | covered.any(0)
             return grown, rounds, n + 1, xp.any(grown != found)

@@ -258,19 +258,19 @@ def parity(
     if num_priorities is None:
         values = np.asarray(priority)
         if not np.issubdtype(values.dtype, np.integer) or values.shape != game.state_shape:
-            raise ValueError(f"priority is {values.dtype}{list(values.shape)}; give "
-                             f"int{list(game.state_shape)}.")
+            raise ValueError(
+                f"priority is {values.dtype}{list(values.shape)}; give int{list(game.state_shape)}."
+            )
         if values.min(initial=0) < 0:
             state = np.argwhere(values < 0)[0]
-            raise ValueError(f"state {state.tolist()} has priority {values.min()}; "
-                             "priorities start at 0.")
+            raise ValueError(
+                f"state {state.tolist()} has priority {values.min()}; priorities start at 0."
+            )
         num_priorities = int(values.max(initial=0)) + 1
     return _parity(game, priority, num_priorities, safe)
 
 
-def _parity(
-    game: Any, priority: Any, num_priorities: int, safe: States, won: Any = None
-) -> Parity:
+def _parity(game: Any, priority: Any, num_priorities: int, safe: States, won: Any = None) -> Parity:
     """Priorities, and what is won; unsafe states that are not won are lost."""
     priority = priority if is_traced(priority) else np.asarray(priority)
     won = np.zeros(game.state_shape, bool) if won is None else won
@@ -336,6 +336,7 @@ def gr1(
       >>> jl.winning_region(path, gr1(path, ["a"], ["b", "!b"])).region.tolist()
       [True, True, True]
     """
+
     def rows(sets: Sequence[States], name: str) -> jax.Array:
         if isinstance(sets, str | Formula):
             raise ValueError(f"{name} is {str(sets)!r}; give a list of sets of states.")

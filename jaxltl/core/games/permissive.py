@@ -128,7 +128,8 @@ def permissive_strategy(
         found = permissive_strategy(game, objective, method=method, bound=bound)
         state = np.asarray(found.base_state)
         return replace(
-            found, base_state=to_jax(origin.base_state[state]),
+            found,
+            base_state=to_jax(origin.base_state[state]),
             automaton_state=to_jax(origin.memory[state]),
         )
     if isinstance(objective, Parity):
@@ -146,9 +147,14 @@ def permissive_strategy(
                 'method="stay": some run that stays in the winning region for ever does not '
                 "win, so no strategy includes every winning one; choose rank, counter or parity."
             )
-        return _on(game, region, stay, True,
-                   "maximal: every run that stays in the winning region wins, so it includes "
-                   "every winning strategy")
+        return _on(
+            game,
+            region,
+            stay,
+            True,
+            "maximal: every run that stays in the winning region wins, so it includes "
+            "every winning strategy",
+        )
     build = {"rank": _by_rank, "counter": _by_counter, "parity": _by_parity}[method]
     return build(arena, region, stay, bound)
 
@@ -204,14 +210,17 @@ def shield_policy(policy: jax.Array, allowed: jax.Array) -> jax.Array:
     """
     xp, policy, allowed = namespace(policy, allowed)
     if xp is np and not allowed.any():
-        raise ValueError("the mask allows no move in any state; the specification is "
-                         "unrealizable, or the mask is of another game.")
+        raise ValueError(
+            "the mask allows no move in any state; the specification is "
+            "unrealizable, or the mask is of another game."
+        )
     first_of: Any = first_action if xp is np else operators.first_action
     some, first = first_of(allowed)
     if operators.is_deterministic(policy):
         if policy.shape != allowed.shape[:-1]:
-            raise ValueError(f"policy has shape {policy.shape}; the mask's states have "
-                             f"{allowed.shape[:-1]}.")
+            raise ValueError(
+                f"policy has shape {policy.shape}; the mask's states have {allowed.shape[:-1]}."
+            )
         inside = xp.take_along_axis(allowed, policy[..., None], axis=-1)[..., 0]
         return to_jax(xp.where(inside | ~some, policy, first.astype(policy.dtype)))
     if policy.shape != allowed.shape:
@@ -238,8 +247,10 @@ def _concrete_graph(game: Game, objective: Any = None) -> HostGraph:
     refuse_sharded(game)
     graph = graph_of(game, objective)
     if not isinstance(graph, HostGraph):
-        raise ValueError("permissive strategies are built on the host: call permissive_strategy "
-                         "outside of jit and vmap, on an MDP, a DenseMDP or a Product.")
+        raise ValueError(
+            "permissive strategies are built on the host: call permissive_strategy "
+            "outside of jit and vmap, on an MDP, a DenseMDP or a Product."
+        )
     return graph
 
 
@@ -321,15 +332,16 @@ def _at(objective: Any, origin: np.ndarray) -> Any:
     return jax.tree.map(np.asarray, objective_at(objective, origin))
 
 
-def _beside(
-    game: Game, delta: np.ndarray, initial: int, letter: chex.Array, label_on: str
-) -> Game:
+def _beside(game: Game, delta: np.ndarray, initial: int, letter: chex.Array, label_on: str) -> Game:
     """The game beside a memory that reads a letter of each state."""
     num_letters = delta.shape[1]
     automaton = Automaton(
-        delta=delta.astype(np.int32), initial=initial,
-        priority=np.zeros(delta.shape, np.int32), letters=np.eye(num_letters, dtype=bool),
-        propositions=tuple(f"letter_{i}" for i in range(num_letters)), acceptance="parity",
+        delta=delta.astype(np.int32),
+        initial=initial,
+        priority=np.zeros(delta.shape, np.int32),
+        letters=np.eye(num_letters, dtype=bool),
+        propositions=tuple(f"letter_{i}" for i in range(num_letters)),
+        acceptance="parity",
     )
     joint = Product(game.mdp, automaton, np.asarray(letter, np.int32), label_on)
     system: Any = np.broadcast_to(game.system[:, None], joint.state_shape)
@@ -343,8 +355,10 @@ def _closed(graph: HostGraph, region: Any) -> bool:
 def _without_won(objective: Parity) -> Parity:
     """The same objective where what is won is never left: the best priority from then on."""
     return replace(
-        objective, priority=np.where(objective.won, 0, objective.priority),
-        won=np.zeros_like(objective.won), lost=objective.lost & ~objective.won,
+        objective,
+        priority=np.where(objective.won, 0, objective.priority),
+        won=np.zeros_like(objective.won),
+        lost=objective.lost & ~objective.won,
     )
 
 
@@ -361,12 +375,16 @@ def _remember_won(game: Game, objective: Parity) -> tuple[Game, Parity, Restrict
     )
     objective = _at(objective, found.base_state)
     won = found.memory == 1
-    return found.model, Parity(
-        priority=np.where(won, 0, objective.priority),
-        won=won,
-        lost=~won & objective.lost & ~objective.won,
-        num_priorities=objective.num_priorities,
-    ), origin
+    return (
+        found.model,
+        Parity(
+            priority=np.where(won, 0, objective.priority),
+            won=won,
+            lost=~won & objective.lost & ~objective.won,
+            num_priorities=objective.num_priorities,
+        ),
+        origin,
+    )
 
 
 # --- the methods ------------------------------------------------------------------------------
@@ -383,10 +401,15 @@ def _by_rank(arena: _Arena, region, stay, bound) -> Permissive:
     near: Any = attract(graph, goal, stay, rule=game.system, among=region)
     nearer = _some_nearer(graph, near.rank, region) | goal[..., None]
     mask = stay & (nearer | ~game.system[..., None])
-    return _on(game, region, mask, False,
-               "not maximal: away from the accepting states it allows the moves that come nearer "
-               "to them, with positive probability where chance decides; at them, every move "
-               "that stays in the winning region")
+    return _on(
+        game,
+        region,
+        mask,
+        False,
+        "not maximal: away from the accepting states it allows the moves that come nearer "
+        "to them, with positive probability where chance decides; at them, every move "
+        "that stays in the winning region",
+    )
 
 
 def _some_nearer(graph: HostGraph, rank: np.ndarray, region: np.ndarray) -> np.ndarray:
@@ -415,9 +438,15 @@ def _by_layers(arena: _Arena, region, stay) -> Permissive:
     delta = np.array([[j, (j + 1) % num_goals] for j in range(num_goals)])
     joint = _beside_goals(game, objective, delta)
     both = np.broadcast_to(region[:, None], joint.state_shape)
-    return _on(joint, both, np.stack(masks, 1), False,
-               "not maximal: towards each guarantee in turn it allows the moves that come nearer "
-               "to it, and where an assumption does not hold those that wait for it", origin)
+    return _on(
+        joint,
+        both,
+        np.stack(masks, 1),
+        False,
+        "not maximal: towards each guarantee in turn it allows the moves that come nearer "
+        "to it, and where an assumption does not hold those that wait for it",
+        origin,
+    )
 
 
 def _beside_goals(game: Game, objective: GR1, delta: np.ndarray) -> Game:
@@ -433,8 +462,10 @@ def _by_counter(arena: _Arena, region, stay, bound) -> Permissive:
     if not _is_buchi(arena.objective):
         raise ValueError('method="counter" is for Buchi objectives; choose parity.')
     if bound is None:
-        raise ValueError('method="counter" needs bound=m, the system\'s moves within which the '
-                         "accepting states are met again.")
+        raise ValueError(
+            'method="counter" needs bound=m, the system\'s moves within which the '
+            "accepting states are met again."
+        )
     (game, _, objective), origin = _explicit(arena, region, stay)
     accepting = objective.priority == 0
     # Memory 2 c + b: c moves since the last accepting state, and b whether the state that is
@@ -452,7 +483,11 @@ def _by_counter(arena: _Arena, region, stay, bound) -> Permissive:
     joint = _beside(game, delta, 0, letter, "entry")
     late = np.arange(2 * bound + 1) == 2 * bound
     return _safe_beside(
-        joint, objective, late, bound, origin,
+        joint,
+        objective,
+        late,
+        bound,
+        origin,
         f"not maximal: it includes every strategy that surely meets the accepting states again "
         f"within {bound} of the system's moves",
     )
@@ -460,8 +495,10 @@ def _by_counter(arena: _Arena, region, stay, bound) -> Permissive:
 
 def _by_parity(arena: _Arena, region, stay, bound) -> Permissive:
     if not isinstance(arena.objective, Parity):
-        raise ValueError('method="parity" is for parity objectives; GR(1) has rank, and as a '
-                         "formula it is a parity objective.")
+        raise ValueError(
+            'method="parity" is for parity objectives; GR(1) has rank, and as a '
+            "formula it is a parity objective."
+        )
     (game, _, objective), origin = _explicit(arena, region, stay)
     inside = np.ones(game.num_states, bool) if origin is not None else region
     priority = objective.priority
@@ -474,9 +511,16 @@ def _by_parity(arena: _Arena, region, stay, bound) -> Permissive:
     spent = np.arange(len(delta)) == len(delta) - 1
     counts = ", ".join(f"{cap} of priority {p}" for p, cap in zip(odd, caps, strict=True))
     return _safe_beside(
-        joint, objective, spent, bound, origin,
-        ("not maximal: it includes every memoryless winning strategy; " if exact
-         else "not maximal: it includes every strategy that keeps to these counts; ")
+        joint,
+        objective,
+        spent,
+        bound,
+        origin,
+        (
+            "not maximal: it includes every memoryless winning strategy; "
+            if exact
+            else "not maximal: it includes every strategy that keeps to these counts; "
+        )
         + f"between lower even priorities at most {counts} are met",
     )
 
@@ -514,8 +558,12 @@ def budgets(caps: list[int], num_priorities: int) -> np.ndarray:
 
 
 def _safe_beside(
-    joint: Game, objective: Parity, spent: np.ndarray, bound: int | None,
-    origin: Restriction | None, reason: str,
+    joint: Game,
+    objective: Parity,
+    spent: np.ndarray,
+    bound: int | None,
+    origin: Restriction | None,
+    reason: str,
 ) -> Permissive:
     """The strategy that stays where the objective can be achieved without some memory states."""
     # The objective itself still counts: the environment may move for ever where the system

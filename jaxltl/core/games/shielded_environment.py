@@ -120,44 +120,61 @@ def shield_environment(
         _require_actions(guide.allowed, environment.actions.num)
         _require_places(environment, place, 1)
         made = replace(
-            environment, reset=Partial(_reset, guide, place, environment.reset),
+            environment,
+            reset=Partial(_reset, guide, place, environment.reset),
             step=Partial(_step, guide, place, environment.step),
             observe=Partial(_of_world, environment.observe),
             labels=Partial(_of_world, environment.labels),
             allowed=Partial(_allowed, guide, environment.allowed),
-            starts=None if environment.starts is None else Partial(
-                _starts, guide, place, environment.starts),
-            outcomes=None if environment.outcomes is None else Partial(
-                _outcomes, guide, place, environment.outcomes))
+            starts=None
+            if environment.starts is None
+            else Partial(_starts, guide, place, environment.starts),
+            outcomes=None
+            if environment.outcomes is None
+            else Partial(_outcomes, guide, place, environment.outcomes),
+        )
     else:
         mask = np.asarray(strategy)
         if mask.dtype != bool or mask.ndim < 2:
-            raise ValueError(f"the mask is {mask.dtype}{list(mask.shape)}; give bool[S, A], or "
-                             "bool[S, Q, A].")
+            raise ValueError(
+                f"the mask is {mask.dtype}{list(mask.shape)}; give bool[S, A], or bool[S, Q, A]."
+            )
         _require_actions(mask, environment.actions.num)
         _require_places(environment, place, mask.ndim - 1)
-        made = replace(
-            environment, allowed=Partial(_looked_up, mask, place, environment.allowed))
+        made = replace(environment, allowed=Partial(_looked_up, mask, place, environment.allowed))
     return make_environment(
-        made.reset, made.step, made.observe, actions=made.actions, labels=made.labels,
-        propositions=made.propositions, allowed=made.allowed, observations=made.observations,
-        horizon=made.horizon, starts=made.starts, outcomes=made.outcomes)
+        made.reset,
+        made.step,
+        made.observe,
+        actions=made.actions,
+        labels=made.labels,
+        propositions=made.propositions,
+        allowed=made.allowed,
+        observations=made.observations,
+        horizon=made.horizon,
+        starts=made.starts,
+        outcomes=made.outcomes,
+    )
 
 
 def _require_actions(mask: Any, num_actions: int) -> None:
     if mask.shape[-1] != num_actions:
-        raise ValueError(f"the shield is of {mask.shape[-1]} actions, and the world has "
-                         f"{num_actions}; they must be the same ones.")
+        raise ValueError(
+            f"the shield is of {mask.shape[-1]} actions, and the world has "
+            f"{num_actions}; they must be the same ones."
+        )
 
 
 def _require_places(environment: Environment, place: Callable[..., Any], count: int) -> None:
     found = jax.eval_shape(lambda key: place(environment.reset(key)), jax.random.key(0))
     parts = found if isinstance(found, tuple) else (found,)
     if len(parts) != count or any(
-            not hasattr(x, "dtype") or x.shape != () or x.dtype.kind not in "iu" for x in parts):
+        not hasattr(x, "dtype") or x.shape != () or x.dtype.kind not in "iu" for x in parts
+    ):
         raise ValueError(
             f"state_of returns {found}; return {'an integer' if count == 1 else 'a tuple of '}"
-            f"{'' if count == 1 else f'{count} integers'}, the state of the model that a world is.")
+            f"{'' if count == 1 else f'{count} integers'}, the state of the model that a world is."
+        )
 
 
 def _guide(strategy: Permissive | Winning) -> _Guide:
@@ -169,7 +186,8 @@ def _guide(strategy: Permissive | Winning) -> _Guide:
         every: Any = np.arange(strategy.game.state_shape[0], dtype=np.int32)
         allowed: Any = staying(graph, region)
         strategy = Permissive(
-            strategy.game, strategy.region, allowed, every, every, False, "what stays")
+            strategy.game, strategy.region, allowed, every, every, False, "what stays"
+        )
     found = apply_strategy(strategy)
     game = found.model
     if not isinstance(game.mdp, MDP):
@@ -180,9 +198,11 @@ def _guide(strategy: Permissive | Winning) -> _Guide:
     after = np.where(used, successor, -1).reshape(len(base), -1)
     after = -np.sort(-after, axis=1)  # padding to the end
     return _Guide(
-        base=base.astype(np.int32), initial=np.asarray(game.initial) > 0,
-        after=after[:, :max(int((after >= 0).sum(1).max()), 1)].astype(np.int32),
-        allowed=np.asarray(game.available))
+        base=base.astype(np.int32),
+        initial=np.asarray(game.initial) > 0,
+        after=after[:, : max(int((after >= 0).sum(1).max()), 1)].astype(np.int32),
+        allowed=np.asarray(game.available),
+    )
 
 
 def _itself(world: Any) -> Any:
@@ -208,16 +228,23 @@ def _begin(guide: _Guide, place: Callable[..., Any], world: Any) -> ShieldedWorl
 
 
 def _step(
-    guide: _Guide, place: Callable[..., Any], step: Callable[..., Timestep],
-    before: ShieldedWorld, action: Any, key: chex.PRNGKey,
+    guide: _Guide,
+    place: Callable[..., Any],
+    step: Callable[..., Timestep],
+    before: ShieldedWorld,
+    action: Any,
+    key: chex.PRNGKey,
 ) -> Timestep:
     found = Timestep(*step(before.world, action, key))
     return found._replace(world=_follow(guide, place, before.state, found.world))
 
 
 def _outcomes(
-    guide: _Guide, place: Callable[..., Any], outcomes: Callable[..., Any],
-    before: ShieldedWorld, action: Any,
+    guide: _Guide,
+    place: Callable[..., Any],
+    outcomes: Callable[..., Any],
+    before: ShieldedWorld,
+    action: Any,
 ) -> tuple[Timestep, jax.Array]:
     found, probability = outcomes(before.world, action)
     worlds = jax.vmap(lambda world: _follow(guide, place, before.state, world))(found[0])

@@ -155,9 +155,16 @@ def _claim(winning: Any) -> _Claim:
         return value.reshape(-1, max(width, 1))
 
     return _Claim(
-        shape, _moves(compiled_form(game)[0]), np.asarray(game.system).ravel(),
-        flat("region", 0)[:, 0].astype(bool), won.ravel(), np.asarray(objective.lost).ravel(),
-        flat("action", len(sets[1])), flat("counter_action", len(sets[0])), priority, *sets,
+        shape,
+        _moves(compiled_form(game)[0]),
+        np.asarray(game.system).ravel(),
+        flat("region", 0)[:, 0].astype(bool),
+        won.ravel(),
+        np.asarray(objective.lost).ravel(),
+        flat("action", len(sets[1])),
+        flat("counter_action", len(sets[0])),
+        priority,
+        *sets,
     )
 
 
@@ -173,9 +180,7 @@ def _refute_system(claim: _Claim) -> str:
     play = _fix(claim, claim.system, claim.action, claim.guarantees)
     memories = play.memories
     node_in = np.repeat(undecided, memories)
-    edge = np.flatnonzero(
-        node_in[play.source] & ~np.repeat(claim.region, memories)[play.target]
-    )
+    edge = np.flatnonzero(node_in[play.source] & ~np.repeat(claim.region, memories)[play.target])
     if edge.size:
         pair = int(play.pair[edge[0]])
         node, action = int(play.owner[pair]), int(claim.moves.action[pair // memories])
@@ -221,8 +226,10 @@ def _failures(claim: _Claim):
         yield from _least_priorities(claim.priority, 1)
         return
     for j, guarantee in enumerate(claim.guarantees):
-        yield guarantee, claim.assumptions, (
-            f"meet every assumption for ever and never guarantee {j}"
+        yield (
+            guarantee,
+            claim.assumptions,
+            (f"meet every assumption for ever and never guarantee {j}"),
         )
 
 
@@ -239,8 +246,10 @@ def _successes(claim: _Claim):
 def _least_priorities(priority: Integers, parity: int):
     for p in np.unique(priority[priority % 2 == parity]).tolist():
         kind = "odd" if parity else "even"
-        yield priority < p, (priority == p)[None], (
-            f"stay for ever with least priority {p}, which is {kind}"
+        yield (
+            priority < p,
+            (priority == p)[None],
+            (f"stay for ever with least priority {p}, which is {kind}"),
         )
 
 

@@ -146,7 +146,8 @@ def _flat(form: Game, objective: Parity | GR1) -> Any:
     if not more:
         return objective
     return jax.tree.map(
-        lambda x: x.reshape(*x.shape[: x.ndim - 1 - more], *form.state_shape), objective)
+        lambda x: x.reshape(*x.shape[: x.ndim - 1 - more], *form.state_shape), objective
+    )
 
 
 def almost_sure_buchi(game: Any, accepting: States) -> Winning:
@@ -247,8 +248,12 @@ def adversarial_chance(game: Game) -> tuple[Game, jax.Array]:
     label = np.asarray(explicit.label)[origin]
     initial = np.concatenate([np.asarray(game.initial).ravel(), np.zeros(s.size)])
     mdp = make_mdp(
-        target, available[:, :, None].astype(float), available=available, initial=initial,
-        label=label, propositions=explicit.propositions,
+        target,
+        available[:, :, None].astype(float),
+        available=available,
+        initial=initial,
+        label=label,
+        propositions=explicit.propositions,
     )
     system = np.concatenate([np.asarray(game.system).ravel(), np.zeros(s.size, bool)])
     return Game(mdp, to_jax(system)), to_jax(origin.astype(np.int32))

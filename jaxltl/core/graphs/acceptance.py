@@ -67,13 +67,16 @@ def accepting_end_components(model: Product) -> Accepting:
         action = xp.where(hit, action, towards)
         new = wins & ~found.region
         return Accepting(
-            found.region | new, xp.where(new, action, found.action),
+            found.region | new,
+            xp.where(new, action, found.action),
             found.inside | (components.inside & new[..., None]),
-            xp.where(new, least, found.least).astype(np.int32))
+            xp.where(new, least, found.least).astype(np.int32),
+        )
 
     nothing = xp.zeros(graph.state_shape, np.int32)
     start = Accepting(
-        ~everywhere, graph.first(available)[1], xp.zeros(available.shape, bool), nothing - 1)
+        ~everywhere, graph.first(available)[1], xp.zeros(available.shape, bool), nothing - 1
+    )
     return to_jax(graph.times(priority.max() // 2 + 1, body, start))
 
 

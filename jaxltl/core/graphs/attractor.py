@@ -97,18 +97,25 @@ def attractor(
 
 
 def attract(
-    graph: Graph, goal: Any, allowed: Any = None, *, rule: Any = True, chance: str = "some",
+    graph: Graph,
+    goal: Any,
+    allowed: Any = None,
+    *,
+    rule: Any = True,
+    chance: str = "some",
     among: Any = None,
 ) -> Attractor:
     """:func:`attractor` on a graph, with a rule ``bool[S]`` or ``bool[]``, True for exists."""
     xp, shape = graph.xp, graph.state_shape
-    return Attractor(*graph.attract(
-        goal,
-        graph.available if allowed is None else allowed,
-        xp.broadcast_to(rule, shape),
-        xp.ones(shape, bool) if among is None else among,
-        chance,
-    ))
+    return Attractor(
+        *graph.attract(
+            goal,
+            graph.available if allowed is None else allowed,
+            xp.broadcast_to(rule, shape),
+            xp.ones(shape, bool) if among is None else among,
+            chance,
+        )
+    )
 
 
 def avoidable(model: Any, goal: jax.Array, allowed: jax.Array | None = None) -> jax.Array:

@@ -37,7 +37,8 @@ def components_by_sweeps(
         stay, _, _ = carry
         label = strong_components(graph, core, stay)
         inside = (graph.least(label) == label[..., None]) & (
-            -graph.least(-label) == label[..., None])
+            -graph.least(-label) == label[..., None]
+        )
         kept = stay & inside
         return kept, label, jnp.any(kept != stay)
 
@@ -79,8 +80,9 @@ def strong_components(graph: Any, states: jax.Array, moves: jax.Array) -> jax.Ar
             sent = jnp.where(moves & found[..., None], (colours + 1)[..., None], 0)
             # Colours do not fall along moves, so the greatest that arrives is the state's own, if
             # any is.
-            new = found | (left & (
-                operators.greatest_predecessor(graph.model, sent) == colours + 1))
+            new = found | (
+                left & (operators.greatest_predecessor(graph.model, sent) == colours + 1)
+            )
             return new, jnp.any(new != found)
 
         return lax.while_loop(lambda carry: carry[1], spread, (root, jnp.bool_(True)))[0]
@@ -94,7 +96,8 @@ def strong_components(graph: Any, states: jax.Array, moves: jax.Array) -> jax.Ar
         return jnp.where(found, root, label), left & ~found, ~forward
 
     label, _, _ = lax.while_loop(
-        lambda carry: jnp.any(carry[1]), body, (number, states, jnp.bool_(True)))
+        lambda carry: jnp.any(carry[1]), body, (number, states, jnp.bool_(True))
+    )
     flat = label.ravel()
     least = jnp.full(flat.shape, none).at[flat].min(number.ravel())
     return least[flat].reshape(states.shape)

@@ -88,5 +88,4 @@ def bottom_components(model: Any, allowed: jax.Array) -> EndComponents:
 def closed_components(graph: Graph, allowed: Any) -> EndComponents:
     """:func:`bottom_components` of a graph."""
     everywhere = graph.xp.ones(graph.state_shape, bool)
-    return EndComponents(
-        *graph.components(everywhere, allowed & graph.available, closed=True))
+    return EndComponents(*graph.components(everywhere, allowed & graph.available, closed=True))

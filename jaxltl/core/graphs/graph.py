@@ -101,7 +101,8 @@ class TracedGraph:
 
         def callback():
             return jax.pure_callback(
-                host, result, self.model, core, allowed, vmap_method="sequential")
+                host, result, self.model, core, allowed, vmap_method="sequential"
+            )
 
         def trivial():
             number = jnp.arange(flat, dtype=jnp.int32).reshape(shape)
@@ -181,7 +182,12 @@ def host_graph(model: Any) -> HostGraph:
     letter = np.asarray(lazy.letter)
     memory = np.ascontiguousarray(np.asarray(lazy.automaton.delta)[:, letter].T)
     return HostGraph(
-        rows, available, memory, letter, lazy.label_on == "entry", lazy.state_shape,
+        rows,
+        available,
+        memory,
+        letter,
+        lazy.label_on == "entry",
+        lazy.state_shape,
         None if lazy.allowed is None else np.asarray(lazy.allowed),
     )
 

@@ -148,9 +148,17 @@ def _worklist(search: Search) -> _Worklist:
     remaining = waiting.reshape(-1, graph.num_actions).sum(-1)
     start, pair = graph.rows.predecessors
     arrays = {
-        "missing": missing, "waiting": waiting, "remaining": remaining, "start": start,
-        "pair": pair, "memory": graph.next_memory, "open": search.open, "rule": search.rule,
-        "region": search.region, "rank": search.rank, "action": search.action,
+        "missing": missing,
+        "waiting": waiting,
+        "remaining": remaining,
+        "start": start,
+        "pair": pair,
+        "memory": graph.next_memory,
+        "open": search.open,
+        "rule": search.rule,
+        "region": search.region,
+        "rank": search.rank,
+        "action": search.action,
     }
     view = {name: memoryview(x.reshape(-1)) for name, x in arrays.items()}
     return _Worklist(search, missing, waiting, remaining, view)
@@ -171,8 +179,10 @@ def _into(worklist: _Worklist, frontier: Integers) -> Integers:
     code = graph.letter[read].astype(np.int64) * graph.num_memory + np.repeat(memory, count)
     count = start[code + 1] - start[code]
     q = before[spans(start[code], count)]
-    return (np.repeat(s.astype(np.int64) * (graph.num_memory * graph.num_actions) + a, count)
-            + q * graph.num_actions)
+    return (
+        np.repeat(s.astype(np.int64) * (graph.num_memory * graph.num_actions) + a, count)
+        + q * graph.num_actions
+    )
 
 
 def _join_pairs(worklist: _Worklist, pairs: Integers) -> Integers:
@@ -183,8 +193,9 @@ def _join_pairs(worklist: _Worklist, pairs: Integers) -> Integers:
     waiting[pair] = False
     state, a = np.divmod(pair, search.graph.num_actions)
     count_down(remaining, state)
-    flat = [x.reshape(-1) for x in (search.rule, search.open, search.action, search.region,
-                                    search.rank)]
+    flat = [
+        x.reshape(-1) for x in (search.rule, search.open, search.action, search.region, search.rank)
+    ]
     rule, open_, action, region, rank = flat
     joins = (rule[state] | (remaining[state] == 0)) & open_[state]
     state, a = state[joins], a[joins]
@@ -219,8 +230,11 @@ def _join_few(worklist: _Worklist, frontier: Integers) -> Integers:
             for pair in row[first:last]:
                 s, a = divmod(pair, num_actions)
                 read = (target if on_entry else s) * num_memory
-                pairs += [(s * num_memory + q) * num_actions + a
-                          for q in range(num_memory) if memory[read + q] == after]
+                pairs += [
+                    (s * num_memory + q) * num_actions + a
+                    for q in range(num_memory)
+                    if memory[read + q] == after
+                ]
         search.round += 1
         few = []
         for pair in sorted(pairs):

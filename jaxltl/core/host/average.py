@@ -60,7 +60,12 @@ class Average(NamedTuple):
 
 
 def average(
-    mdp: HostMDP, reward: Floats, magnitude: Floats, *, tolerance: float, max_steps: int,
+    mdp: HostMDP,
+    reward: Floats,
+    magnitude: Floats,
+    *,
+    tolerance: float,
+    max_steps: int,
     sign: int = 1,
 ) -> Average:
     """The largest long-run average reward of a step.
@@ -85,8 +90,9 @@ def average(
     row[states] = gains.row
     if middle.min() == middle.max():
         value = np.full(mdp.num_states, middle[0])
-        return Average(value, value - half, value + half, _all_to(mdp, states, row), half,
-                       gains.rounds)
+        return Average(
+            value, value - half, value + half, _all_to(mdp, states, row), half, gains.rounds
+        )
     stopping = _with_stops(mdp, found, leaders)
     least = max(float(np.abs(middle).min()), _FLOOR * float(magnitude.max()))
     width = tolerance / 4 * least
@@ -96,8 +102,14 @@ def average(
         # Where little is earned what is not known of other components would be too much.
         low, _, taken, more = _stopped(stopping, gains.lower, tolerance, width, sign)
         high, slack = _stopped(stopping, gains.upper, tolerance, width, sign)[1], 0.0
-    return Average((low + high) / 2, low - slack, high + slack, _routed(mdp, found, taken, row),
-                   half, gains.rounds + more)
+    return Average(
+        (low + high) / 2,
+        low - slack,
+        high + slack,
+        _routed(mdp, found, taken, row),
+        half,
+        gains.rounds + more,
+    )
 
 
 def _stopped(
@@ -115,8 +127,12 @@ def _stopped(
     known = np.concatenate([np.zeros(size), worth - shift])
     open_ = np.arange(mdp.num_states) < size
     problem = Transient(mdp, open_, known, np.zeros(mdp.num_rows))
-    found = optimum(problem, maximize=sign > 0, relative=relative,
-                    tolerance=tolerance / 4 if relative else width)
+    found = optimum(
+        problem,
+        maximize=sign > 0,
+        relative=relative,
+        tolerance=tolerance / 4 if relative else width,
+    )
     slack = 4 * _EPS * (abs(shift) + known.max()) if shift else 0.0
     low, high = (x[node] + shift for x in (found.lower, found.upper))
     low, high = (low, high) if sign > 0 else (-high, -low)
@@ -215,8 +231,10 @@ class _Part(NamedTuple):
         mdp = self.mdp
         step = mdp.probability * (v[mdp.successor] - v[mdp.state][mdp.row])
         slack = np.add.reduceat(np.abs(step), mdp.entry_start[:-1])
-        return (self.reward + np.add.reduceat(step, mdp.entry_start[:-1]),
-                self.unit * (self.magnitude + slack))
+        return (
+            self.reward + np.add.reduceat(step, mdp.entry_start[:-1]),
+            self.unit * (self.magnitude + slack),
+        )
 
     def asked(self, low: Floats, high: Floats, tolerance: float) -> Floats:
         """How wide bounds may be."""
@@ -234,7 +252,11 @@ class _Part(NamedTuple):
 
 
 def _part(
-    mdp: HostMDP, inside: Booleans, states: Integers, start: Integers, reward: Floats,
+    mdp: HostMDP,
+    inside: Booleans,
+    states: Integers,
+    start: Integers,
+    reward: Floats,
     magnitude: Floats,
 ) -> _Part:
     """Some components of a model, with the rows that stay inside."""
@@ -245,10 +267,18 @@ def _part(
     width = np.diff(mdp.entry_start)[row]
     entry = spans(mdp.entry_start[row], width)
     count = np.bincount(number[mdp.state[row]], minlength=states.size)
-    small = HostMDP(starts_of(count), starts_of(width), number[mdp.successor[entry]],
-                    mdp.probability[entry])
-    return _Part(small, start, np.diff(start, append=states.size), row, reward[row],
-                 magnitude[row], backup_unit(small))
+    small = HostMDP(
+        starts_of(count), starts_of(width), number[mdp.successor[entry]], mdp.probability[entry]
+    )
+    return _Part(
+        small,
+        start,
+        np.diff(start, append=states.size),
+        row,
+        reward[row],
+        magnitude[row],
+        backup_unit(small),
+    )
 
 
 @dataclass
@@ -323,8 +353,14 @@ class _Left(NamedTuple):
         states = np.flatnonzero(np.repeat(kept, self.part.size))
         size = self.part.size[kept]
         part = self.part
-        small = _part(part.mdp, np.ones(part.mdp.num_rows, bool), states, size.cumsum() - size,
-                      part.reward, part.magnitude)
+        small = _part(
+            part.mdp,
+            np.ones(part.mdp.num_rows, bool),
+            states,
+            size.cumsum() - size,
+            part.reward,
+            part.magnitude,
+        )
         small = small._replace(row=part.row[small.row])
         return _Left(self.which[kept], self.states[states], small, self.v[states])
 
@@ -347,8 +383,10 @@ def _swept(
         known.note(left)
         left = left.only(known.wide(left, tolerance))
         if hasty and done % _JUDGED == 0 and left.which.size:
-            if before is not None and (
-                    _steps_left(known, left, before, tolerance) > num_steps - done).all():
+            if (
+                before is not None
+                and (_steps_left(known, left, before, tolerance) > num_steps - done).all()
+            ):
                 break
             before = known.upper - known.lower
     known.rounds += done

@@ -73,7 +73,12 @@ class BitGraph:
         return found
 
     def grow(
-        self, goal: Words, among: Words, *, forced: bool, kept: list[Words] | None = None,
+        self,
+        goal: Words,
+        among: Words,
+        *,
+        forced: bool,
+        kept: list[Words] | None = None,
         action: Integers | None = None,
     ) -> Words | None:
         """The least set with a goal to which some action may lead, or else every one.
@@ -111,7 +116,12 @@ class BitGraph:
         return None
 
     def _joining(
-        self, open_: Words, part: Any, seen: Words, forced: bool, kept: list[Words],
+        self,
+        open_: Words,
+        part: Any,
+        seen: Words,
+        forced: bool,
+        kept: list[Words],
         action: Integers | None,
     ) -> Words:
         found = open_.copy() if forced else np.zeros_like(open_)
@@ -157,8 +167,9 @@ def pack(mask: Booleans) -> Words:
     [5]
     """
     size = mask.shape[-1]
-    kind: Any = next(k for k in (np.uint8, np.uint16, np.uint32, np.uint64)
-                     if np.iinfo(k).bits >= size)
+    kind: Any = next(
+        k for k in (np.uint8, np.uint16, np.uint32, np.uint64) if np.iinfo(k).bits >= size
+    )
     words = np.zeros(mask.shape[:-1], kind)
     for q in range(size):
         words |= mask[..., q].astype(kind) << kind(q)
@@ -166,7 +177,11 @@ def pack(mask: Booleans) -> Words:
 
 
 def bit_graph(
-    successor: Integers, used: Booleans, available: Booleans, delta: Integers, letter: Integers,
+    successor: Integers,
+    used: Booleans,
+    available: Booleans,
+    delta: Integers,
+    letter: Integers,
     allowed: Booleans | None = None,
 ) -> BitGraph:
     """The graph of a world beside an automaton of 64 states at most.
@@ -183,13 +198,21 @@ def bit_graph(
     num_memory = delta.shape[0]
     every = used.all()
     columns = [
-        [np.ascontiguousarray(successor[:, a, k]) if every
-         else np.where(used[:, a, k], successor[:, a, k], num_states) for k in range(width)]
-        for a in range(num_actions)]
+        [
+            np.ascontiguousarray(successor[:, a, k])
+            if every
+            else np.where(used[:, a, k], successor[:, a, k], num_states)
+            for k in range(width)
+        ]
+        for a in range(num_actions)
+    ]
     full = pack(np.ones(num_memory, bool))
     permitted = [
-        np.where(available[:, a], full if allowed is None else pack(allowed[:, :, a]), 0)
-        .astype(full.dtype) for a in range(num_actions)]
+        np.where(available[:, a], full if allowed is None else pack(allowed[:, :, a]), 0).astype(
+            full.dtype
+        )
+        for a in range(num_actions)
+    ]
     after = []
     byte = np.arange(256)
     for first in range(0, num_memory, 8):

@@ -134,7 +134,11 @@ def _policies(mdp: HostMDP, backup: Backup, every: list[Integers], num_steps: in
 
 
 def until(
-    mdp: HostMDP, target: Booleans, stay: Booleans, num_steps: int, operation: Any,
+    mdp: HostMDP,
+    target: Booleans,
+    stay: Booleans,
+    num_steps: int,
+    operation: Any,
     by_step: bool = False,
 ) -> Steps:
     """Optimal probability of a target within so many steps, through states where one may stay.
@@ -186,7 +190,11 @@ def _near(mdp: HostMDP, target: Booleans, open_: Booleans, num_steps: int) -> Bo
 
 
 def _within(
-    mdp: HostMDP, target: Booleans, open_: Booleans, num_steps: int, surely: bool,
+    mdp: HostMDP,
+    target: Booleans,
+    open_: Booleans,
+    num_steps: int,
+    surely: bool,
     choose_some: bool,
 ) -> Booleans:
     """Whether a target is met in so many steps possibly, or surely, by some choice or by all."""
@@ -202,8 +210,13 @@ def _within(
 
 
 def total(
-    mdp: HostMDP, reward: Floats, magnitude: Floats, start: Floats, num_steps: int,
-    operation: Any, by_step: bool = False,
+    mdp: HostMDP,
+    reward: Floats,
+    magnitude: Floats,
+    start: Floats,
+    num_steps: int,
+    operation: Any,
+    by_step: bool = False,
 ) -> Steps:
     """Optimal expected reward of so many steps, and then of the state where one is.
 
@@ -221,8 +234,11 @@ def total(
     size = found
     if (start < 0).any() or (magnitude != reward).any():
         # What rounding is relative to: the largest sum of absolute values.
-        most = backup if operation is np.maximum else backup_on(
-            mdp, np.arange(mdp.num_states), np.maximum)
+        most = (
+            backup
+            if operation is np.maximum
+            else backup_on(mdp, np.arange(mdp.num_states), np.maximum)
+        )
         size = most.sweeps(magnitude[backup.row], np.abs(start)[places], num_steps)[0]
     error = size * relative_error(backup_unit(mdp), 2 * num_steps + 1) + UNDERFLOW
     some = start != 0

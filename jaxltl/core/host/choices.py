@@ -108,6 +108,7 @@ def _ranks(having: Integers) -> int:
     entries = having.cumsum()
     by_rank = _SLICE * np.arange(1, having.size + 1) + _ENTRY * entries
     after = np.append(having[1:], 0)
-    by_state = np.where(after > 0, _REDUCTION, 0) + _SPAN * after + _REDUCED * (
-        entries[-1] - entries)
+    by_state = (
+        np.where(after > 0, _REDUCTION, 0) + _SPAN * after + _REDUCED * (entries[-1] - entries)
+    )
     return int((by_rank + by_state).argmin()) + 1

@@ -43,7 +43,8 @@ def reached(source: Integers, target: Integers, start: Booleans) -> Booleans:
         first, num_nodes = np.flatnonzero(start), start.size
         graph = _matrix(
             np.concatenate([source, np.full(first.size, num_nodes)]),
-            np.concatenate([target, first]), num_nodes + 1,
+            np.concatenate([target, first]),
+            num_nodes + 1,
         )
         order = csgraph.breadth_first_order(graph, num_nodes, return_predecessors=False)
         seen[order[1:]] = True

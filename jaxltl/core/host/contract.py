@@ -1,5 +1,4 @@
-"""Smaller models with the same answers: chains of single successors, and end components, as one.
-"""
+"""Smaller models with the same answers: chains of single successors, and end components, as one."""
 
 from __future__ import annotations
 
@@ -77,7 +76,8 @@ def without_chains(mdp: HostMDP, fixed: Booleans, cost: Floats | None) -> Contra
     spent = np.zeros(row.size)
     if cost is not None:
         spent = cost[row] + np.add.reduceat(
-            mdp.probability[entry] * earned[mdp.successor[entry]], smaller.entry_start[:-1])
+            mdp.probability[entry] * earned[mdp.successor[entry]], smaller.entry_start[:-1]
+        )
     return Contraction(smaller, node, row, earned, spent, rounds + 1)
 
 
@@ -98,13 +98,12 @@ def _taken(
     width = np.diff(mdp.entry_start)[row]
     entry = spans(mdp.entry_start[row], width)
     smaller = HostMDP(
-        starts_of(count), starts_of(width), node[mdp.successor[entry]], mdp.probability[entry])
+        starts_of(count), starts_of(width), node[mdp.successor[entry]], mdp.probability[entry]
+    )
     return smaller, entry
 
 
-def merged(
-    mdp: HostMDP, component: Integers, inside: Booleans, cost: Floats
-) -> Contraction:
+def merged(mdp: HostMDP, component: Integers, inside: Booleans, cost: Floats) -> Contraction:
     """Each end component becomes one state, with the rows that leave it.
 
     Args:

@@ -14,8 +14,14 @@ _EPS = float(np.finfo(np.float64).eps)
 
 
 def discounted_value(
-    mdp: HostMDP, reward: Floats, magnitude: Floats, discount: float, *, maximize: bool,
-    tolerance: float, depth: int = 0,
+    mdp: HostMDP,
+    reward: Floats,
+    magnitude: Floats,
+    discount: float,
+    *,
+    maximize: bool,
+    tolerance: float,
+    depth: int = 0,
 ) -> Enclosed:
     """``V = opt_r (reward_r + discount * P_r V)``, enclosed.
 
@@ -43,8 +49,14 @@ def discounted_value(
     lost = terms * float(magnitude.max()) / (1 - discount)
     slack = 4 * _EPS * (np.abs(found.value[:-1]) + abs(always) + lost)
     return Enclosed(
-        value, lower - slack, upper + slack, found.row[:-1], found.rounds, found.residual,
-        found.method)
+        value,
+        lower - slack,
+        upper + slack,
+        found.row[:-1],
+        found.rounds,
+        found.residual,
+        found.method,
+    )
 
 
 def _ending(mdp: HostMDP, discount: float) -> HostMDP:
@@ -61,4 +73,5 @@ def _ending(mdp: HostMDP, discount: float) -> HostMDP:
     successor[place] = mdp.successor
     probability[place] = mdp.probability * discount
     return HostMDP(
-        np.append(mdp.row_start, rows + 1).astype(np.int32), entry_start, successor, probability)
+        np.append(mdp.row_start, rows + 1).astype(np.int32), entry_start, successor, probability
+    )

@@ -90,8 +90,11 @@ class Factors(NamedTuple):
                 right = right + block.outer @ x
             if not np.isfinite(right).all():
                 return np.full(b.size, np.nan)
-            x[block.order] = (_swept(block.inner, right) if block.factor is None
-                              else block.factor.solve(right, trans="T"))
+            x[block.order] = (
+                _swept(block.inner, right)
+                if block.factor is None
+                else block.factor.solve(right, trans="T")
+            )
         return x
 
     def other(self, chosen: Integers) -> Factors | None:
@@ -100,7 +103,8 @@ class Factors(NamedTuple):
         for block in self.blocks:
             swept = block.factor is None
             new = _block(
-                self.rows, self.label, block.order, chosen, swept=swept, sparing=block.sparing)
+                self.rows, self.label, block.order, chosen, swept=swept, sparing=block.sparing
+            )
             if new is None:
                 return None
             if not swept and (new.factor is None or new.fill > _FILL * block.fill):
@@ -115,8 +119,11 @@ class Factors(NamedTuple):
         found, matrix = [], self.rows[chosen]
         for block in self.blocks:
             nodes, swept = block.order, block.factor is None
-            if swept and nodes.size > _LAST and order_of(
-                    matrix[nodes][:, nodes], self.label[nodes]) is None:
+            if (
+                swept
+                and nodes.size > _LAST
+                and order_of(matrix[nodes][:, nodes], self.label[nodes]) is None
+            ):
                 return None
             new = _block(self.rows, self.label, nodes, chosen, sparing=swept or block.sparing)
             if new is None or new.factor is None:
@@ -210,7 +217,12 @@ def order_of(matrix: Any, label: Integers, work: float = np.inf) -> Integers | N
 
 
 def _block(
-    rows: Any, label: Integers, order: Integers, chosen: Integers, *, swept: bool = False,
+    rows: Any,
+    label: Integers,
+    order: Integers,
+    chosen: Integers,
+    *,
+    swept: bool = False,
     sparing: bool = False,
 ) -> _Block | None:
     """Some states of a policy, factored unless that would fill too much; None if singular."""
@@ -232,12 +244,20 @@ def _block(
         return _Block(order, inner, outer, None, 0)
     # In one large component those of least degree may go first (Liu 1985).
     most = np.bincount(label[order]).max(initial=0)
-    wide = (most > max(order.size / 2, _LARGE) and inner.nnz > _SEVERAL * order.size
-            and _bandwidth(inner) > _NARROW)
+    wide = (
+        most > max(order.size / 2, _LARGE)
+        and inner.nnz > _SEVERAL * order.size
+        and _bandwidth(inner) > _NARROW
+    )
     try:
         factor = linalg.splu(
-            _minus(inner).T, permc_spec="MMD_AT_PLUS_A" if sparing or wide else "NATURAL",
-            diag_pivot_thresh=0, relax=1, panel_size=_PANEL, options={"SymmetricMode": True})
+            _minus(inner).T,
+            permc_spec="MMD_AT_PLUS_A" if sparing or wide else "NATURAL",
+            diag_pivot_thresh=0,
+            relax=1,
+            panel_size=_PANEL,
+            options={"SymmetricMode": True},
+        )
     except (RuntimeError, MemoryError):
         return None
     return _Block(order, inner, outer, factor, int(factor.nnz), sparing)
@@ -296,8 +316,8 @@ def _counted(source: Integers, target: Integers, size: int) -> float:
     low, high = np.minimum(source, target), np.maximum(source, target)
     kept = low < high
     pattern = sparse.coo_array(
-        (np.ones(np.count_nonzero(kept), bool), (high[kept], low[kept])),
-        shape=(size, size)).tocsr()
+        (np.ones(np.count_nonzero(kept), bool), (high[kept], low[kept])), shape=(size, size)
+    ).tocsr()
     starts, entries = pattern.indptr.tolist(), pattern.indices.tolist()
     parent, beyond = [-1] * size, [-1] * size
     for i in range(size):

@@ -57,8 +57,10 @@ class _Row(NamedTuple):
 def _row(system: System, row: int) -> _Row:
     matrix = system.matrix
     span = slice(matrix.indptr[row], matrix.indptr[row + 1])
-    weights = {int(j): Fraction(float(w)) for j, w in
-               zip(matrix.indices[span], matrix.data[span], strict=True)}
+    weights = {
+        int(j): Fraction(float(w))
+        for j, w in zip(matrix.indices[span], matrix.data[span], strict=True)
+    }
     total = Fraction(float(system.leaving[row])) + sum(weights.values())
     return _Row(total, Fraction(float(system.known[row])), weights)
 

@@ -75,16 +75,25 @@ def _apart(ahead: Floats) -> tuple[float, Floats, Floats] | None:
 
     count, size = ahead.shape
     found = optimize.linprog(
-        np.append(np.zeros(count), 1.0), A_ub=np.hstack([-ahead.T, -np.ones((size, 1))]),
-        b_ub=np.zeros(size), A_eq=np.append(np.ones(count), 0.0)[None], b_eq=[1.0],
-        bounds=[(0, None)] * count + [(None, None)], method="highs", options=_EXACT)
+        np.append(np.zeros(count), 1.0),
+        A_ub=np.hstack([-ahead.T, -np.ones((size, 1))]),
+        b_ub=np.zeros(size),
+        A_eq=np.append(np.ones(count), 0.0)[None],
+        b_eq=[1.0],
+        bounds=[(0, None)] * count + [(None, None)],
+        method="highs",
+        options=_EXACT,
+    )
     if found.status != 0:
         return None
     normal = np.maximum(-np.asarray(found.ineqlin.marginals), 0)
     total = normal.sum()
     share = np.maximum(found.x[:-1], 0)
-    return (float(found.x[-1]), normal / total if total > 0 else np.full(size, 1 / size),
-            share / share.sum())
+    return (
+        float(found.x[-1]),
+        normal / total if total > 0 else np.full(size, 1 / size),
+        share / share.sum(),
+    )
 
 
 def mixture(lower: Floats, share: Floats) -> Floats:
@@ -110,8 +119,9 @@ def meets(lower: Floats, share: Floats, wanted: Floats) -> bool:
     total = sum(parts, Fraction(0))
     for column, least in zip(lower[used].T, wanted, strict=True):
         if np.isfinite(least):
-            sums = sum((p * Fraction(float(x)) for p, x in zip(parts, column, strict=True)),
-                       Fraction(0))
+            sums = sum(
+                (p * Fraction(float(x)) for p, x in zip(parts, column, strict=True)), Fraction(0)
+            )
             if sums < Fraction(float(least)) * total:
                 return False
     return True
@@ -150,7 +160,12 @@ class Largest(NamedTuple):
 
 
 def largest(
-    points: Floats, normals: Floats, bounds: Floats, index: int, least: Floats, scale: Floats,
+    points: Floats,
+    normals: Floats,
+    bounds: Floats,
+    index: int,
+    least: Floats,
+    scale: Floats,
     known: Floats | None = None,
 ) -> Largest:
     """The largest value of an objective, by what is known.
@@ -188,9 +203,15 @@ def _largest_mixtures(
 
     count = len(points)
     found = optimize.linprog(
-        -points[:, index] / scale[index], A_ub=-(points[:, asked] / scale[asked]).T,
-        b_ub=-least[asked] / scale[asked], A_eq=np.ones((1, count)), b_eq=[1.0],
-        bounds=[(0, None)] * count, method="highs", options=_EXACT)
+        -points[:, index] / scale[index],
+        A_ub=-(points[:, asked] / scale[asked]).T,
+        b_ub=-least[asked] / scale[asked],
+        A_eq=np.ones((1, count)),
+        b_eq=[1.0],
+        bounds=[(0, None)] * count,
+        method="highs",
+        options=_EXACT,
+    )
     inner = separation(points[:, asked], least[asked], scale[asked]).share
     if found.status != 0:
         return [inner]
@@ -217,7 +238,8 @@ def _outer(
     goal[index] = -1
     floor = [(float(least[i] / scale[i]) if i in asked else None, None) for i in range(size)]
     found = optimize.linprog(
-        goal, A_ub=normals * scale, b_ub=bounds, bounds=floor, method="highs", options=_EXACT)
+        goal, A_ub=normals * scale, b_ub=bounds, bounds=floor, method="highs", options=_EXACT
+    )
     if found.status != 0:
         return np.inf, None
     weight = np.maximum(-np.asarray(found.ineqlin.marginals), 0)
@@ -231,8 +253,13 @@ def _outer(
         return np.inf, found.x * scale
     taken = np.where(others & np.isfinite(least), least, 0)
     upper = (bound - normal @ taken) / normal[index]
-    slack = 8 * _EPS * (len(weight) + size) * (
-        weight @ np.abs(bounds) + normal @ np.abs(taken)) / normal[index]
+    slack = (
+        8
+        * _EPS
+        * (len(weight) + size)
+        * (weight @ np.abs(bounds) + normal @ np.abs(taken))
+        / normal[index]
+    )
     return float(upper + slack), found.x * scale
 
 
@@ -248,12 +275,17 @@ def corners(normals: Floats, bounds: Floats, floor: Floats) -> NDArray[Any]:
     limits = np.concatenate([bounds, -floor])
     length = np.linalg.norm(faces, axis=1)
     inner = optimize.linprog(
-        np.append(np.zeros(size), -1.0), A_ub=np.hstack([faces, length[:, None]]), b_ub=limits,
-        bounds=[(None, None)] * size + [(0, None)], method="highs")
+        np.append(np.zeros(size), -1.0),
+        A_ub=np.hstack([faces, length[:, None]]),
+        b_ub=limits,
+        bounds=[(None, None)] * size + [(0, None)],
+        method="highs",
+    )
     if inner.status != 0 or inner.x[-1] <= 1e-12:
         return np.zeros((0, size))
     found = spatial.HalfspaceIntersection(
-        np.hstack([faces, -limits[:, None]]), inner.x[:-1], qhull_options="QJ")
+        np.hstack([faces, -limits[:, None]]), inner.x[:-1], qhull_options="QJ"
+    )
     return found.intersections
 
 

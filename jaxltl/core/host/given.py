@@ -183,7 +183,8 @@ def names(name: str, given: Any) -> tuple[str, ...]:
     for one in found:
         if not isinstance(one, str) or found.count(one) > 1:
             raise ValueError(
-                f"{name}: {shown(one)} is no name, or is given twice; give each its name.")
+                f"{name}: {shown(one)} is no name, or is given twice; give each its name."
+            )
     return tuple(found)
 
 

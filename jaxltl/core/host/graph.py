@@ -96,7 +96,9 @@ class HostGraph:
         return found if self.allowed is None else np.where(self.available, found, most)
 
     def through(
-        self, value: NDArray[Any], reduce: Callable[[NDArray[Any]], NDArray[Any]],
+        self,
+        value: NDArray[Any],
+        reduce: Callable[[NDArray[Any]], NDArray[Any]],
         states: Any = slice(None),
     ) -> NDArray[Any]:
         """A reduction over the rows of some world states, through the memory: ``[N, Q, A]``."""
@@ -144,8 +146,11 @@ class HostGraph:
         )
         attract(search)
         shape = self.state_shape
-        return search.region.reshape(shape), search.action.reshape(shape), (
-            search.rank.reshape(shape))
+        return (
+            search.region.reshape(shape),
+            search.action.reshape(shape),
+            (search.rank.reshape(shape)),
+        )
 
     def components(
         self, core: Booleans, allowed: Booleans, closed: bool

@@ -100,15 +100,18 @@ class HostInterval:
             lack = np.where(np.abs(lack) > self.rounding, lack, 0)
         found = []
         for row, entry, used in tables(self.mdp.entry_start):
-            lower, upper = (x[entry] if used is None else np.where(used, x[entry], 0)
-                            for x in (self.lower, self.upper))
+            lower, upper = (
+                x[entry] if used is None else np.where(used, x[entry], 0)
+                for x in (self.lower, self.upper)
+            )
             ball: dict[str, Floats] = {}
             if self.ball is not None and lack is not None:
                 center = self.ball.center[entry]
                 center = center if used is None else np.where(used, center, 0)
                 ball = {"center": center, "most": self.ball.most[row], "lack": lack[row]}
-            found.append(Table.of(
-                row, entry, used, lower, upper, self.rest[row], self.rounding[row], **ball))
+            found.append(
+                Table.of(row, entry, used, lower, upper, self.rest[row], self.rounding[row], **ball)
+            )
         return found
 
     def total(self, quantity: NDArray[Any]) -> NDArray[Any]:
@@ -186,8 +189,9 @@ class HostInterval:
         """The same distributions, nearer to the center where they are too far from it."""
         center = np.where(entries, ball.center, 0)
         lack = 1 - self.total(center)
-        room, free = (np.where(entries, x, 0) for x in (
-            self.upper - ball.center, ball.center - self.lower))
+        room, free = (
+            np.where(entries, x, 0) for x in (self.upper - ball.center, ball.center - self.lower)
+        )
         more, less = share_of(lack, self.total(room)), share_of(-lack, self.total(free))
         # What gains least keeps to the entries; half of the rest is spent on all of them.
         near = center + room * more[self.mdp.row] - free * less[self.mdp.row]

@@ -45,7 +45,12 @@ def backup_error(model: HostInterval) -> float:
 
 
 def until(
-    model: HostInterval, target: Booleans, stay: Booleans, num_steps: int, *, maximize: bool,
+    model: HostInterval,
+    target: Booleans,
+    stay: Booleans,
+    num_steps: int,
+    *,
+    maximize: bool,
     helpful: bool,
 ) -> RobustSteps:
     """Probability of a target within so many steps, through states where one may stay.
@@ -100,7 +105,12 @@ def next_step(
 
 
 def total(
-    model: HostInterval, earned: Floats, start: Floats, num_steps: int, *, maximize: bool,
+    model: HostInterval,
+    earned: Floats,
+    start: Floats,
+    num_steps: int,
+    *,
+    maximize: bool,
     helpful: bool,
 ) -> RobustSteps:
     """Expected reward of so many steps, and then of the state where one is.
@@ -123,8 +133,11 @@ def total(
         # The same again and again, if nothing changes any more: e -> (1 + one) e + one * size.
         size, repeated = float(np.abs(ahead).max(initial=0)), num_steps - done + 1 if still else 1
         growth = float(np.expm1(min(repeated * np.log1p(one), 500)))
-        error = 1.01 * (error * (1 + growth) + growth * size) if still else (
-            error + one * (size + error))
+        error = (
+            1.01 * (error * (1 + growth) + growth * size)
+            if still
+            else (error + one * (size + error))
+        )
         value = found
         if still:
             break
@@ -151,9 +164,7 @@ def _some(maximize: bool) -> Any:
     return np.logical_or if maximize else np.logical_and
 
 
-def _entering(
-    model: HostInterval, region: Booleans, surely: bool, helpful: bool
-) -> Booleans:
+def _entering(model: HostInterval, region: Booleans, surely: bool, helpful: bool) -> Booleans:
     """The rows by which a region is entered possibly, or surely, with nature for or against it."""
     if surely:
         return model.may_stay(region) if helpful else ~model.mdp.support.lead_to(~region)
@@ -161,8 +172,13 @@ def _entering(
 
 
 def _within(
-    model: HostInterval, target: Booleans, open_: Booleans, num_steps: int, surely: bool,
-    maximize: bool, helpful: bool,
+    model: HostInterval,
+    target: Booleans,
+    open_: Booleans,
+    num_steps: int,
+    surely: bool,
+    maximize: bool,
+    helpful: bool,
 ) -> Booleans:
     """Whether a target is met in so many steps with positive probability, or surely."""
     region = target

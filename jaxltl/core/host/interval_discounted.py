@@ -18,7 +18,12 @@ _ROUNDS = 300
 
 
 def discounted(
-    model: HostInterval, reward: Floats, discount: Floats, *, maximize: bool, large: bool,
+    model: HostInterval,
+    reward: Floats,
+    discount: Floats,
+    *,
+    maximize: bool,
+    large: bool,
     tolerance: float,
 ) -> Robust:
     """``V = opt_r opt_p sum_t p_t (reward_t + discount_r V_t)``, enclosed.
@@ -67,8 +72,15 @@ def discounted(
         if not answers.any():
             row = np.where(better, mdp.first_choice(image == found[mdp.state])[1], row)
     return Robust(
-        np.clip(value, low, high), low, high, row, p, rounds, residual,
-        "policy iteration with nature")
+        np.clip(value, low, high),
+        low,
+        high,
+        row,
+        p,
+        rounds,
+        residual,
+        "policy iteration with nature",
+    )
 
 
 def _backup(
@@ -87,7 +99,11 @@ def _ahead(model: HostInterval, reward: Floats, discount: Floats, value: Floats)
 
 
 def _solved(
-    model: HostInterval, reward: Floats, discount: Floats, row: Integers, p: Floats,
+    model: HostInterval,
+    reward: Floats,
+    discount: Floats,
+    row: Integers,
+    p: Floats,
     label: Integers,
 ) -> Any:
     """The value of a policy and nature; None where the system is singular."""

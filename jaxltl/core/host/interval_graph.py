@@ -39,9 +39,7 @@ def compelled(
     return _compelled(model, goal, every, rows)[0]
 
 
-def attracting(
-    model: HostInterval, goal: Booleans, rows: Booleans | None = None
-) -> Integers:
+def attracting(model: HostInterval, goal: Booleans, rows: Booleans | None = None) -> Integers:
     """Rows by which states must come nearer to a goal against nature: ``int[S]``.
 
     Any row at the goal, and where it cannot be forced.
@@ -94,9 +92,7 @@ class Decided(NamedTuple):
     one: Booleans
 
 
-def decided(
-    model: HostInterval, goal: Booleans, *, maximize: bool, helpful: bool
-) -> Decided:
+def decided(model: HostInterval, goal: Booleans, *, maximize: bool, helpful: bool) -> Decided:
     """Where the probability of reaching a goal is 0 and where it is 1.
 
     Args:
@@ -160,13 +156,17 @@ def surely(
     mdp = model.mdp
     while True:
         # Who cannot keep to the set goes all the way back, not by one step a round.
-        inside = inside & ~(compelled(model, ~inside, every=maximize) if helpful else
-                            forced(mdp, ~inside))
+        inside = inside & ~(
+            compelled(model, ~inside, every=maximize) if helpful else forced(mdp, ~inside)
+        )
         kept = model.may_stay(inside) if helpful else ~mdp.support.lead_to(~inside)
         if maximize:
             kept &= inside[mdp.state]
-            found = (reaching(mdp, goal & inside, kept) if helpful else
-                     compelled(model, goal & inside, every=False, rows=kept))
+            found = (
+                reaching(mdp, goal & inside, kept)
+                if helpful
+                else compelled(model, goal & inside, every=False, rows=kept)
+            )
         else:
             bad = np.zeros(mdp.num_states, bool)
             bad[mdp.state[~kept]] = True

@@ -205,13 +205,17 @@ class Nodes:
         ends = np.where(self.known[mdp.successor] > 0, end, end + 1) if worth else end
         target = np.concatenate([np.where(target < 0, ends, target), [end, end + 1]])
         row_start = np.concatenate([mdp.row_start, mdp.num_rows + np.array([1, 2])])
-        graph = HostMDP(
-            row_start, starts_of(width), target.astype(np.int32), np.ones(target.size))
+        graph = HostMDP(row_start, starts_of(width), target.astype(np.int32), np.ones(target.size))
         row = towards(graph, np.arange(end + 2) == end, np.ones(graph.num_rows, bool))
         return row[:-2].astype(np.int64), self.anything()
 
     def improved(
-        self, found: Choice, z: Floats, extra: float, least: float = 0.0, *,
+        self,
+        found: Choice,
+        z: Floats,
+        extra: float,
+        least: float = 0.0,
+        *,
         everywhere: bool = False,
     ) -> tuple[Choice, float]:
         """The choices that are better at some values, and by how much they are.
@@ -232,9 +236,10 @@ class Nodes:
             noise[row] = 4 * _EPS * (np.abs(z[block.owner]) + block.table.rounding) + least
             fine = np.arange(row.size) if everywhere else block.table.fine
             if fine.size:  # what hardly leaves gains little
-                noise[row[fine]] = np.einsum(
-                    "wn,wn->n", (mass + before)[:, fine], np.abs(ahead[:, fine])
-                ) * block.table.rounding[fine]
+                noise[row[fine]] = (
+                    np.einsum("wn,wn->n", (mass + before)[:, fine], np.abs(ahead[:, fine]))
+                    * block.table.rounding[fine]
+                )
             p.append(np.where(np.abs(gain[row] - now[row]) > noise[row], mass, before))
         more = gain + self.cost
         first = self.part.mdp.row_start[:-1]
@@ -245,8 +250,10 @@ class Nodes:
         row = self.part.mdp.first_choice(more == best[self.part.mdp.state])[1]
         better = best - own > np.maximum(noise[row], noise[chosen])
         change = np.maximum(best - own, mine if self.against else 0)
-        return (found._replace(chosen=np.where(better, row, chosen), p=p),
-                float(change.max(initial=0)))
+        return (
+            found._replace(chosen=np.where(better, row, chosen), p=p),
+            float(change.max(initial=0)),
+        )
 
     def chain(self, choice: Choice) -> Chain | None:
         """The system of choices; None where some never leave their node."""
@@ -265,10 +272,10 @@ class Nodes:
                 return None
             share /= leaving
             earned[owner] = np.einsum("wn,wn->n", share, values.take(index)) + (
-                self.cost[block.table.row[mine]] / leaving)
+                self.cost[block.table.row[mine]] / leaving
+            )
             kept = (index < self.size) & (share > 0)
-            parts.append((
-                np.broadcast_to(owner, kept.shape)[kept], index[kept], share[kept]))
+            parts.append((np.broadcast_to(owner, kept.shape)[kept], index[kept], share[kept]))
         source, target, share = (np.concatenate(x) for x in zip(*parts, strict=True))
         shape = (self.size, self.size)
         return Chain(csr_array((share, (source, target)), shape=shape), earned)
@@ -306,9 +313,7 @@ class Nodes:
                 return False
         return True
 
-    def _sums(
-        self, block: Block, gain: Floats, p: Floats, sign: int, *, every: bool
-    ) -> Floats:
+    def _sums(self, block: Block, gain: Floats, p: Floats, sign: int, *, every: bool) -> Floats:
         """What rows gain, at most (sign 1) or at least (-1).
 
         Args:

@@ -94,7 +94,12 @@ class JointBound(NamedTuple):
 
 
 def joint_bound(
-    problem: Joint, *, maximize: bool, tolerance: float, relative: bool, against: bool = False,
+    problem: Joint,
+    *,
+    maximize: bool,
+    tolerance: float,
+    relative: bool,
+    against: bool = False,
     first: Integers | None = None,
 ) -> JointBound:
     """The optimum of a joint problem, or of one against nature, bounded from both sides.
@@ -121,9 +126,7 @@ def joint_bound(
     return _found(problem, search, far, near)
 
 
-def _found(
-    problem: Joint, search: _Search, far: Choice | None, near: Choice | None
-) -> JointBound:
+def _found(problem: Joint, search: _Search, far: Choice | None, near: Choice | None) -> JointBound:
     """What was found, in the numbers of the model."""
     nodes = search.nodes
     states = np.flatnonzero(problem.open)
@@ -141,8 +144,13 @@ def _found(
         chance[nodes.entry] = nodes.by_entry(last.p)
         row[states] = nodes.row[(near or last).chosen][nodes.node[states]]
     return JointBound(
-        everywhere(lost if far is None else far.z), None if near is None else everywhere(near.z),
-        everywhere(lost if last is None else last.value), row, chance, search.rounds)
+        everywhere(lost if far is None else far.z),
+        None if near is None else everywhere(near.z),
+        everywhere(lost if last is None else last.value),
+        row,
+        chance,
+        search.rounds,
+    )
 
 
 @dataclass
@@ -172,8 +180,11 @@ class _Search:
         """What choices are worth; None where some never leave."""
         chain = self.nodes.chain(choice)
         self.rounds += 1
-        value = None if chain is None else self.systems.solve(
-            chain.matrix, chain.earned, choice.value, left)
+        value = (
+            None
+            if chain is None
+            else self.systems.solve(chain.matrix, chain.earned, choice.value, left)
+        )
         if value is None:
             return None
         self.last = choice._replace(value=value)
@@ -361,5 +372,14 @@ def _nodes(problem: Joint, sign: int, against: bool) -> Nodes:
     part, entry = problem.model.of_rows(starts_of(count), row)
     cost: Any = sign * problem.cost[row]
     return Nodes(
-        part, row, entry, node, sign, sign * problem.known, cost, problem.depth,
-        problem.wandering, against)
+        part,
+        row,
+        entry,
+        node,
+        sign,
+        sign * problem.known,
+        cost,
+        problem.depth,
+        problem.wandering,
+        against,
+    )

@@ -68,24 +68,30 @@ def parity_against_nature(
     mdp_ = model.fixed(p)
     region = accepting_region(mdp_, priority[mdp_.state[mdp_.row]]).region
     other = optimal.reachability(
-        mdp_, region, maximize=True, tolerance=tolerance / 2,
-        depth=terms(mdp_))
+        mdp_, region, maximize=True, tolerance=tolerance / 2, depth=terms(mdp_)
+    )
     lower = np.clip(1 - answer.upper - 1e-16, 0, 1)
     lower = np.where(answer.upper == 0, 1, np.where(answer.upper >= 1, 0, lower))
     upper = np.maximum(other.upper if able else 1, lower)
     return Robust(
-        np.clip(value, lower, upper), lower, upper, row, p, rounds, float(best.max(initial=0)),
-        "strategy improvement against nature")
+        np.clip(value, lower, upper),
+        lower,
+        upper,
+        row,
+        p,
+        rounds,
+        float(best.max(initial=0)),
+        "strategy improvement against nature",
+    )
 
 
-def _answered(
-    model: HostInterval, row: Integers, priority: Integers, tolerance: float
-) -> Robust:
+def _answered(model: HostInterval, row: Integers, priority: Integers, tolerance: float) -> Robust:
     """What nature makes of a policy: the probability that it does not win."""
     part, _ = model.chain(row)
     lost = joint_accepting(part, priority[part.mdp.state[part.mdp.row]] + 1)
     return interval_values.reachability(
-        part, lost.region, maximize=True, helpful=True, tolerance=tolerance / 2)
+        part, lost.region, maximize=True, helpful=True, tolerance=tolerance / 2
+    )
 
 
 class _Game(NamedTuple):
@@ -143,7 +149,8 @@ def almost_surely(game: _Game, priority: Integers, *, leader: str) -> Winning:
     """
     model = game.model
     possible = (model.upper > 0) & (
-        (model.lower > 0) | (model.rest > model.rounding)[model.mdp.row])
+        (model.lower > 0) | (model.rest > model.rounding)[model.mdp.row]
+    )
     inside, outside = game.inside & possible, ~game.inside & possible
     by = _by_policy if leader == "policy" else _by_nature
     return _Fixpoint(game, priority, inside, outside, by).solved([], [])
@@ -230,8 +237,10 @@ class _Fixpoint(NamedTuple):
         mdp = self.game.model.mdp
         source = fresh[mdp.state[mdp.row]]
         return Winning(
-            found.region | fresh, np.where(fresh, new.row, found.row),
-            np.where(source, new.probability, found.probability))
+            found.region | fresh,
+            np.where(fresh, new.row, found.row),
+            np.where(source, new.probability, found.probability),
+        )
 
     def body(self, ys: list[Booleans], xs: list[Booleans]) -> Winning:
         """One step from each state, by its priority."""
@@ -241,6 +250,5 @@ class _Fixpoint(NamedTuple):
         for p in np.unique(self.priority):
             up = p // 2 + 1
             some, row, chance = self.by(self, p % 2 == 1, ys[:up], xs[:up])
-            found = self.joined(
-                found, Winning(some, row, chance), some & (self.priority == p))
+            found = self.joined(found, Winning(some, row, chance), some & (self.priority == p))
         return found

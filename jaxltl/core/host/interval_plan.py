@@ -88,8 +88,15 @@ def plan_reachability(
         every = np.ones(mdp.num_rows, bool)
         out = towards(mdp, one, every) if helpful else attracting(halted, one, every)
         row = np.where(open_, out, row)
-    left = _Left(halted, origin, np.where(open_, np.nan, one), row, within, open_[mdp.state],
-                 np.ones(mdp.num_transitions, bool))
+    left = _Left(
+        halted,
+        origin,
+        np.where(open_, np.nan, one),
+        row,
+        within,
+        open_[mdp.state],
+        np.ones(mdp.num_transitions, bool),
+    )
     return _plan(model, target | blocked, left, log, np.ones(mdp.num_rows, bool))
 
 
@@ -111,7 +118,8 @@ def plan_total_reward(
         nothing = finite & ~reaching(mdp, paying)
     else:
         finite, kept = surely(
-            asked, target, np.ones(target.size, bool), maximize=not maximize, helpful=not large)
+            asked, target, np.ones(target.size, bool), maximize=not maximize, helpful=not large
+        )
         if maximize:
             nothing, _ = surely(asked, target, finite & ~paying, maximize=False, helpful=True)
         else:
@@ -145,7 +153,11 @@ def _keeping(model: HostInterval, entries: Booleans, rows: Booleans) -> HostMDP:
 
 
 def _for_nothing(
-    model: HostInterval, target: Booleans, finite: Booleans, rows: Booleans, large: bool,
+    model: HostInterval,
+    target: Booleans,
+    finite: Booleans,
+    rows: Booleans,
+    large: bool,
     log: list[_Question],
 ) -> Booleans:
     """The states from which a policy surely reaches the target by some rows."""
@@ -236,8 +248,11 @@ def _answers(model: HostInterval, log: list[_Question], entries: Integers) -> An
     kept[first] = True
     chosen = kept[group]
     return Answers(
-        entry[chosen], (np.cumsum(kept) - 1)[group[chosen]], model.mdp.row[entry[start[kept]]],
-        room[kept])
+        entry[chosen],
+        (np.cumsum(kept) - 1)[group[chosen]],
+        model.mdp.row[entry[start[kept]]],
+        room[kept],
+    )
 
 
 # --- what is left -------------------------------------------------------------------------------
@@ -284,5 +299,11 @@ def _plan(
     within, used = (np.ones(mdp.num_transitions, bool) for _ in range(2))
     within[moves], used[moves] = left.within[moved], left.used[moved]
     return IntervalPlan(
-        left.known, left.origin[left.row], within, left.origin[left.rows], used,
-        bool(circling.any()), _answers(model, log, entries))
+        left.known,
+        left.origin[left.row],
+        within,
+        left.origin[left.rows],
+        used,
+        bool(circling.any()),
+        _answers(model, log, entries),
+    )

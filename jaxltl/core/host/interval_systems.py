@@ -80,7 +80,11 @@ class Systems:
 
 
 def _krylov(
-    matrix: Any, b: Floats, x: Floats, left: float, steps: int,
+    matrix: Any,
+    b: Floats,
+    x: Floats,
+    left: float,
+    steps: int,
     solve: Callable[[Floats], Floats] | None,
 ) -> Floats | None:
     """BiCGSTAB, begun anew where it breaks down; None where it does not get there."""

@@ -80,8 +80,9 @@ class Table(NamedTuple):
         given = self._given(left, self.lower, self.upper, self.rounding)
         if self.fine.size:
             order = np.argsort(key[:, self.fine].T, axis=1, kind="stable")
-            ends = (np.take_along_axis(x[:, self.fine].T, order, 1)
-                    for x in (self.lower, self.upper))
+            ends = (
+                np.take_along_axis(x[:, self.fine].T, order, 1) for x in (self.lower, self.upper)
+            )
             mass = np.empty(order.shape)
             np.put_along_axis(mass, order, exactly_given(*ends), 1)
             given[:, self.fine] = mass.T
@@ -96,8 +97,9 @@ class Table(NamedTuple):
         if self.center is not None and self.most is not None and self.lack is not None:
             center = np.take_along_axis(self.center.T, order, 1)
             used = None if self.used is None else np.take_along_axis(self.used.T, order, 1)
-            lower, upper = narrowed(Sorted(
-                lower, upper, center, used, self.most, self.lack, self.rounding))
+            lower, upper = narrowed(
+                Sorted(lower, upper, center, used, self.most, self.lack, self.rounding)
+            )
             rest = np.maximum(1 - lower.sum(1, keepdims=True), 0)
         before = np.zeros_like(lower)
         np.cumsum((upper - lower)[:, :-1], axis=1, out=before[:, 1:])
@@ -127,8 +129,9 @@ class Table(NamedTuple):
         told[self.fine] = False
         if not told.all():
             rows = np.flatnonzero(~told)
-            part = self._replace(row=self.row[rows], lower=self.lower[:, rows],
-                                 upper=self.upper[:, rows])
+            part = self._replace(
+                row=self.row[rows], lower=self.lower[:, rows], upper=self.upper[:, rows]
+            )
             p, gain = p[:, rows], gain[:, rows]
             found[rows] = part._most(p, gain) if every else part._near(p, gain)
         return found
@@ -161,8 +164,7 @@ class Table(NamedTuple):
         found = self._dual(p, gain, missing, price, np.zeros_like(price))
         if self.center is None:
             return found
-        low = self._price(
-            p < self.center, (p > self.lower) & (p <= self.center), gain, missing)
+        low = self._price(p < self.center, (p > self.lower) & (p <= self.center), gain, missing)
         rise = np.where((p < self.upper) & (p >= self.center), gain, -np.inf).max(0)
         rise = np.where(np.isfinite(rise), np.maximum(rise - low, 0), 0)
         return np.minimum(found, self._dual(p, gain, missing, low, rise))
@@ -189,8 +191,9 @@ class Table(NamedTuple):
         paid = rise * (np.maximum(at - self.center, 0) - np.maximum(p - self.center, 0))
         size = np.where(at == p, 0, np.abs(at - self.center) + np.abs(p - self.center))
         slack = 8 * _EPS * (np.abs(part) + rise * size).sum(0)
-        return (_upward(price * missing) + (part - paid).sum(0) + slack
-                + _upward(rise * self.spare(p)))
+        return (
+            _upward(price * missing) + (part - paid).sum(0) + slack + _upward(rise * self.spare(p))
+        )
 
     def _near(self, p: Floats, gain: Floats) -> Floats:
         """How much more than p a distribution of the row gains, at most: ``float64[N]``.
@@ -294,8 +297,7 @@ def row_sums(quantity: Floats, start: Integers, *more: Floats) -> Floats:
         for row, at, used in tables(starts_of(width)):
             terms = quantity[entry[at]]
             terms = terms if used is None else np.where(used, terms, 0)
-            found[near[row]] = exact_sum(
-                np.concatenate([[x[near[row]] for x in more], terms]))
+            found[near[row]] = exact_sum(np.concatenate([[x[near[row]] for x in more], terms]))
     return found
 
 

@@ -61,7 +61,8 @@ class Robust(NamedTuple):
     def covering(self, other: Robust) -> Robust:
         """The same with bounds that enclose what is enclosed by others too."""
         return self._replace(
-            lower=np.minimum(self.lower, other.lower), upper=np.maximum(self.upper, other.upper))
+            lower=np.minimum(self.lower, other.lower), upper=np.maximum(self.upper, other.upper)
+        )
 
 
 class _Solve(NamedTuple):
@@ -88,8 +89,14 @@ class _Solve(NamedTuple):
 
 
 def reachability(
-    model: HostInterval, target: Booleans, *, maximize: bool, helpful: bool,
-    stay: Booleans | None = None, tolerance: float = 1e-6, depth: int = 0,
+    model: HostInterval,
+    target: Booleans,
+    *,
+    maximize: bool,
+    helpful: bool,
+    stay: Booleans | None = None,
+    tolerance: float = 1e-6,
+    depth: int = 0,
 ) -> Robust:
     """The probability of reaching a target, optimal for policy and nature.
 
@@ -115,18 +122,26 @@ def reachability(
     if (mine.zero == other.zero).all() and (mine.one == other.one).all():
         return found
     return found.covering(
-        _reachability(wide, target, stop, tolerance=tolerance, depth=depth, **ask))
+        _reachability(wide, target, stop, tolerance=tolerance, depth=depth, **ask)
+    )
 
 
 def _reachability(
-    model: HostInterval, target: Booleans, stop: Booleans, *, maximize: bool, helpful: bool,
-    tolerance: float, depth: int,
+    model: HostInterval,
+    target: Booleans,
+    stop: Booleans,
+    *,
+    maximize: bool,
+    helpful: bool,
+    tolerance: float,
+    depth: int,
 ) -> Robust:
     halted, row = model.halted(stop)
 
     def exact(mdp: HostMDP, _: Floats, up: bool) -> Enclosed:
         return optimal.reachability(
-            mdp, target, maximize=up, tolerance=tolerance / 2, depth=depth + terms(mdp))
+            mdp, target, maximize=up, tolerance=tolerance / 2, depth=depth + terms(mdp)
+        )
 
     def joint(part: HostInterval, _: Floats, up: bool) -> Robust:
         return _joint_reachability(part, target, up, tolerance, depth, exact)
@@ -146,8 +161,14 @@ def _reachability(
 
 
 def total_reward(
-    model: HostInterval, reward: Floats, target: Booleans, *, maximize: bool, large: bool,
-    tolerance: float = 1e-6, depth: int = 0,
+    model: HostInterval,
+    reward: Floats,
+    target: Booleans,
+    *,
+    maximize: bool,
+    large: bool,
+    tolerance: float = 1e-6,
+    depth: int = 0,
 ) -> Robust:
     """The expected reward until a target is reached, optimal for policy and nature.
 
@@ -167,11 +188,17 @@ def total_reward(
     ask: Any = {"maximize": maximize, "large": large}
     found = _total_reward(model, reward, target, tolerance=tolerance, depth=depth, **ask)
     wide = model.widened
-    if wide is None or (_finite(wide.halted(target)[0], target, **ask)[0]
-                        == _finite(model.halted(target)[0], target, **ask)[0]).all():
+    if (
+        wide is None
+        or (
+            _finite(wide.halted(target)[0], target, **ask)[0]
+            == _finite(model.halted(target)[0], target, **ask)[0]
+        ).all()
+    ):
         return found
     return found.covering(
-        _total_reward(wide, reward, target, tolerance=tolerance, depth=depth, **ask))
+        _total_reward(wide, reward, target, tolerance=tolerance, depth=depth, **ask)
+    )
 
 
 def _finite(
@@ -182,12 +209,19 @@ def _finite(
         one = decided(model, target, maximize=False, helpful=False).one
         return one, one[model.mdp.state]
     return surely(
-        model, target, np.ones(target.size, bool), maximize=not maximize, helpful=not large)
+        model, target, np.ones(target.size, bool), maximize=not maximize, helpful=not large
+    )
 
 
 def _total_reward(
-    model: HostInterval, reward: Floats, target: Booleans, *, maximize: bool, large: bool,
-    tolerance: float, depth: int,
+    model: HostInterval,
+    reward: Floats,
+    target: Booleans,
+    *,
+    maximize: bool,
+    large: bool,
+    tolerance: float,
+    depth: int,
 ) -> Robust:
     halted, row = model.halted(target)
     cost = np.where(target[halted.mdp.state], 0, reward[row])
@@ -196,7 +230,8 @@ def _total_reward(
 
     def exact(mdp: HostMDP, earned: Floats, up: bool) -> Enclosed:
         return optimal.total_reward(
-            mdp, earned, ends, maximize=up, tolerance=tolerance / 2, depth=depth + terms(mdp))
+            mdp, earned, ends, maximize=up, tolerance=tolerance / 2, depth=depth + terms(mdp)
+        )
 
     def joint(some: HostInterval, earned: Floats, up: bool) -> Robust:
         return _joint_reward(some, earned, ends, up, tolerance, depth, exact)
@@ -208,18 +243,21 @@ def _total_reward(
         found = joint(part, cost, maximize)
     elif maximize:
         found = _led_by_nature(
-            part, part.within(np.ones(part.mdp.num_transitions, bool)), solve, -1)
+            part, part.within(np.ones(part.mdp.num_transitions, bool)), solve, -1
+        )
     else:
         found = _led_by_policy(part, _surely_soon(part, ends, solve), solve, -1)
     value, lower, upper = (
-        np.where(finite, x, np.inf) for x in (found.value, found.lower, found.upper))
+        np.where(finite, x, np.inf) for x in (found.value, found.lower, found.upper)
+    )
     # Where it is infinite, and of rows that are not taken, nature is anything.
     taken, open_ = np.zeros(halted.mdp.num_rows, bool), finite[part.mdp.state]
     taken[origin[open_]] = True
     chance = np.where(taken[halted.mdp.row], 0, halted.mdp.probability)
     chance[entry[open_[part.mdp.row]]] = found.probability[open_[part.mdp.row]]
     found = found._replace(
-        value=value, lower=lower, upper=upper, row=origin[found.row], probability=chance)
+        value=value, lower=lower, upper=upper, row=origin[found.row], probability=chance
+    )
     return _unhalted(model, halted, row, target, found)
 
 
@@ -229,7 +267,11 @@ def terms(mdp: HostMDP) -> int:
 
 
 def _joint_reachability(
-    model: HostInterval, target: Booleans, up: bool, tolerance: float, depth: int,
+    model: HostInterval,
+    target: Booleans,
+    up: bool,
+    tolerance: float,
+    depth: int,
     exact: Callable[[HostMDP, Floats, bool], Enclosed],
 ) -> Robust:
     """Policy and nature together make the probability large, or small."""
@@ -246,7 +288,10 @@ def _joint_reachability(
             component, inside, used = _components(model, open_, None)
         found = joint_bound(
             Joint(model, open_, bound, np.zeros(mdp.num_rows), component, depth),
-            maximize=up, tolerance=tolerance, relative=False)
+            maximize=up,
+            tolerance=tolerance,
+            relative=False,
+        )
         bound, rounds = np.clip(found.bound, 0, 1), found.rounds
         of = found.enclosed(up, tolerance, relative=False)
         row, chance = np.where(open_, found.row, row), found.probability
@@ -262,8 +307,11 @@ def _joint_reachability(
     if of is None:
         chain, entry = model.chain(row)
         of = _pinned(exact, chain, chance[entry], np.zeros(0), up)
-    low, high = (of.lower, np.maximum(bound, of.lower)) if up else (
-        np.minimum(bound, of.upper), np.minimum(of.upper, 1))
+    low, high = (
+        (of.lower, np.maximum(bound, of.lower))
+        if up
+        else (np.minimum(bound, of.upper), np.minimum(of.upper, 1))
+    )
     return Robust(of.value, low, high, row, chance, rounds + of.rounds, of.residual, _METHOD)
 
 
@@ -282,7 +330,12 @@ def _opposed_reachability(
         first = attracting(model, one) if up else row
         found = joint_bound(
             Joint(model, open_, known, np.zeros(mdp.num_rows), np.arange(mdp.num_states), depth),
-            maximize=up, tolerance=tolerance, relative=False, against=True, first=first)
+            maximize=up,
+            tolerance=tolerance,
+            relative=False,
+            against=True,
+            first=first,
+        )
         if found.attained is None:
             return None
         low, high = (found.attained, found.bound) if up else (found.bound, found.attained)
@@ -296,7 +349,12 @@ def _opposed_reachability(
 
 
 def _joint_reward(
-    model: HostInterval, cost: Floats, target: Booleans, up: bool, tolerance: float, depth: int,
+    model: HostInterval,
+    cost: Floats,
+    target: Booleans,
+    up: bool,
+    tolerance: float,
+    depth: int,
     exact: Callable[[HostMDP, Floats, bool], Enclosed],
 ) -> Robust:
     """Policy and nature together make the reward large, or small, in a model that surely ends."""
@@ -315,7 +373,10 @@ def _joint_reward(
             component, inside, used = _components(model, open_, cost == 0)
         found = joint_bound(
             Joint(model, open_, bound, cost, component, depth, wandering=not up),
-            maximize=up, tolerance=tolerance, relative=True)
+            maximize=up,
+            tolerance=tolerance,
+            relative=True,
+        )
         bound, rounds = found.bound, found.rounds
         of = found.enclosed(up, tolerance, relative=True)
         row, chance = np.where(open_, found.row, row), found.probability
@@ -324,8 +385,9 @@ def _joint_reward(
     if of is None:
         chain, entry = model.chain(row)
         of = _pinned(exact, chain, chance[entry], cost[row], up)
-    low, high = (of.lower, np.maximum(bound, of.lower)) if up else (
-        np.minimum(bound, of.upper), of.upper)
+    low, high = (
+        (of.lower, np.maximum(bound, of.lower)) if up else (np.minimum(bound, of.upper), of.upper)
+    )
     return Robust(of.value, low, high, row, chance, rounds + of.rounds, of.residual, _METHOD)
 
 
@@ -333,16 +395,18 @@ _METHOD = "policy iteration with nature"
 
 
 def _pinned(
-    exact: Callable[[HostMDP, Floats, bool], Enclosed], model: HostInterval, p: Floats,
-    cost: Floats, up: bool,
+    exact: Callable[[HostMDP, Floats, bool], Enclosed],
+    model: HostInterval,
+    p: Floats,
+    cost: Floats,
+    up: bool,
 ) -> Enclosed:
     """The policy's optimum where nature picks what is next to some distributions."""
     settled, able = model.settled(p)
     found = exact(model.fixed(settled), cost, up)
     if able:
         return found
-    return found._replace(
-        lower=np.zeros_like(found.lower), upper=np.full_like(found.upper, np.inf))
+    return found._replace(lower=np.zeros_like(found.lower), upper=np.full_like(found.upper, np.inf))
 
 
 def _components(
@@ -355,7 +419,11 @@ def _components(
 
 
 def _inner(
-    model: HostInterval, row: Integers, chance: Floats, component: Integers, inside: Booleans,
+    model: HostInterval,
+    row: Integers,
+    chance: Floats,
+    component: Integers,
+    inside: Booleans,
     used: Booleans,
 ) -> tuple[Integers, Floats]:
     """A policy that moves inside each component until it is where its row leaves."""
@@ -371,9 +439,7 @@ def _inner(
     return np.where(moving, towards(model.fixed(chance), goal, taken), row), chance
 
 
-def _led_by_policy(
-    model: HostInterval, row: Integers, solve: _Solve, sign: int
-) -> Robust:
+def _led_by_policy(model: HostInterval, row: Integers, solve: _Solve, sign: int) -> Robust:
     """The policy improves, nature answers best.
 
     Args:
@@ -402,9 +468,7 @@ def _led_by_policy(
     return _between(inner.value, low, high, row, p, rounds + other.rounds, float(best.max()))
 
 
-def _led_by_nature(
-    model: HostInterval, p: Floats, solve: _Solve, sign: int
-) -> Robust:
+def _led_by_nature(model: HostInterval, p: Floats, solve: _Solve, sign: int) -> Robust:
     """Nature improves, the policy answers best.
 
     Args:
@@ -448,12 +512,24 @@ def _least(mdp: HostMDP, gain: Floats) -> Integers:
 
 
 def _between(
-    value: Floats, low: Floats, high: Floats, row: Integers, p: Floats, rounds: int,
+    value: Floats,
+    low: Floats,
+    high: Floats,
+    row: Integers,
+    p: Floats,
+    rounds: int,
     residual: float,
 ) -> Robust:
     return Robust(
-        np.clip(value, low, np.maximum(low, high)), low, np.maximum(low, high), row, p, rounds,
-        abs(residual), "strategy improvement against nature")
+        np.clip(value, low, np.maximum(low, high)),
+        low,
+        np.maximum(low, high),
+        row,
+        p,
+        rounds,
+        abs(residual),
+        "strategy improvement against nature",
+    )
 
 
 def _differences(model: HostInterval, value: Floats) -> Floats:
@@ -461,9 +537,7 @@ def _differences(model: HostInterval, value: Floats) -> Floats:
     return value[mdp.successor] - value[mdp.state[mdp.row]]
 
 
-def gains(
-    model: HostInterval, value: Floats, cost: Floats, *, up: bool
-) -> tuple[Floats, Floats]:
+def gains(model: HostInterval, value: Floats, cost: Floats, *, up: bool) -> tuple[Floats, Floats]:
     """What each row gains when nature makes that large or small, and nature's distributions."""
     ahead = _differences(model, value)
     p = model.nature(ahead, maximize=up)
@@ -475,9 +549,7 @@ def _noise(value: Floats) -> Floats:
     return 64 * _EPS * (np.abs(value) + np.abs(value).max(initial=0))
 
 
-def _started(
-    model: HostInterval, target: Booleans, *, maximize: bool
-) -> tuple[Integers, Floats]:
+def _started(model: HostInterval, target: Booleans, *, maximize: bool) -> tuple[Integers, Floats]:
     """Good rows and distributions where policy and nature want the opposite of a probability.
 
     Both are improved as values rise from zero by sweeps of what they chose.
@@ -519,7 +591,8 @@ def _surely_soon(model: HostInterval, goal: Booleans, solve: _Solve) -> Integers
     """
     row = solve.exact(model.mdp, solve.cost, False).row
     sure, _ = surely(
-        model.chain(row)[0], goal, np.ones(goal.size, bool), maximize=True, helpful=False)
+        model.chain(row)[0], goal, np.ones(goal.size, bool), maximize=True, helpful=False
+    )
     return np.where(sure, row, attracting(model, goal | sure))
 
 
@@ -557,7 +630,8 @@ def _restricted(
     inner = part.within(kept)
     chance = np.where(lone, 1, inner)[kept]
     small = HostMDP(
-        starts, np.concatenate([[0], width.cumsum()]), successor.astype(np.int32), chance)
+        starts, np.concatenate([[0], width.cumsum()]), successor.astype(np.int32), chance
+    )
     return HostInterval(small, lower, upper, ball), row, entry[kept]
 
 

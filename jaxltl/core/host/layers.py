@@ -87,24 +87,23 @@ class _Rows:
             self.action = np.nonzero(available)[1].astype(np.int32)
         self.available = available
         self.host = HostMDP(
-            starts_of(count), starts, column.astype(np.int32, copy=False),
-            weight.astype(np.float64))
+            starts_of(count), starts, column.astype(np.int32, copy=False), weight.astype(np.float64)
+        )
 
     @cached_property
     def cut(self) -> Cut:
         """Of all rows."""
         host = self.host
-        return cut(host.row_start, host.entry_start, host.successor, host.probability,
-                   host.num_states)
+        return cut(
+            host.row_start, host.entry_start, host.successor, host.probability, host.num_states
+        )
 
     def of(self, choices: Booleans) -> Booleans:
         """What holds of actions ``bool[S, A]``, of rows."""
         return choices.reshape(-1) if self.regular else choices[self.available]
 
 
-def layered(
-    world: World, target: Booleans, *, maximize: bool, tolerance: float
-) -> Layered | None:
+def layered(world: World, target: Booleans, *, maximize: bool, tolerance: float) -> Layered | None:
     """The largest or smallest probability of reaching a target.
 
     Args:
@@ -120,7 +119,8 @@ def layered(
     if num_memory > LARGEST or not _mixes(world):
         return None
     graph = bit_graph(
-        world.successor, world.used, world.available, world.delta, world.letter, world.allowed)
+        world.successor, world.used, world.available, world.delta, world.letter, world.allowed
+    )
     sets = decided(graph, pack(target), num_memory, maximize=maximize)
     del graph
     if sets is None:
@@ -136,8 +136,7 @@ def _mixes(world: World) -> bool:
     def follow(states: Any) -> Any:
         return world.successor[states][world.used[states]]
 
-    return any(spreads(follow, np.array([i * size // _STARTS]), size, _MET)
-               for i in range(_STARTS))
+    return any(spreads(follow, np.array([i * size // _STARTS]), size, _MET) for i in range(_STARTS))
 
 
 class _Search:
@@ -169,9 +168,12 @@ class _Search:
         """Fills in all components; whether that succeeded."""
         num_memory = self.world.delta.shape[0]
         read = np.unique(self.world.letter)
-        label = components_in_order(Edges(
-            np.arange(0, num_memory * read.size + 1, read.size),
-            self.world.delta[:, read].ravel().astype(np.int32)))
+        label = components_in_order(
+            Edges(
+                np.arange(0, num_memory * read.size + 1, read.size),
+                self.world.delta[:, read].ravel().astype(np.int32),
+            )
+        )
         parts = [np.flatnonzero(label == i) for i in range(label.max() + 1)]
         parts = [x for x in parts if any(self.open(q).any() for q in x)]
         for i, part in enumerate(parts, 1):
@@ -194,7 +196,8 @@ class _Search:
         near, far, row = found.near, found.far, found.row
         self.sweeps += found.sweeps
         self.known = max(
-            self.known, float(np.abs(far - near)[problem.open[: far.size]].max(initial=0)))
+            self.known, float(np.abs(far - near)[problem.open[: far.size]].max(initial=0))
+        )
         for i, q in enumerate(part):
             span = slice(i * host.num_states, (i + 1) * host.num_states)
             open_ = problem.open[span]
@@ -251,8 +254,16 @@ def _alone(search: _Search, q: int) -> _Problem:
     inner, open_ = after == q, search.open(q)
     mask = None if world.allowed is None else rows.of(world.allowed[:, q])
     return _Problem(
-        rows.host, rows.cut, open_, inner & open_, search.near[after, place],
-        search.far[after, place], mask, search.has(search.sets.stays, q), inner)
+        rows.host,
+        rows.cut,
+        open_,
+        inner & open_,
+        search.near[after, place],
+        search.far[after, place],
+        mask,
+        search.has(search.sets.stays, q),
+        inner,
+    )
 
 
 def _together(search: _Search, part: Integers) -> _Problem:
@@ -270,11 +281,13 @@ def _together(search: _Search, part: Integers) -> _Problem:
     entries = np.concatenate([x[host.successor] for x in column])
     width = np.concatenate([np.tile(np.diff(host.entry_start), part.size), np.ones(ends, int)])
     written = HostMDP(
-        starts_of(np.concatenate([
-            np.tile(np.diff(host.row_start), part.size), np.ones(ends, int)])),
+        starts_of(
+            np.concatenate([np.tile(np.diff(host.row_start), part.size), np.ones(ends, int)])
+        ),
         starts_of(width),
         np.concatenate([entries, np.arange(nodes, nodes + ends, dtype=np.int32)]),
-        np.concatenate([np.tile(host.probability, part.size), np.ones(ends)]))
+        np.concatenate([np.tile(host.probability, part.size), np.ones(ends)]),
+    )
     every = np.concatenate([part, others])
     near, far = (x[every].ravel() for x in (search.near, search.far))
     none = np.zeros(ends, bool)
@@ -283,9 +296,11 @@ def _together(search: _Search, part: Integers) -> _Problem:
     mask = None
     if world.allowed is not None:
         mask = np.concatenate(
-            [*(search.rows.of(world.allowed[:, q]) for q in part), np.ones(ends, bool)])
+            [*(search.rows.of(world.allowed[:, q]) for q in part), np.ones(ends, bool)]
+        )
     return _Problem(
-        written, None, open_, open_, near, far, mask, stays, np.arange(nodes + ends) < nodes)
+        written, None, open_, open_, near, far, mask, stays, np.arange(nodes + ends) < nodes
+    )
 
 
 def _solved(
@@ -305,17 +320,25 @@ def _solved(
             circles = None
     if circles is None:
         blocks = problem.cut or _cut(host)
-        sums = Sums(blocks, problem.open, problem.live, problem.near, problem.far, None,
-                    problem.rows)
+        sums = Sums(
+            blocks, problem.open, problem.live, problem.near, problem.far, None, problem.rows
+        )
         start, time = (None, None) if guess is None else guess
         return relaxed(
-            sums, sign=sign, tolerance=budget, relative=False, unit=unit, start=start, time=time)
+            sums, sign=sign, tolerance=budget, relative=False, unit=unit, start=start, time=time
+        )
     part = merged(host, circles.component, circles.inside, np.zeros(host.num_rows))
     leader = np.flatnonzero(circles.component == np.arange(host.num_states))
     mask = None if problem.rows is None else problem.rows[part.row]
     sums = Sums(
-        _cut(part.mdp), problem.open[leader], problem.live[leader], problem.near[leader],
-        problem.far[leader], None, mask)
+        _cut(part.mdp),
+        problem.open[leader],
+        problem.live[leader],
+        problem.near[leader],
+        problem.far[leader],
+        None,
+        mask,
+    )
     found = relaxed(sums, sign=sign, tolerance=budget, relative=False, unit=unit)
     if found is None:
         return None
@@ -324,6 +347,4 @@ def _solved(
 
 
 def _cut(host: HostMDP) -> Cut:
-    return cut(
-        host.row_start, host.entry_start, host.successor, host.probability, host.num_states)
-
+    return cut(host.row_start, host.entry_start, host.successor, host.probability, host.num_states)

@@ -1,5 +1,4 @@
-"""The order in which a system of states can be solved: level by level before and after its circles.
-"""
+"""The order in which a system of states can be solved: level by level before and after its circles."""
 
 from __future__ import annotations
 

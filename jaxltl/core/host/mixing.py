@@ -46,7 +46,13 @@ def by_sweeps(
         cost = None
     sums = Sums(
         cut(mdp.row_start, mdp.entry_start, mdp.successor, weight, mdp.num_states),
-        problem.open, problem.open, problem.known, problem.known, cost, rows)
+        problem.open,
+        problem.open,
+        problem.known,
+        problem.known,
+        cost,
+        rows,
+    )
     found = relaxed(sums, sign=sign, tolerance=tolerance, relative=relative, unit=unit)
     return None if found is None else _enclosed(problem, found, sign)
 
@@ -64,8 +70,14 @@ def _enclosed(problem: Transient, found: Relaxed, sign: int) -> Enclosed:
     # The operator carries the bounds towards each other, so the value by half of what is between.
     left = (high - value) / np.maximum(value, 1)
     return Enclosed(
-        value, low, high, row, found.sweeps, float(left[problem.open].max(initial=0)),
-        "sweeps in place")
+        value,
+        low,
+        high,
+        row,
+        found.sweeps,
+        float(left[problem.open].max(initial=0)),
+        "sweeps in place",
+    )
 
 
 def _without_loops(problem: Transient) -> tuple[Floats, Booleans | None]:
@@ -88,9 +100,7 @@ def _without_loops(problem: Transient) -> tuple[Floats, Booleans | None]:
     return weight, rows
 
 
-def _spreads(
-    mdp: HostMDP, open_: Booleans, met: int = _MET, steps: int = _STEPS
-) -> bool:
+def _spreads(mdp: HostMDP, open_: Booleans, met: int = _MET, steps: int = _STEPS) -> bool:
     """Whether few steps from a state lead to many, as they do where elimination fills."""
     node, first = np.flatnonzero(open_), mdp.entry_start[mdp.row_start]
 
@@ -102,7 +112,10 @@ def _spreads(
 
 
 def spreads(
-    follow: Callable[[Any], Any], start: Any, num_states: int, met: int | None = None,
+    follow: Callable[[Any], Any],
+    start: Any,
+    num_states: int,
+    met: int | None = None,
     steps: int = _STEPS,
 ) -> bool:
     """Whether few steps from a state lead to many others.

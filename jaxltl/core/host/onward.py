@@ -21,7 +21,12 @@ _LEAST = 0.01  # of the largest gain: less is not carried on
 
 
 def carried_on(
-    matrix: Any, known: Floats, owner: Integers, value: Floats, chosen: Integers, sign: int,
+    matrix: Any,
+    known: Floats,
+    owner: Integers,
+    value: Floats,
+    chosen: Integers,
+    sign: int,
     least: float,
 ) -> Integers:
     """A better policy than one of a known value.
@@ -65,5 +70,4 @@ def carried_on(
             return chosen
         entry = spans(matrix.indptr[rows], count)
         reads = matrix.data[entry] * value[matrix.indices[entry]]
-        image = known[rows] + np.bincount(
-            np.repeat(np.arange(rows.size), count), reads, rows.size)
+        image = known[rows] + np.bincount(np.repeat(np.arange(rows.size), count), reads, rows.size)

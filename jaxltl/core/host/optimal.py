@@ -70,8 +70,13 @@ class _Left(NamedTuple):
 
 
 def reachability(
-    mdp: HostMDP, target: Booleans, *, maximize: bool, stay: Booleans | None = None,
-    tolerance: float = 1e-6, depth: int = 0,
+    mdp: HostMDP,
+    target: Booleans,
+    *,
+    maximize: bool,
+    stay: Booleans | None = None,
+    tolerance: float = 1e-6,
+    depth: int = 0,
 ) -> Enclosed:
     """The largest or smallest probability of reaching a target through states where one may stay.
 
@@ -84,11 +89,16 @@ def reachability(
       depth: how many roundings stand behind each number of the model.
     """
     return _solved(
-        reduce_reachability(mdp, target, maximize=maximize, stay=stay, depth=depth), tolerance)
+        reduce_reachability(mdp, target, maximize=maximize, stay=stay, depth=depth), tolerance
+    )
 
 
 def reduce_reachability(
-    mdp: HostMDP, target: Booleans, *, maximize: bool, stay: Booleans | None = None,
+    mdp: HostMDP,
+    target: Booleans,
+    *,
+    maximize: bool,
+    stay: Booleans | None = None,
     depth: int = 0,
 ) -> Reduced:
     """What the graph leaves of :func:`reachability`, with the same arguments."""
@@ -104,16 +114,29 @@ def reduce_reachability(
 
 def _identity(mdp: HostMDP) -> Contraction:
     return Contraction(
-        mdp, np.arange(mdp.num_states), np.arange(mdp.num_rows), np.zeros(mdp.num_states),
-        np.zeros(mdp.num_rows), 0)
+        mdp,
+        np.arange(mdp.num_states),
+        np.arange(mdp.num_rows),
+        np.zeros(mdp.num_states),
+        np.zeros(mdp.num_rows),
+        0,
+    )
 
 
-def _reduced(
-    mdp: HostMDP, whole: Contraction, left: _Left, most: float, maximize: bool
-) -> Reduced:
+def _reduced(mdp: HostMDP, whole: Contraction, left: _Left, most: float, maximize: bool) -> Reduced:
     return Reduced(
-        mdp, whole, left.part, left.components, left.problem, left.known, left.row, left.sure,
-        left.sure_row, most, maximize)
+        mdp,
+        whole,
+        left.part,
+        left.components,
+        left.problem,
+        left.known,
+        left.row,
+        left.sure,
+        left.sure_row,
+        most,
+        maximize,
+    )
 
 
 def _solved(reduced: Reduced, tolerance: float) -> Enclosed:
@@ -125,8 +148,11 @@ def _solved(reduced: Reduced, tolerance: float) -> Enclosed:
         if reduced.sure is not None and reduced.sure_row is not None:
             row = np.where(reduced.sure, reduced.sure_row, row)
         found = found._replace(
-            value=found.value[part.node], lower=found.lower[part.node],
-            upper=found.upper[part.node], row=row)
+            value=found.value[part.node],
+            lower=found.lower[part.node],
+            upper=found.upper[part.node],
+            row=row,
+        )
     return _expanded(reduced.mdp, reduced.whole, found)
 
 
@@ -136,12 +162,17 @@ def _enclosed(reduced: Reduced, tolerance: float) -> Enclosed:
     if problem is None:
         return Enclosed(known, known, known, reduced.row, 0, 0.0, "the graph")
     found = optimum(
-        problem, maximize=reduced.maximize, tolerance=tolerance, relative=not np.isfinite(most))
+        problem, maximize=reduced.maximize, tolerance=tolerance, relative=not np.isfinite(most)
+    )
     row = np.where(problem.open, found.row, reduced.row)
     value, lower, upper = (
         np.where(np.isinf(known), np.inf, x)
-        for x in (np.minimum(found.value, most), np.clip(found.lower, 0, most),
-                  np.minimum(found.upper, most)))
+        for x in (
+            np.minimum(found.value, most),
+            np.clip(found.lower, 0, most),
+            np.minimum(found.upper, most),
+        )
+    )
     return Enclosed(value, lower, upper, row, found.rounds, found.residual, found.method)
 
 
@@ -174,9 +205,7 @@ def _smallest(mdp: HostMDP, goal: Booleans, dead: Booleans, depth: int) -> _Left
     return _between(mdp, zero, one, mdp.first_choice(stays)[1].astype(np.int64), depth)
 
 
-def _between(
-    mdp: HostMDP, zero: Booleans, one: Booleans, row: Integers, depth: int
-) -> _Left:
+def _between(mdp: HostMDP, zero: Booleans, one: Booleans, row: Integers, depth: int) -> _Left:
     """The probabilities that are neither zero nor one."""
     open_, known = ~(zero | one), one.astype(np.float64)
     if not open_.any():
@@ -238,7 +267,12 @@ def _largest_apart(mdp: HostMDP, goal: Booleans, zero: Booleans, depth: int) -> 
 
 
 def total_reward(
-    mdp: HostMDP, reward: Floats, target: Booleans, *, maximize: bool, tolerance: float = 1e-6,
+    mdp: HostMDP,
+    reward: Floats,
+    target: Booleans,
+    *,
+    maximize: bool,
+    tolerance: float = 1e-6,
     depth: int = 0,
 ) -> Enclosed:
     """The largest or smallest expected reward until a target is reached.
@@ -255,12 +289,18 @@ def total_reward(
       depth: how many roundings stand behind each number of the model.
     """
     return _solved(
-        reduce_total_reward(mdp, reward, target, maximize=maximize, depth=depth), tolerance)
+        reduce_total_reward(mdp, reward, target, maximize=maximize, depth=depth), tolerance
+    )
 
 
 def reduce_total_reward(
-    mdp: HostMDP, reward: Floats, target: Booleans, *, maximize: bool,
-    kept: Booleans | None = None, depth: int = 0,
+    mdp: HostMDP,
+    reward: Floats,
+    target: Booleans,
+    *,
+    maximize: bool,
+    kept: Booleans | None = None,
+    depth: int = 0,
 ) -> Reduced:
     """What the graph leaves of :func:`total_reward`, with the same arguments.
 
@@ -301,8 +341,14 @@ def _nothing(mdp: HostMDP, cost: Floats, goal: Booleans, infinite: Booleans) -> 
 
 
 def _finite(
-    mdp: HostMDP, cost: Floats, goal: Booleans, infinite: Booleans, row: Integers, depth: int,
-    rows: Booleans | None = None, first: Integers | None = None,
+    mdp: HostMDP,
+    cost: Floats,
+    goal: Booleans,
+    infinite: Booleans,
+    row: Integers,
+    depth: int,
+    rows: Booleans | None = None,
+    first: Integers | None = None,
 ) -> _Left:
     """The finite ones, which never meet the others."""
     open_ = ~(goal | infinite)
@@ -335,8 +381,9 @@ def _least(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> _Left:
     goal_[part.node[nothing]], finite_[part.node[finite]] = True, True
     kept = rows[part.row] & ~circles.inside[part.row]
     first = towards(small, goal_, kept)
-    left = _finite(small, part.cost, goal_, ~finite_, small.row_start[:-1].astype(np.int64),
-                   depth, kept, first)
+    left = _finite(
+        small, part.cost, goal_, ~finite_, small.row_start[:-1].astype(np.int64), depth, kept, first
+    )
     return left._replace(part=part, components=circles, sure=nothing, sure_row=row)
 
 
@@ -359,8 +406,7 @@ def reward_forever(
     if not maximize or mdp.is_chain:
         earning = reward > 0
         never = ~_kept_away(mdp, earning)
-        found = total_reward(
-            mdp, reward, never, maximize=False, tolerance=tolerance, depth=depth)
+        found = total_reward(mdp, reward, never, maximize=False, tolerance=tolerance, depth=depth)
         quiet = never[mdp.state] & ~earning & ~mdp.support.lead_to(~never)
         return found._replace(row=np.where(never, mdp.first_choice(quiet)[1], found.row))
     components = end_components(mdp)
@@ -380,8 +426,11 @@ def reward_forever(
     leaving = leaving_by(mdp, components, part.row[found.row][part.node])
     endless = _earning(mdp, components, rich, reward)
     return found._replace(
-        value=found.value[part.node], lower=found.lower[part.node], upper=found.upper[part.node],
-        row=np.where(infinite, endless, leaving))
+        value=found.value[part.node],
+        lower=found.lower[part.node],
+        upper=found.upper[part.node],
+        row=np.where(infinite, endless, leaving),
+    )
 
 
 def _kept_away(mdp: HostMDP, rows: Booleans) -> Booleans:
@@ -390,9 +439,7 @@ def _kept_away(mdp: HostMDP, rows: Booleans) -> Booleans:
     return forced(mdp, nothing, ~rows)
 
 
-def _earning(
-    mdp: HostMDP, components: Components, rich: Booleans, reward: Floats
-) -> Integers:
+def _earning(mdp: HostMDP, components: Components, rich: Booleans, reward: Floats) -> Integers:
     """A policy that gets to components that earn, and earns there for ever."""
     paid = components.inside & (reward > 0)
     some, first = mdp.first_choice(paid)

@@ -106,19 +106,24 @@ def plan_optimum(reduced: Reduced, cost: Floats | None) -> Plan:
             kept &= reduced.problem.rows
         rows = np.flatnonzero(kept)
     nodes, loops = _optimum_nodes(mdp, small, origin, open_, rows, codes, cost)
-    order = schedule(nodes, mdp.num_transitions + mdp.num_rows, mdp.num_transitions
-                     + mdp.num_rows + 1)
+    order = schedule(
+        nodes, mdp.num_transitions + mdp.num_rows, mdp.num_transitions + mdp.num_rows + 1
+    )
     codes = order.size - 1 - codes
     codes[open_] = order.place
     own, row = _own(reduced, codes)
     circles = _circles(reduced)
-    return Plan(order, codes[node].astype(np.int32), own, row, loops, circles,
-                _terms(loops))
+    return Plan(order, codes[node].astype(np.int32), own, row, loops, circles, _terms(loops))
 
 
 def _optimum_nodes(
-    mdp: HostMDP, small: HostMDP, origin: Integers, open_: Booleans, rows: Integers,
-    codes: Integers, cost: Floats | None,
+    mdp: HostMDP,
+    small: HostMDP,
+    origin: Integers,
+    open_: Booleans,
+    rows: Integers,
+    codes: Integers,
+    cost: Floats | None,
 ) -> tuple[Nodes, Loops | None]:
     found = _entries(mdp, small, origin, rows)
     state = small.state[rows]
@@ -142,14 +147,13 @@ def _optimum_nodes(
     return nodes, loops
 
 
-def _entries(
-    mdp: HostMDP, small: HostMDP, origin: Integers, rows: Integers
-) -> _Entries:
+def _entries(mdp: HostMDP, small: HostMDP, origin: Integers, rows: Integers) -> _Entries:
     width = np.diff(small.entry_start)[rows]
     return _Entries(
         np.repeat(np.arange(rows.size), width),
         small.successor[spans(small.entry_start[rows], width)],
-        spans(mdp.entry_start[origin[rows]], width))
+        spans(mdp.entry_start[origin[rows]], width),
+    )
 
 
 def _loops(
@@ -161,8 +165,8 @@ def _loops(
     order = np.argsort(of, kind="stable")
     rows = np.flatnonzero(looping)
     return Loops(
-        found.source[rest][order], of[order], origin[rows], group[rows],
-        int(group[rows].max()) + 1)
+        found.source[rest][order], of[order], origin[rows], group[rows], int(group[rows].max()) + 1
+    )
 
 
 def _with_costs(
@@ -175,13 +179,13 @@ def _with_costs(
     row = np.concatenate([paid, entries.row])
     order = np.argsort(row, kind="stable")
     return _Entries(
-        row[order], np.concatenate([np.full(paid.size, ONE), entries.target])[order],
-        np.concatenate([num_entries + origin[paid], entries.source])[order])
+        row[order],
+        np.concatenate([np.full(paid.size, ONE), entries.target])[order],
+        np.concatenate([num_entries + origin[paid], entries.source])[order],
+    )
 
 
-def _own(
-    reduced: Reduced, codes: Integers
-) -> tuple[Integers, Integers]:
+def _own(reduced: Reduced, codes: Integers) -> tuple[Integers, Integers]:
     """The nodes whose rows states take, and the rows of the others."""
     mdp, whole, part = reduced.mdp, reduced.whole, reduced.part
     mine = mdp.state[whole.row[whole.mdp.row_start[:-1]]]  # the state that each node is
@@ -217,14 +221,15 @@ def _circles(reduced: Reduced) -> Circles | None:
     width = np.diff(mdp.entry_start)[rows]
     mine = reduced.mdp.state[whole.row[mdp.row_start[:-1]]]
     return Circles(
-        mine[region], whole.row[rows], number[mdp.state[rows]],
+        mine[region],
+        whole.row[rows],
+        number[mdp.state[rows]],
         np.repeat(np.arange(rows.size), width),
-        number[mdp.successor[spans(mdp.entry_start[rows], width)]])
+        number[mdp.successor[spans(mdp.entry_start[rows], width)]],
+    )
 
 
-def plan_policy(
-    mdp: HostMDP, target: Booleans, stay: Booleans | None, cost: Floats | None
-) -> Plan:
+def plan_policy(mdp: HostMDP, target: Booleans, stay: Booleans | None, cost: Floats | None) -> Plan:
     """The plan of policies, whatever they are.
 
     Args:
@@ -267,16 +272,30 @@ def plan_policy(
     entries = _Entries(found.row[~loop], to[~loop], found.source[~loop])
     entries = _with_costs(entries, origin[rows], cost, mdp.num_transitions)
     count = int(open_.sum())
-    nodes = Nodes(count, np.arange(count), np.zeros(count, np.int64),
-                  number[state][entries.row], entries.target, entries.source)
-    order = schedule(nodes, mdp.num_transitions + mdp.num_rows, mdp.num_transitions
-                     + mdp.num_rows + 1)
+    nodes = Nodes(
+        count,
+        np.arange(count),
+        np.zeros(count, np.int64),
+        number[state][entries.row],
+        entries.target,
+        entries.source,
+    )
+    order = schedule(
+        nodes, mdp.num_transitions + mdp.num_rows, mdp.num_transitions + mdp.num_rows + 1
+    )
     place = order.size - 1 - codes
     place[open_] = order.place
     most = int(np.diff(mdp.row_start).max())
     row: Any = mdp.row_start[:-1].astype(np.int32)
-    return Plan(order, place[node].astype(np.int32), np.full(mdp.num_states, -1, np.int32), row,
-                loops, None, _terms(loops) + 2 * most + 4)
+    return Plan(
+        order,
+        place[node].astype(np.int32),
+        np.full(mdp.num_states, -1, np.int32),
+        row,
+        loops,
+        None,
+        _terms(loops) + 2 * most + 4,
+    )
 
 
 def _terms(loops: Loops | None) -> int:

@@ -87,7 +87,8 @@ def host_product(
     if host.num_states * num_memory > MAX_PAIRS:
         raise ValueError(
             f"the product of {host.num_states} states and an automaton of {num_memory} has up to "
-            f"{host.num_states * num_memory:.3g} states, more than 2^31; use a smaller formula.")
+            f"{host.num_states * num_memory:.3g} states, more than 2^31; use a smaller formula."
+        )
     step = delta.T.astype(np.int64)  # [L, Q], so that one letter's column is together
     still = np.zeros(num_memory, bool) if still is None else still
     world = _World(host, step, np.asarray(letter), still, on_entry)
@@ -105,8 +106,13 @@ def without_memory(host: HostMDP, state: Integers) -> HostProduct:
     """The world itself as its product with an automaton of one state, reached or not."""
     number = np.arange(host.num_states, dtype=np.int32)
     return HostProduct(
-        host, number, np.zeros_like(number), np.arange(host.num_rows, dtype=np.int32),
-        np.asarray(state, np.int64), np.zeros(host.num_states, bool))
+        host,
+        number,
+        np.zeros_like(number),
+        np.arange(host.num_rows, dtype=np.int32),
+        np.asarray(state, np.int64),
+        np.zeros(host.num_states, bool),
+    )
 
 
 class _World(NamedTuple):
@@ -141,7 +147,8 @@ def _reached(world: _World, start: Integers) -> Booleans:
         count = first_entry[state + 1] - first_entry[state]
         entry = spans(first_entry[state], count)
         follower = world.after(
-            host.successor[entry], np.repeat(state, count), np.repeat(memory, count))
+            host.successor[entry], np.repeat(state, count), np.repeat(memory, count)
+        )
         follower = follower[~seen[follower]]
         seen[follower] = True
         if scratch is None:
@@ -152,8 +159,7 @@ def _reached(world: _World, start: Integers) -> Booleans:
             frontier = follower[scratch[follower] == place]
         rounds, work = rounds + 1, work + follower.size
         if rounds == _ROUNDS:
-            if work < _NARROW * rounds and (
-                    host.num_transitions * world.num_memory <= _MAX_EDGES):
+            if work < _NARROW * rounds and (host.num_transitions * world.num_memory <= _MAX_EDGES):
                 return _searched(world, start)
             rounds = work = 0
     return seen
@@ -204,5 +210,10 @@ def _written(world: _World, code: Integers, number: Any, start: Integers) -> Hos
     probability[alone] = 1.0
     product = HostMDP(starts_of(choices), starts_of(width), successor, probability)
     return HostProduct(
-        product, state.astype(np.int32), memory.astype(np.int32), base_row.astype(np.int32),
-        number(start).astype(np.int64), still)
+        product,
+        state.astype(np.int32),
+        memory.astype(np.int32),
+        base_row.astype(np.int32),
+        number(start).astype(np.int64),
+        still,
+    )

@@ -74,7 +74,8 @@ def transition_rows(
     return [
         sparse.csr_array(
             (entries[a == i].ravel(), (source[a == i].ravel(), column[a == i].ravel())),
-            shape=(size, size))
+            shape=(size, size),
+        )
         for i in range(num_actions)
     ]
 
@@ -117,8 +118,14 @@ def of_policy(row: Any, one: Booleans, undecided: Booleans, unit: float) -> Boun
     value, margin = one.astype(float), np.zeros(len(one))
     value[open_], margin[open_] = found, error
     return Bounds(
-        value, np.maximum(value - margin, 0), np.minimum(value + margin, 1),
-        float(residual.max(initial=0)), 2, np.zeros(len(one), np.int32), undecided)
+        value,
+        np.maximum(value - margin, 0),
+        np.minimum(value + margin, 1),
+        float(residual.max(initial=0)),
+        2,
+        np.zeros(len(one), np.int32),
+        undecided,
+    )
 
 
 class _Choices(NamedTuple):
@@ -150,8 +157,13 @@ class _Choices(NamedTuple):
 
 
 def optimum(
-    rows: list[Any], allowed: Booleans, group: Integers, one: Booleans, undecided: Booleans,
-    sign: int, unit: float,
+    rows: list[Any],
+    allowed: Booleans,
+    group: Integers,
+    one: Booleans,
+    undecided: Booleans,
+    sign: int,
+    unit: float,
 ) -> Bounds | None:
     """The largest or smallest probability of reaching `one`, by policy iteration (Howard 1960).
 
@@ -192,13 +204,23 @@ def optimum(
         if (below & above)[undecided].all():
             exits = undecided & (chosen == np.arange(len(one)))
             return Bounds(
-                np.where(undecided, np.clip(value, 0, 1), target), lower, np.minimum(upper, 1),
-                float(residual), rounds + time[1], action.astype(np.int32), exits)
+                np.where(undecided, np.clip(value, 0, 1), target),
+                lower,
+                np.minimum(upper, 1),
+                float(residual),
+                rounds + time[1],
+                action.astype(np.int32),
+                exits,
+            )
     return None
 
 
 def _iterate(
-    choices: _Choices, open_: Booleans, known: Floats, cost: Floats, sign: int,
+    choices: _Choices,
+    open_: Booleans,
+    known: Floats,
+    cost: Floats,
+    sign: int,
     first: tuple[Integers, Integers] | None = None,
 ) -> tuple[Floats, int] | None:
     """The optimum of ``x = cost + row @ x`` on the open states, `known` on the others.

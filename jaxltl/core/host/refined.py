@@ -42,8 +42,12 @@ class Refined(NamedTuple):
 
 
 def refined(
-    system: System, unit: float, chosen: Integers,
-    solver_of: Callable[[Integers], Solver | None], sign: int, tolerance: float,
+    system: System,
+    unit: float,
+    chosen: Integers,
+    solver_of: Callable[[Integers], Solver | None],
+    sign: int,
+    tolerance: float,
 ) -> Refined | None:
     """The optimum of a system that every policy that counts leaves.
 
@@ -100,8 +104,14 @@ def _share(gap: Floats, scale: Floats) -> float:
 
 
 def _proven(
-    system: System, unit: float, value: Floats, chosen: Integers, gap: Floats, scale: Floats,
-    sign: int, rounds: int,
+    system: System,
+    unit: float,
+    value: Floats,
+    chosen: Integers,
+    gap: Floats,
+    scale: Floats,
+    sign: int,
+    rounds: int,
 ) -> Refined | None:
     """What the differences prove of a policy that surely ends."""
     over = np.maximum(sign * gap, 0)
@@ -130,8 +140,7 @@ class _Rows:
         Their rounding is a share of ``U + D`` that the unit covers: differences
         are right to two roundings, and a row has as many sums as terms.
         """
-        difference = _difference(
-            high[self.target], low[self.target], high[self.of], low[self.of])
+        difference = _difference(high[self.target], low[self.target], high[self.of], low[self.of])
         flow = self.weight * difference
         count = self.known.size
         end = self.leaving * high[self.owner]

@@ -133,13 +133,21 @@ def cut(
     same = size > 0 and bool((count == count[0]).all()) and count[0] <= _COLUMNS
     matrix = sparse.csr_array(
         (weight.astype(np.float64, copy=False), column, entry_start),
-        shape=(entry_start.size - 1, columns))
+        shape=(entry_start.size - 1, columns),
+    )
     return Cut(row_start, matrix, node, single, double, int(count[0]) if same else 0)
 
 
 def relaxed(
-    sums: Sums, *, sign: int, tolerance: float, relative: bool, unit: float,
-    start: Floats | None = None, time: float | None = None, most: int = 150,
+    sums: Sums,
+    *,
+    sign: int,
+    tolerance: float,
+    relative: bool,
+    unit: float,
+    start: Floats | None = None,
+    time: float | None = None,
+    most: int = 150,
 ) -> Relaxed | None:
     """The optimal sums by sweeps.
 
@@ -339,7 +347,8 @@ class _Search:
 
         live = self.sums.live[: self.sums.open.size]
         rows = sparse.csr_array(
-            (chain.data.astype(np.float32), chain.indices, chain.indptr), shape=chain.shape)
+            (chain.data.astype(np.float32), chain.indices, chain.indptr), shape=chain.shape
+        )
         stays: Any = np.zeros(self.sums.live.size, np.float32)
         stays[: live.size] = live
         time: Any = np.zeros(self.sums.live.size, np.float32)

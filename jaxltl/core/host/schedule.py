@@ -162,9 +162,7 @@ def _narrow_rows(nodes: Nodes, width: int, one: int) -> Nodes:
         count += group
 
 
-def _groups(
-    of: Integers, size: Integers, most: int
-) -> tuple[Integers, int, Integers, Integers]:
+def _groups(of: Integers, size: Integers, most: int) -> tuple[Integers, int, Integers, Integers]:
     """Elements of groups that are too large, their new groups' number, first elements, groups."""
     rank = _ranks(of, size.size)
     alone = (rank % most == 0) & (rank == size[of] - 1)  # one that would be a group of its own
@@ -255,14 +253,11 @@ def _layers(edges: Edges, core: Integers) -> list[Integers]:
     source, target = source[kept], target[kept]
     start = np.concatenate([[0], np.bincount(source, minlength=core.size).cumsum()])
     onward = Edges(start, target)
-    levels = _peeled(
-        onward.reverse(), np.diff(start).astype(np.int32), np.ones(core.size, bool))
+    levels = _peeled(onward.reverse(), np.diff(start).astype(np.int32), np.ones(core.size, bool))
     return [core[x] for x in levels]
 
 
-def _distances(
-    source: Integers, target: Integers, leaves: Booleans, label: Integers
-) -> Integers:
+def _distances(source: Integers, target: Integers, leaves: Booleans, label: Integers) -> Integers:
     """How many steps it takes to where a component is left; far where nothing leaves it."""
     size = leaves.size
     start = np.concatenate([[0], np.bincount(target, minlength=size).cumsum()])
@@ -309,12 +304,14 @@ def _filled(
     rank = _ranks(nodes.owner, nodes.number)
     link = nodes.name < 0
     name[at // size, rank, at % size] = np.where(
-        link, -1 - place[np.where(link, -1 - nodes.name, 0)], nodes.name)
+        link, -1 - place[np.where(link, -1 - nodes.name, 0)], nodes.name
+    )
     slot = ((at // size * most + rank) * width) * size + at % size
     flat = slot[nodes.row] + _ranks(nodes.row, nodes.owner.size) * size
     inner = nodes.target >= 0
     target.reshape(-1)[flat] = np.where(
-        inner, place[np.where(inner, nodes.target, 0)], total - 1 - nodes.target)
+        inner, place[np.where(inner, nodes.target, 0)], total - 1 - nodes.target
+    )
     source.reshape(-1)[flat] = nodes.source
     # Rows that a node has not got are its first one again.
     count: Any = np.full(total, most)

@@ -125,8 +125,13 @@ class _Forced(NamedTuple):
     def few(self, frontier: Integers) -> Integers:
         """The same by plain loops, while few states join at a time, as along a chain."""
         arrays: tuple[Any, ...] = (
-            *self.mdp.predecessors, self.mdp.state, self.waiting, self.left, self.open,
-            self.region)
+            *self.mdp.predecessors,
+            self.mdp.state,
+            self.waiting,
+            self.left,
+            self.open,
+            self.region,
+        )
         start, pred, owner, waiting, left, open_, region = (memoryview(x) for x in arrays)
         todo = frontier.tolist()
         while todo and len(todo) <= _FEW:
@@ -199,7 +204,8 @@ def _next_on_the_way(mdp: HostMDP, goal: Booleans, rows: Booleans) -> Integers:
     edges = np.concatenate([mdp.state[row[kept]], last])
     size = mdp.num_states + 1
     graph: Any = csr_array(
-        (np.ones(edges.size), edges, np.append(index, edges.size)), shape=(size, size))
+        (np.ones(edges.size), edges, np.append(index, edges.size)), shape=(size, size)
+    )
     _, before = csgraph.breadth_first_order(graph, size - 1, return_predecessors=True)
     before = before[:-1]
     return np.where((before < 0) | (before == size - 1), -1, before)
@@ -284,9 +290,7 @@ def _labels(
     return label
 
 
-def _untouched(
-    state: Integers, crossing: Booleans, leaves: Booleans, label: Integers
-) -> Booleans:
+def _untouched(state: Integers, crossing: Booleans, leaves: Booleans, label: Integers) -> Booleans:
     """The rows of components that no further row was taken from, which are end components."""
     touched = np.zeros(label.size, bool)
     touched[label[state[crossing & ~leaves]]] = True

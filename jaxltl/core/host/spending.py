@@ -73,7 +73,8 @@ def in_units(cost: Floats, bound: float) -> tuple[Integers, int]:
         raise ValueError(
             f"the rewards have no unit in common but {float(unit):.3g} (one of them is "
             f"{float(worst)!r}), and the bound {bound} has {most:.3g} of these; at most {_LEVELS} "
-            "can be counted. Round the rewards to multiples of a larger unit.")
+            "can be counted. Round the rewards to multiples of a larger unit."
+        )
     # What costs more than everything costs just too much.
     units = np.array([min(int(x / unit), most + 1) for x in exact], np.int64)
     return units[place.reshape(cost.shape)], most
@@ -89,7 +90,12 @@ def _simplest(x: float) -> Fraction:
 
 
 def bounded_cost(
-    mdp: HostMDP, target: Booleans, stay: Booleans, cost: Integers, most: int, maximal: bool,
+    mdp: HostMDP,
+    target: Booleans,
+    stay: Booleans,
+    cost: Integers,
+    most: int,
+    maximal: bool,
     by_level: bool = False,
 ) -> Level:
     """Optimal probability of a target through states where one may stay, at a cost.
@@ -110,7 +116,8 @@ def bounded_cost(
     if 8.0 * size * shape.starts.size > _LARGEST:
         raise ValueError(
             f"{shape.starts.size} states with rewards of up to {size - 1} units would take "
-            f"{8 * size * shape.starts.size / 2**30:.0f} GB; round them to a larger unit.")
+            f"{8 * size * shape.starts.size / 2**30:.0f} GB; round them to a larger unit."
+        )
     ring = np.zeros((size, shape.starts.size))  # the last levels
     error, every = 0.0, []
     for level in range(most + 1):
@@ -186,7 +193,8 @@ def _parts(
         of &= shape.member[goal]
         place = row[of], shape.node[goal[of]]
         matrix = sparse.csr_array(
-            (probability[of], place), shape=(shape.row.size, shape.starts.size))
+            (probability[of], place), shape=(shape.row.size, shape.starts.size)
+        )
         enters = np.bincount(row[hit], probability[hit], shape.row.size).astype(np.float64)
         found.append((c, matrix, enters))
     return found

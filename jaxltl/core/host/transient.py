@@ -113,8 +113,15 @@ class _System(NamedTuple):
         width = np.diff(self.entry_start)[row]
         entry = spans(self.entry_start[row], width)
         return _System(
-            starts_of(count), starts_of(width), self.target[entry], self.weight[entry],
-            self.row[row], self.node[node], self.leaving[row], self.widest)
+            starts_of(count),
+            starts_of(width),
+            self.target[entry],
+            self.weight[entry],
+            self.row[row],
+            self.node[node],
+            self.leaving[row],
+            self.widest,
+        )
 
 
 def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: bool) -> Enclosed:
@@ -148,7 +155,8 @@ def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: b
         core = np.flatnonzero(among)
         if core.size:
             found = _solve_core(
-                system, core, bounds, (unit, grown), sign, problem, tolerance, relative)
+                system, core, bounds, (unit, grown), sign, problem, tolerance, relative
+            )
             rounds, method = found.rounds, found.method
             node = found.node
             bounds[:, node], chosen[node] = (found.near, found.far, found.value), found.chosen
@@ -162,7 +170,12 @@ def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: b
 
 
 def _found(
-    problem: Transient, system: _System, bounds: Floats, chosen: Integers, sign: int, rounds: int,
+    problem: Transient,
+    system: _System,
+    bounds: Floats,
+    chosen: Integers,
+    sign: int,
+    rounds: int,
     method: str,
 ) -> Enclosed:
     near, far, value = bounds
@@ -180,8 +193,14 @@ def _found(
     row = problem.mdp.row_start[:-1].astype(np.int64)
     row[system.node] = system.row[chosen]
     return Enclosed(
-        everywhere(value), everywhere(low), everywhere(high), row, rounds,
-        _residual(system, value, sign), method)
+        everywhere(value),
+        everywhere(low),
+        everywhere(high),
+        row,
+        rounds,
+        _residual(system, value, sign),
+        method,
+    )
 
 
 def _residual(system: _System, value: Floats, sign: int) -> float:
@@ -215,7 +234,8 @@ def _system(problem: Transient) -> _System:
         outer = ~inner
         leaving = np.bincount(of[outer], weight[outer], row.size)
         known = known + np.bincount(
-            of[outer], weight[outer] * problem.known[target[outer]], row.size)
+            of[outer], weight[outer] * problem.known[target[outer]], row.size
+        )
     loops = inner & (target == state[of])
     node = np.flatnonzero(problem.open)
     number: Any = np.zeros(mdp.num_states, np.int32)
@@ -232,8 +252,7 @@ def _system(problem: Transient) -> _System:
             keep = ~stuck
             renumber = np.cumsum(keep) - 1
             row, state, known, leaving = row[keep], state[keep], known[keep], leaving[keep]
-            target, weight, of, inner = (
-                x[keep[of]] for x in (target, weight, renumber[of], inner))
+            target, weight, of, inner = (x[keep[of]] for x in (target, weight, renumber[of], inner))
     if not inner.all():
         target, weight, of = target[inner], weight[inner], of[inner]
     count = np.bincount(of, minlength=row.size)
@@ -279,9 +298,7 @@ def _widen(bounds: Floats, node: Integers, sign: int, share: float) -> None:
     bounds[1, node] *= 1 + sign * share
 
 
-def _sweep(
-    system: _System, levels: Levels, bounds: Floats, chosen: Integers, sign: int
-) -> None:
+def _sweep(system: _System, levels: Levels, bounds: Floats, chosen: Integers, sign: int) -> None:
     """Solves level by level, in place; rounding is accounted for by the caller."""
     if not levels.node.size:
         return
@@ -294,7 +311,8 @@ def _sweep(
     row_at = part.row_start[levels.start]
     entry_at = part.entry_start[row_at].tolist()
     for (a, b), (r0, r1), (e0, e1) in zip(
-            pairwise(levels.start), pairwise(row_at.tolist()), pairwise(entry_at), strict=True):
+        pairwise(levels.start), pairwise(row_at.tolist()), pairwise(entry_at), strict=True
+    ):
         if a == b:
             continue
         target, weight, node = part.target[e0:e1], part.weight[e0:e1], levels.node[a:b]
@@ -401,15 +419,22 @@ def _circles(
     matrix = sparse.csr_array((weight[inner], target[inner], start), shape=shape)
     matrix.sum_duplicates()
     source = np.repeat(owner, np.diff(matrix.indptr))
-    edges = sparse.coo_array((np.ones(source.size, bool), (source, matrix.indices)),
-                             shape=(core.size, core.size)).tocsr()
+    edges = sparse.coo_array(
+        (np.ones(source.size, bool), (source, matrix.indices)), shape=(core.size, core.size)
+    ).tocsr()
     circles = _Circles(matrix, known, leaving, owner, row, choices, sign)
     return circles, core, Edges(edges.indptr, edges.indices)
 
 
 def _solve_core(
-    system: _System, core: Integers, bounds: Floats, errors: tuple[float, float], sign: int,
-    problem: Transient, tolerance: float, relative: bool,
+    system: _System,
+    core: Integers,
+    bounds: Floats,
+    errors: tuple[float, float],
+    sign: int,
+    problem: Transient,
+    tolerance: float,
+    relative: bool,
 ) -> _Core:
     """Policy iteration of the problem whose every step costs a little more."""
     unit = sum(errors)  # the shares by which a backup may err, and what is known outside
@@ -442,8 +467,14 @@ def _solve_core(
                 chosen = proper(_greedy(circles, sign * extra, value, _SWEEPS))
             else:
                 chosen = carried_on(
-                    circles.matrix, circles.known + sign * extra, circles.owner, value, chosen,
-                    sign, _KEPT * extra)
+                    circles.matrix,
+                    circles.known + sign * extra,
+                    circles.owner,
+                    value,
+                    chosen,
+                    sign,
+                    _KEPT * extra,
+                )
                 if (chosen == before).all():
                     break  # what gains is rounding
             solver = solver.other(chosen)
@@ -468,7 +499,8 @@ def _solve_core(
         # A policy that costs of steps led to, where little is proven, may linger nearly for ever.
         good = best is not None and _narrow(best, sign, _GOOD, relative)
         more = other_way(
-            circles, core, label, best.chosen if best and good else first, errors, tolerance)
+            circles, core, label, best.chosen if best and good else first, errors, tolerance
+        )
         if more is not None:
             best = more._replace(rounds=rounds + more.rounds)
     if best is None:
@@ -489,8 +521,12 @@ def _system_of(circles: _Circles) -> System:
 
 
 def _refined(
-    circles: _Circles, core: Integers, label: Integers, chosen: Integers,
-    errors: tuple[float, float], tolerance: float,
+    circles: _Circles,
+    core: Integers,
+    label: Integers,
+    chosen: Integers,
+    errors: tuple[float, float],
+    tolerance: float,
 ) -> _Core | None:
     """The same of a core that takes very long to end, by refinement beyond double precision."""
 
@@ -504,13 +540,24 @@ def _refined(
         return None
     share = found.share + grown
     near, far = (found.value * (1 - end * circles.sign * share) for end in (1, -1))
-    return _Core(core, near, far, found.value, found.chosen, found.rounds,
-                 "policy iteration by elimination, refined")
+    return _Core(
+        core,
+        near,
+        far,
+        found.value,
+        found.chosen,
+        found.rounds,
+        "policy iteration by elimination, refined",
+    )
 
 
 def _in_fractions(
-    circles: _Circles, core: Integers, label: Integers, chosen: Integers,
-    errors: tuple[float, float], tolerance: float,
+    circles: _Circles,
+    core: Integers,
+    label: Integers,
+    chosen: Integers,
+    errors: tuple[float, float],
+    tolerance: float,
 ) -> _Core | None:
     """The same of a small core, however rarely it ends: of the weights as floats give them."""
     del tolerance
@@ -565,9 +612,7 @@ def _getting_out(rows: Any, leaves: Booleans) -> Booleans:
     return searched(back.start, back.target, leaves)
 
 
-def _extra(
-    time: Floats, value: Floats, unit: float, aim: float, relative: bool
-) -> float:
+def _extra(time: Floats, value: Floats, unit: float, aim: float, relative: bool) -> float:
     """What every step shall cost besides: little, but more than rounding."""
     most = float(np.abs(value).max(initial=0))
     if relative:

@@ -187,8 +187,11 @@ def _quotient(
     order = np.argsort(owner, kind="stable")
     taken = spans((width.cumsum() - width)[order], width[order])
     small = HostMDP(
-        starts_of(np.bincount(owner, minlength=end + 1)), starts_of(width[order]),
-        target[taken].astype(np.int32), chance[taken])
+        starts_of(np.bincount(owner, minlength=end + 1)),
+        starts_of(width[order]),
+        target[taken].astype(np.int32),
+        chance[taken],
+    )
     return _Quotient(small, node, origin[order], known[order], stop)
 
 
@@ -218,7 +221,11 @@ def _solved(
 
 
 def _signed(
-    mdp: HostMDP, end: Booleans, reward: Floats, magnitude: Floats, first: Integers,
+    mdp: HostMDP,
+    end: Booleans,
+    reward: Floats,
+    magnitude: Floats,
+    first: Integers,
     tolerance: float,
 ) -> tuple[Floats, Integers]:
     """The same with rewards of both signs, by policy iteration (Howard 1960).

@@ -63,8 +63,12 @@ class Earned:
     steps: int | None = None
 
     def __str__(self) -> str:
-        return {"total": "C", "cumulative": f"C<={self.steps}",
-                "instantaneous": f"I={self.steps}", "average": "LRA"}[self.kind]
+        return {
+            "total": "C",
+            "cumulative": f"C<={self.steps}",
+            "instantaneous": f"I={self.steps}",
+            "average": "LRA",
+        }[self.kind]
 
 
 def unfolded(path: Bounded) -> Formula:

@@ -53,17 +53,13 @@ def is_pure(formula: Formula, absent: frozenset[str]) -> bool:
 @lru_cache(maxsize=1 << 14)
 def is_sigma2(formula: Formula) -> bool:
     """Whether no `G R W` has an `F U M` below it."""
-    return all(
-        is_pure(node, LEAST) for node in subformulas(formula) if node.operator in GREATEST
-    )
+    return all(is_pure(node, LEAST) for node in subformulas(formula) if node.operator in GREATEST)
 
 
 @lru_cache(maxsize=1 << 14)
 def is_pi2(formula: Formula) -> bool:
     """Whether no `F U M` has a `G R W` below it."""
-    return all(
-        is_pure(node, GREATEST) for node in subformulas(formula) if node.operator in LEAST
-    )
+    return all(is_pure(node, GREATEST) for node in subformulas(formula) if node.operator in LEAST)
 
 
 # ---------------------------------------------------------------------------------------------
@@ -111,10 +107,12 @@ class Rewriter:
         least = _outermost(operand, lambda f: f.operator == "F")
         if least is not None:
             often = self.limit_often(least.operands[0])
-            return disjunction([
-                conjunction([often, self.limit_often(replace_all(operand, least, TRUE))]),
-                self.limit_often(replace_all(operand, least, FALSE)),
-            ])
+            return disjunction(
+                [
+                    conjunction([often, self.limit_often(replace_all(operand, least, TRUE))]),
+                    self.limit_often(replace_all(operand, least, FALSE)),
+                ]
+            )
         greatest = _outermost(operand, lambda f: f.operator in GREATEST)
         if greatest is None:
             return whole
@@ -124,13 +122,17 @@ class Rewriter:
             kept, strong = greatest.operands[0], binary("U", *greatest.operands)
         else:
             kept, strong = greatest.operands[1], binary("M", *greatest.operands)
-        return disjunction([
-            self.limit_often(replace_all(operand, greatest, strong)),
-            conjunction([
-                self.limit_ever(kept),
-                self.limit_often(replace_all(operand, greatest, TRUE)),
-            ]),
-        ])
+        return disjunction(
+            [
+                self.limit_often(replace_all(operand, greatest, strong)),
+                conjunction(
+                    [
+                        self.limit_ever(kept),
+                        self.limit_often(replace_all(operand, greatest, TRUE)),
+                    ]
+                ),
+            ]
+        )
 
     def limit_ever(self, operand: Formula) -> Formula:
         """`F G f`, the dual of `limit_often`."""
@@ -152,10 +154,12 @@ class Rewriter:
     ) -> Formula:
         """`f[L] = (L & f[true]) | f[false]` for a limit L below an operator."""
         self._spend(operand)
-        return disjunction([
-            conjunction([self.map_limits(fixed), rebuild(replace_all(operand, fixed, TRUE))]),
-            rebuild(replace_all(operand, fixed, FALSE)),
-        ])
+        return disjunction(
+            [
+                conjunction([self.map_limits(fixed), rebuild(replace_all(operand, fixed, TRUE))]),
+                rebuild(replace_all(operand, fixed, FALSE)),
+            ]
+        )
 
     def to_sigma2(self, formula: Formula) -> Formula:
         """A combination of Sigma-2 formulas and limits that is equivalent to a simplified formula.
@@ -208,10 +212,12 @@ class Rewriter:
         often = self.limit_often(goal)
         without = always(replace_all(left, least, FALSE))
         weaker = binary("W", replace_all(left, least, weak), right)
-        return disjunction([
-            conjunction([often, self.to_sigma2(weaker)]),
-            self.to_sigma2(binary("U", left, disjunction([right, without]))),
-        ])
+        return disjunction(
+            [
+                conjunction([often, self.to_sigma2(weaker)]),
+                self.to_sigma2(binary("U", left, disjunction([right, without]))),
+            ]
+        )
 
 
 # ---------------------------------------------------------------------------------------------
@@ -334,9 +340,7 @@ def _same(operator: str, parts: Combination) -> tuple[Combination, ...]:
     return parts[1:] if not isinstance(parts, Part) and parts[0] == operator else (parts,)
 
 
-def _joined_limits(
-    operator: str, parts: list[Combination], grouped: bool
-) -> list[Combination]:
+def _joined_limits(operator: str, parts: list[Combination], grouped: bool) -> list[Combination]:
     """The parts, with limits joined that one tracker can follow.
 
     Those of propositional formulas need no state, so only `G F f | G F g = G F (f | g)` and its

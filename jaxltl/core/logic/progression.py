@@ -205,9 +205,7 @@ class Namer:
             for variable, value in cube:
                 text, grouped = self.literals[variable]
                 negated = f"!({text})" if grouped else f"!{text}"
-                texts.append(
-                    self.literals[variable] if value == disjunctive else (negated, False)
-                )
+                texts.append(self.literals[variable] if value == disjunctive else (negated, False))
             clauses.append(_joined(inner, texts))
         return _joined(outer, clauses)[0]
 

@@ -141,13 +141,16 @@ class _Token(NamedTuple):
     end: int
 
 
-_TOKEN = re.compile(r"""
+_TOKEN = re.compile(
+    r"""
     (?P<space>(?:\s+|//[^\n]*)+)
   | (?P<quoted>"(?:\\["\\]|[^"])*+")
   | (?P<number>(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)
   | (?P<word>[A-Za-z_][A-Za-z0-9_]*)
   | (?P<sign><=>|=>|<=|>=|!=|&&|\|\||[-<>=&|!()\[\]{},;:?/+*])
-""", re.VERBOSE)
+""",
+    re.VERBOSE,
+)
 _OPERATOR = re.compile(r"(P|R|T|LRA|S)(max|min)?(max|min)?")
 _DIRECTIONS = ("max", "min", "maxmax", "maxmin", "minmax", "minmin")
 _MAX_DIGITS = 400  # of a number and of its exponent's value, as none means more
@@ -159,12 +162,21 @@ def _tokens(text: str) -> list[_Token]:
         match = _TOKEN.match(text, place)
         if match is None:
             hint = ". The quote is never closed" if text[place] == '"' else ""
-            raise ValueError(pointed(
-                "property", text, place, repr(text[place]), f"a property's signs and names{hint}"))
+            raise ValueError(
+                pointed(
+                    "property",
+                    text,
+                    place,
+                    repr(text[place]),
+                    f"a property's signs and names{hint}",
+                )
+            )
         kind = str(match.lastgroup)
         if kind == "word" and re.fullmatch("[XFG]{2,}", match[0]):  # GF"a"
-            found += [_Token("word", letter, place + i, place + i + 1)
-                      for i, letter in enumerate(match[0])]
+            found += [
+                _Token("word", letter, place + i, place + i + 1)
+                for i, letter in enumerate(match[0])
+            ]
         elif kind != "space":
             found.append(_Token(kind, match[0], place, match.end()))
         place = match.end()
@@ -217,8 +229,10 @@ class _Parser:
             if self.accept(";"):
                 continue
             if self.token.text in ("const", "label", "formula") and self.token.kind == "word":
-                raise self.error("a property; constants, labels and formulas are not read from "
-                                 "property files: write numbers and the model's labels")
+                raise self.error(
+                    "a property; constants, labels and formulas are not read from "
+                    "property files: write numbers and the model's labels"
+                )
             name = None
             if self.token.kind == "quoted":
                 name = self.quoted()
@@ -251,8 +265,16 @@ class _Parser:
         self.expect("]", " or an operator")
         text = self.text[start.start : self.tokens[self.place - 1].end]
         return Property(
-            text, operator, objective, relation, threshold, reward, path,  # type: ignore[arg-type]
-            name=name, nature=nature)  # type: ignore[arg-type]
+            text,
+            operator,
+            objective,
+            relation,
+            threshold,
+            reward,
+            path,  # type: ignore[arg-type]
+            name=name,
+            nature=nature,
+        )  # type: ignore[arg-type]
 
     def multi(self, start: _Token, name: str | None) -> Property:
         self.expect("(")
@@ -263,8 +285,11 @@ class _Parser:
             if parts[-1].operator == "multi":
                 raise self.error("a property with P or R; multi stands outermost", first)
             if parts[-1].nature is not None:
-                raise self.error("one direction, max or min: several objectives are solved for "
-                                 "without intervals", first)
+                raise self.error(
+                    "one direction, max or min: several objectives are solved for "
+                    "without intervals",
+                    first,
+                )
             if not self.accept(","):
                 break
         self.expect(")", " or ','")
@@ -397,8 +422,10 @@ class _Parser:
         if token.kind == "word" and _OPERATOR.fullmatch(token.text):
             raise self.error("a label in quotes or an operator; properties are not nested")
         if token.kind == "word":
-            raise self.error(f'a label in double quotes, such as "{token.text}"; variables of a '
-                             "model are not read")
+            raise self.error(
+                f'a label in double quotes, such as "{token.text}"; variables of a '
+                "model are not read"
+            )
         raise self.error("a label in quotes, true, false, '(', '!' or one of X F G")
 
     # --- bounds ---
@@ -428,8 +455,10 @@ class _Parser:
         if relation == "<" and steps == 0:
             raise self.error("a bound that some number of steps meets", start)
         return replace(
-            empty, lower=steps + (relation == ">") if relation in (">", ">=", "=") else 0,
-            upper={"<=": steps, "<": steps - 1, "=": steps}.get(relation))
+            empty,
+            lower=steps + (relation == ">") if relation in (">", ">=", "=") else 0,
+            upper={"<=": steps, "<": steps - 1, "=": steps}.get(relation),
+        )
 
     def reward_bound(self) -> Bounded:
         reward = self.quoted()
@@ -464,12 +493,16 @@ class _Parser:
         if isinstance(path, Formula):
             return path
         if path.reward is not None:
-            raise self.error("a bound on a reward outermost and on state formulas only",
-                             self.tokens[self.place - 1])
+            raise self.error(
+                "a bound on a reward outermost and on state formulas only",
+                self.tokens[self.place - 1],
+            )
         if max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
             raise self.error(
                 f"a bound of at most {MAX_UNFOLDED_STEPS} steps inside of a formula; outermost and "
-                "on state formulas it may be any", self.tokens[self.place - 1])
+                "on state formulas it may be any",
+                self.tokens[self.place - 1],
+            )
         return unfolded(path)
 
     # --- what stands in brackets ---
@@ -495,8 +528,9 @@ class _Parser:
             relation = self.accept("<=", "<")
             if relation is None:
                 if self.token.text == "{":
-                    raise self.error("<= and a number of steps after C; the steps are bounded, "
-                                     "not a reward")
+                    raise self.error(
+                        "<= and a number of steps after C; the steps are bounded, not a reward"
+                    )
                 return Earned("total")
             place = self.token
             steps = self.steps() - (relation == "<")
@@ -510,13 +544,14 @@ class _Parser:
 
     def reach_content(self, start: _Token, wanted: str) -> Formula:
         found = self.path()
-        if (isinstance(found, Bounded) or found.operator != "F"
-                or not is_boolean(found.operands[0])):
+        if isinstance(found, Bounded) or found.operator != "F" or not is_boolean(found.operands[0]):
             raise self.error(wanted, start)
         return found
 
 
 _CONTENT: dict[str, Callable[[_Parser], Formula | Bounded | Earned]] = {
-    "P": _Parser.path_content, "R": _Parser.reward_content, "T": _Parser.steps_content,
+    "P": _Parser.path_content,
+    "R": _Parser.reward_content,
+    "T": _Parser.steps_content,
     "LRA": _Parser.state_content,
 }

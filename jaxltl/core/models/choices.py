@@ -76,8 +76,10 @@ def is_deterministic(policy: chex.Array) -> bool:
     try:
         kind = jnp.result_type(policy)
     except TypeError:
-        raise ValueError(f"policy is {shown(policy)}; give the number of an action (of a sparse "
-                         "model, of a choice) for each state, or weights of all.") from None
+        raise ValueError(
+            f"policy is {shown(policy)}; give the number of an action (of a sparse "
+            "model, of a choice) for each state, or weights of all."
+        ) from None
     return jnp.issubdtype(kind, jnp.integer)
 
 

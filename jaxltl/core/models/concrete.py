@@ -15,8 +15,10 @@ import numpy as np
 
 def is_traced(tree: Any) -> bool:
     """Whether the host does not read a tree: an array is abstract, or lies on several devices."""
-    return any(isinstance(x, jax.core.Tracer) or (
-        isinstance(x, jax.Array) and not x.is_fully_replicated) for x in jax.tree.leaves(tree))
+    return any(
+        isinstance(x, jax.core.Tracer) or (isinstance(x, jax.Array) and not x.is_fully_replicated)
+        for x in jax.tree.leaves(tree)
+    )
 
 
 def namespace(*trees: Any) -> tuple[Any, ...]:
@@ -33,6 +35,7 @@ def namespace(*trees: Any) -> tuple[Any, ...]:
 
 def to_jax(tree: Any) -> Any:
     """A tree with JAX arrays; of NumPy's this compiles nothing, where ``jnp.asarray`` may."""
+
     def one(x: Any) -> jax.Array:
         # What is put on a device may share its memory with what it was made of.
         return x if isinstance(x, jax.Array) else jax.device_put(np.array(x))

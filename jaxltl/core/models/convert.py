@@ -53,9 +53,15 @@ def to_sparse(model: Any) -> SparseMDP:
     state, action = np.nonzero(available)
     count = used.sum(-1)[state, action]
     return make_sparse(
-        starts_of(available.sum(-1)), starts_of(count), target,
-        weight[s, a, k].astype(np.float64), initial=_distribution(model.initial),
-        label=np.asarray(model.label), propositions=model.propositions, action=action)
+        starts_of(available.sum(-1)),
+        starts_of(count),
+        target,
+        weight[s, a, k].astype(np.float64),
+        initial=_distribution(model.initial),
+        label=np.asarray(model.label),
+        propositions=model.propositions,
+        action=action,
+    )
 
 
 def _distribution(initial: Any) -> np.ndarray:
@@ -80,21 +86,31 @@ def _product(model: Product) -> SparseMDP:
     row = spans(host.row_start[state], choices)
     q = np.repeat(memory, choices)
     chosen = kept[row, q]
-    per_state = np.bincount(np.repeat(state * num_memory + memory, choices)[chosen],
-                            minlength=state.size)
+    per_state = np.bincount(
+        np.repeat(state * num_memory + memory, choices)[chosen], minlength=state.size
+    )
     row, q = row[chosen], q[chosen]
     width = np.diff(host.entry_start)[row]
     entry = spans(host.entry_start[row], width)
     s_of, q_of = np.repeat(host.state[row], width), np.repeat(q, width)
     target = flat_successor(host.successor[entry], step, s_of, q_of, model.label_on)
-    rewards = {name: Rewards(
-        None if x.state is None else np.asarray(x.state)[state],
-        None if x.choice is None else np.asarray(x.choice)[row],
-        None if x.transition is None else np.asarray(x.transition)[entry])
-        for name, x in world.rewards.items()}
+    rewards = {
+        name: Rewards(
+            None if x.state is None else np.asarray(x.state)[state],
+            None if x.choice is None else np.asarray(x.choice)[row],
+            None if x.transition is None else np.asarray(x.transition)[entry],
+        )
+        for name, x in world.rewards.items()
+    }
     return make_sparse(
-        starts_of(per_state), starts_of(width), target, host.probability[entry],
+        starts_of(per_state),
+        starts_of(width),
+        target,
+        host.probability[entry],
         initial=_distribution(model.initial).ravel(),
-        label=np.asarray(world.label)[state], propositions=world.propositions, rewards=rewards,
+        label=np.asarray(world.label)[state],
+        propositions=world.propositions,
+        rewards=rewards,
         action=None if world.action is None else np.asarray(world.action)[row],
-        action_names=world.action_names)
+        action_names=world.action_names,
+    )

@@ -105,15 +105,19 @@ def make_box(
             raise ValueError(f"make_box: {name}={bound.tolist()!r}; give numbers.")
     least, most = bounds.values()
     try:
-        full = np.broadcast_shapes(least.shape, most.shape) if shape is None else tuple(
-            int(n) for n in shape)
+        full = (
+            np.broadcast_shapes(least.shape, most.shape)
+            if shape is None
+            else tuple(int(n) for n in shape)
+        )
         fits = np.broadcast_shapes(least.shape, most.shape, full) == full
     except (TypeError, ValueError):
         fits, full = False, ()
     if not fits:
         raise ValueError(
             f"make_box: bounds of shapes {list(least.shape)} and {list(most.shape)} do not fit the "
-            f"shape {shape}; give numbers, or arrays of that shape.")
+            f"shape {shape}; give numbers, or arrays of that shape."
+        )
     if (least > most).any():
         place = np.argwhere(least > most)[0].tolist()
         where = f" at {place}" if place else f": {least} above {most}"
@@ -270,16 +274,24 @@ def make_environment(
             raise ValueError(f"propositions={list(names)}, but no labels; give both or neither.")
         labels = Partial(no_labels)
     made = Environment(
-        reset=as_partial(reset, "reset"), step=as_partial(step, "step"),
-        observe=as_partial(observe, "observe"), labels=as_partial(labels, "labels"),
+        reset=as_partial(reset, "reset"),
+        step=as_partial(step, "step"),
+        observe=as_partial(observe, "observe"),
+        labels=as_partial(labels, "labels"),
         allowed=None if allowed is None else as_partial(allowed, "allowed"),
-        actions=actions, observations=observations, propositions=names, horizon=horizon,
+        actions=actions,
+        observations=observations,
+        propositions=names,
+        horizon=horizon,
         starts=None if starts is None else as_partial(starts, "starts"),
-        outcomes=None if outcomes is None else as_partial(outcomes, "outcomes"))
+        outcomes=None if outcomes is None else as_partial(outcomes, "outcomes"),
+    )
     seen = _check_functions(made)
     if observations is None:
+
         def free(x: Any) -> Box:
             return make_box(-np.inf, np.inf, x.shape, x.dtype)
+
         made = replace(made, observations=jax.tree.map(free, seen))
     elif not _alike(found := _described(_as_arrays(observations)), _described(seen)):
         raise ValueError(f"observe returns {_described(seen)}, but observations is of {found}.")
@@ -294,7 +306,8 @@ def as_partial(function: Callable[..., Any], name: str = "function") -> Partial:
 def require_environment(environment: Any) -> Environment:
     """Refuses what is no :class:`Environment`."""
     found: Environment = given.instance(
-        "environment", environment, Environment, "one of make_environment")
+        "environment", environment, Environment, "one of make_environment"
+    )
     return found
 
 
@@ -373,20 +386,26 @@ def _check_functions(made: Environment) -> Any:
     if not isinstance(found, tuple) or not 3 <= len(found) <= len(Timestep._fields):
         raise ValueError(
             f"step must return Timestep({', '.join(Timestep._fields)}), the last three if they are "
-            f"wanted; it returns {_described(found)}.")
+            f"wanted; it returns {_described(found)}."
+        )
     found = Timestep(*found)
     for name in Timestep._fields[1:]:
         number = getattr(found, name)
         if np.shape(number) != () or not (np.isscalar(number) or hasattr(number, "dtype")):
-            raise ValueError(f"step returns {name} of shape {list(np.shape(number))}; it must be "
-                             "a scalar. Functions are of one trajectory: vmap them for more.")
+            raise ValueError(
+                f"step returns {name} of shape {list(np.shape(number))}; it must be "
+                "a scalar. Functions are of one trajectory: vmap them for more."
+            )
     for name in ("terminated", "truncated"):
         if not _is_bool(getattr(found, name)):
-            raise ValueError(f"step returns {name} as {getattr(found, name).dtype}; return a "
-                             "Boolean.")
+            raise ValueError(
+                f"step returns {name} as {getattr(found, name).dtype}; return a Boolean."
+            )
     if not _alike(after := _described(found.world), before := _described(world)):
-        raise ValueError(f"step returns the world {after}, but reset {before}; both must have the "
-                         "same structure, shapes and dtypes.")
+        raise ValueError(
+            f"step returns the world {after}, but reset {before}; both must have the "
+            "same structure, shapes and dtypes."
+        )
     require_labels(traced("labels", made.labels, world), made.propositions)
     if made.allowed is not None:
         if not isinstance(made.actions, Finite):
@@ -403,7 +422,8 @@ def require_labels(label: Any, propositions: Sequence[str]) -> None:
     if getattr(label, "shape", None) != (len(propositions),) or not _is_bool(label):
         raise ValueError(
             f"labels returns {_described(label)}; return bool[{len(propositions)}], one for each "
-            f"of the propositions {list(propositions)}.")
+            f"of the propositions {list(propositions)}."
+        )
 
 
 def _is_bool(x: Any) -> bool:
@@ -413,17 +433,22 @@ def _is_bool(x: Any) -> bool:
 def _as_arrays(observations: Any) -> Any:
     for leaf in jax.tree.leaves(observations, is_leaf=lambda b: isinstance(b, Box)):
         given.instance("observations", leaf, Box, "a tree of make_box(low, high)")
-    return jax.tree.map(lambda b: jax.ShapeDtypeStruct(b.shape, jnp.dtype(b.dtype)), observations,
-                        is_leaf=lambda b: isinstance(b, Box))
+    return jax.tree.map(
+        lambda b: jax.ShapeDtypeStruct(b.shape, jnp.dtype(b.dtype)),
+        observations,
+        is_leaf=lambda b: isinstance(b, Box),
+    )
 
 
 def _alike(described: Any, other: Any) -> bool:
     """Whether two trees are the same; classes of nodes may have an idea of their own of ``==``."""
     same: Any = jax.tree.structure(described)
     return same == jax.tree.structure(other) and (
-        jax.tree.leaves(described) == jax.tree.leaves(other))
+        jax.tree.leaves(described) == jax.tree.leaves(other)
+    )
 
 
 def _described(tree: Any) -> Any:
     return jax.tree.map(
-        lambda x: f"{x.dtype}{list(x.shape)}" if hasattr(x, "dtype") else type(x).__name__, tree)
+        lambda x: f"{x.dtype}{list(x.shape)}" if hasattr(x, "dtype") else type(x).__name__, tree
+    )

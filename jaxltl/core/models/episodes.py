@@ -28,8 +28,12 @@ from jaxltl.core.show import brief
 def require_agent(agent: Any) -> Agent:
     """Refuses what is no :class:`Agent`."""
     found: Agent = given.instance(
-        "agent", agent, Agent, "an Agent, such as ppo.policy(state, problem, hparams), or "
-        "agent_of(function) of (observation, key)")
+        "agent",
+        agent,
+        Agent,
+        "an Agent, such as ppo.policy(state, problem, hparams), or "
+        "agent_of(function) of (observation, key)",
+    )
     return found
 
 
@@ -161,9 +165,17 @@ def run_episode(
         return jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), row, end)
 
     return Episode(
-        append(made.world, end.world), made.observation, made.action, made.reward, made.cost,
-        append(made.label, environment.labels(end.world)), made.valid, end.terminated,
-        end.truncated, made.discount)
+        append(made.world, end.world),
+        made.observation,
+        made.action,
+        made.reward,
+        made.cost,
+        append(made.label, environment.labels(end.world)),
+        made.valid,
+        end.terminated,
+        end.truncated,
+        made.discount,
+    )
 
 
 @brief
@@ -211,11 +223,14 @@ def continue_episode(
     reward, cost = (jnp.where(active, x, 0.0) for x in (found.reward, found.cost))
     discount = jnp.where(active, found.discount, 1.0)
     after = jax.tree.map(lambda x, y: jnp.where(active, x, y), found.world, world)
-    terminated, truncated = (t | (active & jnp.asarray(f, bool)) for t, f in (
-        (now.terminated, found.terminated), (now.truncated, found.truncated)))
+    terminated, truncated = (
+        t | (active & jnp.asarray(f, bool))
+        for t, f in ((now.terminated, found.terminated), (now.truncated, found.truncated))
+    )
     label = environment.labels(world)
     return Underway(after, memory, terminated, truncated), Move(
-        world, observation, action, reward, cost, label, active, discount)
+        world, observation, action, reward, cost, label, active, discount
+    )
 
 
 def step_or_reset(

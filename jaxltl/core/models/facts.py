@@ -211,8 +211,11 @@ def environment(value: Any) -> Iterator[str]:
 def _spaces(tree: Any) -> str:
     if hasattr(tree, "low"):
         return head(tree)
-    inner = tree.items() if isinstance(tree, dict) else zip(
-        getattr(tree, "_fields", map(str, range(len(tree)))), tree, strict=True)
+    inner = (
+        tree.items()
+        if isinstance(tree, dict)
+        else zip(getattr(tree, "_fields", map(str, range(len(tree)))), tree, strict=True)
+    )
     return f"({', '.join(f'{name}: {_spaces(x)}' for name, x in inner)})"
 
 
@@ -232,4 +235,3 @@ def episode(value: Any) -> Iterator[str]:
             yield f"{name} {span(numbers.sum(-1))}"
     for name in ("terminated", "truncated"):
         yield f"{name} {span(getattr(value, name))}"
-

@@ -68,9 +68,7 @@ class Shares(NamedTuple):
     undecided: jax.Array
 
 
-def make_finite_task(
-    formula: Formula | str | Automaton, propositions: Sequence[str]
-) -> FiniteTask:
+def make_finite_task(formula: Formula | str | Automaton, propositions: Sequence[str]) -> FiniteTask:
     """A formula over the columns of a world's labels; made on the host.
 
     Args:
@@ -165,9 +163,7 @@ def verdict_shares(verdict: chex.Array, axis: int | tuple[int, ...] | None = -1)
     return Shares(*(jnp.mean(verdict == v, axis=axis, dtype=float) for v in order))
 
 
-def finite_shares(
-    task: FiniteTask, label: chex.Array, length: chex.Array | None = None
-) -> Shares:
+def finite_shares(task: FiniteTask, label: chex.Array, length: chex.Array | None = None) -> Shares:
     """:func:`verdict_shares` of the M trajectories of a batch.
 
     Args:

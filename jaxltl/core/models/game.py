@@ -197,8 +197,14 @@ def _that_of_the_model(primitive: Any) -> None:
 
 
 for _primitive in (
-    choices, choice_shape, operators.expectation, operators.exists_successor,
-    operators.forall_successor, operators.least_successor, operators.sample_successor,
-    operators.induced_chain, operators.transition_matrix,
+    choices,
+    choice_shape,
+    operators.expectation,
+    operators.exists_successor,
+    operators.forall_successor,
+    operators.least_successor,
+    operators.sample_successor,
+    operators.induced_chain,
+    operators.transition_matrix,
 ):
     _that_of_the_model(_primitive)

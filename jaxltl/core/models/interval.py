@@ -125,8 +125,11 @@ class IntervalMDP:
     def host(self) -> HostInterval:
         """The transitions as the host engine takes them."""
         lower, upper = (np.asarray(x, np.float64) for x in (self.lower, self.upper))
-        ball = None if self.radius is None or self.center is None else Ball(
-            np.asarray(self.center, np.float64), np.asarray(self.radius, np.float64) / 2)
+        ball = (
+            None
+            if self.radius is None or self.center is None
+            else Ball(np.asarray(self.center, np.float64), np.asarray(self.radius, np.float64) / 2)
+        )
         return HostInterval(self.nominal.host, lower, upper, ball)
 
     @property
@@ -145,8 +148,7 @@ class IntervalMDP:
     def changed(self, change: Callable[[SparseMDP], SparseMDP]) -> IntervalMDP:
         """The model after a change that drops, repeats or moves entries, but adds up none."""
         ends = _travelling(self.lower, self.upper, self.center, self.radius)
-        return _taken_apart(
-            change(self.nominal.replace(rewards=self.rewards | ends)))  # type: ignore[attr-defined]
+        return _taken_apart(change(self.nominal.replace(rewards=self.rewards | ends)))  # type: ignore[attr-defined]
 
 
 def require_interval(model: Any) -> IntervalMDP:
@@ -156,41 +158,53 @@ def require_interval(model: Any) -> IntervalMDP:
       ValueError: it is of another kind.
     """
     if not isinstance(model, IntervalMDP):
-        raise ValueError(f"{type(model).__name__} has no intervals; give an IntervalMDP, as "
-                         "make_interval makes it.")
+        raise ValueError(
+            f"{type(model).__name__} has no intervals; give an IntervalMDP, as "
+            "make_interval makes it."
+        )
     return model
 
 
 def refuse_ball(model: IntervalMDP, why: str) -> None:
     """Raises ValueError if a model has a radius, where only ends are understood."""
     if model.radius is not None:
-        raise ValueError(f"the model has a radius, and {why}; give its smallest intervals, "
-                         "model.box, or ask the solvers that take a radius "
-                         "(reachability_probability, total_reward, robust_discounted_value, "
-                         "robust_satisfaction).")
+        raise ValueError(
+            f"the model has a radius, and {why}; give its smallest intervals, "
+            "model.box, or ask the solvers that take a radius "
+            "(reachability_probability, total_reward, robust_discounted_value, "
+            "robust_satisfaction)."
+        )
 
 
 def _travelling(lower: Any, upper: Any, center: Any, radius: Any) -> dict[str, Rewards]:
-    found = {_ENTRIES["lower"]: Rewards(transition=lower),
-             _ENTRIES["upper"]: Rewards(transition=upper)}
+    found = {
+        _ENTRIES["lower"]: Rewards(transition=lower),
+        _ENTRIES["upper"]: Rewards(transition=upper),
+    }
     if radius is None:
         return found
-    return found | {
-        _ENTRIES["center"]: Rewards(transition=center), _RADIUS: Rewards(choice=radius)}
+    return found | {_ENTRIES["center"]: Rewards(transition=center), _RADIUS: Rewards(choice=radius)}
 
 
 def _taken_apart(model: SparseMDP) -> IntervalMDP:
     rewards, ball = dict(model.rewards), {}
     if _RADIUS in rewards:
         ball = {"radius": np.asarray(rewards.pop(_RADIUS).choice)}
-    ends = {name: np.asarray(rewards.pop(key).transition)
-            for name, key in _ENTRIES.items() if key in rewards}
+    ends = {
+        name: np.asarray(rewards.pop(key).transition)
+        for name, key in _ENTRIES.items()
+        if key in rewards
+    }
     nominal = model.replace(rewards=rewards)  # type: ignore[attr-defined]
     return IntervalMDP(nominal=nominal, **ends, **ball)
 
 
 def make_interval(
-    model: MDP | SparseMDP, lower: Array, upper: Array, *, center: Array | None = None,
+    model: MDP | SparseMDP,
+    lower: Array,
+    upper: Array,
+    *,
+    center: Array | None = None,
     radius: Array | None = None,
 ) -> IntervalMDP:
     """A model whose probabilities are replaced by intervals, and by a ball in each row.
@@ -226,41 +240,70 @@ def make_interval(
       ([0.25, 0.25, 1.0, 1.0], [0.75, 0.75, 1.0, 1.0])
     """
     if not isinstance(model, MDP | SparseMDP):
-        raise ValueError(f"{type(model).__name__} takes no intervals; give an MDP or a SparseMDP "
-                         "(of an interval model, its nominal one).")
+        raise ValueError(
+            f"{type(model).__name__} takes no intervals; give an MDP or a SparseMDP "
+            "(of an interval model, its nominal one)."
+        )
     lower, upper = numbers("lower", lower), numbers("upper", upper)
     shape = np.shape(model.probability)
     for name, ends in (("lower", lower), ("upper", upper), ("center", center)):
         if ends is not None and np.shape(ends) != shape:
-            raise ValueError(f"{name} has shape {np.shape(ends)}; expected {shape}, one for each "
-                             "probability of the model.")
+            raise ValueError(
+                f"{name} has shape {np.shape(ends)}; expected {shape}, one for each "
+                "probability of the model."
+            )
     if isinstance(model, SparseMDP):
         return interval_rows(
-            model.row_start, model.entry_start, model.successor, lower, upper,
-            center=center, radius=radius, initial=model.initial,
-            label=model.label, propositions=model.propositions,
-            rewards=model.rewards, action=model.action, action_names=model.action_names,
-            valuation=model.valuation)
+            model.row_start,
+            model.entry_start,
+            model.successor,
+            lower,
+            upper,
+            center=center,
+            radius=radius,
+            initial=model.initial,
+            label=model.label,
+            propositions=model.propositions,
+            rewards=model.rewards,
+            action=model.action,
+            action_names=model.action_names,
+            valuation=model.valuation,
+        )
     available = np.asarray(model.available)
     if radius is not None and np.shape(radius) != available.shape:
-        raise ValueError(f"radius has shape {np.shape(radius)}; expected {available.shape}, one "
-                         "for each action of a state.")
+        raise ValueError(
+            f"radius has shape {np.shape(radius)}; expected {available.shape}, one "
+            "for each action of a state."
+        )
     used = available[..., None] & ~((lower == 0) & (upper == 0))
     state, action = np.nonzero(available)
     initial = np.asarray(model.initial, np.float64)
     return interval_rows(
-        starts_of(available.sum(-1)), starts_of(used.sum(-1)[state, action]),
-        np.asarray(model.successor)[used], lower[used], upper[used],
+        starts_of(available.sum(-1)),
+        starts_of(used.sum(-1)[state, action]),
+        np.asarray(model.successor)[used],
+        lower[used],
+        upper[used],
         center=None if center is None else np.asarray(center)[used],
         radius=None if radius is None else np.asarray(radius)[available],
-        initial=initial / initial.sum(), label=np.asarray(model.label),
-        propositions=model.propositions, action=action)
+        initial=initial / initial.sum(),
+        label=np.asarray(model.label),
+        propositions=model.propositions,
+        action=action,
+    )
 
 
 def interval_rows(
-    row_start: Array | None, entry_start: Array, successor: Array, lower: Array, upper: Array,
-    *, center: Array | None = None, radius: Array | None = None,
-    rewards: Mapping[str, Rewards] | None = None, **rest: Any,
+    row_start: Array | None,
+    entry_start: Array,
+    successor: Array,
+    lower: Array,
+    upper: Array,
+    *,
+    center: Array | None = None,
+    radius: Array | None = None,
+    rewards: Mapping[str, Rewards] | None = None,
+    **rest: Any,
 ) -> IntervalMDP:
     """A checked :class:`IntervalMDP` from arrays, on the host.
 
@@ -293,13 +336,18 @@ def interval_rows(
     lower, upper = numbers("lower", lower), numbers("upper", upper)
     ball = _ball(center, radius, successor.shape, entry_start.size - 1)
     if not lower.shape == upper.shape == successor.shape:
-        raise ValueError(f"successor has shape {successor.shape}, lower {lower.shape} and upper "
-                         f"{upper.shape}; all must be [transitions].")
+        raise ValueError(
+            f"successor has shape {successor.shape}, lower {lower.shape} and upper "
+            f"{upper.shape}; all must be [transitions]."
+        )
     entry_start = checked_starts("entry_start", entry_start, successor.size, "transitions")
     num_rows = entry_start.size - 1
     starts = checked_starts(
-        "row_start", np.arange(num_rows + 1) if row_start is None else row_start, num_rows,
-        "choices")
+        "row_start",
+        np.arange(num_rows + 1) if row_start is None else row_start,
+        num_rows,
+        "choices",
+    )
     if starts.size < 2:
         raise ValueError("the model has no state; it needs at least one.")
     check_entries(starts, entry_start, successor, np.ones(successor.size))
@@ -322,14 +370,18 @@ def interval_rows(
     lower, upper = _pointed(entry_start, row, lower, upper, ball)
     states: Any = np.zeros(entry_start.size, np.int64)  # the host's rows need no states here
     ends = HostInterval(
-        HostMDP(states, entry_start, successor, lower), lower, upper,
-        None if ball is None else Ball(ball[0], ball[1] / 2))
+        HostMDP(states, entry_start, successor, lower),
+        lower,
+        upper,
+        None if ball is None else Ball(ball[0], ball[1] / 2),
+    )
     # Nature has nothing left to give where lower ends add up to one.
     possible = (upper > 0) & ((lower > 0) | (ends.rest > 0)[row])
     nominal = np.where(possible, ends.within(possible), 0)
     extra = _travelling(lower, upper, *(ball or (None, None)))
-    return _taken_apart(make_sparse(
-        row_start, entry_start, successor, nominal, rewards=rewards | extra, **rest))
+    return _taken_apart(
+        make_sparse(row_start, entry_start, successor, nominal, rewards=rewards | extra, **rest)
+    )
 
 
 def _ball(
@@ -343,37 +395,51 @@ def _ball(
         raise ValueError(f"{given} is given alone; a ball has a center and a radius.")
     center, radius = numbers("center", center), numbers("radius", radius)
     if center.shape != entries or radius.shape != (num_rows,):
-        raise ValueError(f"center has shape {center.shape} and radius {radius.shape}; expected "
-                         f"{entries} and ({num_rows},), one for each transition and each choice.")
+        raise ValueError(
+            f"center has shape {center.shape} and radius {radius.shape}; expected "
+            f"{entries} and ({num_rows},), one for each transition and each choice."
+        )
     return center, radius
 
 
 def _check_ball(
-    row_start: np.ndarray, entry_start: np.ndarray, row: np.ndarray, lower: np.ndarray,
-    upper: np.ndarray, center: np.ndarray, radius: np.ndarray,
+    row_start: np.ndarray,
+    entry_start: np.ndarray,
+    row: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    center: np.ndarray,
+    radius: np.ndarray,
 ) -> None:
     total = np.add.reduceat(center, entry_start[:-1])
     bad = ~((radius >= 0) & (radius < np.inf))
     if bad.any():
         r = int(np.argmax(bad))
-        raise ValueError(f"{placed(row_start, r)}: the radius is {radius[r]}; it must be a number "
-                         "of at least 0.")
+        raise ValueError(
+            f"{placed(row_start, r)}: the radius is {radius[r]}; it must be a number of at least 0."
+        )
     bad = ~(np.abs(total - 1) <= NEAR)
     if bad.any():
         r = int(np.argmax(bad))
-        raise ValueError(f"{placed(row_start, r)}: the center sums to {total[r]:.9g}; it must be "
-                         "a distribution.")
+        raise ValueError(
+            f"{placed(row_start, r)}: the center sums to {total[r]:.9g}; it must be a distribution."
+        )
     bad = ~((lower - NEAR <= center) & (center <= upper + NEAR) & (center >= 0))
     if bad.any():
         e = int(np.argmax(bad))
         raise ValueError(
             f"{placed(row_start, int(row[e]))}: the center has {center[e]:.9g} where the interval "
-            f"is [{lower[e]:.9g}, {upper[e]:.9g}]; the center must lie between the ends.")
+            f"is [{lower[e]:.9g}, {upper[e]:.9g}]; the center must lie between the ends."
+        )
 
 
 def _around(
-    entry_start: np.ndarray, row: np.ndarray, lower: np.ndarray, upper: np.ndarray,
-    center: np.ndarray, radius: np.ndarray,
+    entry_start: np.ndarray,
+    row: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    center: np.ndarray,
+    radius: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """The ends that a ball leaves, and the ball, whose center is between them."""
     total = np.add.reduceat(center, entry_start[:-1])
@@ -396,7 +462,10 @@ def _outwards(x: np.ndarray, y: np.ndarray, side: int) -> np.ndarray:
 
 
 def _pointed(
-    entry_start: np.ndarray, row: np.ndarray, lower: np.ndarray, upper: np.ndarray,
+    entry_start: np.ndarray,
+    row: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
     ball: tuple[np.ndarray, np.ndarray] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The ends, equal in rows that hold no distribution, by rounding: these are in proportion.
@@ -416,7 +485,10 @@ def _pointed(
 
 
 def _check_ends(
-    row_start: np.ndarray, row: np.ndarray, successor: np.ndarray, lower: np.ndarray,
+    row_start: np.ndarray,
+    row: np.ndarray,
+    successor: np.ndarray,
+    lower: np.ndarray,
     upper: np.ndarray,
 ) -> None:
     bad = ~((lower >= 0) & (lower <= upper) & (upper <= 1 + NEAR))
@@ -424,11 +496,15 @@ def _check_ends(
         e = int(np.flatnonzero(bad)[0])
         raise ValueError(
             f"{placed(row_start, int(row[e]))}: the interval of successor {successor[e]} is "
-            f"[{lower[e]:.9g}, {upper[e]:.9g}]; ends must satisfy 0 <= lower <= upper <= 1.")
+            f"[{lower[e]:.9g}, {upper[e]:.9g}]; ends must satisfy 0 <= lower <= upper <= 1."
+        )
 
 
 def _scaled(
-    row_start: np.ndarray, entry_start: np.ndarray, row: np.ndarray, lower: np.ndarray,
+    row_start: np.ndarray,
+    entry_start: np.ndarray,
+    row: np.ndarray,
+    lower: np.ndarray,
     upper: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The ends, such that each row has a distribution between them."""
@@ -437,8 +513,11 @@ def _scaled(
     bad = (low > 1 + NEAR) | (high < 1 - NEAR)
     if bad.any():
         r = int(np.flatnonzero(bad)[0])
-        what = (f"the lower ends sum to {low[r]:.9g}, which is above 1" if low[r] > 1 else
-                f"the upper ends sum to {high[r]:.9g}, which is below 1")
+        what = (
+            f"the lower ends sum to {low[r]:.9g}, which is above 1"
+            if low[r] > 1
+            else f"the upper ends sum to {high[r]:.9g}, which is below 1"
+        )
         raise ValueError(f"{placed(row_start, r)}: {what}; no distribution lies between them.")
     lower = np.where((low > 1 + rounding)[row], lower / np.maximum(low, 1)[row], lower)
     upper = np.where((high < 1 - rounding)[row], upper / np.minimum(high, 1)[row], upper)
@@ -446,7 +525,9 @@ def _scaled(
 
 
 def _merged(
-    row: np.ndarray, successor: np.ndarray, numbers: list[np.ndarray],
+    row: np.ndarray,
+    successor: np.ndarray,
+    numbers: list[np.ndarray],
     rewards: dict[str, Rewards],
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], dict[str, Rewards]]:
     """Entries of one row with one successor as one, with sums, if they earn the same."""
@@ -459,14 +540,20 @@ def _merged(
             continue
         earned = np.asarray(reward.transition)
         if earned.shape != order.shape:
-            raise ValueError(f"reward {name!r} has shape {earned.shape} on its transition part; "
-                             f"expected {order.shape}.")
+            raise ValueError(
+                f"reward {name!r} has shape {earned.shape} on its transition part; "
+                f"expected {order.shape}."
+            )
         earned = earned[order]
         if (np.maximum.reduceat(earned, start) != np.minimum.reduceat(earned, start)).any():
             raise ValueError(
                 f"reward {name!r} differs between entries of one row that lead to one state; give "
-                "one entry for each state.")
-        rewards = rewards | {name: reward.replace(  # type: ignore[attr-defined]
-            transition=earned[start])}
+                "one entry for each state."
+            )
+        rewards = rewards | {
+            name: reward.replace(  # type: ignore[attr-defined]
+                transition=earned[start]
+            )
+        }
     lower, upper, *rest = (np.add.reduceat(x[order], start) for x in numbers)
     return row[start], successor[start], [lower, np.minimum(upper, 1), *rest], rewards

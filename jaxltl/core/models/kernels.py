@@ -71,13 +71,23 @@ def by_action(
         return [found[:, a] for a in range(num_actions)]
     if num_actions * width <= WRITTEN_OUT:
         return [
-            fold([successor[:, a, k] for k in range(width)],
-                 [weight[:, a, k] for k in range(width)], value, term, combine)
+            fold(
+                [successor[:, a, k] for k in range(width)],
+                [weight[:, a, k] for k in range(width)],
+                value,
+                term,
+                combine,
+            )
             for a in range(num_actions)
         ]
     if width <= UNROLL:
-        found = fold([successor[..., k] for k in range(width)],
-                     [weight[..., k] for k in range(width)], value, term, combine)
+        found = fold(
+            [successor[..., k] for k in range(width)],
+            [weight[..., k] for k in range(width)],
+            value,
+            term,
+            combine,
+        )
     else:
         found = folded(successor, weight, value, term, combine, axis=2)
     return [found[:, a] for a in range(num_actions)]
@@ -129,12 +139,14 @@ def owners(start: Any, total: int) -> jax.Array:
     if not is_traced(start):
         return to_jax(np.repeat(np.arange(count, dtype=np.int32), np.diff(np.asarray(start))))
     # Spans are not empty, so each begins one.
-    begins = jnp.zeros(total, jnp.int32).at[start[1:-1]].add(
-        1, indices_are_sorted=True, mode="promise_in_bounds")
+    begins = (
+        jnp.zeros(total, jnp.int32)
+        .at[start[1:-1]]
+        .add(1, indices_are_sorted=True, mode="promise_in_bounds")
+    )
     return jnp.cumsum(begins, dtype=jnp.int32)
 
 
 def segment(operation: Any, quantity: jax.Array, owner: jax.Array, count: int) -> jax.Array:
     """A reduction such as ``jax.ops.segment_sum`` of what each of so many owners has."""
-    return operation(
-        quantity, owner, count, indices_are_sorted=True, mode="promise_in_bounds")
+    return operation(quantity, owner, count, indices_are_sorted=True, mode="promise_in_bounds")

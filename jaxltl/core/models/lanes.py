@@ -98,6 +98,7 @@ def on_host(tree: Any) -> Any:
       >>> on_host({"a": jnp.arange(3), "b": 2.5})["a"].tolist()
       [0, 1, 2]
     """
+
     def one(x: Any) -> Any:
         if not isinstance(x, jax.Array):
             return np.asarray(x)
@@ -122,7 +123,8 @@ def axes_of(mesh: Mesh, axis: str | Sequence[str] | None) -> tuple[str, ...]:
     if not names or len(set(names)) < len(names) or not set(names) <= set(mesh.axis_names):
         raise ValueError(
             f"axis={axis!r}; the mesh has the axes {', '.join(map(repr, mesh.axis_names))}: name "
-            "one of them, or several, each once.")
+            "one of them, or several, each once."
+        )
     return names
 
 
@@ -163,14 +165,16 @@ def require_split(name: str, sharding: Any, **sizes: int) -> None:
     if not axes:
         raise ValueError(
             f"{name} has the spec {sharding.spec}, which splits nothing; name a mesh axis, "
-            f"PartitionSpec({sharding.mesh.axis_names[0]!r}).")
+            f"PartitionSpec({sharding.mesh.axis_names[0]!r})."
+        )
     devices = _count(sharding.mesh, axes)
     for what, size in sizes.items():
         if size % devices:
             more = devices - size % devices
             raise ValueError(
                 f"{name} splits over {devices} devices, but {what} is {size}; choose a multiple, "
-                f"such as {size + more}.")
+                f"such as {size + more}."
+            )
 
 
 def split(tree: Any, sharding: NamedSharding | None, axis: int = 0) -> Any:
@@ -193,7 +197,9 @@ def whole(tree: Any, sharding: NamedSharding | None) -> Any:
 
 
 def apart(
-    function: Callable[..., Any], sharding: NamedSharding | None, axes: Sequence[int | None],
+    function: Callable[..., Any],
+    sharding: NamedSharding | None,
+    axes: Sequence[int | None],
     out_axes: Any,
 ) -> Callable[..., Any]:
     """A function that each device calls with its own part of the arguments; under ``jit``.
@@ -212,9 +218,13 @@ def apart(
         return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, names)
 
     return jax.shard_map(
-        function, mesh=mesh, in_specs=tuple(map(spec, axes)),
+        function,
+        mesh=mesh,
+        in_specs=tuple(map(spec, axes)),
         out_specs=jax.tree.map(spec, out_axes, is_leaf=lambda x: x is None),
-        axis_names=set(names), check_vma=False)
+        axis_names=set(names),
+        check_vma=False,
+    )
 
 
 def vmap_split(function: Callable[..., Any], sharding: NamedSharding | None, in_axes: Any) -> Any:
@@ -251,6 +261,7 @@ def running_sum(
 
 def _spread(in_axes: Any, arguments: tuple[Any, ...]) -> list[bool]:
     """For each array of the arguments whether it has lanes."""
+
     def is_none(x: Any) -> bool:
         return x is None
 
@@ -258,17 +269,22 @@ def _spread(in_axes: Any, arguments: tuple[Any, ...]) -> list[bool]:
     if len(axes) != len(arguments):
         raise ValueError(
             f"in_axes={in_axes} has {len(axes)} entries for {len(arguments)} arguments; give one "
-            "for each.")
+            "for each."
+        )
     lanes: list[bool] = []
     for entry, argument in zip(axes, arguments, strict=True):
         for axis in jax.tree.leaves(entry, is_leaf=is_none):
             if axis is not None and (isinstance(axis, bool) or axis != 0):
                 raise ValueError(
                     f"in_axes has an entry {axis!r}; lanes lie along the first axis of an "
-                    "argument, 0, or it has none, None.")
+                    "argument, 0, or it has none, None."
+                )
         jax.tree.map(
             lambda axis, part: lanes.extend([axis == 0] * len(jax.tree.leaves(part))),
-            entry, argument, is_leaf=is_none)
+            entry,
+            argument,
+            is_leaf=is_none,
+        )
     return lanes
 
 
@@ -280,7 +296,8 @@ def _number(lanes: tuple[bool, ...], arguments: Any) -> int:
         raise ValueError(
             f"arguments with lanes have the first axes {[list(x) for x in numbers]}; give one "
             "number of lanes, at least 1, along the first axis of each, and in_axes of None for "
-            "what all lanes share.")
+            "what all lanes share."
+        )
     return numbers[0][0]
 
 
@@ -304,15 +321,17 @@ def _placed(
         return jax.device_put(x, sharding)
 
     leaves, tree = jax.tree.flatten(arguments)
-    return jax.tree.unflatten(tree, [
-        one(x, own if has and even else all_) for x, has in zip(leaves, lanes, strict=True)])
+    return jax.tree.unflatten(
+        tree, [one(x, own if has and even else all_) for x, has in zip(leaves, lanes, strict=True)]
+    )
 
 
 def _from_each(x: Any, sharding: NamedSharding) -> jax.Array:
     """An array over the devices of several processes, of which each gives its part."""
     if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(
-            _from_each(jax.random.key_data(x), sharding), impl=jax.random.key_impl(x))
+            _from_each(jax.random.key_data(x), sharding), impl=jax.random.key_impl(x)
+        )
     numbers = np.asarray(x)
     return jax.make_array_from_callback(numbers.shape, sharding, lambda part: numbers[part])
 
@@ -334,8 +353,12 @@ def _constrained(x: jax.Array, mesh: Any, spec: PartitionSpec) -> jax.Array:
 
 @partial(jax.jit, static_argnames=("function", "mesh", "axes", "lanes", "options"))
 def _mapped(
-    function: Callable[..., Any], mesh: Mesh, axes: tuple[str, ...], lanes: tuple[bool, ...],
-    options: tuple[tuple[str, Any], ...], arguments: Any,
+    function: Callable[..., Any],
+    mesh: Mesh,
+    axes: tuple[str, ...],
+    lanes: tuple[bool, ...],
+    options: tuple[tuple[str, Any], ...],
+    arguments: Any,
 ) -> Any:
     here = _here(mesh)
     leaves, tree = jax.tree.flatten(arguments)
@@ -347,15 +370,22 @@ def _mapped(
         repeated = np.arange(number + devices - uneven) % number
         leaves = [x[repeated] if has else x for x, has in zip(leaves, lanes, strict=True)]
     if AxisType.Explicit in here.axis_types:
-        leaves = [jax.sharding.reshard(x, NamedSharding(here, spec))
-                  for x, spec in zip(leaves, specs, strict=True)]
+        leaves = [
+            jax.sharding.reshard(x, NamedSharding(here, spec))
+            for x, spec in zip(leaves, specs, strict=True)
+        ]
     side_by_side = jax.vmap(
         partial(function, **dict(options)),
-        jax.tree.unflatten(tree, [0 if has else None for has in lanes]))
+        jax.tree.unflatten(tree, [0 if has else None for has in lanes]),
+    )
     # Loops begin with constants, which are not marked as different on each device: no check.
     found = jax.shard_map(
-        side_by_side, mesh=here, in_specs=jax.tree.unflatten(tree, specs),
-        out_specs=PartitionSpec(axes), axis_names=set(axes), check_vma=False,
+        side_by_side,
+        mesh=here,
+        in_specs=jax.tree.unflatten(tree, specs),
+        out_specs=PartitionSpec(axes),
+        axis_names=set(axes),
+        check_vma=False,
     )(*jax.tree.unflatten(tree, leaves))
     if uneven:
         found = jax.tree.map(lambda x: _constrained(x, here, PartitionSpec())[:number], found)

@@ -43,10 +43,10 @@ def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectorie
     if is_traced((model, trajectories)):
         return _lifted(model, trajectories)
     state = np.asarray(trajectories.state)
-    lifted = np.where(
-        trajectories.mask, state * model.num_memory + memory_along(model, state), 0)
+    lifted = np.where(trajectories.mask, state * model.num_memory + memory_along(model, state), 0)
     return replace(
-        trajectories, state=to_jax(lifted.astype(np.int32)), state_shape=model.state_shape)
+        trajectories, state=to_jax(lifted.astype(np.int32)), state_shape=model.state_shape
+    )
 
 
 def _lifted(model: Product, trajectories: Trajectories) -> Trajectories:
@@ -62,8 +62,10 @@ def _lifted(model: Product, trajectories: Trajectories) -> Trajectories:
     inside = jnp.arange(trajectories.state.shape[1]) < trajectories.length[:, None]
     state = jax.vmap(one)(trajectories.state)
     return replace(
-        trajectories, state=jnp.where(inside, state, 0).astype(jnp.int32),
-        state_shape=model.state_shape)
+        trajectories,
+        state=jnp.where(inside, state, 0).astype(jnp.int32),
+        state_shape=model.state_shape,
+    )
 
 
 def project_trajectories(model: Product, trajectories: Trajectories) -> Trajectories:
@@ -90,8 +92,10 @@ def project_trajectories(model: Product, trajectories: Trajectories) -> Trajecto
     """
     require_states(trajectories, model)
     return replace(
-        trajectories, state=trajectories.state // model.num_memory,
-        state_shape=model.mdp.state_shape)
+        trajectories,
+        state=trajectories.state // model.num_memory,
+        state_shape=model.mdp.state_shape,
+    )
 
 
 def memory_along(model: Product, state: np.ndarray) -> np.ndarray:
@@ -122,14 +126,16 @@ def allowed_steps(model: Any, trajectories: Trajectories) -> np.ndarray:
     world = model.mdp if isinstance(model, Product) else model
     require_states(trajectories, world)
     state, action, inside = (
-        np.asarray(x) for x in (trajectories.state, trajectories.action, trajectories.mask))
+        np.asarray(x) for x in (trajectories.state, trajectories.action, trajectories.mask)
+    )
     place = (state, memory_along(model, state)) if isinstance(model, Product) else (state,)
     kept = inside & np.asarray(model.available)[(*place, action)]
     if (lost := np.flatnonzero(inside.any(1) & ~kept.any(1))).size:
         n = lost[0]
         raise ValueError(
             f"trajectory {n}: none of its {inside[n].sum()} steps takes an allowed action, so "
-            "nothing can be learned from it; leave it out, or allow more.")
+            "nothing can be learned from it; leave it out, or allow more."
+        )
     return kept
 
 

@@ -191,8 +191,10 @@ def make_mdp(
         )
     num_states, num_actions, _ = probability.shape
     if num_states == 0 or num_actions == 0:
-        raise ValueError(f"the model has {num_states} states and {num_actions} actions; "
-                         "it needs at least one of each.")
+        raise ValueError(
+            f"the model has {num_states} states and {num_actions} actions; "
+            "it needs at least one of each."
+        )
     if not np.issubdtype(successor.dtype, np.integer):
         raise ValueError(f"successor has dtype {successor.dtype}; it must hold integers.")
     _check_probability(probability)
@@ -258,8 +260,12 @@ def from_dense(
     successor = np.argsort(~(transition > 0), axis=-1, kind="stable")[:, :, :width]
     probability = np.take_along_axis(transition, successor, axis=-1)
     return make_mdp(
-        successor, probability, available=available, initial=initial,
-        label=label, propositions=propositions,
+        successor,
+        probability,
+        available=available,
+        initial=initial,
+        label=label,
+        propositions=propositions,
     )
 
 
@@ -367,12 +373,15 @@ def refuse_negative(initial: np.ndarray, *, first: int = 0) -> None:
     bad = ~(initial >= 0)
     if bad.any():
         s = np.flatnonzero(bad)[0]
-        raise ValueError(f"initial probability of state {first + s} is {initial[s]}; "
-                         "it must not be negative or NaN.")
+        raise ValueError(
+            f"initial probability of state {first + s} is {initial[s]}; "
+            "it must not be negative or NaN."
+        )
 
 
 def checked_label(
-    label: chex.Array | Mapping[str, Sequence[int]] | None, propositions: Sequence[str],
+    label: chex.Array | Mapping[str, Sequence[int]] | None,
+    propositions: Sequence[str],
     num_states: int,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Where propositions hold, and their names, checked, on the host.

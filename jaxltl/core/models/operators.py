@@ -220,8 +220,10 @@ def pushforward(model: Any, mass: jax.Array) -> jax.Array:
 def _unknown(model: Any) -> str:
     if hasattr(model, "nominal"):
         return no_model(model)
-    return (f"{type(model).__name__} is not a model: pass an MDP, a DenseMDP, a SparseMDP, a "
-            "Product or a Game.")
+    return (
+        f"{type(model).__name__} is not a model: pass an MDP, a DenseMDP, a SparseMDP, a "
+        "Product or a Game."
+    )
 
 
 @singledispatch
@@ -327,8 +329,10 @@ def make_chain(successor: jax.Array, probability: jax.Array, initial: jax.Array)
     """An MDP with one action from ``int32[S, K]`` successors and their probabilities."""
     num_states = successor.shape[0]
     return MDP(
-        successor=successor[:, None, :], probability=probability[:, None, :],
-        available=jnp.ones((num_states, 1), bool), initial=initial,
+        successor=successor[:, None, :],
+        probability=probability[:, None, :],
+        available=jnp.ones((num_states, 1), bool),
+        initial=initial,
         label=jnp.zeros((num_states, 0), bool),
     )
 
@@ -343,8 +347,10 @@ def _(model: DenseMDP, policy: jax.Array) -> DenseMDP:
     rows = jnp.take_along_axis(model.successor_probability, policy[:, None, None], axis=1)
     return replace(
         model,
-        transition=rows, available=jnp.ones((model.num_states, 1), bool),
-        label=jnp.zeros((model.num_states, 0), bool), propositions=(),
+        transition=rows,
+        available=jnp.ones((model.num_states, 1), bool),
+        label=jnp.zeros((model.num_states, 0), bool),
+        propositions=(),
     )
 
 
@@ -416,7 +422,8 @@ def _(model: SparseMDP, key: chex.PRNGKey, state: jax.Array, action: jax.Array) 
     first = start[action]
     # The first entry up to which there is more than was drawn; the last one but for rounding.
     _, entry, _ = lax.while_loop(
-        lambda carry: (carry[0] < end) & (carry[2] >= 0), step, (first, first, draw))
+        lambda carry: (carry[0] < end) & (carry[2] >= 0), step, (first, first, draw)
+    )
     return jnp.asarray(model.successor)[entry]
 
 
@@ -443,14 +450,18 @@ def policy_distribution(model: Any, policy: Any) -> jax.Array:
     states, pairs = model.state_shape, choice_shape(model)
     if is_deterministic(policy):
         if jnp.shape(policy) != states:
-            raise ValueError(f"policy has shape {jnp.shape(policy)}; a deterministic policy "
-                             f"(integers) for this model has shape {states}.")
+            raise ValueError(
+                f"policy has shape {jnp.shape(policy)}; a deterministic policy "
+                f"(integers) for this model has shape {states}."
+            )
         if isinstance(getattr(model, "mdp", model), SparseMDP):
             return choices(model).one_hot(policy, model.dtype)
         return jax.nn.one_hot(policy, pairs[-1], dtype=model.dtype)
     if jnp.shape(policy) != pairs:
-        raise ValueError(f"policy has shape {jnp.shape(policy)}; a stochastic policy for this "
-                         f"model has shape {pairs}.")
+        raise ValueError(
+            f"policy has shape {jnp.shape(policy)}; a stochastic policy for this "
+            f"model has shape {pairs}."
+        )
     return policy
 
 
@@ -484,7 +495,8 @@ def valid_policy(model: Any, policy: jax.Array, where: jax.Array | bool = True) 
     row |= ~jnp.asarray(where & given_states(model))
     uniform = available / over.spread(jnp.maximum(over.sum(available), 1))
     used = jnp.where(
-        over.spread(row), jnp.where(available, policy, 0), uniform.astype(policy.dtype))
+        over.spread(row), jnp.where(available, policy, 0), uniform.astype(policy.dtype)
+    )
     return Policy(used, lax.stop_gradient(given), jnp.all(row))
 
 
@@ -511,8 +523,10 @@ def require_policy(model: Any, policy: Any, where: Any = True) -> None:
             state = np.argwhere(bad)[0]
             name = state[0] if len(state) == 1 else tuple(state.tolist())
             actions = np.flatnonzero(available[tuple(state)]).tolist()
-            raise ValueError(f"the policy takes action {table[tuple(state)]} in state {name}, "
-                             f"which is not available; choose one of {actions}.")
+            raise ValueError(
+                f"the policy takes action {table[tuple(state)]} in state {name}, "
+                f"which is not available; choose one of {actions}."
+            )
         return
     if table.shape != shape:
         policy_distribution(model, table)
@@ -538,20 +552,25 @@ def row_weights(model: SparseMDP, policy: Any, where: Any = True) -> np.ndarray:
     host, policy = model.host, np.asarray(policy)
     if is_deterministic(policy):
         if policy.shape != (host.num_states,):
-            raise ValueError(f"policy has shape {policy.shape}; expected ({host.num_states},), a "
-                             f"row for each state, or ({host.num_rows},) weights of rows.")
+            raise ValueError(
+                f"policy has shape {policy.shape}; expected ({host.num_states},), a "
+                f"row for each state, or ({host.num_rows},) weights of rows."
+            )
         wrong = ((policy < host.row_start[:-1]) | (policy >= host.row_start[1:])) & where
         if wrong.any():
             s = int(np.flatnonzero(wrong)[0])
             raise ValueError(
                 f"the policy takes row {policy[s]} in state {s}, whose rows are "
-                f"{host.row_start[s]} to {host.row_start[s + 1] - 1}.")
+                f"{host.row_start[s]} to {host.row_start[s + 1] - 1}."
+            )
         weight = np.zeros(host.num_rows)
         weight[policy[np.broadcast_to(where, policy.shape)]] = 1
         return weight
     if policy.shape != (host.num_rows,):
-        raise ValueError(f"policy has shape {policy.shape}; expected ({host.num_rows},), a weight "
-                         "for each choice.")
+        raise ValueError(
+            f"policy has shape {policy.shape}; expected ({host.num_rows},), a weight "
+            "for each choice."
+        )
     weight = policy.astype(np.float64)
     require_weights(host, weight, row_tolerance(policy.dtype), where)
     return weight

@@ -39,15 +39,21 @@ def part_of(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMDP
 
     rewards = {
         name: Rewards(taken(x.state, kept), taken(x.choice, row), taken(x.transition, entry))
-        for name, x in model.rewards.items()}
+        for name, x in model.rewards.items()
+    }
     initial = np.asarray(model.initial)[kept]
     return replace(
         model,
-        row_start=starts_of(choices), entry_start=starts_of(width),
-        successor=number[host.successor[entry]], probability=host.probability[entry],
+        row_start=starts_of(choices),
+        entry_start=starts_of(width),
+        successor=number[host.successor[entry]],
+        probability=host.probability[entry],
         initial=initial / initial.sum() if initial.sum() else initial,
-        label=np.asarray(model.label)[kept], rewards=rewards, action=taken(model.action, row),
-        valuation={name: taken(x, kept) for name, x in model.valuation.items()})
+        label=np.asarray(model.label)[kept],
+        rewards=rewards,
+        action=taken(model.action, row),
+        valuation={name: taken(x, kept) for name, x in model.valuation.items()},
+    )
 
 
 def reachable(model: SparseMDP, start: np.ndarray, rows: np.ndarray) -> np.ndarray:

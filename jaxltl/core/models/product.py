@@ -59,8 +59,11 @@ def _automaton(rest: Any, tables: Any) -> Automaton:
     acceptance, names = rest
     propositions, state_names = names.texts
     return Automaton(
-        **dict(zip(_TABLES, tables, strict=True)), propositions=propositions,
-        acceptance=acceptance, state_names=state_names)
+        **dict(zip(_TABLES, tables, strict=True)),
+        propositions=propositions,
+        acceptance=acceptance,
+        state_names=state_names,
+    )
 
 
 # So formulas whose automata have one shape share compiled programs. (What such a program returns of
@@ -192,8 +195,9 @@ def letters_of(
       >>> [sorted(letter) for letter in letters_of(world)]
       [[], ['a']]
     """
-    keep = [i for i, p in enumerate(world.propositions)
-            if propositions is None or p in propositions]
+    keep = [
+        i for i, p in enumerate(world.propositions) if propositions is None or p in propositions
+    ]
     names = [world.propositions[i] for i in keep]
     rows, _ = distinct_rows(label_rows(world)[:, keep])
     return [frozenset(n for n, holds in zip(names, row, strict=True) if holds) for row in rows]
@@ -311,8 +315,7 @@ def reads(model: Product, marked: jax.Array) -> jax.Array:
     here = jnp.asarray(marked)[:, model.letter].T
     if model.label_on == "exit":
         return here[:, :, None] & model.available
-    found = _each_memory(
-        model.mdp, operators.exists_successor, here, kernels.hits, jnp.logical_or)
+    found = _each_memory(model.mdp, operators.exists_successor, here, kernels.hits, jnp.logical_or)
     return found & model.available
 
 
@@ -373,8 +376,13 @@ def _(model: Product, region: jax.Array) -> jax.Array:
 @operators.least_successor.register
 def _(model: Product, value: jax.Array) -> jax.Array:
     return _through(
-        model, operators.least_successor, value, kernels.only_real, jnp.minimum,
-        kernels.largest(value.dtype))
+        model,
+        operators.least_successor,
+        value,
+        kernels.only_real,
+        jnp.minimum,
+        kernels.largest(value.dtype),
+    )
 
 
 @operators.sample_successor.register
@@ -395,7 +403,8 @@ def _(model: Product, policy: jax.Array) -> MDP:
     flat = flat_successor(successor, model.next_memory, s[..., None], q, model.label_on)
     width = flat.shape[-1]
     return operators.make_chain(
-        flat.reshape(-1, width).astype(jnp.int32), probability.reshape(-1, width),
+        flat.reshape(-1, width).astype(jnp.int32),
+        probability.reshape(-1, width),
         model.initial.ravel(),
     )
 
@@ -405,8 +414,11 @@ def _(model: Product, policy: jax.Array) -> jax.Array:
     if not isinstance(model.mdp, MDP | DenseMDP):
         eye = jnp.eye(model.num_states, dtype=model.dtype)
         return jax.vmap(
-            lambda v: operators.action_mean(policy, operators.expectation(
-                model, v.reshape(model.state_shape))).ravel(), out_axes=-1)(eye)
+            lambda v: operators.action_mean(
+                policy, operators.expectation(model, v.reshape(model.state_shape))
+            ).ravel(),
+            out_axes=-1,
+        )(eye)
     s = jnp.arange(model.mdp.num_states)[:, None, None, None]
     q = jnp.arange(model.num_memory)[None, :, None, None]
     successor = _successor(model.mdp)[:, None]

@@ -27,17 +27,20 @@ def traced(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
         text = str(problem).split("\n", 1)[0]
         raise ValueError(
             f"{name} cannot be traced: {text} Write it with jax.numpy; lax.cond and jnp.where "
-            "take the place of if.") from problem
+            "take the place of if."
+        ) from problem
     except Exception as problem:
         if "Leaked" not in str(problem):
             raise
         raise ValueError(
             f"{name} is not pure: it keeps what it was called with. Keep it in the world that "
-            "is returned.") from problem
+            "is returned."
+        ) from problem
     if not _same(first, again):
         raise ValueError(
             f"{name} is not pure: called twice it is two different functions. Draw from the key "
-            "that is given, and keep what changes in the world that is returned.")
+            "that is given, and keep what changes in the world that is returned."
+        )
     return shapes
 
 
@@ -54,13 +57,22 @@ def _kept_by_jax(problem: Exception) -> bool:
     """
     head, *leaks = str(problem).strip().split("\n\n")
     own = "<PyTreeDef ", "<WeakrefLRUCache ", "jax._src."
-    return "Leaked" in head and bool(leaks) and all(
-        any(f" is referred to by {x}" in leak for x in own) for leak in leaks)
+    return (
+        "Leaked" in head
+        and bool(leaks)
+        and all(any(f" is referred to by {x}" in leak for x in own) for leak in leaks)
+    )
 
 
 def _same(first: Any, again: Any) -> bool:
     constants = zip(first.consts, again.consts, strict=False)
-    return len(first.consts) == len(again.consts) and str(first.jaxpr) == str(again.jaxpr) and all(
-        np.array_equal(np.asarray(x), np.asarray(y), equal_nan=np.asarray(x).dtype.kind == "f")
-        for x, y in constants if not isinstance(x, jax.core.Tracer) and not jax.dtypes.issubdtype(
-            getattr(x, "dtype", np.dtype(float)), jax.dtypes.prng_key))
+    return (
+        len(first.consts) == len(again.consts)
+        and str(first.jaxpr) == str(again.jaxpr)
+        and all(
+            np.array_equal(np.asarray(x), np.asarray(y), equal_nan=np.asarray(x).dtype.kind == "f")
+            for x, y in constants
+            if not isinstance(x, jax.core.Tracer)
+            and not jax.dtypes.issubdtype(getattr(x, "dtype", np.dtype(float)), jax.dtypes.prng_key)
+        )
+    )

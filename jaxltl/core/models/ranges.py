@@ -35,8 +35,10 @@ def ranges(functions: Rationals, low: np.ndarray, high: np.ndarray) -> Ends:
     """
     if not (low >= 0).all():
         d = int(np.flatnonzero(~(low >= 0))[0])
-        raise ValueError(f"the box reaches down to {low[d]:.6g} in parameter {d}; ranges are found "
-                         "for parameters of at least 0.")
+        raise ValueError(
+            f"the box reaches down to {low[d]:.6g} in parameter {d}; ranges are found "
+            "for parameters of at least 0."
+        )
     above = _ranges(functions.numerator, low, high)
     if functions.denominator is None:
         return above
@@ -54,7 +56,7 @@ def _ranges(of: Polynomials, low: np.ndarray, high: np.ndarray) -> Ends:
     coefficient = np.asarray(of.coefficient, np.float64)
     ends = np.stack([low, high])
     # Term by term: of numbers that are not negative, monomials grow.
-    least, most = (np.prod(x ** powers, axis=1)[monomial] for x in ends)
+    least, most = (np.prod(x**powers, axis=1)[monomial] for x in ends)
     small = np.where(coefficient > 0, coefficient * least, coefficient * most)
     large = np.where(coefficient > 0, coefficient * most, coefficient * least)
     lower, upper = (np.bincount(owner, x, of.count) for x in (small, large))
@@ -68,8 +70,10 @@ def _ranges(of: Polynomials, low: np.ndarray, high: np.ndarray) -> Ends:
     for n in np.unique(number[linear & (terms > 1) & (number <= _MOST)]):
         some = np.flatnonzero(linear & (terms > 1) & (number == n))
         found = _corners(some, n, used, owner, powers[monomial], coefficient, ends)
-        lower[some], upper[some] = np.maximum(lower[some], found[0]), np.minimum(
-            upper[some], found[1])
+        lower[some], upper[some] = (
+            np.maximum(lower[some], found[0]),
+            np.minimum(upper[some], found[1]),
+        )
     # Powers, products, the sum and the coefficient are rounded.
     slack = (2 * powers.max(initial=0) + 2 * low.size + terms + 4) * _EPS * size
     return Ends(lower - slack, upper + slack)
@@ -86,8 +90,13 @@ def _powers(of: Polynomials, num_parameters: int) -> np.ndarray:
 
 
 def _corners(
-    some: np.ndarray, n: int, used: np.ndarray, owner: np.ndarray, powers: np.ndarray,
-    coefficient: np.ndarray, ends: np.ndarray,
+    some: np.ndarray,
+    n: int,
+    used: np.ndarray,
+    owner: np.ndarray,
+    powers: np.ndarray,
+    coefficient: np.ndarray,
+    ends: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The least and largest value at the corners, of polynomials of n parameters each."""
     place = np.full(used.shape[0], -1)

@@ -49,7 +49,8 @@ def with_allowed(model: Any, allowed: chex.Array) -> Any:
     shape = (*model.state_shape, model.num_actions)
     if np.shape(allowed) != shape or allowed.dtype != bool:
         raise ValueError(
-            f"allowed is {allowed.dtype}{list(np.shape(allowed))}; expected bool{list(shape)}.")
+            f"allowed is {allowed.dtype}{list(np.shape(allowed))}; expected bool{list(shape)}."
+        )
     if not is_traced((model, allowed)):
         mask, available = np.asarray(allowed), np.asarray(model.available)
         if (wrong := np.argwhere(mask & ~available)).size:
@@ -57,7 +58,8 @@ def with_allowed(model: Any, allowed: chex.Array) -> Any:
             raise ValueError(f"allowed: action {action} is not available in state {_named(state)}.")
         if (stuck := np.argwhere(available.any(-1) & ~mask.any(-1))).size:
             raise ValueError(
-                f"allowed: no action is left in state {_named(stuck[0].tolist())}; allow one.")
+                f"allowed: no action is left in state {_named(stuck[0].tolist())}; allow one."
+            )
     if isinstance(model, Game):
         return replace(model, mdp=with_allowed(model.mdp, allowed))
     if isinstance(model, Product):
@@ -68,8 +70,10 @@ def with_allowed(model: Any, allowed: chex.Array) -> Any:
 def _with_rows(model: SparseMDP, allowed: chex.Array) -> SparseMDP:
     mask = np.asarray(allowed)
     if mask.shape != (model.num_rows,) or mask.dtype != bool:
-        raise ValueError(f"allowed is {mask.dtype}{list(mask.shape)}; expected "
-                         f"bool[{model.num_rows}], one for each choice of the sparse model.")
+        raise ValueError(
+            f"allowed is {mask.dtype}{list(mask.shape)}; expected "
+            f"bool[{model.num_rows}], one for each choice of the sparse model."
+        )
     return part_of(model, np.ones(model.num_states, bool), mask)
 
 
@@ -212,8 +216,10 @@ def _restrict_sparse(
     if allowed is not None:
         rows = np.asarray(allowed)
         if rows.shape != (sparse.num_rows,):
-            raise ValueError(f"allowed has shape {rows.shape}; expected ({sparse.num_rows},), the "
-                             "choices of to_sparse(model).")
+            raise ValueError(
+                f"allowed has shape {rows.shape}; expected ({sparse.num_rows},), the "
+                "choices of to_sparse(model)."
+            )
     states = reachable(sparse, start > 0, rows)
     found = part_of(replace(sparse, initial=start / start.sum()), states, rows)
     num_memory = lazy.num_memory if isinstance(lazy, Product) else 1

@@ -170,20 +170,26 @@ def sequence_sampler(
     found = {name: given.numbers(name, row) for name, row in rows.items()}
     for name, row in found.items():
         if row.ndim != 1 or not (np.isfinite(row) & (row >= 0)).all() or not row.sum() > 0:
-            raise ValueError(f"{name}={row.tolist()}; give weights of one axis, none of them "
-                             "negative, some of them positive.")
+            raise ValueError(
+                f"{name}={row.tolist()}; give weights of one axis, none of them "
+                "negative, some of them positive."
+            )
     groups = _booleans(sets)
     if groups.dtype != np.bool_ or groups.ndim not in (1, 2):
-        raise ValueError(f"sets has type {groups.dtype} and shape {list(groups.shape)}; give "
-                         "Booleans, a row for each set and a column for each event.")
+        raise ValueError(
+            f"sets has type {groups.dtype} and shape {list(groups.shape)}; give "
+            "Booleans, a row for each set and a column for each event."
+        )
     if groups.ndim == 1:
         groups = np.eye(groups.size, dtype=bool)[groups]
     for row in np.flatnonzero(~groups.any(-1))[:1]:
         raise ValueError(f"sets: row {row} has no event; leave it out.")
     most = int(np.flatnonzero(found["reach"])[-1]) + 1 + int(np.flatnonzero(found["avoid"])[-1])
     if most > len(groups):
-        raise ValueError(f"reach and avoid ask for up to {most} sets in a step, but there are "
-                         f"{len(groups)}; give fewer weights.")
+        raise ValueError(
+            f"reach and avoid ask for up to {most} sets in a step, but there are "
+            f"{len(groups)}; give fewer weights."
+        )
     return SequenceSampler(found["length"], found["reach"], found["avoid"], groups)
 
 
@@ -263,25 +269,35 @@ def sequence_environment(
     given.instance("sampler", sampler, SequenceSampler, "one of sequence_sampler")
     count = len(inner.propositions)
     if rows.ndim != 2 or rows.dtype != np.bool_ or rows.shape[1] != count:
-        raise ValueError(f"events has shape {list(rows.shape)} and type {rows.dtype}; give "
-                         f"Booleans [E, {count}], a column for each of the environment's "
-                         "propositions.")
+        raise ValueError(
+            f"events has shape {list(rows.shape)} and type {rows.dtype}; give "
+            f"Booleans [E, {count}], a column for each of the environment's "
+            "propositions."
+        )
     width = np.shape(sampler.sets)[-1]
     if width != len(rows):
-        raise ValueError(f"the sampler is of {width} events, but {len(rows)} are given; both must "
-                         "be of the same events.")
+        raise ValueError(
+            f"the sampler is of {width} events, but {len(rows)} are given; both must "
+            "be of the same events."
+        )
     shape = (len(sampler.length), len(rows))
-    told: Any = Sequence(make_box(0, 1, shape, bool), make_box(0, 1, shape, bool),  # type: ignore[arg-type]
-                         make_box(0, np.inf, (), np.int32))  # type: ignore[arg-type]
+    told: Any = Sequence(
+        make_box(0, 1, shape, bool),
+        make_box(0, 1, shape, bool),  # type: ignore[arg-type]
+        make_box(0, np.inf, (), np.int32),
+    )  # type: ignore[arg-type]
     numbers = np.array([given.number("violation", violation), given.number("progress", progress)])
     return replace(
         inner,
         reset=Partial(_reset, inner, rows, sampler),
         step=Partial(_step, inner, rows, numbers),
-        observe=Partial(_observe, inner), labels=Partial(_labels, inner),
+        observe=Partial(_observe, inner),
+        labels=Partial(_labels, inner),
         allowed=None if inner.allowed is None else Partial(_allowed, inner),
         observations=SequenceObservation(inner.observations, told),
-        starts=None, outcomes=None)  # so many sequences are drawn that they are not told
+        starts=None,
+        outcomes=None,
+    )  # so many sequences are drawn that they are not told
 
 
 def remaining(sequence: Sequence, index: chex.Numeric) -> Sequence:
@@ -289,8 +305,7 @@ def remaining(sequence: Sequence, index: chex.Numeric) -> Sequence:
     depth = sequence.reach.shape[-2]
     row = jnp.arange(depth) + index
     kept, row = (row < depth)[:, None], jnp.minimum(row, depth - 1)
-    return Sequence(
-        sequence.reach[row] & kept, sequence.avoid[row] & kept, sequence.length - index)
+    return Sequence(sequence.reach[row] & kept, sequence.avoid[row] & kept, sequence.length - index)
 
 
 def _read(
@@ -301,8 +316,10 @@ def _read(
     wanted, shunned = sequence.reach[index, event], sequence.avoid[index, event]
     after = index + wanted
     verdict = jnp.where(
-        shunned, Verdict.VIOLATED,
-        jnp.where(after == sequence.length, Verdict.SATISFIED, Verdict.UNDECIDED))
+        shunned,
+        Verdict.VIOLATED,
+        jnp.where(after == sequence.length, Verdict.SATISFIED, Verdict.UNDECIDED),
+    )
     return SequenceWorld(world, sequence, after.astype(jnp.int32), verdict.astype(jnp.int32))
 
 
@@ -316,29 +333,39 @@ def _reset(
     over = found.verdict != Verdict.UNDECIDED
     return found._replace(
         stage=jnp.where(over, 0, found.stage),
-        verdict=jnp.where(over, Verdict.UNDECIDED, found.verdict).astype(jnp.int32))
+        verdict=jnp.where(over, Verdict.UNDECIDED, found.verdict).astype(jnp.int32),
+    )
 
 
 def _step(
-    inner: Environment, events: jax.Array, numbers: jax.Array, state: SequenceWorld, action: Any,
+    inner: Environment,
+    events: jax.Array,
+    numbers: jax.Array,
+    state: SequenceWorld,
+    action: Any,
     key: chex.PRNGKey,
 ) -> Timestep:
     found = Timestep(*inner.step(state.world, action, key))
     after = _read(inner, events, found.world, state.sequence, state.stage)
     violation, progress = numbers
     reward = (
-        (after.verdict == Verdict.SATISFIED) + violation * (after.verdict == Verdict.VIOLATED)
-        + progress * (after.stage - state.stage) / state.sequence.length)
+        (after.verdict == Verdict.SATISFIED)
+        + violation * (after.verdict == Verdict.VIOLATED)
+        + progress * (after.stage - state.stage) / state.sequence.length
+    )
     decided = after.verdict != Verdict.UNDECIDED
     return Timestep(
-        world=after, reward=reward.astype(jnp.result_type(float)),
-        terminated=jnp.asarray(found.terminated, bool) | decided, truncated=found.truncated,
-        cost=found.cost, discount=found.discount)
+        world=after,
+        reward=reward.astype(jnp.result_type(float)),
+        terminated=jnp.asarray(found.terminated, bool) | decided,
+        truncated=found.truncated,
+        cost=found.cost,
+        discount=found.discount,
+    )
 
 
 def _observe(inner: Environment, state: SequenceWorld) -> SequenceObservation:
-    return SequenceObservation(
-        inner.observe(state.world), remaining(state.sequence, state.stage))
+    return SequenceObservation(inner.observe(state.world), remaining(state.sequence, state.stage))
 
 
 def _labels(inner: Environment, state: SequenceWorld) -> jax.Array:

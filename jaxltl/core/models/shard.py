@@ -110,16 +110,26 @@ def shard(
         width = np.diff(host.entry_start)[row]
         entry = spans(host.entry_start[row], width)
         return ModelPart(
-            row_start=starts_of(choices), entry_start=starts_of(width),
-            successor=place[host.successor[entry]], probability=host.probability[entry],
-            action=column[row], initial=initial[state], label=label[state],
-            rewards={name: x[row] for name, x in rewards.items()}, row=row)
+            row_start=starts_of(choices),
+            entry_start=starts_of(width),
+            successor=place[host.successor[entry]],
+            probability=host.probability[entry],
+            action=column[row],
+            initial=initial[state],
+            label=label[state],
+            rewards={name: x[row] for name, x in rewards.items()},
+            row=row,
+        )
 
     return _assembled(part, ordered, host.num_states, mesh, axis, sparse.propositions)
 
 
 def model_from_parts(
-    part: Callable[[int, int], ModelPart], num_states: int, mesh: Mesh, *, axis: str | None = None,
+    part: Callable[[int, int], ModelPart],
+    num_states: int,
+    mesh: Mesh,
+    *,
+    axis: str | None = None,
     propositions: tuple[str, ...] = (),
 ) -> ShardedMDP:
     """A model on a mesh that is too large for one process, made where its parts are to be.
@@ -197,14 +207,16 @@ def to_mesh(model: ShardedMDP, quantity: Any, fill: Any = 0) -> jax.Array:
         found[piece.device] = np.where(missing, quantity.dtype.type(fill), taken)
     shape = (*index.shape, *quantity.shape[1:])
     return jax.make_array_from_single_device_arrays(
-        shape, sharding, [jax.device_put(x, device) for device, x in found.items()])
+        shape, sharding, [jax.device_put(x, device) for device, x in found.items()]
+    )
 
 
 def _rows_of(model: ShardedMDP, shape: tuple[int, ...]) -> jax.Array:
     if model.row is None or shape != (_num_rows(model),):
         raise ValueError(
             f"the quantity has shape {shape}; expected ({model.num_given}, ...), a number for each "
-            "state or each pair of a state and an action, or for each choice of a sparse model.")
+            "state or each pair of a state and an action, or for each choice of a sparse model."
+        )
     return model.row
 
 
@@ -273,7 +285,7 @@ class _Layout(NamedTuple):
     def devices(self, d: int) -> list[Any]:
         """The devices with the d-th range, more than one where the mesh has other axes."""
         along = self.mesh.axis_names.index(self.axis)
-        return list(np.moveaxis(self.mesh.devices, along, 0)[d:d + 1].ravel())
+        return list(np.moveaxis(self.mesh.devices, along, 0)[d : d + 1].ravel())
 
     def owner(self, d: int) -> int:
         """The process that speaks for a range."""
@@ -283,8 +295,11 @@ class _Layout(NamedTuple):
     def mine(self) -> list[int]:
         """The ranges of which this process holds a copy."""
         here = jax.process_index()
-        return [d for d in range(self.parts)
-                if any(device.process_index == here for device in self.devices(d))]
+        return [
+            d
+            for d in range(self.parts)
+            if any(device.process_index == here for device in self.devices(d))
+        ]
 
     def span(self, d: int) -> tuple[int, int]:
         return int(self.starts[d]), int(self.starts[d + 1])
@@ -293,8 +308,11 @@ class _Layout(NamedTuple):
         """The global array of which each device has a piece, all of one shape."""
         here, found = jax.process_index(), []
         for d, piece in pieces.items():
-            found += [jax.device_put(piece, device) for device in self.devices(d)
-                      if device.process_index == here]
+            found += [
+                jax.device_put(piece, device)
+                for device in self.devices(d)
+                if device.process_index == here
+            ]
         some = next(iter(pieces.values()))
         shape = (some.shape[0] * self.parts, *some.shape[1:])
         return jax.make_array_from_single_device_arrays(shape, self.sharding, found)
@@ -302,7 +320,8 @@ class _Layout(NamedTuple):
     def replicated(self, x: np.ndarray) -> jax.Array:
         """The same on all devices."""
         return jax.make_array_from_callback(
-            x.shape, NamedSharding(self.mesh, PartitionSpec()), lambda index: x[index])
+            x.shape, NamedSharding(self.mesh, PartitionSpec()), lambda index: x[index]
+        )
 
     def exchanged(self, pieces: Mapping[int, np.ndarray]) -> list[np.ndarray]:
         """What every range has, in every process; pieces differ in their first axis alone."""
@@ -317,11 +336,13 @@ class _Layout(NamedTuple):
         some = next(iter(pieces.values()))
         padded = np.zeros((self.parts, int(length.max()), *some.shape[1:]), some.dtype)
         for d, piece in pieces.items():
-            padded[d, :len(piece)] = piece
+            padded[d, : len(piece)] = piece
         # Bytes, since JAX may hold no wider numbers than single precision.
         every = np.asarray(multihost_utils.process_allgather(padded.view(np.uint8)))
-        return [np.ascontiguousarray(every[self.owner(d), d]).view(some.dtype)[:length[d]]
-                for d in range(self.parts)]
+        return [
+            np.ascontiguousarray(every[self.owner(d), d]).view(some.dtype)[: length[d]]
+            for d in range(self.parts)
+        ]
 
 
 def _layout(num_states: int, mesh: Mesh, axis: str | None) -> _Layout:
@@ -331,8 +352,9 @@ def _layout(num_states: int, mesh: Mesh, axis: str | None) -> _Layout:
         raise ValueError(f"the mesh has axes {mesh.axis_names}; name one of them as axis.")
     axis = names[0]
     if num_states < mesh.shape[axis]:
-        raise ValueError(f"{num_states} states cannot lie on {mesh.shape[axis]} devices; give a "
-                         "mesh of fewer.")
+        raise ValueError(
+            f"{num_states} states cannot lie on {mesh.shape[axis]} devices; give a mesh of fewer."
+        )
     return _Layout(automatic(mesh), axis, num_states)
 
 
@@ -351,7 +373,8 @@ def _order(model: SparseMDP, order: Any) -> np.ndarray:
         return np.asarray(csgraph.reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=False))
     order = np.asarray(order)
     if order.shape != (host.num_states,) or not np.array_equal(
-            np.sort(order), np.arange(host.num_states)):
+        np.sort(order), np.arange(host.num_states)
+    ):
         raise ValueError(f"order must hold each of the {host.num_states} states once.")
     return order
 
@@ -382,18 +405,27 @@ def _assembled(
     total = facts[:, _INITIAL].sum()
     if abs(total - 1) > 1e-6:
         raise ValueError(f"the initial distribution sums to {total:.9g}, not 1.")
-    labels = np.unique(np.concatenate(layout.exchanged(
-        {d: np.unique(x.label, axis=0) for d, x in parts.items()})), axis=0)
+    labels = np.unique(
+        np.concatenate(layout.exchanged({d: np.unique(x.label, axis=0) for d, x in parts.items()})),
+        axis=0,
+    )
     pieces = {}
     for d, x in parts.items():
         tables, place = _tables(layout, halo, facts, d, x)
         pieces[d] = _of_states(layout, facts, d, x, tables, place, labels, ordered)
     whole: _Piece = jax.tree.map(
-        lambda *each: layout.array(dict(zip(pieces, each, strict=True))), *pieces.values())
+        lambda *each: layout.array(dict(zip(pieces, each, strict=True))), *pieces.values()
+    )
     return ShardedMDP(
-        **whole._asdict(), sent=tuple(layout.array(x) for x in halo.sent),
-        shown=layout.replicated(labels), propositions=propositions, num_given=num_states,
-        mesh=layout.mesh, axis=layout.axis, rounds=halo.rounds)
+        **whole._asdict(),
+        sent=tuple(layout.array(x) for x in halo.sent),
+        shown=layout.replicated(labels),
+        propositions=propositions,
+        num_given=num_states,
+        mesh=layout.mesh,
+        axis=layout.axis,
+        rounds=halo.rounds,
+    )
 
 
 class _Range(NamedTuple):
@@ -425,23 +457,35 @@ def _checked(part: Any, layout: _Layout, d: int, num_labels: int) -> _Range:
     if count != stop - start:
         raise ValueError(f"part({start}, {stop}) has {count} states; it must have {stop - start}.")
     check_entries(
-        row_start, entry_start, successor, probability, first=start, num_states=layout.num_given)
+        row_start, entry_start, successor, probability, first=start, num_states=layout.num_given
+    )
     probability = scaled(row_start, entry_start, probability, first=start)
     owner = np.repeat(np.arange(count), np.diff(row_start))
     action = np.arange(owner.size) - row_start[owner] if found.action is None else found.action
     initial = np.full(count, 1 / layout.num_given) if found.initial is None else found.initial
     label = np.zeros((count, num_labels), bool) if found.label is None else found.label
     for name, x, shape in (
-            ("action", action, (owner.size,)), ("initial", initial, (count,)),
-            ("label", label, (count, num_labels)),
-            ("row", action if found.row is None else found.row, (owner.size,)),
-            *((f"reward {n!r}", r, (owner.size,)) for n, r in found.rewards.items())):
+        ("action", action, (owner.size,)),
+        ("initial", initial, (count,)),
+        ("label", label, (count, num_labels)),
+        ("row", action if found.row is None else found.row, (owner.size,)),
+        *((f"reward {n!r}", r, (owner.size,)) for n, r in found.rewards.items()),
+    ):
         if np.shape(x) != shape:
-            raise ValueError(f"part({start}, {stop}): {name} has shape {np.shape(x)}; expected "
-                             f"{shape}.")
+            raise ValueError(
+                f"part({start}, {stop}): {name} has shape {np.shape(x)}; expected {shape}."
+            )
     return _Range(
-        entry_start, successor, probability, row_start, np.asarray(action),
-        np.asarray(initial, np.float64), np.asarray(label, bool), dict(found.rewards), found.row)
+        entry_start,
+        successor,
+        probability,
+        row_start,
+        np.asarray(action),
+        np.asarray(initial, np.float64),
+        np.asarray(label, bool),
+        dict(found.rewards),
+        found.row,
+    )
 
 
 _ACTIONS, _WIDEST, _TRANSITIONS, _INITIAL, _COUNTS = range(5)
@@ -451,9 +495,17 @@ def _facts(part: _Range) -> np.ndarray:
     """Of a range: actions, widest row, transitions, initial mass, and the rows of each width."""
     width = np.diff(part.entry_start)
     rows = np.bincount(np.searchsorted(_WIDTHS, width), minlength=_WIDTHS.size)
-    return np.concatenate([
-        [part.action.max(initial=0) + 1.0, width.max(initial=1), part.successor.size,
-         part.initial.sum()], rows])[None]
+    return np.concatenate(
+        [
+            [
+                part.action.max(initial=0) + 1.0,
+                width.max(initial=1),
+                part.successor.size,
+                part.initial.sum(),
+            ],
+            rows,
+        ]
+    )[None]
 
 
 class _Halo(NamedTuple):
@@ -508,7 +560,7 @@ def _halo(layout: _Layout, parts: Mapping[int, _Range]) -> _Halo:
         for e in parts:
             pieces[e] = np.zeros(longest, np.int32)
             asking = lists[(e - k) % count]
-            pieces[e][:asking.size] = asking - layout.starts[e]
+            pieces[e][: asking.size] = asking - layout.starts[e]
         sent.append(pieces)
         first.update({(d, (d + k) % count): begins for d in range(count)})
         begins += longest
@@ -556,8 +608,14 @@ def _tables(
 
 
 def _of_states(
-    layout: _Layout, facts: np.ndarray, d: int, part: _Range, tables: Any, place: Any,
-    labels: np.ndarray, ordered: Any,
+    layout: _Layout,
+    facts: np.ndarray,
+    d: int,
+    part: _Range,
+    tables: Any,
+    place: Any,
+    labels: np.ndarray,
+    ordered: Any,
 ) -> _Piece:
     num_actions, here = int(facts[:, _ACTIONS].max()), part.initial.size
     state = np.repeat(np.arange(here), np.diff(part.row_start))
@@ -570,8 +628,10 @@ def _of_states(
 
     available = on_choices(np.ones(state.size, bool), False, bool)
     if available.sum() != state.size:
-        raise ValueError(f"two choices of one of the states {layout.span(d)} have the same action; "
-                         "number them apart.")
+        raise ValueError(
+            f"two choices of one of the states {layout.span(d)} have the same action; "
+            "number them apart."
+        )
     available[here:, 0] = True
     kind = np.zeros(layout.size, np.int32)  # filled states show what another shows
     different, of = np.unique(part.label, axis=0, return_inverse=True)

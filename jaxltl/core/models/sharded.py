@@ -179,14 +179,18 @@ def _(model: ShardedMDP, value: jax.Array, term: Any, combine: Any) -> jax.Array
         seen = seen_by(model, sent, value)
         if place is None:
             shape = (*available.shape, -1)
-            (successor, weight), = tables
-            return kernels.stacked(kernels.by_action(
-                successor.reshape(shape), weight.reshape(shape), seen, term, combine))
+            ((successor, weight),) = tables
+            return kernels.stacked(
+                kernels.by_action(
+                    successor.reshape(shape), weight.reshape(shape), seen, term, combine
+                )
+            )
         found = jnp.concatenate([_rows(table, seen, term, combine) for table in tables])
         return jnp.moveaxis(kernels.gather(found, place), 1, -1)
 
     return over_devices(
-        model, one, model.tables, model.place, model.sent, model.available, jnp.asarray(value))
+        model, one, model.tables, model.place, model.sent, model.available, jnp.asarray(value)
+    )
 
 
 def _rows(table: RowTable, seen: jax.Array, term: Any, combine: Any) -> jax.Array:
@@ -195,8 +199,12 @@ def _rows(table: RowTable, seen: jax.Array, term: Any, combine: Any) -> jax.Arra
     if width > kernels.UNROLL:
         return kernels.folded(successor, weight, seen, term, combine, axis=1)
     return kernels.fold(
-        [successor[:, k] for k in range(width)], [weight[:, k] for k in range(width)], seen, term,
-        combine)
+        [successor[:, k] for k in range(width)],
+        [weight[:, k] for k in range(width)],
+        seen,
+        term,
+        combine,
+    )
 
 
 @operators.greatest_predecessor.register
@@ -216,19 +224,20 @@ def _(model: ShardedMDP, quantity: jax.Array) -> jax.Array:
         seen, first = jnp.zeros((length, *wide), quantity.dtype), 0
         for successor, weight in tables:
             count, width = successor.shape
-            mine = rows[first:first + count].reshape(count, 1, *wide)
+            mine = rows[first : first + count].reshape(count, 1, *wide)
             used = (weight > 0).reshape(count, width, *(1,) * len(wide))
             seen = seen.at[successor].max(jnp.where(used, mine, 0))
             first += count
         if model.rounds is None:
             # What all see of one another's, and of that the largest.
             every = lax.all_to_all(
-                seen.reshape(model.num_devices, size, *wide), model.axis, 0, 0, tiled=False)
+                seen.reshape(model.num_devices, size, *wide), model.axis, 0, 0, tiled=False
+            )
             return every.max(axis=0)
         found, first = seen[:size], size
         for index, pairs in zip(sent, model.rounds, strict=True):
             back = [(target, source) for source, target in pairs]
-            part = lax.ppermute(seen[first:first + index.size], model.axis, back)
+            part = lax.ppermute(seen[first : first + index.size], model.axis, back)
             found = found.at[index].max(part)
             first += index.size
         return found
@@ -295,7 +304,8 @@ def _(model: ShardedMDP, policy: jax.Array) -> Any:
         return kernels.gather(jnp.concatenate(found), row)
 
     return lambda value: over_devices(
-        model, one, model.tables, model.place, model.sent, model.available, policy, value)
+        model, one, model.tables, model.place, model.sent, model.available, policy, value
+    )
 
 
 @operators.transition_matrix.register

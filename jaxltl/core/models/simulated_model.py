@@ -62,13 +62,15 @@ def environment_of(
     if not isinstance(model, MDP | DenseMDP):
         raise ValueError(
             f"environment_of: {type(model).__name__} is no world; simulate the MDP under it, and "
-            "give the task to task_environment.")
+            "give the task to task_environment."
+        )
     size, num_actions = model.num_states, model.num_actions
     table = np.zeros(size) if reward is None else np.asarray(reward)
     if table.shape not in ((size,), (size, num_actions)) or table.dtype.kind not in "biuf":
         raise ValueError(
             f"reward has shape {list(table.shape)} and type {table.dtype}; give numbers [{size}], "
-            f"of states, or [{size}, {num_actions}], of their actions.")
+            f"of states, or [{size}, {num_actions}], of their actions."
+        )
     table = table.astype(jnp.result_type(float))
     step, outcomes = Partial(_step, model, table), Partial(_outcomes, model, table)
     if owner is not None:
@@ -79,11 +81,17 @@ def environment_of(
         raise ValueError("opponent is for games; make_game tells whose turn it is in a state.")
     spaces = make_box(0, 1, (size,)) if observe is None else None
     return make_environment(
-        Partial(_reset, model.initial), step,
+        Partial(_reset, model.initial),
+        step,
         Partial(_one_hot, model.initial) if observe is None else observe,
-        actions=num_actions, labels=Partial(_labels, model.label), propositions=model.propositions,
-        allowed=Partial(_available, model.available), observations=spaces,
-        starts=Partial(_starts, model.initial), outcomes=outcomes)
+        actions=num_actions,
+        labels=Partial(_labels, model.label),
+        propositions=model.propositions,
+        allowed=Partial(_available, model.available),
+        observations=spaces,
+        starts=Partial(_starts, model.initial),
+        outcomes=outcomes,
+    )
 
 
 def _starts(initial: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -95,7 +103,10 @@ def _reset(initial: jax.Array, key: chex.PRNGKey) -> jax.Array:
 
 
 def _step(
-    model: MDP | DenseMDP, reward: jax.Array, state: jax.Array, action: jax.Array,
+    model: MDP | DenseMDP,
+    reward: jax.Array,
+    state: jax.Array,
+    action: jax.Array,
     key: chex.PRNGKey,
 ) -> Timestep:
     after = sample_successor(model, key, state, action).astype(jnp.int32)
@@ -114,33 +125,37 @@ def _outcomes(
     return Timestep(after, earned, terminated=jnp.bool_(False)), probability
 
 
-def _earned(
-    reward: jax.Array, state: jax.Array, action: jax.Array, after: jax.Array
-) -> jax.Array:
+def _earned(reward: jax.Array, state: jax.Array, action: jax.Array, after: jax.Array) -> jax.Array:
     table = jnp.asarray(reward)
     return table[after] if table.ndim == 1 else table[state, action]
 
 
-def _opponent(
-    model: MDP | DenseMDP, system: np.ndarray, policy: ArrayLike | None
-) -> np.ndarray:
+def _opponent(model: MDP | DenseMDP, system: np.ndarray, policy: ArrayLike | None) -> np.ndarray:
     """The logarithm of what it plays."""
     available = np.asarray(model.available)
     plays = available.astype(float) if policy is None else given.numbers("opponent", policy)
     if plays.shape != available.shape or not np.isfinite(plays).all() or (plays < 0).any():
-        raise ValueError(f"opponent has shape {list(plays.shape)}; give weights "
-                         f"{list(available.shape)}, of each action in each state.")
+        raise ValueError(
+            f"opponent has shape {list(plays.shape)}; give weights "
+            f"{list(available.shape)}, of each action in each state."
+        )
     weight = np.where(available, plays, 0)
     for state in np.flatnonzero(~system & ~weight.any(1))[:1]:
-        raise ValueError(f"opponent: it moves in state {state}, but has no weight on what is "
-                         "available there; give some.")
+        raise ValueError(
+            f"opponent: it moves in state {state}, but has no weight on what is "
+            "available there; give some."
+        )
     with np.errstate(divide="ignore"):
         weight[system] = 1
         return np.log(weight).astype(jnp.result_type(float))
 
 
 def _step_of_two(
-    opponent: jax.Array, system: jax.Array, step: Any, state: jax.Array, action: jax.Array,
+    opponent: jax.Array,
+    system: jax.Array,
+    step: Any,
+    state: jax.Array,
+    action: jax.Array,
     key: chex.PRNGKey,
 ) -> Timestep:
     key, other = jax.random.split(key)

@@ -22,9 +22,11 @@ from jaxltl.core.models.kernels import gather, owners, segment
 from jaxltl.core.models.mdp import checked_initial, checked_label
 from jaxltl.core.show import brief
 
-_PADDED = ("this takes models that are padded: give to_padded(model). Sparse models have choices "
-           "in rows, and are taken by the primitives, the functions of graphs and games, the "
-           "solvers of values, and prepare; not by permissive strategies, learners and rollouts.")
+_PADDED = (
+    "this takes models that are padded: give to_padded(model). Sparse models have choices "
+    "in rows, and are taken by the primitives, the functions of graphs and games, the "
+    "solvers of values, and prepare; not by permissive strategies, learners and rollouts."
+)
 Array = Any  # NumPy's in double precision as it is read, or JAX's
 
 
@@ -145,7 +147,8 @@ class SparseMDP:
     def host(self) -> HostMDP:
         """The transitions as the host engine takes them, with what it finds out about them."""
         row_start, entry_start, successor = (
-            np.asarray(x) for x in (self.row_start, self.entry_start, self.successor))
+            np.asarray(x) for x in (self.row_start, self.entry_start, self.successor)
+        )
         probability = np.asarray(self.probability, np.float64)
         return HostMDP(row_start, entry_start, successor, probability)
 
@@ -156,8 +159,10 @@ class SparseMDP:
           ValueError: there is no such proposition.
         """
         if proposition not in self.propositions:
-            raise ValueError(f"there is no label {proposition!r}; the model has "
-                             f"{', '.join(self.propositions) or 'none'}.")
+            raise ValueError(
+                f"there is no label {proposition!r}; the model has "
+                f"{', '.join(self.propositions) or 'none'}."
+            )
         return self.label[:, self.propositions.index(proposition)]
 
 
@@ -209,22 +214,27 @@ def reward_parts(model: SparseMDP, reward: str | Rewards | chex.Array | None = N
         reward = next(iter(model.rewards))
     if isinstance(reward, str):
         if reward not in model.rewards:
-            raise ValueError(f"there is no reward {reward!r}; the model has "
-                             f"{_listed(model.rewards)}.")
+            raise ValueError(
+                f"there is no reward {reward!r}; the model has {_listed(model.rewards)}."
+            )
         reward = model.rewards[reward]
     if not isinstance(reward, Rewards):
         return _shaped(model, reward)
     for size, name in _sizes(model):
         part = getattr(reward, name)
         if part is not None and np.shape(part) != (size,):
-            raise ValueError(f"reward has shape {np.shape(part)} on its {name} part; expected "
-                             f"({size},).")
+            raise ValueError(
+                f"reward has shape {np.shape(part)} on its {name} part; expected ({size},)."
+            )
     return reward
 
 
 def _sizes(model: SparseMDP) -> tuple[tuple[int, str], ...]:
-    return ((model.num_states, "state"), (model.num_rows, "choice"),
-            (model.num_transitions, "transition"))
+    return (
+        (model.num_states, "state"),
+        (model.num_rows, "choice"),
+        (model.num_transitions, "transition"),
+    )
 
 
 def _traced_reward(model: SparseMDP, reward: Rewards) -> Any:
@@ -251,7 +261,8 @@ def _shaped(model: SparseMDP, reward: Any) -> Rewards:
             return Rewards(**{name: reward})
     raise ValueError(
         f"reward has shape {reward.shape}; give one number for each of the {model.num_states} "
-        f"states, {model.num_rows} choices or {model.num_transitions} transitions.")
+        f"states, {model.num_rows} choices or {model.num_transitions} transitions."
+    )
 
 
 def make_sparse(
@@ -301,17 +312,34 @@ def make_sparse(
       (2, 3, 4, False)
     """
     model = sparse_part(
-        row_start, entry_start, successor, probability, label=label, propositions=propositions,
-        rewards=rewards, action=action, action_names=action_names, valuation=valuation)
+        row_start,
+        entry_start,
+        successor,
+        probability,
+        label=label,
+        propositions=propositions,
+        rewards=rewards,
+        action=action,
+        action_names=action_names,
+        valuation=valuation,
+    )
     return replace(model, initial=checked_initial(initial, model.num_states))
 
 
 def sparse_part(
-    row_start: chex.Array | None, entry_start: chex.Array, successor: chex.Array,
-    probability: chex.Array, *, label: Any = None, propositions: Sequence[str] = (),
-    rewards: Mapping[str, Rewards] | None = None, action: chex.Array | None = None,
-    action_names: Sequence[str] = (), valuation: Mapping[str, chex.Array] | None = None,
-    begins: tuple[int, int, int] = (0, 0, 0), num_states: int | None = None,
+    row_start: chex.Array | None,
+    entry_start: chex.Array,
+    successor: chex.Array,
+    probability: chex.Array,
+    *,
+    label: Any = None,
+    propositions: Sequence[str] = (),
+    rewards: Mapping[str, Rewards] | None = None,
+    action: chex.Array | None = None,
+    action_names: Sequence[str] = (),
+    valuation: Mapping[str, chex.Array] | None = None,
+    begins: tuple[int, int, int] = (0, 0, 0),
+    num_states: int | None = None,
 ) -> SparseMDP:
     """What :func:`make_sparse` makes of a range of a model's states, without initial ones.
 
@@ -329,7 +357,8 @@ def sparse_part(
     if successor.ndim != 1 or successor.shape != probability.shape:
         raise ValueError(
             f"successor has shape {successor.shape} and probability {probability.shape}; "
-            "both must be [transitions].")
+            "both must be [transitions]."
+        )
     if not np.issubdtype(successor.dtype, np.integer):
         raise ValueError(f"successor has dtype {successor.dtype}; it must hold integers.")
     entry_start = checked_starts("entry_start", entry_start, successor.size, "transitions")
@@ -341,28 +370,39 @@ def sparse_part(
     if here == 0:
         raise ValueError("the model has no state; it needs at least one.")
     check_entries(
-        row_start, entry_start, successor, probability, first=first, num_states=num_states)
+        row_start, entry_start, successor, probability, first=first, num_states=num_states
+    )
     for of, each in (("rewards", rewards), ("valuation", valuation)):
         if each is not None and not isinstance(each, Mapping):
             raise ValueError(f"{of} is {shown(each)}; give a dict, by name.")
     action_names = tuple(listed("action_names", action_names))
     sizes = here, num_rows, successor.size
-    rewards = {name: _checked_rewards(name, x, sizes, begins)
-               for name, x in (rewards or {}).items()}
+    rewards = {
+        name: _checked_rewards(name, x, sizes, begins) for name, x in (rewards or {}).items()
+    }
     label, names = checked_label(label, propositions, here)
     action = None if action is None else _checked_action(action, num_rows, action_names)
     for name, x in (valuation or {}).items():
         if np.shape(x) != (here,):
-            raise ValueError(f"valuation {name!r} has shape {np.shape(x)}; expected "
-                             f"({here},), a value for each state.")
+            raise ValueError(
+                f"valuation {name!r} has shape {np.shape(x)}; expected "
+                f"({here},), a value for each state."
+            )
     parts = _canonical(row_start, entry_start, successor, probability, rewards, first)
     start, successor, probability, rewards = parts
     return SparseMDP(
-        row_start=row_start.astype(np.int32), entry_start=start, successor=successor,
+        row_start=row_start.astype(np.int32),
+        entry_start=start,
+        successor=successor,
         probability=scaled(row_start, start, probability, first=first),
-        initial=np.zeros(here), label=label, rewards=rewards,
-        action=action, valuation={n: np.asarray(x) for n, x in (valuation or {}).items()},
-        propositions=names, action_names=action_names)
+        initial=np.zeros(here),
+        label=label,
+        rewards=rewards,
+        action=action,
+        valuation={n: np.asarray(x) for n, x in (valuation or {}).items()},
+        propositions=names,
+        action_names=action_names,
+    )
 
 
 def checked_starts(name: str, start: Any, total: int, of: str) -> np.ndarray:
@@ -373,16 +413,21 @@ def checked_starts(name: str, start: Any, total: int, of: str) -> np.ndarray:
     """
     start = np.asarray(start)
     if start.ndim != 1 or not start.size or not np.issubdtype(start.dtype, np.integer):
-        raise ValueError(f"{name} is {start.dtype}{list(start.shape)}; expected integers, one more "
-                         "than there are spans.")
+        raise ValueError(
+            f"{name} is {start.dtype}{list(start.shape)}; expected integers, one more "
+            "than there are spans."
+        )
     if start[0] != 0 or start[-1] != total:
-        raise ValueError(f"{name} goes from {start[0]} to {start[-1]}; it must go from 0 to the "
-                         f"number of {of}, {total}.")
+        raise ValueError(
+            f"{name} goes from {start[0]} to {start[-1]}; it must go from 0 to the "
+            f"number of {of}, {total}."
+        )
     falls = start[1:] < start[:-1]  # differences of unsigned numbers are never negative
     if falls.any():
         i = int(np.flatnonzero(falls)[0])
-        raise ValueError(f"{name} falls from {start[i]} to {start[i + 1]} at {i + 1}; it must "
-                         "ascend.")
+        raise ValueError(
+            f"{name} falls from {start[i]} to {start[i + 1]} at {i + 1}; it must ascend."
+        )
     return start.astype(np.int64)  # NumPy takes no unsigned ones for counts
 
 
@@ -393,8 +438,13 @@ def placed(row_start: np.ndarray, row: int, first: int = 0) -> str:
 
 
 def check_entries(
-    row_start: np.ndarray, entry_start: np.ndarray, successor: np.ndarray, probability: np.ndarray,
-    *, first: int = 0, num_states: int | None = None,
+    row_start: np.ndarray,
+    entry_start: np.ndarray,
+    successor: np.ndarray,
+    probability: np.ndarray,
+    *,
+    first: int = 0,
+    num_states: int | None = None,
 ) -> None:
     """Raises a ValueError where a state, a row or an entry is not what a model may have.
 
@@ -402,22 +452,28 @@ def check_entries(
     """
     num_states = row_start.size - 1 if num_states is None else num_states
     if (np.diff(row_start) == 0).any():
-        raise ValueError(f"state {first + np.flatnonzero(np.diff(row_start) == 0)[0]} has no "
-                         "choice; give it one, for example a loop to itself.")
+        raise ValueError(
+            f"state {first + np.flatnonzero(np.diff(row_start) == 0)[0]} has no "
+            "choice; give it one, for example a loop to itself."
+        )
     if (np.diff(entry_start) == 0).any():
         row = int(np.flatnonzero(np.diff(entry_start) == 0)[0])
         raise ValueError(f"{placed(row_start, row, first)} leads nowhere; give it a successor.")
     if successor.min() < 0 or successor.max() >= num_states:
         e = int(np.flatnonzero((successor < 0) | (successor >= num_states))[0])
         row = int(np.searchsorted(entry_start, e, "right")) - 1
-        raise ValueError(f"{placed(row_start, row, first)}: successor {successor[e]} is out of "
-                         f"range; states are 0 to {num_states - 1}.")
+        raise ValueError(
+            f"{placed(row_start, row, first)}: successor {successor[e]} is out of "
+            f"range; states are 0 to {num_states - 1}."
+        )
     # A sum is NaN or infinite if any of it is.
     if not probability.min() >= 0 or not np.isfinite(probability.sum()):
         e = int(np.flatnonzero(~(probability >= 0) | np.isinf(probability))[0])
         row = int(np.searchsorted(entry_start, e, "right")) - 1
-        raise ValueError(f"{placed(row_start, row, first)}: probability {probability[e]}; "
-                         "probabilities must be finite and not negative.")
+        raise ValueError(
+            f"{placed(row_start, row, first)}: probability {probability[e]}; "
+            "probabilities must be finite and not negative."
+        )
 
 
 def _checked_rewards(
@@ -432,8 +488,9 @@ def _checked_rewards(
             continue
         given = np.asarray(given, np.float64)
         if given.shape != (size,):
-            raise ValueError(f"reward {name!r} has shape {given.shape} on its {part} part; "
-                             f"expected ({size},).")
+            raise ValueError(
+                f"reward {name!r} has shape {given.shape} on its {part} part; expected ({size},)."
+            )
         if np.isnan(given).any():
             place = f"{part} {first + np.flatnonzero(np.isnan(given))[0]}"
             raise ValueError(f"reward {name!r} is NaN at {place}; give a number.")
@@ -444,17 +501,25 @@ def _checked_rewards(
 def _checked_action(action: Any, num_rows: int, names: tuple[str, ...]) -> np.ndarray:
     action = np.asarray(action)
     if action.shape != (num_rows,) or not np.issubdtype(action.dtype, np.integer):
-        raise ValueError(f"action is {action.dtype}{list(action.shape)}; expected integers "
-                         f"[{num_rows}], the action of each choice.")
+        raise ValueError(
+            f"action is {action.dtype}{list(action.shape)}; expected integers "
+            f"[{num_rows}], the action of each choice."
+        )
     if action.size and (action.min() < 0 or (names and action.max() >= len(names))):
-        raise ValueError(f"actions go from {action.min()} to {action.max()}; there are "
-                         f"{len(names)} names, for 0 to {len(names) - 1}.")
+        raise ValueError(
+            f"actions go from {action.min()} to {action.max()}; there are "
+            f"{len(names)} names, for 0 to {len(names) - 1}."
+        )
     return action.astype(np.int32)
 
 
 def _canonical(
-    row_start: np.ndarray, entry_start: np.ndarray, successor: np.ndarray,
-    probability: np.ndarray, rewards: dict[str, Rewards], state: int,
+    row_start: np.ndarray,
+    entry_start: np.ndarray,
+    successor: np.ndarray,
+    probability: np.ndarray,
+    rewards: dict[str, Rewards],
+    state: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Rewards]]:
     """Entries in ascending order, without repetitions and zeros; `state` is the first's number."""
     index: Any = np.int32 if successor.size < 2**31 else np.int64
@@ -478,7 +543,8 @@ def _canonical(
             # What stands alone keeps its reward bit for bit.
             alone = np.diff(np.append(start, order.size)) == 1
             reward = replace(
-                reward, transition=np.where(alone, reward.transition[order][start], earned))
+                reward, transition=np.where(alone, reward.transition[order][start], earned)
+            )
         found[name] = reward
     count = np.bincount(row[start], minlength=entry_start.size - 1)
     if (count == 0).any():
@@ -513,8 +579,10 @@ def scaled(
     off = np.abs(total - 1)
     if off.max() > 1e-6:
         row = int(np.flatnonzero(off > 1e-6)[0])
-        raise ValueError(f"{placed(row_start, row, first)}: the probabilities sum to "
-                         f"{total[row]:.9g}, not 1; correct the row.")
+        raise ValueError(
+            f"{placed(row_start, row, first)}: the probabilities sum to "
+            f"{total[row]:.9g}, not 1; correct the row."
+        )
     count = np.diff(entry_start)
     wrong = off > (count + 2) * np.finfo(np.float64).eps
     if not wrong.any():

@@ -77,5 +77,6 @@ def letters_of(
       ValueError: there is no such label.
     """
     rows, number = distinct_rows(label_columns(model, names, place))
-    return [frozenset(n for n, holds in zip(names, row, strict=True) if holds)
-            for row in rows], number
+    return [
+        frozenset(n for n, holds in zip(names, row, strict=True) if holds) for row in rows
+    ], number

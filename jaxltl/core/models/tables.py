@@ -111,13 +111,15 @@ class SpreadSuccessors:
 
     def expectation(self, value: jax.Array) -> list[jax.Array]:
         """As :meth:`Successors.expectation`."""
+
         def one(successor: Any, probability: Any, sent: Any, value: jax.Array) -> list[jax.Array]:
             seen = seen_by(self.model, sent, value)
             pairs = zip(successor, probability, strict=True)
             return [kernels.fold(targets, weights, seen) for targets, weights in pairs]
 
         return over_devices(
-            self.model, one, self.successor, self.probability, self.model.sent, value)
+            self.model, one, self.successor, self.probability, self.model.sent, value
+        )
 
 
 @brief
@@ -155,14 +157,17 @@ def _spread_out(model: ShardedMDP) -> SpreadSuccessors | None:
     if model.place is not None or num_actions * width > kernels.WRITTEN_OUT:
         return None
     successor, probability = (
-        [[x.reshape(-1, num_actions, width)[:, a, k] for k in range(width)]
-         for a in range(num_actions)] for x in model.tables[0])
+        [
+            [x.reshape(-1, num_actions, width)[:, a, k] for k in range(width)]
+            for a in range(num_actions)
+        ]
+        for x in model.tables[0]
+    )
     return SpreadSuccessors(model, successor, probability)
 
 
 def successors(model: Any) -> Successors | None:
-    """The successor table of an MDP, of a product of one or of a game; None where it is too large.
-    """
+    """The successor table of an MDP, of a product of one or of a game; None where it is too large."""
     model = model.mdp if isinstance(model, Game) else model
     world = model.mdp if isinstance(model, Product) else model
     if not isinstance(world, MDP):

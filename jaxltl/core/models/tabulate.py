@@ -145,8 +145,14 @@ def tabulate(
     label = _labels(kind, world, listed.ended.size)
     model = _model(kind, listed, initial, label)
     return Table(
-        model, _typed(kind, world), listed.start, listed.ended == _TERMINATED,
-        listed.ended == _TRUNCATED, limit, evidence)
+        model,
+        _typed(kind, world),
+        listed.start,
+        listed.ended == _TERMINATED,
+        listed.ended == _TRUNCATED,
+        limit,
+        evidence,
+    )
 
 
 def _itself(world: Any) -> Any:
@@ -166,8 +172,9 @@ class _Kind(NamedTuple):
 
 
 def _is_key(x: Any) -> bool:
-    return jax.dtypes.issubdtype(jnp.asarray(x).dtype if not hasattr(x, "dtype") else x.dtype,
-                                 jax.dtypes.prng_key)
+    return jax.dtypes.issubdtype(
+        jnp.asarray(x).dtype if not hasattr(x, "dtype") else x.dtype, jax.dtypes.prng_key
+    )
 
 
 def _plain(world: Any) -> Any:
@@ -177,15 +184,20 @@ def _plain(world: Any) -> Any:
 
 def _typed(kind: _Kind, plain: Any) -> Any:
     """What :func:`_plain` was made of."""
+
     def back(x: Any, y: Any) -> Any:
-        return jax.random.wrap_key_data(jnp.asarray(x), impl=jax.random.key_impl(y)) if (
-            _is_key(y)) else x
+        return (
+            jax.random.wrap_key_data(jnp.asarray(x), impl=jax.random.key_impl(y))
+            if (_is_key(y))
+            else x
+        )
 
     return jax.tree.map(back, plain, kind.like)
 
 
 def _bytes(world: Any) -> jax.Array:
     """``uint8[W]``, the same for worlds whose numbers are equal."""
+
     def of(x: Any) -> jax.Array:
         if jnp.issubdtype(x.dtype, jnp.inexact):
             x = jnp.where(x == 0, jnp.zeros_like(x), x)  # minus zero is zero
@@ -208,9 +220,7 @@ def _rows(table: np.ndarray) -> np.ndarray:
 # --- where it begins ------------------------------------------------------------------------------
 
 
-def _begin(
-    kind: _Kind, environment: Environment, worlds: Any
-) -> tuple[Any, np.ndarray, str]:
+def _begin(kind: _Kind, environment: Environment, worlds: Any) -> tuple[Any, np.ndarray, str]:
     """The worlds to begin from, the probability of each, and why it is so."""
     inner = kind.environment
     shape = jax.eval_shape(inner.reset, kind.keys[0])
@@ -226,11 +236,15 @@ def _begin(
         worlds, probability = inner.starts()
         count = _count("starts", worlds, shape)
         probability = np.asarray(probability, np.float64)
-        if probability.shape != (count,) or not (probability >= 0).all() or not np.isclose(
-                probability.sum(), 1, rtol=0, atol=1e-5):
+        if (
+            probability.shape != (count,)
+            or not (probability >= 0).all()
+            or not np.isclose(probability.sum(), 1, rtol=0, atol=1e-5)
+        ):
             raise ValueError(
                 f"starts: the probabilities have shape {list(probability.shape)} and sum to "
-                f"{probability.sum():.9g}; give one for each of the {count} worlds, and 1 in sum.")
+                f"{probability.sum():.9g}; give one for each of the {count} worlds, and 1 in sum."
+            )
         told = _rows(_told_apart(kind, _plain(worlds)))
         if not np.isin(seen, told[probability > 0]).all():
             raise ValueError("reset draws a world that starts does not tell; give all of them.")
@@ -241,7 +255,8 @@ def _begin(
         raise ValueError(
             f"tabulate: reset is random, {len(np.unique(seen))} worlds from {len(seen)} keys, and "
             "the environment does not tell how. Give worlds to begin from, or "
-            "make_environment(starts=...).")
+            "make_environment(starts=...)."
+        )
     one = jax.tree.map(lambda x: x[:1], drawn)
     return one, np.ones(1), "keys" if reads_key(inner.reset, kind.keys[0]) else "keyless"
 
@@ -264,23 +279,27 @@ def _told_apart(kind: _Kind, plain: Any) -> np.ndarray:
     """``uint8[N, W]``, the bytes of worlds."""
     plain = jax.tree.map(np.asarray, plain)
     count = len(jax.tree.leaves(plain)[0])
-    return np.concatenate([np.asarray(_codes(kind, batch))[:rows]
-                           for rows, batch in _batches(plain, count, _BATCH)])
+    return np.concatenate(
+        [np.asarray(_codes(kind, batch))[:rows] for rows, batch in _batches(plain, count, _BATCH)]
+    )
 
 
 def _fits(worlds: Any, shape: Any) -> bool:
     same: Any = jax.tree.structure(shape)
     return same == jax.tree.structure(worlds) and all(
-        np.shape(x)[1:] == y.shape and _same_type(x, y) for x, y in zip(
-            jax.tree.leaves(worlds), jax.tree.leaves(shape), strict=True))
+        np.shape(x)[1:] == y.shape and _same_type(x, y)
+        for x, y in zip(jax.tree.leaves(worlds), jax.tree.leaves(shape), strict=True)
+    )
 
 
 def _same_type(x: Any, like: Any) -> bool:
     """In single precision also of NumPy's numbers of double precision."""
     kind = getattr(x, "dtype", None)
     return kind == like.dtype or (
-        isinstance(kind, np.dtype) and kind.kind in "biufc"
-        and jax.dtypes.canonicalize_dtype(kind) == like.dtype)
+        isinstance(kind, np.dtype)
+        and kind.kind in "biufc"
+        and jax.dtypes.canonicalize_dtype(kind) == like.dtype
+    )
 
 
 def _count(name: str, worlds: Any, shape: Any) -> int:
@@ -288,7 +307,8 @@ def _count(name: str, worlds: Any, shape: Any) -> int:
     if not _fits(worlds, shape) or len(lengths) != 1 or lengths & {(), (0,)}:
         raise ValueError(
             f"{name}: give worlds as reset returns them, each array of its type, with a first axis "
-            "more, of the same length.")
+            "more, of the same length."
+        )
     return int(lengths.pop()[0])
 
 
@@ -398,6 +418,7 @@ def _follow(kind: _Kind, draws: int, world: Any) -> _Followers:
         def one(key: Any) -> Timestep:
             found = Timestep(*environment.step(world, action, key))
             return Timestep(*jax.tree.map(jnp.asarray, tuple(found)))
+
         return jax.vmap(one)(kind.keys[:draws])
 
     def one(action: Any) -> _Followers:
@@ -415,8 +436,14 @@ def _follow(kind: _Kind, draws: int, world: Any) -> _Followers:
             paid = jax.vmap(lambda x: _bytes((x.reward, x.cost)))(tries)
             drawn_again = jnp.concatenate([drawn_again, paid], axis=-1)
         return _Followers(
-            _plain(found.world), jax.vmap(seen)(found), probability, found.reward, found.cost,
-            mask, drawn_again)
+            _plain(found.world),
+            jax.vmap(seen)(found),
+            probability,
+            found.reward,
+            found.cost,
+            mask,
+            drawn_again,
+        )
 
     every = jax.vmap(one)(jnp.arange(environment.actions.num, dtype=jnp.int32))  # type: ignore[union-attr]
     mask = allowed_in(environment, world)
@@ -438,8 +465,12 @@ def _search(kind: _Kind, begun: Any, max_states: int) -> _Listed:
         _count("outcomes", jax.eval_shape(environment.outcomes, shape, action)[0][0], shape)
     keyless = not told and not reads_key(environment.step, shape, action, kind.keys[0])
     draws = 1 if keyless else len(kind.keys)
-    width = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(
-        partial(_followers, draws), kind, jax.tree.map(lambda x: x[:1], begun))))
+    width = sum(
+        x.size * x.dtype.itemsize
+        for x in jax.tree.leaves(
+            jax.eval_shape(partial(_followers, draws), kind, jax.tree.map(lambda x: x[:1], begun))
+        )
+    )
     size = int(np.clip(_BYTES // max(width, 1), 1, _BATCH))
 
     number: dict[bytes, int] = {}
@@ -454,7 +485,8 @@ def _search(kind: _Kind, begun: Any, max_states: int) -> _Listed:
         new = []
         for rows, batch in _batches(frontier, count, size):
             found = jax.tree.map(
-                lambda x, n=rows: np.asarray(x)[:n], _followers(draws, kind, batch))
+                lambda x, n=rows: np.asarray(x)[:n], _followers(draws, kind, batch)
+            )
             _check(found, sum(len(x.allowed) for x in parts), told)
             real = found.allowed[..., None] & (found.probability > 0)
             after, before = _rows(found.seen), len(ended)
@@ -464,26 +496,33 @@ def _search(kind: _Kind, begun: Any, max_states: int) -> _Listed:
             if len(ended) > max_states:
                 raise ValueError(
                     f"tabulate: there are more than max_states={max_states} worlds. Allow more, "
-                    "take less into a world, or say by distinct= what of it matters.")
+                    "take less into a world, or say by distinct= what of it matters."
+                )
             successor.append(places)
             parts.append(found._replace(world=None, seen=None, drawn=None))
-            listed.append(jax.tree.map(
-                lambda x, n=after.shape, f=first: x.reshape(-1, *x.shape[len(n):])[f],
-                found.world))
+            listed.append(
+                jax.tree.map(
+                    lambda x, n=after.shape, f=first: x.reshape(-1, *x.shape[len(n) :])[f],
+                    found.world,
+                )
+            )
             going = np.array(ended[before:], int) == _LIVE
             new.append(jax.tree.map(lambda x, g=going: x[g], listed[-1]))
         frontier = _joined(new)
     evidence = "told" if told else "keyless" if keyless else "keys"
     return _Listed(
-        listed, np.array(ended, np.uint8), start.astype(np.int32), successor, parts, evidence)
+        listed, np.array(ended, np.uint8), start.astype(np.int32), successor, parts, evidence
+    )
 
 
 def _batches(frontier: Any, count: int, size: int) -> Iterator[tuple[int, Any]]:
     """Batches of one size, the last one filled up, and how many are meant."""
     for begin in range(0, count, size):
         place = np.minimum(np.arange(begin, begin + size), count - 1)
-        yield min(size, count - begin), jax.tree.map(partial(np.take, indices=place, axis=0),
-                                                     frontier)
+        yield (
+            min(size, count - begin),
+            jax.tree.map(partial(np.take, indices=place, axis=0), frontier),
+        )
 
 
 def _numbered(
@@ -507,8 +546,10 @@ def _check(found: _Followers, base: int, told: bool) -> None:
     """Refuses what is random and not told, or is drawn but not told, and dead ends."""
     stuck = np.flatnonzero(~found.allowed.any(axis=1))
     if stuck.size:
-        raise ValueError(f"tabulate: no action is allowed in world {base + stuck[0]}, counted in "
-                         "the order of the search; end the episode there.")
+        raise ValueError(
+            f"tabulate: no action is allowed in world {base + stuck[0]}, counted in "
+            "the order of the search; end the episode there."
+        )
     drawn = _rows(found.drawn)  # [B, A, N]
     if told:
         sums = found.probability.sum(axis=-1, dtype=np.float64)
@@ -516,14 +557,16 @@ def _check(found: _Followers, base: int, told: bool) -> None:
         for b, a in np.argwhere(bad)[:1]:
             raise ValueError(
                 f"outcomes: of action {a} in world {base + b} the probabilities are "
-                f"{found.probability[b, a].tolist()}; they must be a distribution.")
+                f"{found.probability[b, a].tolist()}; they must be a distribution."
+            )
         seen = _rows(found.seen)
         known = (drawn[..., None] == seen[:, :, None]) & (found.probability > 0)[:, :, None]
         fails = ~known.any(axis=-1).all(axis=-1) & found.allowed
         for b, a in np.argwhere(fails)[:1]:
             raise ValueError(
                 f"outcomes: action {a} in world {base + b} leads to a world that they do not tell; "
-                "give every world to which the step may lead, with how the episode ends there.")
+                "give every world to which the step may lead, with how the episode ends there."
+            )
         return
     differ = (drawn != drawn[..., :1]).any(axis=-1) & found.allowed
     for b, a in np.argwhere(differ)[:1]:
@@ -531,7 +574,8 @@ def _check(found: _Followers, base: int, told: bool) -> None:
             f"tabulate: step is random: action {a} in world {base + b} leads to "
             f"{len(np.unique(drawn[b, a]))} outcomes from {drawn.shape[-1]} keys, and the "
             "environment does not tell how. Give make_environment(outcomes=...), which tells the "
-            "worlds and their probabilities.")
+            "worlds and their probabilities."
+        )
 
 
 # --- as a model -----------------------------------------------------------------------------------
@@ -548,8 +592,9 @@ def _labeled(kind: _Kind, plain: Any) -> jax.Array:
 
 def _labels(kind: _Kind, plain: Any, count: int) -> np.ndarray:
     """``bool[S, P]``."""
-    return np.concatenate([np.asarray(_labeled(kind, batch))[:rows]
-                           for rows, batch in _batches(plain, count, _BATCH)])
+    return np.concatenate(
+        [np.asarray(_labeled(kind, batch))[:rows] for rows, batch in _batches(plain, count, _BATCH)]
+    )
 
 
 def _model(kind: _Kind, listed: _Listed, initial: np.ndarray, label: np.ndarray) -> SparseMDP:
@@ -558,8 +603,10 @@ def _model(kind: _Kind, listed: _Listed, initial: np.ndarray, label: np.ndarray)
     followers = _joined(listed.parts)
     state, action = np.nonzero(followers.allowed)
     successor = np.concatenate(listed.successor)[state, action]
-    columns = [np.asarray(x, np.float64)[state, action] for x in (
-        followers.probability, followers.reward, followers.cost)]
+    columns = [
+        np.asarray(x, np.float64)[state, action]
+        for x in (followers.probability, followers.reward, followers.cost)
+    ]
     # Each state that has ended gets a row of its own, a loop without reward.
     over = np.flatnonzero(listed.ended != _LIVE)
     owner = np.concatenate([live[state], over])
@@ -569,13 +616,21 @@ def _model(kind: _Kind, listed: _Listed, initial: np.ndarray, label: np.ndarray)
     successor = np.concatenate([successor, loop])[order].ravel()
     single = np.tile(np.arange(width) == 0, (len(over), 1)).astype(float)
     probability, reward, cost = (
-        np.concatenate([x, y])[order].ravel() for x, y in zip(
-            columns, (single, 0 * single, 0 * single), strict=True))
+        np.concatenate([x, y])[order].ravel()
+        for x, y in zip(columns, (single, 0 * single, 0 * single), strict=True)
+    )
     rewards = {"reward": Rewards(transition=reward)}
     if cost.any():
         rewards["cost"] = Rewards(transition=cost)
     number = np.concatenate([action, np.zeros(len(over), np.int64)])[order]
     return make_sparse(
         starts_of(np.bincount(owner, minlength=num_states)),
-        np.arange(len(owner) + 1) * width, successor, probability, initial=initial, label=label,
-        propositions=environment.propositions, rewards=rewards, action=number)
+        np.arange(len(owner) + 1) * width,
+        successor,
+        probability,
+        initial=initial,
+        label=label,
+        propositions=environment.propositions,
+        rewards=rewards,
+        action=number,
+    )

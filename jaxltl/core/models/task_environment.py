@@ -181,27 +181,41 @@ def make_task_tables(
         reading = make_finite_task(automaton, propositions)
     decisions = verdicts(automaton)
     pay: Pay = pay_of(
-        automaton, decisions, reward=reward, discount=discount, ratio=ratio, shaping=shaping,
-        learner_discount=learner_discount)
+        automaton,
+        decisions,
+        reward=reward,
+        discount=discount,
+        ratio=ratio,
+        shaping=shaping,
+        learner_discount=learner_discount,
+    )
     weight = np.zeros(len(propositions), np.int32)
     weight[list(reading.columns)] = 1 << np.arange(len(reading.columns))
     shown = None if embedding is None else given.numbers("embedding", embedding)
     if shown is not None and (
-            shown.ndim < 2 or len(shown) != len(decisions) or shown.dtype.kind not in "biuf"):
+        shown.ndim < 2 or len(shown) != len(decisions) or shown.dtype.kind not in "biuf"
+    ):
         raise ValueError(
             f"embedding has shape {list(shown.shape)} and type {shown.dtype}; give numbers "
-            f"[{len(decisions)}, ...], a row for each state of the automaton.")
+            f"[{len(decisions)}, ...], a row for each state of the automaton."
+        )
     number = jnp.result_type(float)
     return TaskTables(
-        weight=weight, letter=np.asarray(reading.letter),
-        delta=np.asarray(automaton.delta, np.int32), initial=np.int32(automaton.initial),
-        verdict=decisions, repeated=_at_the_end(automaton, ending),
-        accepting=pay.accepting, reward=pay.reward.astype(number),
-        discount=pay.discount.astype(number), decided=pay.decided.astype(number),
+        weight=weight,
+        letter=np.asarray(reading.letter),
+        delta=np.asarray(automaton.delta, np.int32),
+        initial=np.int32(automaton.initial),
+        verdict=decisions,
+        repeated=_at_the_end(automaton, ending),
+        accepting=pay.accepting,
+        reward=pay.reward.astype(number),
+        discount=pay.discount.astype(number),
+        decided=pay.decided.astype(number),
         potential=pay.potential.astype(number),
         learner_discount=np.asarray(learner_discount, number),
         embedding=None if shown is None else shown.astype(number),
-        text=Names(automaton.state_names))
+        text=Names(automaton.state_names),
+    )
 
 
 def task_environment(
@@ -288,18 +302,39 @@ def task_environment(
     environment = require_environment(environment)
     names = environment.propositions if propositions is None else propositions
     inner = make_environment(
-        environment.reset, environment.step, environment.observe, actions=environment.actions,
-        labels=environment.labels if labels is None else labels, propositions=names,
-        allowed=environment.allowed, observations=environment.observations,
-        horizon=environment.horizon, starts=environment.starts, outcomes=environment.outcomes)
-    tables = formula if isinstance(formula, TaskTables) else make_task_tables(
-        formula, inner.propositions, reward=reward, discount=discount, ratio=ratio, shaping=shaping,
-        learner_discount=learner_discount, ending=ending, embedding=embedding)
+        environment.reset,
+        environment.step,
+        environment.observe,
+        actions=environment.actions,
+        labels=environment.labels if labels is None else labels,
+        propositions=names,
+        allowed=environment.allowed,
+        observations=environment.observations,
+        horizon=environment.horizon,
+        starts=environment.starts,
+        outcomes=environment.outcomes,
+    )
+    tables = (
+        formula
+        if isinstance(formula, TaskTables)
+        else make_task_tables(
+            formula,
+            inner.propositions,
+            reward=reward,
+            discount=discount,
+            ratio=ratio,
+            shaping=shaping,
+            learner_discount=learner_discount,
+            ending=ending,
+            embedding=embedding,
+        )
+    )
     names = inner.propositions
     if tables.weight.shape != (len(names),):
         raise ValueError(
             f"the tables are of {tables.weight.shape[-1]} propositions, and the world has "
-            f"{len(names)}: {', '.join(names) or '(none)'}. Make them with the world's own.")
+            f"{len(names)}: {', '.join(names) or '(none)'}. Make them with the world's own."
+        )
     return _beside(inner, tables)
 
 
@@ -315,7 +350,8 @@ def with_tables(environment: Environment, tables: TaskTables) -> Environment:
     made: Any = environment
     parts: Any = {
         name: None if (part := getattr(made, name)) is None else part.args[-1]
-        for name in ("reset", "step", "observe", "labels", "allowed", "starts", "outcomes")}
+        for name in ("reset", "step", "observe", "labels", "allowed", "starts", "outcomes")
+    }
     return _beside(replace(environment, **parts, observations=made.observations.world), tables)
 
 
@@ -384,7 +420,8 @@ def stack_tasks(environments: Sequence[Environment]) -> Environment:
         if shape != shapes[0]:
             raise ValueError(
                 f"environments 0 and {number} are worlds of different structure: their functions, "
-                "spaces, propositions, horizons and shapes of arrays must be the same.")
+                "spaces, propositions, horizons and shapes of arrays must be the same."
+            )
     return _stacked(made)
 
 
@@ -430,16 +467,20 @@ def _beside(inner: Environment, tables: TaskTables) -> Environment:
         memory = make_box(-np.inf, np.inf, tables.embedding.shape[1:])
     spaces: Any = TaskObservation(inner.observations, memory)  # type: ignore[arg-type]
     return replace(
-        inner, reset=Partial(_reset, tables, inner.labels, inner.reset),
+        inner,
+        reset=Partial(_reset, tables, inner.labels, inner.reset),
         step=Partial(_step, tables, inner.labels, inner.step),
         observe=Partial(_observe, tables, inner.observe),
         labels=Partial(_of_world, inner.labels),
         allowed=None if inner.allowed is None else Partial(_of_world, inner.allowed),
-        starts=None if inner.starts is None else Partial(
-            _starts, tables, inner.labels, inner.starts),
-        outcomes=None if inner.outcomes is None else Partial(
-            _outcomes, tables, inner.labels, inner.outcomes),
-        observations=spaces)
+        starts=None
+        if inner.starts is None
+        else Partial(_starts, tables, inner.labels, inner.starts),
+        outcomes=None
+        if inner.outcomes is None
+        else Partial(_outcomes, tables, inner.labels, inner.outcomes),
+        observations=spaces,
+    )
 
 
 def _read(tables: TaskTables, label: jax.Array) -> jax.Array:
@@ -471,21 +512,29 @@ def _begin(tables: TaskTables, labels: Callable[..., Any], world: Any) -> TaskWo
 
 
 def _step(
-    tables: TaskTables, labels: Callable[..., Any], step: Callable[..., Timestep],
-    before: TaskWorld, action: Any, key: chex.PRNGKey,
+    tables: TaskTables,
+    labels: Callable[..., Any],
+    step: Callable[..., Timestep],
+    before: TaskWorld,
+    action: Any,
+    key: chex.PRNGKey,
 ) -> Timestep:
     return _read_on(tables, labels, before, Timestep(*step(before.world, action, key)))
 
 
 def _outcomes(
-    tables: TaskTables, labels: Callable[..., Any], outcomes: Callable[..., Any],
-    before: TaskWorld, action: Any,
+    tables: TaskTables,
+    labels: Callable[..., Any],
+    outcomes: Callable[..., Any],
+    before: TaskWorld,
+    action: Any,
 ) -> tuple[Timestep, jax.Array]:
     told, probability = outcomes(before.world, action)
     told = Timestep(*told)
     rest = (jnp.broadcast_to(jnp.asarray(x), jnp.shape(probability)) for x in told[1:])
     return jax.vmap(lambda found: _read_on(tables, labels, before, found))(
-        Timestep(told.world, *rest)), probability
+        Timestep(told.world, *rest)
+    ), probability
 
 
 def _read_on(
@@ -506,8 +555,11 @@ def _read_on(
     reward = jnp.where(decided, tables.decided[verdict], tables.reward[reading])
     world = TaskWorld(found.world, memory, verdict, accepted, before.visits + accepted)
     return found._replace(
-        world=world, reward=reward + after - tables.potential[before.memory],
-        terminated=terminated, discount=discount)
+        world=world,
+        reward=reward + after - tables.potential[before.memory],
+        terminated=terminated,
+        discount=discount,
+    )
 
 
 def _observe(tables: TaskTables, observe: Callable[..., Any], joint: TaskWorld) -> TaskObservation:
@@ -542,30 +594,38 @@ def _padded(tables: Sequence[TaskTables]) -> list[TaskTables]:
         if t.weight.shape != tables[0].weight.shape:
             raise ValueError(
                 f"tasks 0 and {number} are over {len(tables[0].weight)} and {len(t.weight)} "
-                "propositions; make all of them over those of the one world.")
+                "propositions; make all of them over those of the one world."
+            )
         shapes = [None if x.embedding is None else x.embedding.shape[1:] for x in (tables[0], t)]
         if shapes[0] != shapes[1]:
-            raise ValueError(f"tasks 0 and {number} have embeddings of shapes {shapes[0]} and "
-                             f"{shapes[1]} a state; give them one width.")
+            raise ValueError(
+                f"tasks 0 and {number} have embeddings of shapes {shapes[0]} and "
+                f"{shapes[1]} a state; give them one width."
+            )
 
     def grow(array: Any, rows: int, columns: int | None = None, fill: Any = 0) -> np.ndarray:
         array = np.asarray(array)
         wide = [(0, rows - array.shape[0])]
-        wide += [] if array.ndim == 1 else [
-            (0, 0 if columns is None else columns - array.shape[1])]
+        wide += [] if array.ndim == 1 else [(0, 0 if columns is None else columns - array.shape[1])]
         wide += [(0, 0)] * (array.ndim - 2)
         return np.pad(array, wide, constant_values=fill)
 
     sizes = num_memory, num_letters
     return [
         replace(
-            t, letter=grow(t.letter, num_codes), delta=grow(t.delta, *sizes),
+            t,
+            letter=grow(t.letter, num_codes),
+            delta=grow(t.delta, *sizes),
             verdict=grow(t.verdict, num_memory, fill=Verdict.VIOLATED),
             repeated=grow(t.repeated, *sizes, fill=Verdict.VIOLATED),
-            accepting=grow(t.accepting, *sizes), reward=grow(t.reward, *sizes),
-            discount=grow(t.discount, *sizes), potential=grow(t.potential, num_memory),
-            embedding=None if t.embedding is None else grow(t.embedding, num_memory))
-        for t in tables]
+            accepting=grow(t.accepting, *sizes),
+            reward=grow(t.reward, *sizes),
+            discount=grow(t.discount, *sizes),
+            potential=grow(t.potential, num_memory),
+            embedding=None if t.embedding is None else grow(t.embedding, num_memory),
+        )
+        for t in tables
+    ]
 
 
 def _stacked(trees: Sequence[Any]) -> Any:

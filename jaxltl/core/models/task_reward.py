@@ -19,7 +19,7 @@ from jaxltl.core.show import brief
 
 REWARDS = ("auto", "reach", "keep", "eventual", "two-discount", "parity")
 _BY_KIND = {"cosafe": "reach", "safety": "keep", "buchi": "eventual", "parity": "parity"}
-_DEFAULT = .99
+_DEFAULT = 0.99
 
 
 @brief
@@ -117,7 +117,8 @@ def pay_of(
     if not 0 < discount <= 1 or (discount == 1 and not final):
         raise ValueError(
             f"discount={discount}; the reward {name!r} needs one above 0 and "
-            f"{'at most' if final else 'below'} 1.")
+            f"{'at most' if final else 'below'} 1."
+        )
     learner_discount = given.share("learner_discount", learner_discount, ends=(False, True))
     rank = _ranks(automaton)
     accepting = rank % 2 == 0
@@ -142,11 +143,13 @@ def _require_fit(automaton: Automaton, name: str) -> None:
     if kind != needed:
         raise ValueError(
             f"reward={name!r} is for {needed} tasks, and this one has {kind} acceptance; "
-            f"its own is {_BY_KIND[kind]!r}, and 'auto' takes it.")
+            f"its own is {_BY_KIND[kind]!r}, and 'auto' takes it."
+        )
     if name in ("eventual", "two-discount") and np.max(_ranks(automaton)) > 1:
         raise ValueError(
             f"reward={name!r} knows accepting readings and others, and the automaton has more than "
-            "two priorities; take 'parity'.")
+            "two priorities; take 'parity'."
+        )
 
 
 def _ranks(automaton: Automaton) -> np.ndarray:
@@ -173,12 +176,16 @@ def _stopping(
         raise ValueError(
             f"discount={discount} and ratio={ratio}: reading rank {rank[lost].min()} would stop "
             f"with probability {stops[lost].max():.0e}, which {number.name} does not tell from "
-            "none; give a greater ratio, a smaller discount, or compute in float64.")
+            "none; give a greater ratio, a smaller discount, or compute in float64."
+        )
     return np.where(rank % 2 == 0, stops, 0), 1 - stops
 
 
 def _potential(
-    automaton: Automaton, decisions: np.ndarray, accepting: np.ndarray, name: str,
+    automaton: Automaton,
+    decisions: np.ndarray,
+    accepting: np.ndarray,
+    name: str,
     shaping: str | ArrayLike,
 ) -> np.ndarray:
     if isinstance(shaping, str):
@@ -195,11 +202,15 @@ def _potential(
         share = np.where(known, steps, most) / most
         return share if name == "keep" else 1 - share
     table = np.asarray(shaping)
-    if table.shape != decisions.shape or table.dtype.kind not in "biuf" or not (
-            np.isfinite(table).all()):
+    if (
+        table.shape != decisions.shape
+        or table.dtype.kind not in "biuf"
+        or not (np.isfinite(table).all())
+    ):
         raise ValueError(
             f"shaping has shape {list(table.shape)} and type {table.dtype}; give finite numbers "
-            f"[{len(decisions)}], a potential of each state of the automaton.")
+            f"[{len(decisions)}], a potential of each state of the automaton."
+        )
     return table.astype(float)
 
 
@@ -223,4 +234,5 @@ def _require_discounted(
             f"shaping with the reward {name!r}: some step is not discounted, and a run that never "
             "ends would keep the potential of where it stays, which may change what is best. Give "
             + ("discount below 1" if name in ("reach", "keep") else "the reward 'two-discount'")
-            + ", or the learner_discount below 1 that the learner has.")
+            + ", or the learner_discount below 1 that the learner has."
+        )

@@ -43,14 +43,18 @@ def with_time_limit(environment: Environment, num_steps: int) -> Environment:
     num_steps = given.whole("num_steps", num_steps, least=1, most=2**31 - 1)
     inner = require_environment(environment)
     return replace(
-        inner, reset=Partial(_reset_clock, inner.reset),
+        inner,
+        reset=Partial(_reset_clock, inner.reset),
         step=Partial(_step_clock, inner.step, np.int32(num_steps)),
-        observe=Partial(_of_first, inner.observe), labels=Partial(_of_first, inner.labels),
+        observe=Partial(_of_first, inner.observe),
+        labels=Partial(_of_first, inner.labels),
         allowed=None if inner.allowed is None else Partial(_of_first, inner.allowed),
         horizon=min(num_steps, inner.horizon or num_steps),
         starts=None if inner.starts is None else Partial(_start_clock, inner.starts),
-        outcomes=None if inner.outcomes is None else Partial(
-            _clocked, inner.outcomes, np.int32(num_steps)))
+        outcomes=None
+        if inner.outcomes is None
+        else Partial(_clocked, inner.outcomes, np.int32(num_steps)),
+    )
 
 
 def without_time_limit(environment: Environment) -> tuple[Environment, int | None]:
@@ -58,8 +62,11 @@ def without_time_limit(environment: Environment) -> tuple[Environment, int | Non
     timed: Any = require_environment(environment)
     if timed.step.func is not _step_clock:
         return environment, None
-    parts = {name: part and part.args[0] for name in ("reset", "step", "observe", "labels",
-             "allowed", "starts", "outcomes") for part in [getattr(timed, name)]}
+    parts = {
+        name: part and part.args[0]
+        for name in ("reset", "step", "observe", "labels", "allowed", "starts", "outcomes")
+        for part in [getattr(timed, name)]
+    }
     return replace(environment, horizon=None, **parts), int(timed.step.args[1])
 
 
@@ -72,7 +79,8 @@ def _step_clock(
 ) -> Timestep:
     found, time = Timestep(*step(timed[0], action, key)), timed[1] + 1
     return found._replace(
-        world=(found.world, time), truncated=jnp.asarray(found.truncated, bool) | (time >= limit))
+        world=(found.world, time), truncated=jnp.asarray(found.truncated, bool) | (time >= limit)
+    )
 
 
 def _start_clock(starts: Callable[..., Any]) -> Any:
@@ -87,8 +95,8 @@ def _clocked(
     found, time = Timestep(*found), timed[1] + 1
     times = jnp.full(jnp.shape(probability), time)
     return found._replace(
-        world=(found.world, times),
-        truncated=jnp.asarray(found.truncated, bool) | (time >= limit)), probability
+        world=(found.world, times), truncated=jnp.asarray(found.truncated, bool) | (time >= limit)
+    ), probability
 
 
 def _of_first(function: Callable[..., Any], timed: Any) -> Any:

@@ -86,11 +86,14 @@ def make_trajectories(
         for t, (s, a) in enumerate(pairs):
             where = f"trajectory {n}, step {t}"
             if not 0 <= s < model.num_states:
-                raise ValueError(f"{where}: state {s} does not exist; "
-                                 f"states are 0 to {model.num_states - 1}.")
+                raise ValueError(
+                    f"{where}: state {s} does not exist; states are 0 to {model.num_states - 1}."
+                )
             if not 0 <= a < model.num_actions or not available[s, a]:
-                raise ValueError(f"{where}: action {a} is not available in state {s}; "
-                                 f"available are {np.flatnonzero(available[s]).tolist()}.")
+                raise ValueError(
+                    f"{where}: action {a} is not available in state {s}; "
+                    f"available are {np.flatnonzero(available[s]).tolist()}."
+                )
             state[n, t], action[n, t] = s, a
     given = (state, action, np.asarray(length, np.int32))
     _check_steps(model, *given)
@@ -112,14 +115,16 @@ def require_states(trajectories: Trajectories, model: Any) -> None:
         elif len(found) < len(expected):
             hint = "; lift_trajectories(product, trajectories) adds the memory"
         raise ValueError(
-            f"the trajectories belong to a model of shape {found}; expected {expected}{hint}.")
+            f"the trajectories belong to a model of shape {found}; expected {expected}{hint}."
+        )
     if found is None and not is_traced(trajectories):
         state = np.where(trajectories.mask, trajectories.state, 0)
         if (wrong := np.argwhere((state < 0) | (state >= model.num_states))).size:
             n, t = wrong[0]
             raise ValueError(
                 f"trajectory {n}, step {t}: state {state[n, t]} does not exist; states are 0 to "
-                f"{model.num_states - 1}.")
+                f"{model.num_states - 1}."
+            )
 
 
 def _check_steps(
@@ -178,7 +183,8 @@ def rollout(
     distribution = policy_distribution(model, policy).reshape(-1, model.num_actions)
     nowhere = np.zeros(model.state_shape, bool)
     return _rollout(
-        model, distribution, key, nowhere if stop is None else stop, num_trajectories, num_steps)
+        model, distribution, key, nowhere if stop is None else stop, num_trajectories, num_steps
+    )
 
 
 @partial(jax.jit, static_argnums=(4, 5))
@@ -211,5 +217,8 @@ def _rollout(
     states, actions, length = jax.vmap(one)(jax.random.split(key, num_trajectories))
     mask = jnp.arange(num_steps) < length[:, None]
     return Trajectories(
-        jnp.where(mask, states, 0), jnp.where(mask, actions, 0), length,
-        state_shape=model.state_shape)
+        jnp.where(mask, states, 0),
+        jnp.where(mask, actions, 0),
+        length,
+        state_shape=model.state_shape,
+    )

@@ -129,7 +129,10 @@ class _Aim(NamedTuple):
 
 
 def solve_property(
-    model: SparseMDP | IntervalMDP, prop: Property | str, *, states: Any = None,
+    model: SparseMDP | IntervalMDP,
+    prop: Property | str,
+    *,
+    states: Any = None,
     tolerance: float = TOLERANCE,
 ) -> Answer:
     """The value of a property, or whether its threshold is met, with certified bounds.
@@ -164,8 +167,10 @@ def solve_property(
     if not isinstance(prop, Property):
         raise ValueError(f"prop is {shown(prop)}; give a property or its text.")
     if not isinstance(model, SparseMDP | IntervalMDP):
-        raise ValueError(f"{type(model).__name__} is no model that answers properties; give a "
-                         "SparseMDP (to_sparse makes one) or an IntervalMDP.")
+        raise ValueError(
+            f"{type(model).__name__} is no model that answers properties; give a "
+            "SparseMDP (to_sparse makes one) or an IntervalMDP."
+        )
     if prop.operator == "multi":
         raise ValueError("multi(...) has several values; solve it with achievable or pareto.")
     if states is None:
@@ -195,11 +200,16 @@ def as_answer(
 
 
 def _answer(
-    prop: Property, states: np.ndarray, found: _Found, holds: list[bool | None] | None,
+    prop: Property,
+    states: np.ndarray,
+    found: _Found,
+    holds: list[bool | None] | None,
     tolerance: float,
 ) -> Answer:
-    value, lower, upper = (np.asarray(x, np.float64) for x in (
-        found.solution.value, found.solution.lower, found.solution.upper))
+    value, lower, upper = (
+        np.asarray(x, np.float64)
+        for x in (found.solution.value, found.solution.lower, found.solution.upper)
+    )
     if holds is None:
         status = _status(prop, found, tolerance)
     else:
@@ -233,8 +243,10 @@ def _is_exact(found: _Found) -> bool:
 def _verdicts(prop: Property, found: _Found) -> list[bool | None]:
     assert prop.relation is not None and prop.threshold is not None
     lower, upper = np.asarray(found.solution.lower), np.asarray(found.solution.upper)
-    return [meets(prop.relation, prop.threshold, low, high)
-            for low, high in zip(lower.tolist(), upper.tolist(), strict=True)]
+    return [
+        meets(prop.relation, prop.threshold, low, high)
+        for low, high in zip(lower.tolist(), upper.tolist(), strict=True)
+    ]
 
 
 def meets(relation: str, threshold: Fraction, lower: float, upper: float) -> bool | None:
@@ -261,13 +273,15 @@ def _aim(model: SparseMDP | IntervalMDP, prop: Property) -> _Aim:
     if prop.nature is not None:
         raise ValueError(
             f"{prop.text}: the model has no intervals from which nature could pick; ask for "
-            f"{sign}{prop.objective}=?.")
+            f"{sign}{prop.objective}=?."
+        )
     if prop.direction is not None:
         return _Aim(prop.direction)
     if not model.is_chain:
         raise ValueError(
             f"{prop.text}: the model has states with several choices, so the value depends on a "
-            f"strategy; ask for {sign}max=? or {sign}min=?.")
+            f"strategy; ask for {sign}max=? or {sign}min=?."
+        )
     return _Aim("max")
 
 
@@ -281,13 +295,15 @@ def _robust_aim(model: IntervalMDP, prop: Property, sign: str) -> _Aim:
     if model.is_chain:
         raise ValueError(
             f"{prop.text}: the probabilities of this chain are intervals, so the value depends on "
-            f"what nature picks from them; ask for {sign}min=? or {sign}max=?.")
+            f"what nature picks from them; ask for {sign}min=? or {sign}max=?."
+        )
     firsts = ("max", "min") if prop.objective is None else (prop.objective,)
     listed = [f"{sign}{first}{second}=?" for first in firsts for second in ("min", "max")]
     raise ValueError(
         f"{prop.text}: probabilities are intervals, so the value depends on a strategy and on what "
         f"nature picks; ask for {', '.join(listed[:-1])} or {listed[-1]}, the strategy's direction "
-        "first and nature's second.")
+        "first and nature's second."
+    )
 
 
 # --- which solver -----------------------------------------------------------------------------
@@ -305,36 +321,46 @@ def _solver(
         assert isinstance(path, Formula)
         known = _without_intervals(model, prop, "averages in the long run")
         share = states_satisfying(graph, path, prop.text).astype(np.float64)
-        return lambda tolerance: _plain(states, average_reward(
-            known, share, objective=aim.policy, tolerance=tolerance))._replace(method=_AVERAGE)
+        return lambda tolerance: _plain(
+            states, average_reward(known, share, objective=aim.policy, tolerance=tolerance)
+        )._replace(method=_AVERAGE)
     reward: Any = np.ones(model.num_rows) if prop.operator == "T" else prop.reward
     if isinstance(path, Formula):
         target: Any = states_satisfying(graph, path.operands[0], prop.text)
-        return lambda tolerance: _plain(states, total_reward(
-            model, reward, target, tolerance=tolerance, **aim.directions))
+        return lambda tolerance: _plain(
+            states, total_reward(model, reward, target, tolerance=tolerance, **aim.directions)
+        )
     assert isinstance(path, Earned)
     if path.steps is not None:
         return _steps_solver(model, path.kind == "cumulative", reward, path.steps, aim, states)
     what = "rewards for ever (C)" if path.kind == "total" else "averages in the long run"
     known = _without_intervals(model, prop, what)
     if path.kind == "total":
-        return lambda tolerance: _plain(states, total_reward(
-            known, reward, objective=aim.policy, tolerance=tolerance))
-    return lambda tolerance: _plain(states, average_reward(
-        known, reward, objective=aim.policy, tolerance=tolerance))._replace(method=_AVERAGE)
+        return lambda tolerance: _plain(
+            states, total_reward(known, reward, objective=aim.policy, tolerance=tolerance)
+        )
+    return lambda tolerance: _plain(
+        states, average_reward(known, reward, objective=aim.policy, tolerance=tolerance)
+    )._replace(method=_AVERAGE)
 
 
 def _steps_solver(
-    model: SparseMDP | IntervalMDP, cumulative: bool, reward: Any, steps: int, aim: _Aim,
+    model: SparseMDP | IntervalMDP,
+    cumulative: bool,
+    reward: Any,
+    steps: int,
+    aim: _Aim,
     states: np.ndarray,
 ) -> Callable[[float], _Found]:
     if isinstance(model, IntervalMDP):
         robust = robust_cumulative_reward if cumulative else robust_instantaneous_reward
         return lambda tolerance: _plain(
-            states, robust(model, reward, steps, **aim.directions), by="steps")
+            states, robust(model, reward, steps, **aim.directions), by="steps"
+        )
     solve = bounded.cumulative_reward if cumulative else bounded.instantaneous_reward
     return lambda tolerance: _plain(
-        states, solve(model, reward, steps, objective=aim.policy), by="steps")
+        states, solve(model, reward, steps, objective=aim.policy), by="steps"
+    )
 
 
 def _graph(model: SparseMDP | IntervalMDP) -> SparseMDP:
@@ -352,15 +378,21 @@ def _without_intervals(
         f"{prop}: {what} are not solved for where probabilities are intervals; solved for are "
         "probabilities of formulas, and expected rewards until a state is reached (F), of so many "
         "steps (C<=k) and after them (I=k). Ask for one of these, or give model.nominal, which is "
-        "one choice of nature.")
+        "one choice of nature."
+    )
 
 
 def _plain(states: np.ndarray, solution: Solution, by: str = "") -> _Found:
     method = str(solution.method) or {
-        "steps": "step by step", "reward": "level by level of the reward"}.get(by, "")
+        "steps": "step by step",
+        "reward": "level by level of the reward",
+    }.get(by, "")
     nature = None if solution.nature is None else np.asarray(solution.nature)
-    return _Found(at_states(solution, states), method,
-                  PropertyStrategy(np.asarray(solution.policy), by, nature=nature))
+    return _Found(
+        at_states(solution, states),
+        method,
+        PropertyStrategy(np.asarray(solution.policy), by, nature=nature),
+    )
 
 
 class _Probability(NamedTuple):
@@ -404,9 +436,19 @@ class _Probability(NamedTuple):
         holds: Any = self.where(path).astype(np.float64)[self.states]
         zero: Any = np.int32(0)
         nobody: Any = np.zeros(0, np.int32)
-        return _Found(Solution(
-            value=holds, policy=nobody, lower=holds, upper=holds, residual=zero, num_steps=zero,
-            status=zero), "the label", None)
+        return _Found(
+            Solution(
+                value=holds,
+                policy=nobody,
+                lower=holds,
+                upper=holds,
+                residual=zero,
+                num_steps=zero,
+                status=zero,
+            ),
+            "the label",
+            None,
+        )
 
     def opposite(self, path: Formula | Bounded, aim: _Aim) -> Callable[[float], _Found]:
         solve = self.of(path, aim.opposite)
@@ -420,15 +462,21 @@ class _Probability(NamedTuple):
     def until(self, left: Formula, right: Formula, aim: _Aim) -> Callable[[float], _Found]:
         target: Any = self.where(right)
         stay: Any = None if left == TRUE else self.where(left)
-        return lambda tolerance: _plain(self.states, reachability_probability(
-            self.model, target, stay=stay, tolerance=tolerance, **aim.directions))
+        return lambda tolerance: _plain(
+            self.states,
+            reachability_probability(
+                self.model, target, stay=stay, tolerance=tolerance, **aim.directions
+            ),
+        )
 
     def next(self, target: np.ndarray, aim: _Aim) -> _Found:
         if isinstance(self.model, IntervalMDP):
-            return _plain(self.states, robust_next_probability(
-                self.model, target, **aim.directions))
-        return _plain(self.states, bounded.next_probability(
-            self.model, target, objective=aim.policy))
+            return _plain(
+                self.states, robust_next_probability(self.model, target, **aim.directions)
+            )
+        return _plain(
+            self.states, bounded.next_probability(self.model, target, objective=aim.policy)
+        )
 
     def automaton(self, path: Formula, aim: _Aim) -> Callable[[float], _Found]:
         def found(tolerance: float) -> _Found:
@@ -436,41 +484,52 @@ class _Probability(NamedTuple):
             nature = None
             if isinstance(self.model, IntervalMDP):
                 result = robust_satisfaction(
-                    self.model, path, states=self.states, tolerance=tolerance, **aim.directions)
-                row, nature = (np.asarray(x) for x in (
-                    result.solution.policy, result.solution.nature))
+                    self.model, path, states=self.states, tolerance=tolerance, **aim.directions
+                )
+                row, nature = (
+                    np.asarray(x) for x in (result.solution.policy, result.solution.nature)
+                )
             else:
                 result = sparse_satisfaction(
-                    self.model, path, objective=aim.policy, states=self.states,
-                    tolerance=tolerance)
+                    self.model, path, objective=aim.policy, states=self.states, tolerance=tolerance
+                )
                 row = result.row
             method = str(result.solution.method)
             size = f"product of {result.product.host.num_states} states"
-            return _Found(result.solution, f"{size}, {method}" if method else size,
-                          PropertyStrategy(row, memory=result, nature=nature))
+            return _Found(
+                result.solution,
+                f"{size}, {method}" if method else size,
+                PropertyStrategy(row, memory=result, nature=nature),
+            )
 
         return found
 
     def within(self, path: Bounded, aim: _Aim) -> Callable[[float], _Found]:
         if path.operator == "R":
             negated = TRUE if path.left.operator == "false" else ~path.left
-            return self.opposite(
-                replace(path, operator="U", left=negated, right=~path.right), aim)
+            return self.opposite(replace(path, operator="U", left=negated, right=~path.right), aim)
         if path.reward is not None:
             return self.within_reward(path, aim)
         if path.lower or path.upper is None:
             if max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
                 raise ValueError(
                     f"{self.text}: a lower bound on steps is solved for up to "
-                    f"{MAX_UNFOLDED_STEPS} steps; drop it or make it smaller.")
+                    f"{MAX_UNFOLDED_STEPS} steps; drop it or make it smaller."
+                )
             return self.of(unfolded(path), aim)
         target, stay = self.where(path.right), self.where(path.left)
         steps, model = path.upper, self.model
         if isinstance(model, IntervalMDP):
-            return lambda tolerance: _plain(self.states, robust_bounded_reachability(
-                model, target, steps, stay=stay, **aim.directions), by="steps")
-        return lambda tolerance: _plain(self.states, bounded.bounded_reachability(
-            model, target, steps, stay=stay, objective=aim.policy), by="steps")
+            return lambda tolerance: _plain(
+                self.states,
+                robust_bounded_reachability(model, target, steps, stay=stay, **aim.directions),
+                by="steps",
+            )
+        return lambda tolerance: _plain(
+            self.states,
+            bounded.bounded_reachability(model, target, steps, stay=stay, objective=aim.policy),
+            by="steps",
+        )
 
     def within_reward(self, path: Bounded, aim: _Aim) -> Callable[[float], _Found]:
         assert path.limit is not None
@@ -479,5 +538,10 @@ class _Probability(NamedTuple):
         limit = path.limit - Fraction(1, 10**9) * path.strict
         reward = path.reward or None
         model = _without_intervals(self.model, self.text, "bounds on rewards")
-        return lambda tolerance: _plain(self.states, bounded.reward_bounded_reachability(
-            model, target, reward, float(limit), stay=stay, objective=aim.policy), by="reward")
+        return lambda tolerance: _plain(
+            self.states,
+            bounded.reward_bounded_reachability(
+                model, target, reward, float(limit), stay=stay, objective=aim.policy
+            ),
+            by="reward",
+        )

@@ -70,8 +70,7 @@ class Question:
 
     def is_answered(self, answer: Answer, part: float) -> bool:
         """Whether no narrower bounds are to be tried, of those in :data:`FINER`."""
-        return (self.prop.relation is None or answer.status == Status.CONVERGED
-                or part <= FINER[-1])
+        return self.prop.relation is None or answer.status == Status.CONVERGED or part <= FINER[-1]
 
 
 def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
@@ -92,20 +91,27 @@ def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
     starts = _starts(model)
     states = np.asarray(on_host(_pick(model, starts, model.number)))
     if path.operator == "F" and is_boolean(path.operands[0]):
-        holds = satisfying(
-            np.asarray(model.shown), model.propositions, path.operands[0], prop.text)
+        holds = satisfying(np.asarray(model.shown), model.propositions, path.operands[0], prop.text)
         target = _shown_by(model, holds)
         if prop.operator == "P":
             advance = partial(_reach, model, target, objective)
         else:
             advance = partial(_earn, model, _reward(model, prop), target, objective)
         return Question(
-            prop, states, model.state_shape, advance,
-            lambda x: np.asarray(on_host(_pick(model, starts, x)), np.float64))
+            prop,
+            states,
+            model.state_shape,
+            advance,
+            lambda x: np.asarray(on_host(_pick(model, starts, x)), np.float64),
+        )
     both = product(model, path)
     return Question(
-        prop, states, both.state_shape, partial(_satisfy, both, objective),
-        lambda x: np.asarray(on_host(_pick_memory(both, starts, x)), np.float64))
+        prop,
+        states,
+        both.state_shape,
+        partial(_satisfy, both, objective),
+        lambda x: np.asarray(on_host(_pick_memory(both, starts, x)), np.float64),
+    )
 
 
 def _path(prop: Property) -> Formula:
@@ -113,11 +119,15 @@ def _path(prop: Property) -> Formula:
     path = prop.path
     if prop.operator in ("P", "R", "T") and isinstance(path, Formula):
         return path
-    what = {"LRA": "averages in the long run", "multi": "several objectives",
-            "P": "bounds on steps or rewards"}.get(prop.operator, f"rewards [ {path} ]")
+    what = {
+        "LRA": "averages in the long run",
+        "multi": "several objectives",
+        "P": "bounds on steps or rewards",
+    }.get(prop.operator, f"rewards [ {path} ]")
     raise ValueError(
         f"{prop.text}: {what} are not solved for over a mesh; probabilities of formulas are, and "
-        "expected rewards and steps until a state is reached (F). Leave --mesh out for this one.")
+        "expected rewards and steps until a state is reached (F). Leave --mesh out for this one."
+    )
 
 
 def _reward(model: ShardedMDP, prop: Property) -> Any:
@@ -127,16 +137,20 @@ def _reward(model: ShardedMDP, prop: Property) -> Any:
     names = [prop.reward] if prop.reward is not None else list(model.rewards)
     if len(names) != 1 or names[0] not in model.rewards:
         asked = "" if prop.reward is None else f" {prop.reward!r}"
-        raise ValueError(f"{prop.text}: which reward{asked}? The model has "
-                         f"{', '.join(map(repr, model.rewards)) or 'none'}.")
+        raise ValueError(
+            f"{prop.text}: which reward{asked}? The model has "
+            f"{', '.join(map(repr, model.rewards)) or 'none'}."
+        )
     return model.rewards[names[0]]
 
 
 def first_bounds(model: ShardedMDP, question: Question) -> Bounds:
     """Those that any probability has, where the model's values are."""
+
     def one(fill: float) -> jax.Array:
-        make = jax.jit(lambda: jnp.full(question.shape, fill, model.dtype),
-                       out_shardings=model.sharding)
+        make = jax.jit(
+            lambda: jnp.full(question.shape, fill, model.dtype), out_shardings=model.sharding
+        )
         return make()
 
     return one(0.0), one(1.0)
@@ -148,7 +162,8 @@ def _objective(model: ShardedMDP, prop: Property) -> str:
     if bool(on_host(jax.jit(lambda x: (x.sum(-1) > 1).any())(model.available))):
         raise ValueError(
             f"{prop.text}: the model has states with several choices, so the value depends on a "
-            "strategy; ask for Pmax=? or Pmin=?.")
+            "strategy; ask for Pmax=? or Pmin=?."
+        )
     return "max"
 
 
@@ -156,8 +171,8 @@ def _starts(model: ShardedMDP) -> jax.Array:
     """Where the initial states are, in order of their numbers; on every device."""
     number = int(on_host(jax.jit(lambda x: (x > 0).sum())(model.initial)))
     found = jax.jit(
-        lambda x: jnp.flatnonzero(x > 0, size=number), out_shardings=_everywhere(model))(
-            model.initial)
+        lambda x: jnp.flatnonzero(x > 0, size=number), out_shardings=_everywhere(model)
+    )(model.initial)
     order = np.argsort(on_host(_pick(model, found, model.number)), kind="stable")
     return jax.jit(lambda x: x[order], out_shardings=_everywhere(model))(found)
 
@@ -185,7 +200,8 @@ def _shown_by(model: ShardedMDP, holds: np.ndarray) -> jax.Array:
 @partial(jax.jit, static_argnames="objective")
 def _reach_for(model: Any, target: Any, start: Any, half: Any, steps: Any, objective: str) -> Any:
     return reachability_probability(
-        model, target, objective=objective, tolerance=half, max_steps=steps, start=start)
+        model, target, objective=objective, tolerance=half, max_steps=steps, start=start
+    )
 
 
 def _reach(
@@ -200,14 +216,18 @@ def _earn_until(model: Any, reward: Any, target: Any, share: Any, objective: str
 
 
 def _earn(
-    model: ShardedMDP, reward: jax.Array, target: jax.Array, objective: str, start: Bounds,
-    half: float, steps: int,
+    model: ShardedMDP,
+    reward: jax.Array,
+    target: jax.Array,
+    objective: str,
+    start: Bounds,
+    half: float,
+    steps: int,
 ) -> Solution:
     return _earn_until(model, reward, target, 2 * half, objective)
 
 
-def _satisfy(
-    both: Product, objective: str, start: Bounds, half: float, steps: int
-) -> Solution:
+def _satisfy(both: Product, objective: str, start: Bounds, half: float, steps: int) -> Solution:
     return optimal_satisfaction(
-        both, objective=objective, tolerance=half, max_steps=steps, start=start)
+        both, objective=objective, tolerance=half, max_steps=steps, start=start
+    )

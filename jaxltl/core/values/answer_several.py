@@ -69,7 +69,8 @@ def answer_several(
     if isinstance(strict, Achievable) or isinstance(loose, Achievable):
         if isinstance(loose, Achievable) and loose.holds:
             return loose._replace(
-                holds=None, share=None, status=Status.PRECISION, nearest=_missing(prop, loose))
+                holds=None, share=None, status=Status.PRECISION, nearest=_missing(prop, loose)
+            )
         return loose
     assert isinstance(strict, ConstrainedOptimum) and isinstance(loose, ConstrainedOptimum)
     return _between(prop, strict, loose)
@@ -83,10 +84,13 @@ def _between(
         return loose if loose.holds is False else strict
     if not strict.holds:
         return loose._replace(
-            holds=None, share=None, status=Status.PRECISION, nearest=_missing(prop, loose))
+            holds=None, share=None, status=Status.PRECISION, nearest=_missing(prop, loose)
+        )
     return strict._replace(
-        lower=min(strict.lower, loose.lower), upper=max(strict.upper, loose.upper),
-        status=max(strict.status, loose.status))
+        lower=min(strict.lower, loose.lower),
+        upper=max(strict.upper, loose.upper),
+        status=max(strict.status, loose.status),
+    )
 
 
 def _missing(prop: Property, loose: Achievable | ConstrainedOptimum) -> NearestMixture | None:
@@ -95,8 +99,9 @@ def _missing(prop: Property, loose: Achievable | ConstrainedOptimum) -> NearestM
         return loose.nearest
     wanted = [_rounded(x, True) for x in prop.parts]
     signs = np.array([-1 if x.relation == "<=" or x.objective == "min" else 1 for x in prop.parts])
-    thresholds = np.array([-s * np.inf if x is None else x
-                           for x, s in zip(wanted, signs, strict=True)])
+    thresholds = np.array(
+        [-s * np.inf if x is None else x for x, s in zip(wanted, signs, strict=True)]
+    )
     return nearest_of(loose.front, loose.share, thresholds, signs)
 
 
@@ -124,16 +129,22 @@ def _objective(model: SparseMDP, prop: Property, strict: bool) -> Objective:
     direction = prop.objective
     if prop.relation is not None:
         if prop.relation in (">", "<"):
-            raise ValueError(f"{prop.text}: of several objectives it is not told whether one is "
-                             f"met with something to spare; write {prop.relation}=.")
+            raise ValueError(
+                f"{prop.text}: of several objectives it is not told whether one is "
+                f"met with something to spare; write {prop.relation}=."
+            )
         wanted = "max" if prop.relation == ">=" else "min"
         if direction not in (None, wanted):
-            raise ValueError(f"{prop.text}: inside of multi(...) one strategy is to meet the "
-                             f"threshold; write {prop.operator}{prop.relation}.")
+            raise ValueError(
+                f"{prop.text}: inside of multi(...) one strategy is to meet the "
+                f"threshold; write {prop.operator}{prop.relation}."
+            )
         direction = wanted  # type: ignore[assignment]
     if direction is None:
-        raise ValueError(f"{prop.text}: inside of multi(...), ask for {prop.operator}max=? or "
-                         f"{prop.operator}min=?, or give a threshold.")
+        raise ValueError(
+            f"{prop.text}: inside of multi(...), ask for {prop.operator}max=? or "
+            f"{prop.operator}min=?, or give a threshold."
+        )
     given: dict[str, Any] = {"direction": direction, "threshold": _rounded(prop, strict)}
     if prop.operator == "P":
         return Objective(**given, **_event(model, prop))
@@ -144,8 +155,10 @@ def _event(model: SparseMDP, prop: Property) -> dict[str, Any]:
     path = prop.path
     if isinstance(path, Bounded):
         if path.reward is not None or max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
-            raise ValueError(f"{prop.text}: inside of multi(...) a bound may be on at most "
-                             f"{MAX_UNFOLDED_STEPS} steps.")
+            raise ValueError(
+                f"{prop.text}: inside of multi(...) a bound may be on at most "
+                f"{MAX_UNFOLDED_STEPS} steps."
+            )
         path = unfolded(path)
     assert isinstance(path, Formula)
 
@@ -165,8 +178,10 @@ def _event(model: SparseMDP, prop: Property) -> dict[str, Any]:
 def _sum(model: SparseMDP, prop: Property) -> dict[str, Any]:
     path = prop.path
     if prop.operator == "LRA" or not (isinstance(path, Formula) or path.kind == "total"):  # type: ignore[union-attr]
-        raise ValueError(f"{prop.text}: inside of multi(...) probabilities, R [ F ... ], R [ C ] "
-                         "and T are solved for.")
+        raise ValueError(
+            f"{prop.text}: inside of multi(...) probabilities, R [ F ... ], R [ C ] "
+            "and T are solved for."
+        )
     reward = np.ones(model.num_rows) if prop.operator == "T" else row_reward(model, prop.reward)
     if isinstance(path, Formula):
         target = states_satisfying(model, path.operands[0], prop.text)

@@ -13,7 +13,11 @@ from jaxltl.core.values.bounded import enclosed, finite_reward, optimum_of
 
 
 def average_reward(
-    model: Any, reward: Any, *, objective: str = "max", tolerance: float = 1e-6,
+    model: Any,
+    reward: Any,
+    *,
+    objective: str = "max",
+    tolerance: float = 1e-6,
     max_steps: int = 1_000_000,
 ) -> Solution:
     """Largest or smallest expected long-run average of a reward, a step.
@@ -52,17 +56,26 @@ def average_reward(
       ([5.0, 8.0, 4.0], [0, 2, 3])
     """
     if hasattr(model, "nominal"):
-        raise ValueError("averages in the long run are not solved for where probabilities are "
-                         "intervals; ask robust_discounted_value, with a discount near 1, or "
-                         "total_reward until a target, or give model.nominal, which is one "
-                         "choice of nature.")
+        raise ValueError(
+            "averages in the long run are not solved for where probabilities are "
+            "intervals; ask robust_discounted_value, with a discount near 1, or "
+            "total_reward until a target, or give model.nominal, which is one "
+            "choice of nature."
+        )
     model = to_sparse(model)
     sign = 1 if optimum_of(objective) is np.maximum else -1
     earned, magnitude = finite_reward(model, reward)
-    found = average(model.host, sign * earned, magnitude, tolerance=tolerance,
-                    max_steps=max_steps, sign=sign)
+    found = average(
+        model.host, sign * earned, magnitude, tolerance=tolerance, max_steps=max_steps, sign=sign
+    )
     small = 1e-6 if (earned >= 0).all() else 1e-3
     error = np.maximum(found.upper - found.value, found.value - found.lower)
-    return enclosed(sign * found.value, error, found.row.astype(np.int32), found.rounds,
-                    tolerance=tolerance, least=small * float(magnitude.max()),
-                    residual=found.residual)
+    return enclosed(
+        sign * found.value,
+        error,
+        found.row.astype(np.int32),
+        found.rounds,
+        tolerance=tolerance,
+        least=small * float(magnitude.max()),
+        residual=found.residual,
+    )

@@ -118,14 +118,25 @@ def boltzmann_value(
     if method not in ("damped", "newton"):
         raise ValueError(f"method={method!r}; choose damped or newton.")
     form, reward = compiled_form(model, reward)
-    return in_shape_of(model, _boltzmann_value(
-        form, reward, discount, initial, tolerance, max_steps, adjoint=adjoint, method=method))
+    return in_shape_of(
+        model,
+        _boltzmann_value(
+            form, reward, discount, initial, tolerance, max_steps, adjoint=adjoint, method=method
+        ),
+    )
 
 
 @partial(jax.jit, static_argnames=("adjoint", "method"))
 def _boltzmann_value(
-    model: Any, reward: Any, discount: Any, initial: Any, tolerance: Any, max_steps: Any, *,
-    adjoint: str, method: str,
+    model: Any,
+    reward: Any,
+    discount: Any,
+    initial: Any,
+    tolerance: Any,
+    max_steps: Any,
+    *,
+    adjoint: str,
+    method: str,
 ) -> Solution:
     discount = jnp.asarray(discount, model.dtype)
     given = _given(model, reward, discount, tolerance)
@@ -133,20 +144,36 @@ def _boltzmann_value(
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
     damping = jnp.where(given.contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
     value, image, n = newton.solve(
-        table(model), softmax_mean, _judge,
-        newton.Backup(gains(model, reward), discount, damping, given), start,
-        monotone=False, first_sweeps=4 if method == "damped" else 0, max_steps=max_steps)
+        table(model),
+        softmax_mean,
+        _judge,
+        newton.Backup(gains(model, reward), discount, damping, given),
+        start,
+        monotone=False,
+        first_sweeps=4 if method == "damped" else 0,
+        max_steps=max_steps,
+    )
     bound = _error(value, image, given)
     converged = bound <= given.goal
     half = jnp.where(converged & given.contracts, bound, jnp.inf)
     value, image = (x.reshape(model.state_shape) for x in (value, image))
-    solution = jax.tree.map(lax.stop_gradient, Solution(
-        value=value, policy=value, lower=value - half, upper=value + half,
-        residual=jnp.max(jnp.abs(image - value)), num_steps=n,
-        status=status_code(
-            converged, jnp.isfinite(bound) & (discount < 1), bound <= given.enough,
-            certified=given.contracts),
-    ))
+    solution = jax.tree.map(
+        lax.stop_gradient,
+        Solution(
+            value=value,
+            policy=value,
+            lower=value - half,
+            upper=value + half,
+            residual=jnp.max(jnp.abs(image - value)),
+            num_steps=n,
+            status=status_code(
+                converged,
+                jnp.isfinite(bound) & (discount < 1),
+                bound <= given.enough,
+                certified=given.contracts,
+            ),
+        ),
+    )
 
     def backup(v: jax.Array) -> jax.Array:
         policy = over.softmax(policy_logits(model, reward, discount, v))
@@ -201,7 +228,8 @@ def softmax_mean(over: Any, q: Any, given: Any) -> tuple[jax.Array, Any]:
     finite = jax.tree.map(lambda x: jnp.where(jnp.isneginf(x), 0, x), q)
     value = over.mean(policy, finite)
     return value, jax.tree.map(
-        lambda p, x, v: p * (1 + x - v), policy, finite, over.spread(value, finite))
+        lambda p, x, v: p * (1 + x - v), policy, finite, over.spread(value, finite)
+    )
 
 
 def boltzmann_fixed_points(
@@ -255,7 +283,8 @@ def boltzmann_fixed_points(
     for method in ("damped", "newton"):
         run = jax.vmap(
             lambda v, method=method: boltzmann_value(
-                model, reward, discount, initial=v, method=method, tolerance=residual)
+                model, reward, discount, initial=v, method=method, tolerance=residual
+            )
         )
         batch = run(starts)
         for i in np.flatnonzero(np.asarray(batch.status) <= Status.UNCERTIFIED):

@@ -55,13 +55,19 @@ def next_probability(model: Any, target: Any, *, objective: str = "max") -> Solu
     sure = mdp.over_choices(choose, ~mdp.support.lead_to(~target))
     error = value * host.relative_error(host.backup_unit(mdp), 1)
     value = np.where(sure, 1, np.where(positive, value, 0))
-    _, row = mdp.first_choice(image == np.repeat(
-        mdp.over_choices(operation, image), np.diff(mdp.row_start)))
+    _, row = mdp.first_choice(
+        image == np.repeat(mdp.over_choices(operation, image), np.diff(mdp.row_start))
+    )
     return enclosed(value, np.where(sure | ~positive, 0, error), row, 1, highest=1)
 
 
 def bounded_reachability(
-    model: Any, target: Any, num_steps: int, *, stay: Any = None, objective: str = "max",
+    model: Any,
+    target: Any,
+    num_steps: int,
+    *,
+    stay: Any = None,
+    objective: str = "max",
     by_step: bool = False,
 ) -> Solution:
     """Probability to reach a set within so many steps, through states where one may stay.
@@ -170,8 +176,14 @@ def instantaneous_reward(
 
 
 def reward_bounded_reachability(
-    model: Any, target: Any, reward: Any, bound: float, *, stay: Any = None,
-    objective: str = "max", by_level: bool = False,
+    model: Any,
+    target: Any,
+    reward: Any,
+    bound: float,
+    *,
+    stay: Any = None,
+    objective: str = "max",
+    by_level: bool = False,
 ) -> Solution:
     """Probability to reach a set before more than so much reward is earned.
 
@@ -213,8 +225,10 @@ def reward_bounded_reachability(
     cost = _entry_reward(model, reward_parts(model, reward))
     if (cost < 0).any():
         e = int(np.flatnonzero(cost < 0)[0])
-        raise ValueError(f"the reward is {cost[e]:.9g} from state {mdp.state[mdp.row[e]]} to "
-                         f"{mdp.successor[e]}; a bound on rewards needs rewards of at least 0.")
+        raise ValueError(
+            f"the reward is {cost[e]:.9g} from state {mdp.state[mdp.row[e]]} to "
+            f"{mdp.successor[e]}; a bound on rewards needs rewards of at least 0."
+        )
     units, most = in_units(np.where((stay & ~target)[mdp.state[mdp.row]], cost, 0), bound)
     found = bounded_cost(mdp, target, stay, units, most, operation is np.maximum, by_level)
     error = np.where(found.open, found.error, 0)
@@ -246,8 +260,10 @@ def states(model: SparseMDP, given: Any, name: str) -> np.ndarray:
         return np.asarray(model.states_where(given), bool)
     given = np.asarray(given).reshape(-1)
     if given.shape != (model.num_states,) or given.dtype != bool:
-        raise ValueError(f"{name} is {given.dtype}{list(given.shape)}; give one bool for each of "
-                         f"the {model.num_states} states, or a label.")
+        raise ValueError(
+            f"{name} is {given.dtype}{list(given.shape)}; give one bool for each of "
+            f"the {model.num_states} states, or a label."
+        )
     return given
 
 
@@ -259,8 +275,10 @@ def state_reward(model: SparseMDP, reward: Any) -> np.ndarray:
     """
     given = reward_parts(model, reward)
     if given.state is None:
-        raise ValueError("the reward of a state after so many steps needs a reward on states, and "
-                         "this one has none; give an array of one number a state.")
+        raise ValueError(
+            "the reward of a state after so many steps needs a reward on states, and "
+            "this one has none; give an array of one number a state."
+        )
     return finite_reward(model, Rewards(state=given.state))[0][model.host.row_start[:-1]]
 
 
@@ -275,13 +293,23 @@ def finite_reward(model: SparseMDP, reward: Any) -> tuple[np.ndarray, np.ndarray
     if not np.isfinite(earned).all():
         row = int(np.flatnonzero(~np.isfinite(earned))[0])
         state = int(model.host.state[row])
-        raise ValueError(f"the reward of state {state}, choice {row - int(model.row_start[state])} "
-                         f"is {earned[row]}; make it finite.")
-    if all(x is None or (np.asarray(x) >= 0).all()
-           for x in (given.state, given.choice, given.transition)):
+        raise ValueError(
+            f"the reward of state {state}, choice {row - int(model.row_start[state])} "
+            f"is {earned[row]}; make it finite."
+        )
+    if all(
+        x is None or (np.asarray(x) >= 0).all()
+        for x in (given.state, given.choice, given.transition)
+    ):
         return earned, earned
-    sizes = {name: None if x is None else np.abs(np.asarray(x)) for name, x in (
-        ("state", given.state), ("choice", given.choice), ("transition", given.transition))}
+    sizes = {
+        name: None if x is None else np.abs(np.asarray(x))
+        for name, x in (
+            ("state", given.state),
+            ("choice", given.choice),
+            ("transition", given.transition),
+        )
+    }
     return earned, row_reward(model, Rewards(**sizes))
 
 
@@ -297,14 +325,23 @@ def _entry_reward(model: SparseMDP, given: Rewards) -> np.ndarray:
         found += np.asarray(given.state, np.float64)[mdp.state[mdp.row]]
     if not np.isfinite(found).all():
         e = int(np.flatnonzero(~np.isfinite(found))[0])
-        raise ValueError(f"the reward is {found[e]} from state {mdp.state[mdp.row[e]]} to "
-                         f"{mdp.successor[e]}; make it finite.")
+        raise ValueError(
+            f"the reward is {found[e]} from state {mdp.state[mdp.row[e]]} to "
+            f"{mdp.successor[e]}; make it finite."
+        )
     return found
 
 
 def enclosed(
-    value: np.ndarray, error: Any, policy: Any, num_steps: int, *, highest: float = math.inf,
-    tolerance: float = TOLERANCE, least: float = 1.0, residual: float = 0.0,
+    value: np.ndarray,
+    error: Any,
+    policy: Any,
+    num_steps: int,
+    *,
+    highest: float = math.inf,
+    tolerance: float = TOLERANCE,
+    least: float = 1.0,
+    residual: float = 0.0,
 ) -> Solution:
     """A host solver's :class:`Solution`.
 
@@ -328,7 +365,12 @@ def enclosed(
     narrow = bool((error <= tolerance * np.maximum(np.abs(value), least)).all())
     status = Status.CONVERGED if narrow else Status.PRECISION if finite else Status.NONFINITE
     found: Any = {
-        "value": value + 0.0, "policy": policy, "lower": lower, "upper": upper,
-        "residual": np.float64(residual), "num_steps": np.int32(num_steps),
-        "status": np.int32(status)}
+        "value": value + 0.0,
+        "policy": policy,
+        "lower": lower,
+        "upper": upper,
+        "residual": np.float64(residual),
+        "num_steps": np.int32(num_steps),
+        "status": np.int32(status),
+    }
     return Solution(**found)

@@ -87,8 +87,17 @@ def enclose_circles(
     """
     none, zero = jnp.asarray(False), jnp.asarray(0, jnp.int32)
     tolerance = problem.tolerance
-    state = State(low, high, none, none, tolerance, _NEAR * tolerance, zero, zero,
-                  jnp.full((), jnp.inf, low.dtype))
+    state = State(
+        low,
+        high,
+        none,
+        none,
+        tolerance,
+        _NEAR * tolerance,
+        zero,
+        zero,
+        jnp.full((), jnp.inf, low.dtype),
+    )
 
     def body(state: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
         s, tried = state
@@ -182,7 +191,9 @@ class _Choices(NamedTuple):
         inside = (target >= core.first) & (target < core.last)
         return Chosen(
             jnp.where(inside, target - core.first, count * block),
-            jnp.where(inside, weight, 0) * self.keep.reshape(count, 1, block), cyclic=True)
+            jnp.where(inside, weight, 0) * self.keep.reshape(count, 1, block),
+            cyclic=True,
+        )
 
 
 def _choices(problem: Problem, dtype: Any) -> _Choices:
@@ -204,8 +215,7 @@ def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
     rows = _choices(problem, x.dtype)
     sign = rows.sign
     # What comes in from before lies between its bounds, so each side is proven with its own.
-    middle = state.low.at[: core.first].set(
-        (state.low[: core.first] + high[: core.first]) / 2)
+    middle = state.low.at[: core.first].set((state.low[: core.first] + high[: core.first]) / 2)
 
     def improve(p: _Policy) -> _Policy:
         timing = (p.rounds == 1) | p.done
@@ -226,10 +236,24 @@ def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
         return _Policy(value, rank, time, extra, done, p.done, p.rounds + 1)
 
     none = jnp.asarray(False)
-    return _proven(rows, state, high, lax.while_loop(
-        lambda p: ~p.ended & (p.rounds < _ROUNDS) & jnp.all(jnp.isfinite(p.value)), improve,
-        _Policy(x, rows.best(rows.image(middle, x))[0], jnp.ones_like(x), jnp.zeros((), x.dtype),
-                none, none, jnp.asarray(0, jnp.int32))))
+    return _proven(
+        rows,
+        state,
+        high,
+        lax.while_loop(
+            lambda p: ~p.ended & (p.rounds < _ROUNDS) & jnp.all(jnp.isfinite(p.value)),
+            improve,
+            _Policy(
+                x,
+                rows.best(rows.image(middle, x))[0],
+                jnp.ones_like(x),
+                jnp.zeros((), x.dtype),
+                none,
+                none,
+                jnp.asarray(0, jnp.int32),
+            ),
+        ),
+    )
 
 
 def _proven(rows: _Choices, state: State, high: jax.Array, p: _Policy) -> State:
@@ -244,23 +268,30 @@ def _proven(rows: _Choices, state: State, high: jax.Array, p: _Policy) -> State:
     fixed = (rows.keep == 0) | jnp.all(core.weight == 0, axis=(1, 2)).ravel()
     far, near = (jnp.where(fixed, rows.put, y) for y in (far, near))
     slack = problem.unit * jnp.abs(far) * 2 + problem.least
-    onward = time - rows.system(p.rank).image(
-        jnp.concatenate([time, jnp.zeros(3, time.dtype)]))
-    proven = jnp.all(fixed | ((beyond >= slack) & (attained >= slack)
-                              & (time >= 0) & (onward >= 0.5)))
+    onward = time - rows.system(p.rank).image(jnp.concatenate([time, jnp.zeros(3, time.dtype)]))
+    proven = jnp.all(
+        fixed | ((beyond >= slack) & (attained >= slack) & (time >= 0) & (onward >= 0.5))
+    )
     low, top = (near, far) if sign > 0 else (far, near)
     proven, low = proven & jnp.all(top >= 0), jnp.maximum(low, 0)
     width = problem.tolerance * top if problem.relative else problem.tolerance
     good = proven & jnp.all(top - low <= width)
     low_, top_ = state.low.at[span].set(low), high.at[span].set(top)
     return state._replace(
-        low=jnp.where(good, low_, state.low), high=jnp.where(good, top_, state.high),
-        proven=good, steps=state.steps + p.rounds + 1,
-        moved=jnp.where(good, jnp.max(jnp.abs(beyond)), state.moved))
+        low=jnp.where(good, low_, state.low),
+        high=jnp.where(good, top_, state.high),
+        proven=good,
+        steps=state.steps + p.rounds + 1,
+        moved=jnp.where(good, jnp.max(jnp.abs(beyond)), state.moved),
+    )
 
 
 def _swept(
-    problem: Problem, outer: jax.Array, value: jax.Array, *, shift: jax.Array,
+    problem: Problem,
+    outer: jax.Array,
+    value: jax.Array,
+    *,
+    shift: jax.Array,
     rank: jax.Array,
 ) -> jax.Array:
     """The greedy rows after some passes, by which news goes on from where policies change."""

@@ -94,8 +94,10 @@ class Contest:
         """The gain that the policy prefers in each node, and its row: ``[N]``."""
         each = gain[self.choice]
         rank = jnp.argmax(each if self.policy_leads else -each, axis=1)[:, None]
-        return (jnp.take_along_axis(each, rank, 1)[:, 0],
-                jnp.take_along_axis(self.choice, rank, 1)[:, 0])
+        return (
+            jnp.take_along_axis(each, rank, 1)[:, 0],
+            jnp.take_along_axis(self.choice, rank, 1)[:, 0],
+        )
 
 
 class Bounds(NamedTuple):
@@ -154,15 +156,12 @@ def _left(lower: jax.Array, upper: jax.Array, key: jax.Array) -> tuple[jax.Array
     else:
         order = jnp.argsort(key, axis=1)
         ranked = jnp.take_along_axis(free, order, 1)
-        sums = jnp.concatenate(
-            [jnp.zeros_like(rest), jnp.cumsum(ranked[:, :-1], axis=1)], axis=1)
+        sums = jnp.concatenate([jnp.zeros_like(rest), jnp.cumsum(ranked[:, :-1], axis=1)], axis=1)
         before = jnp.take_along_axis(sums, jnp.argsort(order, axis=1), 1)
     return rest - before, free
 
 
-def system(
-    target: jax.Array, weight: jax.Array
-) -> tuple[Any, Any]:
+def system(target: jax.Array, weight: jax.Array) -> tuple[Any, Any]:
     """Solvers of ``x - P x = b`` and of its transpose.
 
     Args:
@@ -233,13 +232,23 @@ def enclose(contest: Contest, tolerance: jax.Array, max_rounds: jax.Array) -> Bo
     share = jnp.where(every > 0, jnp.minimum(rest / jnp.where(every > 0, every, 1), 1), 0)
     p = contest.lower + (contest.upper - contest.lower) * share
     zero, no = jnp.zeros(contest.size, p.dtype), jnp.asarray(False)
-    start = _Play(contest.first, p, zero, zero, jnp.full((), jnp.inf, p.dtype),
-                  jnp.ones((), p.dtype), jnp.int32(0), ~no, no, no)
+    start = _Play(
+        contest.first,
+        p,
+        zero,
+        zero,
+        jnp.full((), jnp.inf, p.dtype),
+        jnp.ones((), p.dtype),
+        jnp.int32(0),
+        ~no,
+        no,
+        no,
+    )
     apart = jnp.arange(contest.size + 2)
     near = _played(contest, start, -1.0, apart, tolerance, max_rounds)
     label = apart
     if contest.circling:
-        label = jnp.concatenate([_groups(near.base, contest.eps)[0], apart[contest.size:]])
+        label = jnp.concatenate([_groups(near.base, contest.eps)[0], apart[contest.size :]])
     again = start._replace(row=near.row, probability=near.probability)
     far = _played(contest, again, 1.0, label, tolerance, max_rounds)
     low, high = contest.ahead(near.z), contest.ahead(far.z)
@@ -248,8 +257,16 @@ def enclose(contest: Contest, tolerance: jax.Array, max_rounds: jax.Array) -> Bo
     # Who leads shows what attains the one bound, and who is against it what attains the other.
     row = contest.best(lows if contest.policy_leads else highs)[1]
     middle = jnp.where(near.proven & far.proven, (near.z + far.z) / 2, near.base)
-    return Bounds(near.z, far.z, near.proven, far.proven, middle, row,
-                  p_low if contest.nature_leads else p_high, near.rounds + far.rounds)
+    return Bounds(
+        near.z,
+        far.z,
+        near.proven,
+        far.proven,
+        middle,
+        row,
+        p_low if contest.nature_leads else p_high,
+        near.rounds + far.rounds,
+    )
 
 
 def _groups(z: jax.Array, eps: float) -> tuple[jax.Array, jax.Array]:
@@ -259,14 +276,17 @@ def _groups(z: jax.Array, eps: float) -> tuple[jax.Array, jax.Array]:
     apart = _EQUAL * eps * jnp.max(jnp.abs(z))
     new = jnp.diff(ranked, prepend=ranked[:1]) > apart
     number = jnp.cumsum(new)
-    largest = jax.ops.segment_max(
-        ranked, number, z.shape[0], indices_are_sorted=True)
+    largest = jax.ops.segment_max(ranked, number, z.shape[0], indices_are_sorted=True)
     label = jnp.zeros_like(number).at[order].set(number)
     return label, largest[label]
 
 
 def _played(
-    contest: Contest, start: _Play, sign: float, label: jax.Array, tolerance: jax.Array,
+    contest: Contest,
+    start: _Play,
+    sign: float,
+    label: jax.Array,
+    tolerance: jax.Array,
     max_rounds: jax.Array,
 ) -> _Play:
     """Policy iteration until a bound is proven: from below the value, or from above it."""
@@ -294,8 +314,9 @@ def _played(
         # Moves at once may end where nobody gets out; moves in turn do not.
         lost = ~(jnp.all(jnp.isfinite(z)) & jnp.all(time >= 0))
         again = lost & play.hasty
-        row, chance = (jnp.where(again, x, y) for x, y in (
-            (start.row, row), (start.probability, chance)))
+        row, chance = (
+            jnp.where(again, x, y) for x, y in ((start.row, row), (start.probability, chance))
+        )
         z = jnp.where(again, 0, z)
         hasty = play.hasty & ~lost & (play.rounds < _HASTY)
         still = jnp.all(row == play.row) & jnp.all(chance == play.probability)
@@ -311,9 +332,7 @@ def _played(
     return lax.while_loop(goes_on, body, start)
 
 
-def _extra(
-    contest: Contest, base: jax.Array, time: jax.Array, tolerance: jax.Array
-) -> jax.Array:
+def _extra(contest: Contest, base: jax.Array, time: jax.Array, tolerance: jax.Array) -> jax.Array:
     """How much more a step earns: little beside the tolerance, and more than rounding."""
     largest = jnp.max(jnp.abs(base))
     scale: jax.Array | float = 1.0

@@ -61,9 +61,16 @@ class DataGuarantee:
 
 
 def learn_guarantee(
-    model: Any, counts: TransitionCounts | np.ndarray, task: Task, confidence: float, *,
-    method: Method = "anytime", objective: str = "max", rows: Any = None,
-    num_claims: int | None = None, tolerance: float | None = None,
+    model: Any,
+    counts: TransitionCounts | np.ndarray,
+    task: Task,
+    confidence: float,
+    *,
+    method: Method = "anytime",
+    objective: str = "max",
+    rows: Any = None,
+    num_claims: int | None = None,
+    tolerance: float | None = None,
 ) -> DataGuarantee:
     """A policy for a formula, and the probability that it has with a confidence.
 
@@ -106,14 +113,21 @@ def learn_guarantee(
     sparse = to_sparse(model)
     count = counts_on(sparse, counts) if isinstance(counts, TransitionCounts) else counts
     sets = intervals_from_counts(
-        count, confidence, method=method, entry_start=sparse.entry_start, rows=rows,
-        num_claims=num_claims)
+        count,
+        confidence,
+        method=method,
+        entry_start=sparse.entry_start,
+        rows=rows,
+        num_claims=num_claims,
+    )
     interval, kept = _with_sets(sparse, sets)
     against, along = ("min", "max") if objective == "max" else ("max", "min")
     found = robust_satisfaction(
-        interval, task, objective=objective, nature=against, tolerance=tolerance)
+        interval, task, objective=objective, nature=against, tolerance=tolerance
+    )
     best = robust_satisfaction(
-        interval, task, objective=objective, nature=along, tolerance=tolerance)
+        interval, task, objective=objective, nature=along, tolerance=tolerance
+    )
     share = np.asarray(interval.initial)
     share = share[share > 0]
     sure, most = ("lower", "upper") if objective == "max" else ("upper", "lower")
@@ -121,9 +135,13 @@ def learn_guarantee(
     sign = 1 if objective == "max" else -1
     return DataGuarantee(
         bound=safe_mean(share, getattr(found.solution, sure), up=objective != "max", highest=1),
-        confidence=float(confidence), satisfaction=found,
+        confidence=float(confidence),
+        satisfaction=found,
         optimistic=safe_mean(share, getattr(best.solution, most), up=objective == "max", highest=1),
-        model=interval, sets=sets, gain=sign * _gain(interval, found, center, share))
+        model=interval,
+        sets=sets,
+        gain=sign * _gain(interval, found, center, share),
+    )
 
 
 def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.ndarray]:
@@ -132,8 +150,10 @@ def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.
     found = make_interval(model, sets.lower, sets.upper, **ball)
     if found.num_transitions == model.num_transitions:
         return found, np.ones(model.num_transitions, bool)
-    code = [np.asarray(x.host.row, np.int64) * model.num_states + x.successor
-            for x in (model, found.nominal)]
+    code = [
+        np.asarray(x.host.row, np.int64) * model.num_states + x.successor
+        for x in (model, found.nominal)
+    ]
     return found, np.isin(*code)
 
 
@@ -155,7 +175,8 @@ def _gain(
     inner = entry & open_[host.state[host.row]] & open_[host.successor] & (nature > 0)
     size = host.num_states
     step = csr_array(
-        (nature[inner], (host.successor[inner], host.state[host.row][inner])), shape=(size, size))
+        (nature[inner], (host.successor[inner], host.state[host.row][inner])), shape=(size, size)
+    )
     first = np.zeros(size)
     np.add.at(first, product.start, share)
     visits = spsolve((eye_array(size) - step).tocsc(), np.where(open_, first, 0))
@@ -173,8 +194,15 @@ def _gain(
 
 
 def guarantee_curve(
-    model: Any, counts: TransitionCounts | np.ndarray, task: Task, confidence: float,
-    sizes: Sequence[int], *, seed: int = 0, method: Method = "anytime", objective: str = "max",
+    model: Any,
+    counts: TransitionCounts | np.ndarray,
+    task: Task,
+    confidence: float,
+    sizes: Sequence[int],
+    *,
+    seed: int = 0,
+    method: Method = "anytime",
+    objective: str = "max",
 ) -> np.ndarray:
     """The bound over the number of samples, of random parts of the data.
 
@@ -215,12 +243,14 @@ def guarantee_curve(
     total = int(every.sum())
     wrong = (wanted < 0) | (wanted > total)
     if wrong.any():
-        raise ValueError(f"sizes[{int(np.argmax(wrong))}] is {wanted[wrong][0]}; there are {total} "
-                         "transitions.")
+        raise ValueError(
+            f"sizes[{int(np.argmax(wrong))}] is {wanted[wrong][0]}; there are {total} transitions."
+        )
     rng = np.random.default_rng(whole("seed", seed))
     bound = np.empty(wanted.size)
     for i in np.argsort(-wanted, kind="stable"):
         every = rng.multivariate_hypergeometric(every, int(wanted[i]), method="marginals")
         bound[i] = learn_guarantee(
-            sparse, every, task, confidence, method=method, objective=objective).bound
+            sparse, every, task, confidence, method=method, objective=objective
+        ).bound
     return bound

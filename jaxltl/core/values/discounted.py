@@ -120,8 +120,11 @@ def parameters(model: Any, reward: Any, discount: Any, tolerance: Any) -> Parame
     """Of a problem with a reward as it was given."""
     goal = None if tolerance is None else jnp.asarray(tolerance, model.dtype)
     return Parameters(
-        jnp.asarray(discount, model.dtype), reward_size(model, reward),
-        jnp.asarray(rounding_unit(model), model.dtype), goal)
+        jnp.asarray(discount, model.dtype),
+        reward_size(model, reward),
+        jnp.asarray(rounding_unit(model), model.dtype),
+        goal,
+    )
 
 
 def gains(model: Any, reward: jax.Array) -> Any:
@@ -131,7 +134,11 @@ def gains(model: Any, reward: jax.Array) -> Any:
 
 
 def solution_of(
-    model: Any, given: Parameters, value: jax.Array, image: jax.Array, policy: jax.Array,
+    model: Any,
+    given: Parameters,
+    value: jax.Array,
+    image: jax.Array,
+    policy: jax.Array,
     num_steps: jax.Array,
 ) -> Solution:
     """The solution that a value and its image certify, without derivatives.
@@ -147,8 +154,12 @@ def solution_of(
     middle = (image + found.shift).reshape(model.state_shape)
     # With a certificate the whole image is finite.
     solution = Solution(
-        value=middle, policy=policy, lower=middle - found.half, upper=middle + found.half,
-        residual=jnp.max(jnp.abs(image - value)), num_steps=num_steps,
+        value=middle,
+        policy=policy,
+        lower=middle - found.half,
+        upper=middle + found.half,
+        residual=jnp.max(jnp.abs(image - value)),
+        num_steps=num_steps,
         status=status_code(found.converged, found.finite, found.exhausted),
     )
     return jax.tree.map(lax.stop_gradient, solution)
@@ -164,6 +175,7 @@ def differentiable(
       backup: closes over what it is differentiable in.
       system: makes ``I - J``, with J the derivative of `backup` in v at the solution.
     """
+
     def solve(b: jax.Array) -> jax.Array:
         return solver(system()).solve(b)
 
@@ -237,17 +249,19 @@ def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solu
         return over.mean(given.policy, q), given.policy
 
     value, image, n = newton.solve(
-        rows, combine, judge, newton.Backup(
-            over.columns(reward), given.discount,
-            jnp.zeros_like(given.discount), given),
-        jnp.zeros(model.num_states, model.dtype), max_steps=max_steps)
+        rows,
+        combine,
+        judge,
+        newton.Backup(over.columns(reward), given.discount, jnp.zeros_like(given.discount), given),
+        jnp.zeros(model.num_states, model.dtype),
+        max_steps=max_steps,
+    )
 
     def backup(v: jax.Array) -> jax.Array:
         return over.mean(checked.distribution, action_value(model, reward, given.discount, v))
 
     solution = solution_of(model, given, value, image, checked.distribution, n)
-    solution = differentiable(
-        solution, backup, lambda: System(rows, weight, given.discount))
+    solution = differentiable(solution, backup, lambda: System(rows, weight, given.discount))
     return refuse(replace(solution, policy=checked.distribution), checked.given, checked.valid)
 
 
@@ -301,9 +315,18 @@ def optimal_value(
     if is_sparse(model) and not is_traced((model, reward, discount, tolerance)):
         return discounted(model, reward, discount, tolerance=tolerance)
     form, reward = compiled_form(model, reward)
-    return in_shape_of(model, _optimal_value(
-        form, reward, discount, method=method, tolerance=tolerance, max_steps=max_steps,
-        evaluation_sweeps=evaluation_sweeps))
+    return in_shape_of(
+        model,
+        _optimal_value(
+            form,
+            reward,
+            discount,
+            method=method,
+            tolerance=tolerance,
+            max_steps=max_steps,
+            evaluation_sweeps=evaluation_sweeps,
+        ),
+    )
 
 
 @partial(jax.jit, static_argnames=("method",))
@@ -327,13 +350,20 @@ def _optimal_value(
     zero = jnp.zeros(model.num_states, model.dtype)
     if method == "modified_policy_iteration":
         value, image, n = _modified_policy_iteration(
-            model, reward, given, max_steps, evaluation_sweeps)
+            model, reward, given, max_steps, evaluation_sweeps
+        )
     else:
         value, image, n = newton.solve(
-            table(model), best_action, judge,
-            newton.Backup(gains(model, reward), given.discount,
-                          jnp.zeros_like(given.discount), given),
-            zero, newton=method == "policy_iteration", max_steps=max_steps)
+            table(model),
+            best_action,
+            judge,
+            newton.Backup(
+                gains(model, reward), given.discount, jnp.zeros_like(given.discount), given
+            ),
+            zero,
+            newton=method == "policy_iteration",
+            max_steps=max_steps,
+        )
     q = reward + given.discount * expectation(model, value.reshape(model.state_shape))
     _, policy = over.argmax(q)
 
@@ -344,8 +374,7 @@ def _optimal_value(
         chosen = over.one_hot(policy, model.dtype)
         return System(table(model), over.columns(chosen), given.discount)
 
-    return differentiable(
-        solution_of(model, given, value, image, policy, n), backup, system)
+    return differentiable(solution_of(model, given, value, image, policy, n), backup, system)
 
 
 def best_action(over: Any, q: Any, given: Any) -> tuple[jax.Array, Any]:
@@ -365,8 +394,7 @@ def _modified_policy_iteration(model, reward, given: Parameters, max_steps, swee
         _, image, policy = carry
         onward = following(model, policy)
         gain = over.mean(policy, reward).ravel()
-        value = lax.fori_loop(
-            0, sweeps, lambda _, v: gain + given.discount * onward(v), image)
+        value = lax.fori_loop(0, sweeps, lambda _, v: gain + given.discount * onward(v), image)
         return value, *greedy(value)
 
     def finished(carry, _):
@@ -375,5 +403,6 @@ def _modified_policy_iteration(model, reward, given: Parameters, max_steps, swee
     zero = jnp.zeros(model.num_states, model.dtype)
     start = lax.stop_gradient((zero, *greedy(zero)))
     (value, image, _), n = lax.stop_gradient(
-        iterate(step, finished, None, start, None, max_steps=max_steps, lanes="mapped"))
+        iterate(step, finished, None, start, None, max_steps=max_steps, lanes="mapped")
+    )
     return value, image, n

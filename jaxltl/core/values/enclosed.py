@@ -59,9 +59,14 @@ def solution_of(
         policy = np.asarray(sparse.action)[found.row]
     policy = policy.astype(np.int32).reshape(shape)
     parts: dict[str, Any] = {
-        "value": found.value.reshape(shape), "policy": policy, "lower": low.reshape(shape),
-        "upper": high.reshape(shape), "residual": np.float64(found.residual),
-        "num_steps": np.int32(found.rounds), "status": np.int32(status)}
+        "value": found.value.reshape(shape),
+        "policy": policy,
+        "lower": low.reshape(shape),
+        "upper": high.reshape(shape),
+        "residual": np.float64(found.residual),
+        "num_steps": np.int32(found.rounds),
+        "status": np.int32(status),
+    }
     method = Method(found.method)
     if is_sparse(model):
         return Solution(**parts, method=method)
@@ -69,14 +74,18 @@ def solution_of(
     exact = low == high
     low, high = (
         np.where(exact, x, np.nextafter(x.astype(dtype), end)).astype(dtype)
-        for x, end in ((low, dtype.type(-np.inf)), (high, dtype.type(np.inf))))
+        for x, end in ((low, dtype.type(-np.inf)), (high, dtype.type(np.inf)))
+    )
     low = np.maximum(low, 0)
     if not relative:
         high = np.minimum(high, 1)
     low, high = low.reshape(shape), high.reshape(shape)
     parts |= {
-        "value": np.clip(parts["value"].astype(dtype), low, high), "lower": low, "upper": high,
-        "residual": np.asarray(found.residual, dtype)}
+        "value": np.clip(parts["value"].astype(dtype), low, high),
+        "lower": low,
+        "upper": high,
+        "residual": np.asarray(found.residual, dtype),
+    }
     return Solution(**to_jax(parts), method=method)
 
 
@@ -140,8 +149,10 @@ def _weights(model: Any, sparse: SparseMDP, policy: np.ndarray) -> np.ndarray:
     if is_deterministic(policy) and policy.shape == actions[:-1]:
         policy = np.eye(model.num_actions)[policy]
     if policy.shape != actions:
-        raise ValueError(f"policy has shape {policy.shape}; expected {actions[:-1]} of actions "
-                         f"or {actions} of their probabilities.")
+        raise ValueError(
+            f"policy has shape {policy.shape}; expected {actions[:-1]} of actions "
+            f"or {actions} of their probabilities."
+        )
     flat = policy.reshape(sparse.num_states, -1)
     return flat[sparse.host.state, np.asarray(sparse.action)].astype(np.float64)
 
@@ -166,7 +177,8 @@ def reachability(
     if is_traced((model, target, stay, policy)):
         raise ValueError(
             "a sparse model, or what may be passed (stay), is read on the host: give concrete "
-            "arrays; inside jit use prepare(model, target), or the formula's product.")
+            "arrays; inside jit use prepare(model, target), or the formula's product."
+        )
     sparse = to_sparse(model)
     target = np.asarray(target, bool).ravel()
     if stay is not None:
@@ -177,7 +189,8 @@ def reachability(
     if policy is not None:
         host, _, depth = chain_of(model, sparse, policy)
     found = optimal.reachability(
-        host, target, maximize=objective == "max", stay=stay, tolerance=asked, depth=depth)
+        host, target, maximize=objective == "max", stay=stay, tolerance=asked, depth=depth
+    )
     return given_policy(solution_of(model, sparse, found, asked, relative=False), policy)
 
 
@@ -201,13 +214,19 @@ def discounted(
         earned, magnitude = (chain.mean(x, host.row_start) for x in (earned, magnitude))
         host, depth = chain.mdp, chain.depth
     found = discounted_value(
-        host, earned, magnitude, float(discount), maximize=True, tolerance=asked, depth=depth)
+        host, earned, magnitude, float(discount), maximize=True, tolerance=asked, depth=depth
+    )
     width = found.upper - found.lower
     status = Status.CONVERGED if (width <= asked).all() else Status.PRECISION
     parts: dict[str, Any] = {
-        "value": found.value, "policy": found.row.astype(np.int32), "lower": found.lower,
-        "upper": found.upper, "residual": np.float64(found.residual),
-        "num_steps": np.int32(found.rounds), "status": np.int32(status)}
+        "value": found.value,
+        "policy": found.row.astype(np.int32),
+        "lower": found.lower,
+        "upper": found.upper,
+        "residual": np.float64(found.residual),
+        "num_steps": np.int32(found.rounds),
+        "status": np.int32(status),
+    }
     parts = {name: x.reshape(model.state_shape) if np.ndim(x) else x for name, x in parts.items()}
     return given_policy(Solution(**parts, method=Method(found.method)), policy)
 

@@ -87,8 +87,11 @@ def episode_evaluator(
       [-1.3125, 0.328125]
     """
     num_episodes = given.whole("num_episodes", num_episodes, least=1, most=2**31 - 1)
-    several = (costs,) if isinstance(costs, str) or callable(costs) else tuple(
-        given.listed("costs", costs))
+    several = (
+        (costs,)
+        if isinstance(costs, str) or callable(costs)
+        else tuple(given.listed("costs", costs))
+    )
     task = task_world(jax.eval_shape(require_environment(environment).reset, jax.random.key(0)))
     names = SUMS if task is None else SUMS + OF_TASKS
     for score in (objective, *several):
@@ -97,9 +100,9 @@ def episode_evaluator(
             why = "needs a task, which task_environment gives" if of_task else "is none"
             raise ValueError(
                 f"the score {given.shown(score)} {why}; choose one of {', '.join(names)}, or "
-                "give a function of the totals.")
-    settings = _Scores(
-        objective, several, num_episodes, checked_steps(environment, num_steps))
+                "give a function of the totals."
+            )
+    settings = _Scores(objective, several, num_episodes, checked_steps(environment, num_steps))
     if not isinstance(discount, jax.core.Tracer):
         given.share("discount", discount)
     return Partial(_evaluate, settings, environment, as_partial(agent, "agent"), discount)
@@ -107,12 +110,20 @@ def episode_evaluator(
 
 @jax.jit  # so that calls outside of jit share one compilation
 def _evaluate(
-    settings: _Scores, environment: Environment, agent: Callable[..., Any],
-    discount: chex.Numeric, parameters: chex.Array, key: chex.PRNGKey,
+    settings: _Scores,
+    environment: Environment,
+    agent: Callable[..., Any],
+    discount: chex.Numeric,
+    parameters: chex.Array,
+    key: chex.PRNGKey,
 ) -> Any:
     run = partial(
-        episode_totals, environment=environment, agent=agent(parameters),
-        num_steps=settings.num_steps, discount=discount)
+        episode_totals,
+        environment=environment,
+        agent=agent(parameters),
+        num_steps=settings.num_steps,
+        discount=discount,
+    )
     totals = jax.vmap(run)(jax.random.split(key, settings.num_episodes))
 
     def mean(score: Score) -> jax.Array:
@@ -125,7 +136,10 @@ def _evaluate(
 
 
 _VERDICTS = {
-    "success": Verdict.SATISFIED, "violation": Verdict.VIOLATED, "undecided": Verdict.UNDECIDED}
+    "success": Verdict.SATISFIED,
+    "violation": Verdict.VIOLATED,
+    "undecided": Verdict.UNDECIDED,
+}
 
 
 def _of_one(score: Score, totals: Any) -> jax.Array:

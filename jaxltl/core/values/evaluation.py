@@ -115,8 +115,12 @@ def episode_totals(
         kept, read = kept * discount, accepting(now.world)
         reward, discounted, cost, visits, early = sums
         sums = (
-            reward + made.reward, discounted + paid * made.reward, cost + made.cost,
-            visits + read.astype(jnp.int32), early + jnp.where(read, kept, 0))
+            reward + made.reward,
+            discounted + paid * made.reward,
+            cost + made.cost,
+            visits + read.astype(jnp.int32),
+            early + jnp.where(read, kept, 0),
+        )
         sums = tuple(x.astype(y.dtype) for x, y in zip(sums, carry[-1], strict=True))
         paid = (paid * discount * made.discount).astype(number)
         return now, time + 1, paid, kept.astype(number), sums
@@ -125,13 +129,21 @@ def episode_totals(
     reward, discounted, cost, visits, early = sums
     task = task_world(now.world)
     return EpisodeTotals(
-        reward, discounted, cost, time, now.terminated, now.truncated & ~now.terminated,
+        reward,
+        discounted,
+        cost,
+        time,
+        now.terminated,
+        now.truncated & ~now.terminated,
         None if task is None else jnp.asarray(task.verdict, jnp.int32),
-        visits if counted else None, early if counted else None)
+        visits if counted else None,
+        early if counted else None,
+    )
 
 
 def task_world(world: Any) -> Any:
     """The part of a world that tells a verdict, also inside of others; None if there is none."""
+
     def tells(x: Any) -> bool:
         return hasattr(x, "verdict")
 
@@ -224,16 +236,19 @@ class Evaluation:
     def __str__(self) -> str:
         lines = [
             f"{self.num_episodes:,} episodes of at most {self.num_steps:,} steps; each interval "
-            f"holds with {self.confidence:g}"]
+            f"holds with {self.confidence:g}"
+        ]
         for name in ESTIMATES:
             found = getattr(self, name)
             if found is not None:
                 ends = f"[{found.lower:.6g}, {found.upper:.6g}]"
-                lines.append(f"  {name.replace('_', ' '):18}{found.mean:<10.6g}{ends:24}"
-                             f"{found.method}")
+                lines.append(
+                    f"  {name.replace('_', ' '):18}{found.mean:<10.6g}{ends:24}{found.method}"
+                )
         lines.append(
             f"  ended: {self.terminated:,} terminated, {self.truncated:,} truncated, "
-            f"{self.cut_off:,} cut off")
+            f"{self.cut_off:,} cut off"
+        )
         if self.threshold is not None:
             said = {None: "open whether success is", True: "success is", False: "success is not"}
             lines.append(f"  {said[self.decision]} at least {self.threshold:g}")
@@ -243,11 +258,21 @@ class Evaluation:
 
 
 ESTIMATES = (
-    "success", "violation", "undecided", "reward", "discounted_reward", "cost", "length", "visits",
+    "success",
+    "violation",
+    "undecided",
+    "reward",
+    "discounted_reward",
+    "cost",
+    "length",
+    "visits",
     "discounted_visits",
 )
 _SHARES = {
-    "success": Verdict.SATISFIED, "violation": Verdict.VIOLATED, "undecided": Verdict.UNDECIDED}
+    "success": Verdict.SATISFIED,
+    "violation": Verdict.VIOLATED,
+    "undecided": Verdict.UNDECIDED,
+}
 
 
 def evaluate(
@@ -329,12 +354,22 @@ def evaluate(
     if threshold is not None and task_world(world) is None:
         raise ValueError(
             f"threshold={threshold}, but the environment has no task; make one with "
-            "task_environment.")
+            "task_environment."
+        )
     failure, parts, count, success, decision = 1 - confidence, [], 0, 0, None
     while count < num_episodes and decision is None:
-        found = on_host(_batch(
-            key, environment, agent, jnp.int32(count), 1.0 if discount is None else discount,
-            num_steps=num_steps, batch=min(batch, num_episodes), sharding=sharding))
+        found = on_host(
+            _batch(
+                key,
+                environment,
+                agent,
+                jnp.int32(count),
+                1.0 if discount is None else discount,
+                num_steps=num_steps,
+                batch=min(batch, num_episodes),
+                sharding=sharding,
+            )
+        )
         parts.append(jax.tree.map(lambda x, most=num_episodes - count: x[:most], found))
         count += len(parts[-1].length)
         if threshold is not None:
@@ -346,8 +381,14 @@ def evaluate(
 
 @partial(jax.jit, static_argnames=("num_steps", "batch", "sharding"))
 def _batch(
-    key: chex.PRNGKey, environment: Environment, agent: Agent, first: jax.Array,
-    discount: chex.Numeric, *, num_steps: int, batch: int,
+    key: chex.PRNGKey,
+    environment: Environment,
+    agent: Agent,
+    first: jax.Array,
+    discount: chex.Numeric,
+    *,
+    num_steps: int,
+    batch: int,
     sharding: NamedSharding | None = None,
 ) -> EpisodeTotals:
     def one(
@@ -355,8 +396,10 @@ def _batch(
     ) -> EpisodeTotals:
         return episode_totals(key, environment, agent, num_steps=num_steps, discount=discount)
 
-    axes, keys = (0, None, None, None), jax.vmap(partial(jax.random.fold_in, key))(
-        first + jnp.arange(batch))
+    axes, keys = (
+        (0, None, None, None),
+        jax.vmap(partial(jax.random.fold_in, key))(first + jnp.arange(batch)),
+    )
     return vmap_split(one, sharding, axes)(keys, environment, agent, discount)
 
 
@@ -372,8 +415,12 @@ def _decided(success: int, count: int, threshold: float, failure: float) -> bool
 
 
 def _told(
-    totals: EpisodeTotals, num_steps: int, confidence: float, threshold: float | None,
-    discount: float | None, decision: bool | None,
+    totals: EpisodeTotals,
+    num_steps: int,
+    confidence: float,
+    threshold: float | None,
+    discount: float | None,
+    decision: bool | None,
 ) -> Evaluation:
     count, failure, fixed = len(totals.length), 1 - confidence, threshold is None
     sums = (totals.reward, totals.discounted_reward, totals.cost)
@@ -381,8 +428,10 @@ def _told(
     status = Status.CONVERGED if fixed or decision is not None else Status.MAX_STEPS
     shares: dict[str, Estimate | None] = dict.fromkeys(_SHARES)
     if totals.verdict is not None:
-        shares = {name: share_estimate(int((totals.verdict == code).sum()), count, failure, fixed)
-                  for name, code in _SHARES.items()}
+        shares = {
+            name: share_estimate(int((totals.verdict == code).sum()), count, failure, fixed)
+            for name, code in _SHARES.items()
+        }
 
     def bounded(x: Any, low: float, high: float) -> Estimate | None:
         planned = count if fixed else None
@@ -396,15 +445,26 @@ def _told(
     length = bounded(totals.length, 1, num_steps)
     assert length is not None
     return Evaluation(
-        **shares, reward=_mean_estimate(totals.reward, failure),
-        discounted_reward=None if discount is None else _mean_estimate(
-            totals.discounted_reward, failure),
-        cost=_mean_estimate(totals.cost, failure), length=length,
-        visits=bounded(totals.visits, 0, num_steps + 1), discounted_visits=early,
-        terminated=int(totals.terminated.sum()), truncated=int(totals.truncated.sum()),
-        cut_off=int((~totals.terminated & ~totals.truncated).sum()), num_episodes=count,
-        num_steps=num_steps, confidence=confidence, threshold=threshold, discount=discount,
-        decision=decision, status=status if fine else Status.NONFINITE)
+        **shares,
+        reward=_mean_estimate(totals.reward, failure),
+        discounted_reward=None
+        if discount is None
+        else _mean_estimate(totals.discounted_reward, failure),
+        cost=_mean_estimate(totals.cost, failure),
+        length=length,
+        visits=bounded(totals.visits, 0, num_steps + 1),
+        discounted_visits=early,
+        terminated=int(totals.terminated.sum()),
+        truncated=int(totals.truncated.sum()),
+        cut_off=int((~totals.terminated & ~totals.truncated).sum()),
+        num_episodes=count,
+        num_steps=num_steps,
+        confidence=confidence,
+        threshold=threshold,
+        discount=discount,
+        decision=decision,
+        status=status if fine else Status.NONFINITE,
+    )
 
 
 def share_estimate(count: int, total: int, failure: float, fixed: bool = True) -> Estimate:
@@ -422,8 +482,12 @@ def share_estimate(count: int, total: int, failure: float, fixed: bool = True) -
     (lower,), (upper,) = ends(np.array([count]), np.array([total]), failure)
     share = count / total
     return Estimate(
-        share, float(lower), float(upper), math.sqrt(share * (1 - share) / total),
-        "Clopper-Pearson" if fixed else "Jeffreys' mixture, at any time")
+        share,
+        float(lower),
+        float(upper),
+        math.sqrt(share * (1 - share) / total),
+        "Clopper-Pearson" if fixed else "Jeffreys' mixture, at any time",
+    )
 
 
 def _mean_estimate(x: Any, failure: float) -> Estimate:
@@ -464,7 +528,8 @@ def checked_steps(environment: Environment, num_steps: int | None) -> int:
     if steps is None:
         raise ValueError(
             "episodes that never end: neither the environment nor num_steps says after how many "
-            "steps; give num_steps, or with_time_limit(environment, num_steps).")
+            "steps; give num_steps, or with_time_limit(environment, num_steps)."
+        )
     return given.whole("num_steps", steps, least=1, most=2**31 - 1)
 
 
@@ -482,8 +547,10 @@ def _checked_agent(agent: Any, environment: Environment) -> tuple[Agent, Any]:
     space = some_action(environment.actions)
     whole = jnp.issubdtype(space.dtype, jnp.integer)
     if getattr(found, "shape", None) != space.shape or (
-            whole and not jnp.issubdtype(found.dtype, jnp.integer)):
+        whole and not jnp.issubdtype(found.dtype, jnp.integer)
+    ):
         raise ValueError(
             f"the agent's action is {found}; the environment takes {space.dtype}"
-            f"{list(space.shape)}.")
+            f"{list(space.shape)}."
+        )
     return agent, world

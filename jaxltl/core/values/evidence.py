@@ -93,8 +93,10 @@ def judged(down: Any, up: Any, rounding: Any, tolerance: Any) -> Enclosure:
     finite = jnp.isfinite(half)
     goal = 4 * rounding if tolerance is None else tolerance
     return Enclosure(
-        shift=jnp.where(finite, (up + down) / 2, 0), half=jnp.where(finite, half, jnp.inf),
-        converged=finite & (half <= goal), exhausted=finite & (half <= 2 * rounding),
+        shift=jnp.where(finite, (up + down) / 2, 0),
+        half=jnp.where(finite, half, jnp.inf),
+        converged=finite & (half <= goal),
+        exhausted=finite & (half <= 2 * rounding),
         finite=finite,
     )
 
@@ -141,13 +143,16 @@ def refuse(solution: Solution, policy: jax.Array, valid: jax.Array) -> Solution:
       policy: as it was given, NaN at unavailable actions.
       valid: whether it is a policy.
     """
+
     def where(good: jax.Array, bad: float) -> jax.Array:
         return jnp.where(valid, good, jnp.asarray(bad, good.dtype))
 
     return replace(
-        solution, value=where(solution.value, jnp.nan), policy=jnp.where(
-            valid, solution.policy, policy),
-        lower=where(solution.lower, -jnp.inf), upper=where(solution.upper, jnp.inf),
+        solution,
+        value=where(solution.value, jnp.nan),
+        policy=jnp.where(valid, solution.policy, policy),
+        lower=where(solution.lower, -jnp.inf),
+        upper=where(solution.upper, jnp.inf),
         residual=where(solution.residual, jnp.nan),
         status=jnp.where(valid, solution.status, Status.INVALID).astype(jnp.int32),
     )

@@ -33,8 +33,11 @@ def estimate(value: Any) -> Iterator[str]:
 
 def guarantee(value: Any) -> Iterator[str]:
     """Of a DataGuarantee."""
-    yield f"at least {value.bound:.6g}" if value.bound <= value.optimistic else (
-        f"at most {value.bound:.6g}")
+    yield (
+        f"at least {value.bound:.6g}"
+        if value.bound <= value.optimistic
+        else (f"at most {value.bound:.6g}")
+    )
     yield f"no policy beyond {value.optimistic:.6g}"
     yield f"confidence {value.confidence:g}"
     samples = readable(value.sets.num_samples)
@@ -46,8 +49,11 @@ def guarantee(value: Any) -> Iterator[str]:
 def gap(value: Any) -> Iterator[str]:
     """Of an OptimalityGap."""
     yield count(len(value.start), "beginning")
-    for name, ends in (("gap", value.mean), ("value", value.mean_value),
-                       ("optimum", value.mean_optimum)):
+    for name, ends in (
+        ("gap", value.mean),
+        ("value", value.mean_value),
+        ("optimum", value.mean_optimum),
+    ):
         yield f"mean {name} in [{ends[0]:.6g}, {ends[1]:.6g}]"
     most = readable(value.upper)
     yield f"gap at most {number(most.max(initial=0.0))}" if most is not None else ""

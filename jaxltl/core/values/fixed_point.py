@@ -88,6 +88,7 @@ def _seldom_differentiated(
         _, change = jax.jvp(lambda c: image(c, v), (constants,), (tangents[0],))
         _, jacobian = jax.linearize(lambda x: image(constants, x), v)
         return v, lax.custom_linear_solve(
-            lambda x: x - jacobian(x), change, solve=linear, transpose_solve=linear)
+            lambda x: x - jacobian(x), change, solve=linear, transpose_solve=linear
+        )
 
     return root(closed.consts, fixed_point)

@@ -51,6 +51,7 @@ def iterate(
     Returns:
       The last carry, and how many steps were made, ``int32[]``.
     """
+
     def loop(table: Any, carry: Any, given: Any, most: jax.Array) -> tuple[Any, jax.Array]:
         def one(carry: Any, n: jax.Array, active: jax.Array) -> tuple[Any, jax.Array]:
             new = step(table, carry, given)
@@ -90,6 +91,7 @@ def in_turn(function: Callable[..., Any], *arguments: Any) -> Any:
       function: of trees of arrays; it closes over nothing that differs from lane to lane.
       arguments: its arguments.
     """
+
     @jax.custom_batching.sequential_vmap
     def one(arguments: tuple[Any, ...]) -> Any:
         return function(*arguments)
@@ -105,6 +107,7 @@ def side_by_side(function: Callable[..., Any], table: Any, *arguments: Any) -> A
       table: shared by the lanes; if it is batched too, they are mapped as usual.
       arguments: trees of arrays.
     """
+
     @jax.custom_batching.custom_vmap
     def one(table: Any, arguments: tuple[Any, ...]) -> Any:
         return function(table, *arguments)
@@ -116,6 +119,7 @@ def side_by_side(function: Callable[..., Any], table: Any, *arguments: Any) -> A
             axes = jax.tree.map(lambda b: 0 if b else None, (of_table, of_arguments))
             found = jax.vmap(lambda t, x: function(t, *x), axes)(table, arguments)
         else:
+
             def last(x: jax.Array, b: bool) -> jax.Array:
                 x = x if b else jnp.broadcast_to(x, (size, *x.shape))
                 return fill_row(jnp.moveaxis(x, 0, -1))

@@ -132,8 +132,13 @@ class Krylov(NamedTuple):
     def counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
         """As of an Inverse."""
         x, n = _krylov(
-            lambda table, given, x: System(table, *given).matvec(x), self.system.table,
-            self.system[1:], b.ravel(), self.tolerance, self.max_steps)
+            lambda table, given, x: System(table, *given).matvec(x),
+            self.system.table,
+            self.system[1:],
+            b.ravel(),
+            self.tolerance,
+            self.max_steps,
+        )
         return x.reshape(b.shape), n
 
     def transpose_solve(self, b: jax.Array) -> jax.Array:
@@ -143,8 +148,13 @@ class Krylov(NamedTuple):
     def transpose_counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
         """As of an Inverse."""
         x, n = _krylov(
-            lambda table, given, x: System(table, *given).vecmat(x), self.system.table,
-            self.system[1:], b.ravel(), self.tolerance, self.max_steps)
+            lambda table, given, x: System(table, *given).vecmat(x),
+            self.system.table,
+            self.system[1:],
+            b.ravel(),
+            self.tolerance,
+            self.max_steps,
+        )
         return x.reshape(b.shape), n
 
 
@@ -259,7 +269,8 @@ class Bicgstab(NamedTuple):
         """With the system applied to `p`; it is to be applied to `r` next."""
         alpha = _ratio(self.rho, dot(self.shadow, image))
         return self._replace(
-            x=self.x + alpha * self.p, r=self.r - alpha * image, v=image, alpha=alpha)
+            x=self.x + alpha * self.p, r=self.r - alpha * image, v=image, alpha=alpha
+        )
 
     def second(self, image: jax.Array) -> Bicgstab:
         """With the system applied to `r`; it is to be applied to `p` next."""
@@ -327,6 +338,7 @@ def solve_linear(
     Returns:
       x. Judge it by its residual: the best iterate is returned however it ended.
     """
+
     def flat(table: None, given: tuple[()], x: jax.Array) -> jax.Array:
         return matvec(x.reshape(b.shape)).ravel()
 
@@ -350,13 +362,26 @@ def _krylov(matvec, table, given, b, tolerance, max_steps, *, lanes: str = "in t
 
     zero, none, no = jnp.zeros_like(b), jnp.int32(0), jnp.bool_(False)
     start = _Search(
-        phase=jnp.int32(_RICHARDSON), z=b, krylov=start_bicgstab(zero, b), error=size, steps=none,
-        forced=no, returning=no, best=jnp.where(jnp.isfinite(size), zero, jnp.nan),
-        best_error=size, num_steps=none,
+        phase=jnp.int32(_RICHARDSON),
+        z=b,
+        krylov=start_bicgstab(zero, b),
+        error=size,
+        steps=none,
+        forced=no,
+        returning=no,
+        best=jnp.where(jnp.isfinite(size), zero, jnp.nan),
+        best_error=size,
+        num_steps=none,
     )
     last, n = iterate(
-        step, lambda k, _: k.phase == _DONE, table, start, (given, wanted),
-        max_steps=max_steps, lanes=lanes)
+        step,
+        lambda k, _: k.phase == _DONE,
+        table,
+        start,
+        (given, wanted),
+        max_steps=max_steps,
+        lanes=lanes,
+    )
     return last.best, n
 
 
@@ -369,7 +394,10 @@ def _richardson(wanted: _Wanted, k: _Search, image: jax.Array) -> _Search:
     look = small & ~slow
     after = jnp.where(look, _LOOK, jnp.where(slow, _FIRST, _RICHARDSON)).astype(jnp.int32)
     return k._replace(
-        phase=after, krylov=start_bicgstab(x, r), error=error, z=jnp.where(look, x, r),
+        phase=after,
+        krylov=start_bicgstab(x, r),
+        error=error,
+        z=jnp.where(look, x, r),
         steps=jnp.where(slow, 0, k.steps + 1),
     )
 
@@ -384,7 +412,9 @@ def _second(wanted: _Wanted, k: _Search, image: jax.Array) -> _Search:
     error = krylov.size
     ended = (error <= wanted.target / 2) | (k.steps >= _STRETCH) | ~jnp.isfinite(error)
     return k._replace(
-        krylov=krylov, error=error, steps=k.steps + 1,
+        krylov=krylov,
+        error=error,
+        steps=k.steps + 1,
         phase=jnp.where(ended, _LOOK, _FIRST).astype(jnp.int32),
         z=jnp.where(ended, krylov.x, krylov.p),
     )
@@ -409,9 +439,14 @@ def _look(wanted: _Wanted, k: _Search, image: jax.Array) -> _Search:
     returning = ~(better | k.returning | stop)
     after = jnp.where(halved, _FIRST, jnp.where(returning, _LOOK, _RICHARDSON))
     return k._replace(
-        phase=jnp.where(stop, _DONE, after).astype(jnp.int32), steps=jnp.zeros_like(k.steps),
-        krylov=start_bicgstab(best, r), error=error, z=jnp.where(returning, best, r),
-        best=best, best_error=best_error, forced=jnp.where(returning, k.forced, ~halved),
+        phase=jnp.where(stop, _DONE, after).astype(jnp.int32),
+        steps=jnp.zeros_like(k.steps),
+        krylov=start_bicgstab(best, r),
+        error=error,
+        z=jnp.where(returning, best, r),
+        best=best,
+        best_error=best_error,
+        forced=jnp.where(returning, k.forced, ~halved),
         returning=returning,
     )
 

@@ -91,7 +91,8 @@ def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> S
     return Solution(
         value=jnp.asarray(value.reshape(shape)),
         policy=jnp.asarray(policy.reshape(shape), jnp.int32),
-        lower=jnp.asarray(lower.reshape(shape)), upper=jnp.asarray(upper.reshape(shape)),
+        lower=jnp.asarray(lower.reshape(shape)),
+        upper=jnp.asarray(upper.reshape(shape)),
         residual=jnp.zeros((), game.dtype),
         num_steps=jnp.int32(num_steps),
         status=status_code(jnp.bool_(done), jnp.bool_(True)),
@@ -228,9 +229,7 @@ def _improve(graph: _Graph, v: _Biases, policy, chooser: NDArray[np.bool_]) -> N
     level = rank == best
     image = np.where(level, image, image.min() - 1)
     action = image.argmax(-1)
-    better = (best[:, 0] > rank[states, policy]) | (
-        image[states, action] > image[states, policy]
-    )
+    better = (best[:, 0] > rank[states, policy]) | (image[states, action] > image[states, policy])
     return np.where(chooser & better, action, policy)
 
 

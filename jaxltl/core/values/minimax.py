@@ -123,9 +123,22 @@ def minimax_value(
     moves = moves & ~graph.on_choices(lost) & ~graph.exists(lost)
     defined = _returns(graph, per, system | lost, moves, xp.zeros_like(lost))
     moves, live = to_jax((moves, ~lost))
-    return in_shape_of(given, _solve(
-        game, None, moves, live, defined, reward, discount, tolerance, max_steps,
-        per=per, method=method))
+    return in_shape_of(
+        given,
+        _solve(
+            game,
+            None,
+            moves,
+            live,
+            defined,
+            reward,
+            discount,
+            tolerance,
+            max_steps,
+            per=per,
+            method=method,
+        ),
+    )
 
 
 def strategy_value(
@@ -205,9 +218,22 @@ def strategy_value(
     moves = moves & ~graph.on_choices(lost)
     defined = _returns(graph, per, system | lost, moves, drawn)
     moves, drawn, live = to_jax((moves, drawn, ~lost))
-    return in_shape_of(asked, _solve(
-        game, checked._replace(used=drawn), moves, live, defined, reward, discount,
-        tolerance, max_steps, per=per, method=method))
+    return in_shape_of(
+        asked,
+        _solve(
+            game,
+            checked._replace(used=drawn),
+            moves,
+            live,
+            defined,
+            reward,
+            discount,
+            tolerance,
+            max_steps,
+            per=per,
+            method=method,
+        ),
+    )
 
 
 def _read(game: Game, states: Any) -> Any:
@@ -322,7 +348,11 @@ def _gains(rows: Any, play: _Play, reward: Any, moves: Any, live: jax.Array) -> 
     spread = rows.choices.spread
     return jax.tree.map(
         lambda lives, m, r, none: jnp.where(lives, jnp.where(m, r, none), 0),
-        spread(live, reward), moves, reward, spread(never, reward))
+        spread(live, reward),
+        moves,
+        reward,
+        spread(never, reward),
+    )
 
 
 # --- bounds --------------------------------------------------------------------------------
@@ -347,10 +377,18 @@ def _horizon(rows: Any, play: _Play, moves, live, per: str, defined, max_steps) 
 
         ones = jax.tree.map(lambda m: jnp.ones(m.shape, tau.dtype), moves)
         tau, after, _ = newton.solve(
-            rows, lambda over, q, given: _chosen(over, q, given[0]), judge,
-            newton.Backup(_gains(rows, slow, ones, moves, free), free.astype(tau.dtype),
-                          jnp.zeros_like(play.discount), (slow, defined)),
-            jnp.zeros(live.shape, tau.dtype), max_steps=max_steps)
+            rows,
+            lambda over, q, given: _chosen(over, q, given[0]),
+            judge,
+            newton.Backup(
+                _gains(rows, slow, ones, moves, free),
+                free.astype(tau.dtype),
+                jnp.zeros_like(play.discount),
+                (slow, defined),
+            ),
+            jnp.zeros(live.shape, tau.dtype),
+            max_steps=max_steps,
+        )
         growth = jnp.max(after - tau)
         tau = jnp.where(growth < 0.5, tau / (1 - growth), jnp.inf)
     horizon = (1 + play.discount * jnp.max(tau)) / (1 - play.discount) + tau
@@ -393,8 +431,18 @@ _FIRST_SWEEPS = 128  # of large games: they cost less than linear systems far fr
 
 @partial(jax.jit, static_argnames=("per", "method"))
 def _solve(
-    game: Game, drawn: _Drawn | None, moves, live, defined, reward, discount, tolerance,
-    max_steps, *, per: str, method: str,
+    game: Game,
+    drawn: _Drawn | None,
+    moves,
+    live,
+    defined,
+    reward,
+    discount,
+    tolerance,
+    max_steps,
+    *,
+    per: str,
+    method: str,
 ) -> Solution:
     discount = jnp.asarray(discount, game.dtype)
     size = jnp.where(moves, expected_reward(game, jax.tree.map(jnp.abs, reward)), 0)
@@ -412,17 +460,24 @@ def _solve(
 
     flat = live.ravel()
     play = _Play(
-        game.system.ravel(), None if drawn is None else drawn.used.ravel(),
+        game.system.ravel(),
+        None if drawn is None else drawn.used.ravel(),
         None if drawn is None else over.columns(drawn.weight),
-        discount, discount, jnp.asarray(rounding_unit(game), game.dtype),
+        discount,
+        discount,
+        jnp.asarray(rounding_unit(game), game.dtype),
         jnp.max(size),
-        None if tolerance is None else jnp.asarray(tolerance, game.dtype))
+        None if tolerance is None else jnp.asarray(tolerance, game.dtype),
+    )
     rows, columns = table(game), over.columns(moves)
     horizon = _horizon(rows, play, columns, flat, per, defined, max_steps)
     play = play._replace(horizon=jnp.max(horizon))
     numbers = newton.Backup(
-        _gains(rows, play, over.columns(reward), columns, flat), rate.ravel(),
-        jnp.zeros_like(discount), play)
+        _gains(rows, play, over.columns(reward), columns, flat),
+        rate.ravel(),
+        jnp.zeros_like(discount),
+        play,
+    )
     zero = jnp.zeros(flat.shape, game.dtype)
     value, image, num_steps, weight = _approached(rows, numbers, zero, method, max_steps)
     play, horizon = lax.stop_gradient((play, horizon))
@@ -458,9 +513,17 @@ def _approached(rows: Any, numbers: newton.Backup, zero: jax.Array, method: str,
         value, image, num_steps = _strategy_iteration(rows, numbers, zero, max_steps)
     else:
         value, image, num_steps, *chosen = newton.solve(
-            rows, _chosen, _judge, numbers, zero, newton=policies, monotone=False,
+            rows,
+            _chosen,
+            _judge,
+            numbers,
+            zero,
+            newton=policies,
+            monotone=False,
             first_sweeps=_FIRST_SWEEPS if zero.size > DENSE_LIMIT else 0,
-            max_steps=max_steps, weights=policies)
+            max_steps=max_steps,
+            weights=policies,
+        )
     rows, numbers = lax.stop_gradient((rows, numbers))
     if policies:
         return value, image, num_steps, rows.choices.unpacked(*chosen)
@@ -485,6 +548,7 @@ class _Strategies(NamedTuple):
 def _strategy_iteration(rows: Any, numbers: newton.Backup, zero: jax.Array, max_steps: Any):
     """Solves for the value of both players' choices, then improves the environment's, or,
     where those are a best answer already, the system's (Hoffman and Karp 1966)."""
+
     def step(rows: Any, k: _Strategies, given: newton.Backup) -> _Strategies:
         over, play = rows.choices, given.extra
         q = newton.action_values(over, given, rows.expectation(k.z))
@@ -503,13 +567,19 @@ def _strategy_iteration(rows: Any, numbers: newton.Backup, zero: jax.Array, max_
         def solved() -> jax.Array:
             # Solving for the correction refines the value where the choices stay the same.
             return k.z + solver(System(rows, weight, given.scale)).solve(
-                _mean(over, weight, q) - k.z)
+                _mean(over, weight, q) - k.z
+            )
 
         z = lax.cond(done, lambda: k.z, solved)
         return _Strategies(z, weight, k.z, image, unchanged, done)
 
     start = _Strategies(
-        zero, _chosen(rows.choices, numbers.reward, numbers.extra)[1], zero, zero, jnp.int32(-1),
-        jnp.bool_(False))
+        zero,
+        _chosen(rows.choices, numbers.reward, numbers.extra)[1],
+        zero,
+        zero,
+        jnp.int32(-1),
+        jnp.bool_(False),
+    )
     last, n = iterate(step, lambda k, _: k.done, rows, start, numbers, max_steps=max_steps)
     return last.value, last.image, n

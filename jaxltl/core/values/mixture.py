@@ -82,8 +82,11 @@ def require_attainable(
         raise ValueError(
             f"guarantee = {probability}: the best that can be achieved is "
             f"{np.floor(possible * 1e6) / 1e6:g} "
-            + ("on average over the initial states" if over == "mean"
-               else "from the worst initial state")
+            + (
+                "on average over the initial states"
+                if over == "mean"
+                else "from the worst initial state"
+            )
             + f" (least from {place(where)}); ask for no more than that, or change the "
             "task, the map or where runs start."
         )
@@ -124,7 +127,12 @@ def least_mixture(
 
 
 def reaching(
-    model: Product, policy: Any, inside: Any, best: Solution, probability: float, *,
+    model: Product,
+    policy: Any,
+    inside: Any,
+    best: Solution,
+    probability: float,
+    *,
     over: str = "mean",
 ) -> Mixture:
     """A policy with the least share of moves that lose nothing by which a probability is reached.
@@ -183,6 +191,8 @@ def safe_ends(model: Any, found: Any, *, highest: float = np.inf) -> tuple[float
     """What encloses the mean over the initial distribution of what `lower` and `upper` enclose."""
     share = np.asarray(model.initial, np.float64)
     start = np.flatnonzero(share)
-    low, high = (safe_mean(share[start], x[start], up=up, highest=highest)
-                 for x, up in ((found.lower, False), (found.upper, True)))
+    low, high = (
+        safe_mean(share[start], x[start], up=up, highest=highest)
+        for x, up in ((found.lower, False), (found.upper, True))
+    )
     return low, high

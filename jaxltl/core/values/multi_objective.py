@@ -25,8 +25,17 @@ from jaxltl.core.values.enclosed import chain_of
 from jaxltl.core.values.objectives import Objective, Part, sums_of
 from jaxltl.core.values.sparse_satisfaction import as_sparse
 
-__all__ = ["Achievable", "ConstrainedOptimum", "Front", "NearestMixture", "Objective", "Pareto",
-           "achievable", "multi_objective", "pareto"]
+__all__ = [
+    "Achievable",
+    "ConstrainedOptimum",
+    "Front",
+    "NearestMixture",
+    "Objective",
+    "Pareto",
+    "achievable",
+    "multi_objective",
+    "pareto",
+]
 
 _SHARPEST = 1e-12  # to which sums are solved where the border is near
 
@@ -183,8 +192,12 @@ class Pareto(NamedTuple):
 
 
 def achievable(
-    model: Any, objectives: Sequence[Objective], thresholds: Sequence[float] | None = None, *,
-    tolerance: float = TOLERANCE, max_points: int = 200,
+    model: Any,
+    objectives: Sequence[Objective],
+    thresholds: Sequence[float] | None = None,
+    *,
+    tolerance: float = TOLERANCE,
+    max_points: int = 200,
 ) -> Achievable:
     """Whether one policy can meet thresholds on several objectives at once.
 
@@ -221,14 +234,17 @@ def achievable(
     if thresholds is None:
         thresholds = [np.nan if o.threshold is None else o.threshold for o in objectives]
     if len(thresholds) != len(objectives) or not np.isfinite(np.asarray(thresholds, float)).all():
-        raise ValueError(f"thresholds={list(thresholds)}; give one finite number for each of the "
-                         f"{len(objectives)} objectives.")
+        raise ValueError(
+            f"thresholds={list(thresholds)}; give one finite number for each of the "
+            f"{len(objectives)} objectives."
+        )
     search = _Search(model, objectives, tolerance)
     wanted = search.signs * np.asarray(thresholds, np.float64)
     holds, share, normal = search.decide(wanted, max_points)
     if holds is None:
-        return Achievable(None, None, None, search.front(), Status.PRECISION,
-                          search.nearest(wanted))
+        return Achievable(
+            None, None, None, search.front(), Status.PRECISION, search.nearest(wanted)
+        )
     return Achievable(holds, share, normal, search.front(), Status.CONVERGED)
 
 
@@ -264,8 +280,13 @@ def pareto(
     gap = search.close(tolerance, max_points)
     front = search.front()
     lower, near = np.stack(search.lower), search.tolerance * search.scale
-    kept = [i for i, x in enumerate(lower) if not any(
-        (y >= x - near).all() and ((y > x + near).any() or j < i) for j, y in enumerate(lower))]
+    kept = [
+        i
+        for i, x in enumerate(lower)
+        if not any(
+            (y >= x - near).all() and ((y > x + near).any() or j < i) for j, y in enumerate(lower)
+        )
+    ]
     points = front.points[kept]
     status = Status.CONVERGED if gap <= tolerance else Status.MAX_STEPS
     return Pareto(points[np.lexsort(points.T[::-1])], front, gap, status)
@@ -273,17 +294,22 @@ def pareto(
 
 def _require(model: Any, objectives: Sequence[Objective]) -> None:
     if hasattr(model, "nominal"):
-        raise ValueError("several objectives at once are not solved for where probabilities are "
-                         "intervals; ask for one at a time, by robust_satisfaction or "
-                         "total_reward, or give model.nominal, which is one choice of "
-                         "nature.")
+        raise ValueError(
+            "several objectives at once are not solved for where probabilities are "
+            "intervals; ask for one at a time, by robust_satisfaction or "
+            "total_reward, or give model.nominal, which is one choice of "
+            "nature."
+        )
     for i, each in enumerate(listed("objectives", objectives)):
         if not isinstance(each, Objective):
             raise ValueError(f"objectives[{i}] is {shown(each)}; give an Objective.")
 
 
 def multi_objective(
-    model: Any, objectives: Sequence[Objective], *, tolerance: float = TOLERANCE,
+    model: Any,
+    objectives: Sequence[Objective],
+    *,
+    tolerance: float = TOLERANCE,
     max_points: int = 200,
 ) -> Achievable | ConstrainedOptimum | Pareto:
     """Several objectives, some with thresholds, as in ``multi(...)`` of PRISM and Storm.
@@ -323,12 +349,16 @@ def multi_objective(
         if len(free) < len(objectives):
             raise ValueError(
                 f"{len(free)} of {len(objectives)} objectives have no threshold; give one to all "
-                "but one of them (the best value), to all (achievability) or to none (the curve).")
+                "but one of them (the best value), to all (achievability) or to none (the curve)."
+            )
         return pareto(model, objectives, tolerance=max(tolerance, 1e-6), max_points=max_points)
     search = _Search(model, objectives, tolerance)
-    wanted = np.array([
-        -np.inf if o.threshold is None else s * o.threshold
-        for o, s in zip(objectives, search.signs, strict=True)])
+    wanted = np.array(
+        [
+            -np.inf if o.threshold is None else s * o.threshold
+            for o, s in zip(objectives, search.signs, strict=True)
+        ]
+    )
     return search.best(free[0], wanted, max_points)
 
 
@@ -368,7 +398,8 @@ class _Search:
             names = " and ".join(str(p.number + 1) for p in self.parts if p.kind == "cost")
             raise ValueError(
                 f"the expected reward of objective {names or 1} is infinite under every policy: "
-                "what it counts goes on for ever, or its target is not reached almost surely.")
+                "what it counts goes on for ever, or its target is not reached almost surely."
+            )
         self.where: Ends = where
         self._require_finite()
         self.signs = np.array([p.sign for p in self.parts])
@@ -395,31 +426,46 @@ class _Search:
                 continue
             earns = (circles & (self.sums.gain[part.place] > 0)).any()
             if earns or (part.open is not None and (everywhere & part.open[mdp.state]).any()):
-                why = ("reward is earned for ever in an end component" if earns
-                       else "some policy does not reach its target")
+                why = (
+                    "reward is earned for ever in an end component"
+                    if earns
+                    else "some policy does not reach its target"
+                )
                 raise ValueError(
                     f"the largest expected reward of objective {part.number + 1} is infinite: "
-                    f"{why}; make it small, or take that end component out of the model.")
+                    f"{why}; make it small, or take that end component out of the model."
+                )
 
     def _rescale(self) -> None:
         reach = np.abs(np.stack(self.lower)).max(0)
-        self.scale = np.array([
-            1.0 if p.kind == "sure" or not x > 0 else x
-            for p, x in zip(self.parts, reach, strict=True)])
+        self.scale = np.array(
+            [
+                1.0 if p.kind == "sure" or not x > 0 else x
+                for p, x in zip(self.parts, reach, strict=True)
+            ]
+        )
 
     def ask(self, normal: np.ndarray) -> None:
         """Solves a weighted sum, and adds its point and its half-space."""
         weights: dict[str, np.ndarray] = {
-            "sure": np.zeros(len(self.sums.priority)), "gain": np.zeros(len(self.sums.gain)),
-            "cost": np.zeros(len(self.sums.cost))}
+            "sure": np.zeros(len(self.sums.priority)),
+            "gain": np.zeros(len(self.sums.gain)),
+            "cost": np.zeros(len(self.sums.cost)),
+        }
         for part, w in zip(self.parts, normal, strict=True):
             weights[part.kind][part.place] = w
         found = weigh(
-            self.sums, self.where, weights["sure"], weights["gain"], weights["cost"],
-            self.tolerance / 4 * float((normal * self.scale).sum()))
+            self.sums,
+            self.where,
+            weights["sure"],
+            weights["gain"],
+            weights["cost"],
+            self.tolerance / 4 * float((normal * self.scale).sum()),
+        )
         # A probability to be made small is one minus the one that was made large.
-        shift = sum(w for p, w in zip(self.parts, normal, strict=True)
-                    if p.kind == "sure" and p.sign < 0)
+        shift = sum(
+            w for p, w in zip(self.parts, normal, strict=True) if p.kind == "sure" and p.sign < 0
+        )
         value, lower, upper = self.evaluate(found.weight, found.home)
         self.values.append(value)
         self.lower.append(lower)
@@ -445,14 +491,19 @@ class _Search:
                 np.minimum.at(least, leader, level[inside])
                 good = home & (least[component] % 2 == 0)
                 x = optimal.reachability(
-                    chain.mdp, good, maximize=True, tolerance=self.tolerance / 8,
-                    depth=chain.depth)
+                    chain.mdp, good, maximize=True, tolerance=self.tolerance / 8, depth=chain.depth
+                )
             else:
                 rows = (sums.gain if part.kind == "gain" else sums.cost)[part.place]
                 earned = chain.mean(rows, sums.mdp.row_start)
                 x = optimal.total_reward(
-                    chain.mdp, earned, home, maximize=False, tolerance=self.tolerance / 8,
-                    depth=chain.depth)
+                    chain.mdp,
+                    earned,
+                    home,
+                    maximize=False,
+                    tolerance=self.tolerance / 8,
+                    depth=chain.depth,
+                )
             found.append(self._expected(part, x))
         return tuple(np.array(x) for x in zip(*found, strict=True))  # type: ignore[return-value]
 
@@ -461,8 +512,9 @@ class _Search:
         first = np.flatnonzero(self.sums.start)
         share = self.sums.start[first]
         slack = 1e-15 * (first.size + 2)
-        value, low, high = (float(share @ x[first]) for x in (
-            found.value, found.lower, found.upper))
+        value, low, high = (
+            float(share @ x[first]) for x in (found.value, found.lower, found.upper)
+        )
         exact = low == high and (first.size == 1 or (part.kind == "sure" and low in (0, 1)))
         if not exact:
             low, high = low - slack * abs(low), high + slack * abs(high)
@@ -477,11 +529,19 @@ class _Search:
 
     def front(self) -> Front:
         values, lower, upper = (
-            np.stack(x) * self.signs for x in (self.values, self.lower, self.upper))
+            np.stack(x) * self.signs for x in (self.values, self.lower, self.upper)
+        )
         lower, upper = np.minimum(lower, upper), np.maximum(lower, upper)
         values, lower, upper = (x + 0.0 for x in (values, lower, upper))
-        return Front(values, lower, upper, np.stack(self.normals) * self.signs,
-                     np.array(self.bounds), tuple(self.policies), self.product)
+        return Front(
+            values,
+            lower,
+            upper,
+            np.stack(self.normals) * self.signs,
+            np.array(self.bounds),
+            tuple(self.policies),
+            self.product,
+        )
 
     def decide(
         self, wanted: np.ndarray, max_points: int
@@ -518,7 +578,8 @@ class _Search:
         return any(
             np.abs(size / size.sum() - x * self.scale / (x * self.scale).sum()).max() < 1e-12
             for x, exactness in zip(self.normals, self.exactness, strict=True)
-            if exactness <= self.tolerance)
+            if exactness <= self.tolerance
+        )
 
     def nearest(self, wanted: np.ndarray, index: int | None = None) -> NearestMixture:
         """The mixture that comes nearest to thresholds, with the best of an objective if asked."""
@@ -528,7 +589,8 @@ class _Search:
         if index is not None:
             enough = wanted - (apart.distance + 1e-15) * self.scale
             found = frontier.largest(
-                lower, np.stack(self.normals), np.array(self.bounds), index, enough, self.scale)
+                lower, np.stack(self.normals), np.array(self.bounds), index, enough, self.scale
+            )
             share = found.share if np.isfinite(found.lower) else share
         return nearest_of(self.front(), share, self.signs * wanted, self.signs)
 
@@ -544,8 +606,14 @@ class _Search:
         while True:
             lower = np.stack(self.lower)
             known = frontier.largest(
-                lower, np.stack(self.normals), np.array(self.bounds), index, wanted, self.scale,
-                share)
+                lower,
+                np.stack(self.normals),
+                np.array(self.bounds),
+                index,
+                wanted,
+                self.scale,
+                share,
+            )
             size = max(1.0 if self.parts[index].kind == "sure" else abs(known.upper), 1e-300)
             narrow = known.upper - known.lower <= tolerance * size
             if narrow or known.vector is None or len(lower) >= max_points:
@@ -559,11 +627,13 @@ class _Search:
         if met:
             status = Status.CONVERGED if narrow else Status.PRECISION
             return ConstrainedOptimum(
-                (low + high) / 2, low, high, True, known.share, self.front(), status)
+                (low + high) / 2, low, high, True, known.share, self.front(), status
+            )
         near = self.nearest(wanted, index)
         value = float(np.clip((near.lower[index] + near.upper[index]) / 2, low, high))
         return ConstrainedOptimum(
-            value, low, high, holds, None, self.front(), Status.PRECISION, near)
+            value, low, high, holds, None, self.front(), Status.PRECISION, near
+        )
 
     def close(self, tolerance: float, max_points: int) -> float:
         """Asks until no value is farther beyond the mixtures than the tolerance; how far it is."""

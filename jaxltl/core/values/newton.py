@@ -128,17 +128,26 @@ def solve(
     zero = jnp.zeros_like(value)
     scalar, none, no = zero[0], jnp.int32(0), jnp.bool_(False)
     start = _Search(
-        phase=jnp.int32(_LOOK), z=value, value=value, image=value,
+        phase=jnp.int32(_LOOK),
+        z=value,
+        value=value,
+        image=value,
         weight=over.packed(over.spread(zero, backup.reward)),
-        error=jnp.full_like(scalar, jnp.inf), done=no,
-        newton=no, plain=jnp.int32(first_sweeps), pause=none, solved=no,
+        error=jnp.full_like(scalar, jnp.inf),
+        done=no,
+        newton=no,
+        plain=jnp.int32(first_sweeps),
+        pause=none,
+        solved=no,
         krylov=start_bicgstab(zero, zero),
-        target=scalar, inner=none,
+        target=scalar,
+        inner=none,
     )
     # Side by side wins where a row of lanes fills a vector unit, which doubles do not.
     lanes = "side by side" if not newton and value.dtype.itemsize <= 4 else "in turn"
     last, n = iterate(
-        step, lambda k, _: k.done, table, start, backup, max_steps=max_steps, lanes=lanes)
+        step, lambda k, _: k.done, table, start, backup, max_steps=max_steps, lanes=lanes
+    )
     found = (last.value, last.image, n)
     return (*found, last.weight) if weights else found
 
@@ -157,8 +166,8 @@ def _look(
     if monotone:
         kept |= k.solved & jnp.isfinite(error)
     value, image, weight, error = jax.tree.map(
-        partial(jnp.where, kept), (k.z, image, weight, error),
-        (k.value, k.image, k.weight, k.error))
+        partial(jnp.where, kept), (k.z, image, weight, error), (k.value, k.image, k.weight, k.error)
+    )
     change = image - value
     pause = jnp.where(kept, jnp.where(k.newton, 0, k.pause), 2 * k.pause + 4)
     plain = jnp.where(kept, jnp.maximum(k.plain - 1, 0), pause)
@@ -166,9 +175,18 @@ def _look(
     sweep = value + (1 - given.damping) * change
     return k._replace(
         phase=jnp.where(sweeps, _LOOK, _FIRST).astype(jnp.int32),
-        z=jnp.where(sweeps, sweep, change), value=value, image=image, weight=weight, error=error,
-        done=done & kept, newton=~sweeps, plain=plain, pause=pause, solved=jnp.zeros_like(done),
-        krylov=start_bicgstab(jnp.zeros_like(change), change), target=_EXACT * norm(change),
+        z=jnp.where(sweeps, sweep, change),
+        value=value,
+        image=image,
+        weight=weight,
+        error=error,
+        done=done & kept,
+        newton=~sweeps,
+        plain=plain,
+        pause=pause,
+        solved=jnp.zeros_like(done),
+        krylov=start_bicgstab(jnp.zeros_like(change), change),
+        target=_EXACT * norm(change),
         inner=jnp.zeros_like(k.inner),
     )
 
@@ -176,7 +194,8 @@ def _look(
 def action_values(over: Any, given: Backup, ahead: Quantity) -> Quantity:
     """``g + c x`` of a backup's numbers and what is ahead of each choice."""
     return jax.tree.map(
-        lambda g, c, x: g + c * x, given.reward, over.spread(given.scale, ahead), ahead)
+        lambda g, c, x: g + c * x, given.reward, over.spread(given.scale, ahead), ahead
+    )
 
 
 def _applied(over: Any, given: Backup, k: _Search, ahead: Quantity) -> jax.Array:
@@ -195,7 +214,10 @@ def _second(over: Any, small: bool, given: Backup, k: _Search, ahead: Quantity) 
     failed = ~solved & ((inner >= _INNER) | ~jnp.isfinite(size))
     after = jnp.where(solved, _LOOK, jnp.where(failed, _DIRECT if small else _LOOK, _FIRST))
     return k._replace(
-        phase=after.astype(jnp.int32), krylov=krylov, inner=inner, solved=solved,
+        phase=after.astype(jnp.int32),
+        krylov=krylov,
+        inner=inner,
+        solved=solved,
         z=jnp.where(solved | failed, k.value + krylov.x, krylov.p),
     )
 

@@ -107,10 +107,17 @@ def sums_of(
     trackers = [_tracker(model, o, r is not None) for o, r in zip(objectives, rewards, strict=True)]
     used = [i for i, x in enumerate(trackers) if x is not None]
     if sum(r is None for r in rewards) > _MOST:
-        raise ValueError(f"there are {sum(r is None for r in rewards)} probabilities; at most "
-                         f"{_MOST} can be had at once.")
-    product, members = _product(model, [x for x in trackers if x is not None], all(
-        o.target is not None for o, r in zip(objectives, rewards, strict=True) if r is not None))
+        raise ValueError(
+            f"there are {sum(r is None for r in rewards)} probabilities; at most "
+            f"{_MOST} can be had at once."
+        )
+    product, members = _product(
+        model,
+        [x for x in trackers if x is not None],
+        all(
+            o.target is not None for o, r in zip(objectives, rewards, strict=True) if r is not None
+        ),
+    )
     mdp = product.host
     state = members[product.memory]  # int[N, trackers]
     still = product.still
@@ -137,10 +144,18 @@ def sums_of(
     start = np.zeros(mdp.num_states)
     start[product.start] = initial[initial > 0]
     shape = (-1, mdp.num_rows)
-    return Sums(
-        mdp, start, np.array(found["sure"], np.int64).reshape(shape),
-        np.array(found["gain"], np.float64).reshape(shape),
-        np.array(found["cost"], np.float64).reshape(shape), ended), parts, product
+    return (
+        Sums(
+            mdp,
+            start,
+            np.array(found["sure"], np.int64).reshape(shape),
+            np.array(found["gain"], np.float64).reshape(shape),
+            np.array(found["cost"], np.float64).reshape(shape),
+            ended,
+        ),
+        parts,
+        product,
+    )
 
 
 def _checked(model: SparseMDP, index: int, objective: Objective) -> np.ndarray | None:
@@ -150,8 +165,10 @@ def _checked(model: SparseMDP, index: int, objective: Objective) -> np.ndarray |
         raise ValueError(f'{name}: direction={objective.direction!r}; it must be "max" or "min".')
     given = [n for n in ("formula", "avoid", "reward") if getattr(objective, n) is not None]
     if len(given) > 1 or (not given and objective.target is None):
-        raise ValueError(f"{name}: give one of formula, avoid, reward or target; it has "
-                         f"{', '.join(given) or 'none'}.")
+        raise ValueError(
+            f"{name}: give one of formula, avoid, reward or target; it has "
+            f"{', '.join(given) or 'none'}."
+        )
     if given and given[0] != "reward" and objective.target is not None:
         raise ValueError(f"{name}: a target goes with a reward or alone, not with {given[0]}.")
     if objective.stay is not None and (given or objective.target is None):
@@ -163,7 +180,8 @@ def _checked(model: SparseMDP, index: int, objective: Objective) -> np.ndarray |
         r = int(np.flatnonzero(reward < 0)[0])
         raise ValueError(
             f"{name}: the reward of a choice of state {model.host.state[r]} is {reward[r]:.6g}; "
-            "expected total rewards need rewards of at least 0.")
+            "expected total rewards need rewards of at least 0."
+        )
     return reward
 
 
@@ -173,8 +191,13 @@ def _tracker(model: SparseMDP, objective: Objective, is_reward: bool) -> _Tracke
         automaton, letter = automaton_of(model, objective.formula)
         yes, no = universal_states(automaton), ~live_states(automaton)
         return _Tracker(
-            automaton.delta, letter, int(automaton.initial), yes | no,
-            automaton.priority + opposite, np.where(yes, 0, 1) + opposite)
+            automaton.delta,
+            letter,
+            int(automaton.initial),
+            yes | no,
+            automaton.priority + opposite,
+            np.where(yes, 0, 1) + opposite,
+        )
     if is_reward and objective.target is None:
         return None
     if objective.avoid is not None:
@@ -189,8 +212,14 @@ def _tracker(model: SparseMDP, objective: Objective, is_reward: bool) -> _Tracke
     decided = np.array([False, True, True])
     if is_reward:
         return _Tracker(delta, letter, 0, decided, None, None)
-    return _Tracker(delta, letter, 0, decided, np.where(delta == 1, 0, 1) + opposite,
-                    np.array([1, 0, 1]) + opposite)
+    return _Tracker(
+        delta,
+        letter,
+        0,
+        decided,
+        np.where(delta == 1, 0, 1) + opposite,
+        np.array([1, 0, 1]) + opposite,
+    )
 
 
 def _product(
@@ -205,8 +234,11 @@ def _product(
     letter = letter.reshape(-1)
 
     def after(members: np.ndarray, read: np.ndarray) -> np.ndarray:
-        return np.stack([x.delta[members[:, i], read[:, i]] for i, x in enumerate(trackers)],
-                        -1) if trackers else members
+        return (
+            np.stack([x.delta[members[:, i], read[:, i]] for i, x in enumerate(trackers)], -1)
+            if trackers
+            else members
+        )
 
     begin = np.tile([x.first for x in trackers], (first.size, 1)).reshape(first.size, -1)
     begin = after(begin.astype(np.int64), letters[first])
@@ -222,7 +254,8 @@ def _product(
         new = [x for x in map(tuple, np.unique(reached, axis=0).tolist()) if x not in codes]
         frontier = np.array(new, np.int64).reshape(len(new), len(trackers))
     delta = np.array([codes[tuple(x)] for x in np.vstack(steps).tolist()]).reshape(
-        len(known), len(shown))
+        len(known), len(shown)
+    )
     still = np.full(len(known), all_end)
     for i, x in enumerate(trackers):
         still &= x.decided[known[:, i]]

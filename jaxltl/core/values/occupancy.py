@@ -70,8 +70,11 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
     policy = checked.distribution
     discount = jnp.asarray(discount, model.dtype)
     start = jnp.asarray(start, model.dtype)
-    start = jnp.broadcast_to(start, model.state_shape) if start.ndim < 2 else start.reshape(
-        model.state_shape)
+    start = (
+        jnp.broadcast_to(start, model.state_shape)
+        if start.ndim < 2
+        else start.reshape(model.state_shape)
+    )
 
     def flow(d: jax.Array) -> jax.Array:
         return start + discount * pushforward(model, over.spread(d) * policy)
@@ -92,8 +95,7 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
     finite = jnp.isfinite(bound)
     bound = jnp.where(finite, bound, jnp.inf)
     goal = 4 * rounding if tolerance is None else tolerance
-    visits = implicit(
-        flow, visits, solve=linear.transpose_solve, transpose_solve=linear.solve)
+    visits = implicit(flow, visits, solve=linear.transpose_solve, transpose_solve=linear.solve)
     value = over.spread(visits) * policy
     frozen = lax.stop_gradient(value)
     solution = Solution(
@@ -104,7 +106,8 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
         residual=lax.stop_gradient(residual),
         num_steps=n,
         status=status_code(
-            lax.stop_gradient(bound <= goal), lax.stop_gradient(finite), bound <= 8 * rounding),
+            lax.stop_gradient(bound <= goal), lax.stop_gradient(finite), bound <= 8 * rounding
+        ),
     )
     return refuse(solution, checked.given, checked.valid)
 

@@ -121,14 +121,17 @@ def optimal_actions(
     """
     refuse_sharded(model)
     if is_traced((model, solution, tolerance)):
-        raise ValueError("optimal_actions(model) reads values, so it works on the host only: "
-                         "call it outside jit and vmap, and pass the mask in.")
+        raise ValueError(
+            "optimal_actions(model) reads values, so it works on the host only: "
+            "call it outside jit and vmap, and pass the mask in."
+        )
     goal = float(np.sqrt(np.finfo(model.dtype).eps) if tolerance is None else tolerance)
     problem = as_reachability(model, objective)
     if solution is None:
         solution = optimal_satisfaction(model, objective=objective, tolerance=goal / 8)
-    found = _certified(model, solution, _conserving(problem, solution, objective), problem,
-                       objective, goal)
+    found = _certified(
+        model, solution, _conserving(problem, solution, objective), problem, objective, goal
+    )
     if int(found.status) == Status.CONVERGED:
         return found
     # What is left of it attains bounds whatever the shares of its actions.
@@ -151,8 +154,9 @@ def _conserving(problem: Reaching, solution: Solution, objective: str) -> Boolea
     if problem.objective == "max":
         # Inside an end component the best probability is everywhere the same.
         keeps = keeps | components_within(graph, open_).inside
-    return graph.available & (keeps | (~decided[..., None] & _by_bounds(
-        problem.model, solution, objective)))
+    return graph.available & (
+        keeps | (~decided[..., None] & _by_bounds(problem.model, solution, objective))
+    )
 
 
 def _on_graph(problem: Reaching) -> tuple[Booleans, Booleans, Booleans]:
@@ -185,13 +189,17 @@ def _bounded(
     decided, sure, _ = _on_graph(problem)
     graph = graph_of(problem.model)
     allowed, policy = _staying(
-        problem, graph.available & (sure | (~decided[..., None] & keeps)), problem.model.dtype)
-    return _judged(
-        allowed, policy, bounds, replace(bounds, policy=policy), objective, goal)
+        problem, graph.available & (sure | (~decided[..., None] & keeps)), problem.model.dtype
+    )
+    return _judged(allowed, policy, bounds, replace(bounds, policy=policy), objective, goal)
 
 
 def _certified(
-    model: Product, solution: Solution, keeps: Booleans, problem: Reaching, objective: str,
+    model: Product,
+    solution: Solution,
+    keeps: Booleans,
+    problem: Reaching,
+    objective: str,
     goal: float,
 ) -> OptimalActions:
     """The mask of conserving actions, and what its uniform policy attains."""
@@ -201,7 +209,11 @@ def _certified(
 
 
 def _judged(
-    allowed: jax.Array, policy: jax.Array, solution: Solution, attained: Solution, objective: str,
+    allowed: jax.Array,
+    policy: jax.Array,
+    solution: Solution,
+    attained: Solution,
+    objective: str,
     goal: float,
 ) -> OptimalActions:
     above, below = (solution, attained) if objective == "max" else (attained, solution)
@@ -209,8 +221,7 @@ def _judged(
     status = Status.CONVERGED if loss <= goal else Status.PRECISION
     # Rounded up to the model's precision.
     loss = np.nextafter(loss.astype(policy.dtype), np.asarray(2, policy.dtype))
-    return OptimalActions(
-        allowed, policy, solution, attained, *to_jax((loss, np.int32(status))))
+    return OptimalActions(allowed, policy, solution, attained, *to_jax((loss, np.int32(status))))
 
 
 def _staying(problem: Reaching, keeps: Booleans, dtype: Any) -> tuple[jax.Array, jax.Array]:

@@ -119,7 +119,7 @@ def tabulate_policy(
     for begin in range(0, count, size):
         place = np.minimum(np.arange(begin, begin + size), count - 1)
         some = jax.tree.map(lambda x, i=place: jnp.asarray(x)[i], table.world)
-        parts.append(np.asarray(_acts(policy, inner, memory, some))[:count - begin])
+        parts.append(np.asarray(_acts(policy, inner, memory, some))[: count - begin])
     return np.concatenate(parts)
 
 
@@ -188,10 +188,15 @@ def optimality_gap(
     model = product(table.model, task)
     shown = _rows_of(policy)
     shape, num_actions = model.state_shape, int(np.max(np.asarray(table.model.action))) + 1
-    if shown.shape[:2] != shape or shown.ndim != 2 + (not is_deterministic(shown)) or (
-            shown.ndim == 3 and shown.shape[2] < num_actions):
-        raise ValueError(f"policy is {shown.dtype}{list(shown.shape)}; expected actions "
-                         f"int{list(shape)}, or probabilities float{[*shape, num_actions]}.")
+    if (
+        shown.shape[:2] != shape
+        or shown.ndim != 2 + (not is_deterministic(shown))
+        or (shown.ndim == 3 and shown.shape[2] < num_actions)
+    ):
+        raise ValueError(
+            f"policy is {shown.dtype}{list(shown.shape)}; expected actions "
+            f"int{list(shape)}, or probabilities float{[*shape, num_actions]}."
+        )
     start = np.unique(np.asarray(table.start))
     weight = np.asarray(table.model.initial)[start]
     if steps is None:
@@ -205,9 +210,17 @@ def optimality_gap(
     lower = np.maximum(np.where(sure, below, np.nextafter(below, -np.inf)), 0)
     upper = np.maximum(np.where(sure, above, np.nextafter(above, np.inf)), 0)
     return OptimalityGap(
-        start.astype(np.int32), weight, value, optimum, lower, upper,
-        _mean(weight, lower, upper), _mean(weight, *own), _mean(weight, *best),
-        table.evidence)
+        start.astype(np.int32),
+        weight,
+        value,
+        optimum,
+        lower,
+        upper,
+        _mean(weight, lower, upper),
+        _mean(weight, *own),
+        _mean(weight, *best),
+        table.evidence,
+    )
 
 
 def _rows_of(policy: Any) -> np.ndarray:
@@ -216,8 +229,7 @@ def _rows_of(policy: Any) -> np.ndarray:
     except ValueError:  # ragged
         found = np.asarray(None)
     if found.dtype.kind not in "iuf":
-        raise ValueError(
-            f"policy is {given.shown(policy)}; give actions, or their probabilities.")
+        raise ValueError(f"policy is {given.shown(policy)}; give actions, or their probabilities.")
     return found
 
 
@@ -227,8 +239,13 @@ def _bounded(
     """The agent's probability and the best within so many steps, from each beginning."""
     base, decisions, letter = table.model.host, verdicts(task), np.asarray(model.letter)
     found = host_product(
-        base, np.asarray(task.delta), letter, start,
-        np.asarray(model.initial_memory)[start], still=decisions != Verdict.UNDECIDED)
+        base,
+        np.asarray(task.delta),
+        letter,
+        start,
+        np.asarray(model.initial_memory)[start],
+        still=decisions != Verdict.UNDECIDED,
+    )
     ended = np.asarray(table.terminated)[found.base_state]
     at_end = lasting_verdicts(task)[found.memory, letter[found.base_state]]
     target = np.where(ended, at_end, decisions[found.memory]) == Verdict.SATISFIED
@@ -237,8 +254,13 @@ def _bounded(
     single = np.diff(base.row_start)[found.base_state] == 1
     fixed = found.still | (single & (ended | ~going))
     weight = _weights(
-        policy, np.asarray(table.model.action)[found.base_row],
-        found.base_state, found.memory, found.host, fixed)
+        policy,
+        np.asarray(table.model.action)[found.base_row],
+        found.base_state,
+        found.memory,
+        found.host,
+        fixed,
+    )
     written = as_sparse(found)
     chain = chain_of(written, written, weight)
     own = host.until(chain.mdp, target, going, steps, np.maximum)
@@ -249,29 +271,35 @@ def _bounded(
     at = found.start
     return (
         enclosed(own.value[at], error[at], None, own.num_steps, highest=1),
-        enclosed(best.value[at], best.error[at], found.base_row[best.row[at]], best.num_steps,
-                 highest=1))
+        enclosed(
+            best.value[at], best.error[at], found.base_row[best.row[at]], best.num_steps, highest=1
+        ),
+    )
 
 
-def _unbounded(
-    table: Table, model: Any, policy: np.ndarray, start: np.ndarray
-) -> tuple[Any, Any]:
+def _unbounded(table: Table, model: Any, policy: np.ndarray, start: np.ndarray) -> tuple[Any, Any]:
     """The same without a limit."""
     if np.asarray(table.truncated).any():
         raise ValueError(
             "optimality_gap: the environment cuts episodes off, and what would come is not in the "
-            "table; give num_steps, or tabulate it without its limit.")
+            "table; give num_steps, or tabulate it without its limit."
+        )
     base = table.model
     num_memory = model.num_memory
-    state, memory = np.repeat(base.host.state, num_memory), np.tile(
-        np.arange(num_memory), base.num_rows)
+    state, memory = (
+        np.repeat(base.host.state, num_memory),
+        np.tile(np.arange(num_memory), base.num_rows),
+    )
     ended = np.asarray(table.terminated)
     action = np.repeat(np.asarray(base.action), num_memory)
     mass = _mass(policy, action, state, memory)
     mass = np.where(ended[state], 1.0, mass).reshape(base.num_rows, num_memory)
     total = np.add.reduceat(mass, base.host.row_start[:-1], axis=0)
-    _require(total, np.minimum.reduceat(mass, base.host.row_start[:-1], axis=0),
-             lambda at: (int(at[0]), int(at[1])))
+    _require(
+        total,
+        np.minimum.reduceat(mass, base.host.row_start[:-1], axis=0),
+        lambda at: (int(at[0]), int(at[1])),
+    )
     own = product_satisfaction(model, policy=mass / total[base.host.state])
     best = product_satisfaction(model)
     at: Any = start, np.asarray(model.initial_memory)[start]
@@ -288,15 +316,22 @@ def _mass(
 
 
 def _weights(
-    policy: np.ndarray, action: np.ndarray, base: np.ndarray, memory: np.ndarray, mdp: Any,
+    policy: np.ndarray,
+    action: np.ndarray,
+    base: np.ndarray,
+    memory: np.ndarray,
+    mdp: Any,
     fixed: np.ndarray,
 ) -> np.ndarray:
     """``float64[R']``, the agent's distribution over the rows of each pair."""
     weight = _mass(policy, action, base[mdp.state], memory[mdp.state])
     weight = np.where(fixed[mdp.state], 1.0, weight)
     total = mdp.over_choices(np.add, weight)
-    _require(total, mdp.over_choices(np.minimum, weight),
-             lambda at: (int(base[at[0]]), int(memory[at[0]])))
+    _require(
+        total,
+        mdp.over_choices(np.minimum, weight),
+        lambda at: (int(base[at[0]]), int(memory[at[0]])),
+    )
     return weight / total[mdp.state]
 
 
@@ -305,7 +340,8 @@ def _require(total: np.ndarray, least: np.ndarray, place: Callable[..., tuple[in
         state, memory = place(at)
         raise ValueError(
             f"policy: in state {state} with memory {memory} the actions that are allowed have the "
-            f"probability {total[tuple(at)]:.9g} in sum; it must be a distribution over them.")
+            f"probability {total[tuple(at)]:.9g} in sum; it must be a distribution over them."
+        )
 
 
 def _mean(weight: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[float, float]:

@@ -143,16 +143,28 @@ def _task_performance(model: Product, policy: jax.Array, tolerance, *, method: s
         lower, upper = jnp.maximum(value - error, 0), jnp.minimum(value + error, 1)
     else:
         solution = satisfaction_probability(
-            model, policy, tolerance=tolerance,
+            model,
+            policy,
+            tolerance=tolerance,
             method="iterative" if math.prod(model.state_shape) > _BLOCK_LIMIT else "auto",
         )
         value, lower, upper = solution.value, solution.lower, solution.upper
     found = _summarize(model, value, lower, upper, tolerance)
     unknown: Any = {
-        "mean": jnp.nan, "lower": 0, "upper": 1, "worst": jnp.nan, "worst_lower": 0,
-        "worst_upper": 1, "value": jnp.nan, "status": Status.INVALID}
-    return jax.tree.map(lambda x, bad: jnp.where(valid, x, jnp.asarray(bad, x.dtype)),
-                        found, replace(found, **unknown))
+        "mean": jnp.nan,
+        "lower": 0,
+        "upper": 1,
+        "worst": jnp.nan,
+        "worst_lower": 0,
+        "worst_upper": 1,
+        "value": jnp.nan,
+        "status": Status.INVALID,
+    }
+    return jax.tree.map(
+        lambda x, bad: jnp.where(valid, x, jnp.asarray(bad, x.dtype)),
+        found,
+        replace(found, **unknown),
+    )
 
 
 def _summarize(model: Product, value, lower, upper, tolerance) -> Performance:
@@ -168,10 +180,12 @@ def _summarize(model: Product, value, lower, upper, tolerance) -> Performance:
     worst_state = jnp.argmin(jnp.where(starts, value, jnp.inf)).astype(jnp.int32)
     narrow = jnp.max(jnp.where(starts, upper - lower, 0)) <= 2 * goal
     finite = jnp.all(jnp.isfinite(value))
+
     def mean(x: jax.Array, slack: jax.Array) -> jax.Array:
         # Rounding takes no mean out of the range of what it is of.
-        least, most = (f(jnp.where(starts, x, out)) for f, out in (
-            (jnp.min, jnp.inf), (jnp.max, -jnp.inf)))
+        least, most = (
+            f(jnp.where(starts, x, out)) for f, out in ((jnp.min, jnp.inf), (jnp.max, -jnp.inf))
+        )
         return jnp.clip(jnp.sum(weight * x) + slack, least, most)
 
     return Performance(
@@ -312,8 +326,7 @@ def task_performances(
         return found
     columns = jax.tree.map(np.array, found)
     for w in redone:
-        model, policy = to_jax(
-            jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies)))
+        model, policy = to_jax(jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies)))
         bounds = _by_elimination(model, policy_distribution(model, policy))
         value, lower, upper = (to_jax(np.asarray(x, model.dtype)) for x in bounds)
         exact = _summarize(model, value, lower, upper, tolerance)
@@ -353,9 +366,7 @@ def _together(models: Product, policies: jax.Array, tolerance) -> Performance:
     return jax.vmap(partial(task_performance, tolerance=tolerance))(models, policies)
 
 
-def _by_elimination(
-    model: Product, policy: jax.Array
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _by_elimination(model: Product, policy: jax.Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Probability of the task and bounds on it, ``float64[S, Q]``, on the host.
 
     States are eliminated one by one. Each weight stays a sum of products of weights, so
@@ -414,7 +425,8 @@ def _chain(model: Product, policy: jax.Array) -> np.ndarray:
     total = probability.sum(-1, keepdims=True)
     probability = np.divide(probability, total, where=total > 0, out=np.zeros_like(probability))
     successor = np.broadcast_to(
-        getattr(world, "successor", np.arange(num_states)), probability.shape)
+        getattr(world, "successor", np.arange(num_states)), probability.shape
+    )
     s, q, a, k = np.indices((num_states, num_memory, *probability.shape[1:]))
     read = successor[s, a, k] if model.label_on == "entry" else s
     column = successor[s, a, k] * num_memory + memory[read, q]
@@ -538,9 +550,14 @@ def summarize(
     kept = np.array([name not in leave_out for name in names])
     if not kept.any():
         raise ValueError("leave_out names every world; leave at least one in.")
-    infeasible = np.array([
-        np.asarray(infeasible_starts(jax.tree.map(lambda x, w=w: np.asarray(x)[w], models))).any()
-        for w in range(count)])
+    infeasible = np.array(
+        [
+            np.asarray(
+                infeasible_starts(jax.tree.map(lambda x, w=w: np.asarray(x)[w], models))
+            ).any()
+            for w in range(count)
+        ]
+    )
     mean = np.asarray(performance.mean, np.float64)
     worst = int(np.argmin(np.where(kept, mean, np.inf)))
 

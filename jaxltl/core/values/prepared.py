@@ -139,8 +139,10 @@ def prepare(
         raise ValueError(f'objective={objective!r}; it must be "max", "min" or "policy".')
     refuse_sharded(model)
     if is_traced((model, target, stay, reward)):
-        raise ValueError("prepare reads its model, so it works on concrete arrays only; call it "
-                         "before jit, and solve_prepared inside.")
+        raise ValueError(
+            "prepare reads its model, so it works on concrete arrays only; call it "
+            "before jit, and solve_prepared inside."
+        )
     if stay is not None and reward is not None:
         raise ValueError("expected rewards are until the target alone: leave stay out.")
     sparse = to_sparse(model)
@@ -153,27 +155,31 @@ def prepare(
     cost = None if reward is None else row_reward(sparse, reward)
     if cost is not None and not (np.isfinite(cost) & (cost >= 0)).all():
         r = int(np.flatnonzero(~(np.isfinite(cost) & (cost >= 0)))[0])
-        raise ValueError(f"the reward of a choice of state {host.state[r]} is {cost[r]:.6g}; "
-                         "prepared solves need finite rewards of at least 0.")
+        raise ValueError(
+            f"the reward of a choice of state {host.state[r]} is {cost[r]:.6g}; "
+            "prepared solves need finite rewards of at least 0."
+        )
     if objective == "policy":
         plan = plan_policy(host, target, stay, cost)
     elif cost is None:
         plan = plan_optimum(
-            reduce_reachability(host, target, maximize=objective == "max", stay=stay), None)
+            reduce_reachability(host, target, maximize=objective == "max", stay=stay), None
+        )
     else:
         kept = host.over_choices(np.maximum, cost) > 0
-        plan = plan_optimum(reduce_total_reward(
-            host, cost, target, maximize=objective == "max", kept=kept), cost)
+        plan = plan_optimum(
+            reduce_total_reward(host, cost, target, maximize=objective == "max", kept=kept), cost
+        )
     return _prepared(host, plan, cost, objective)
 
 
 def _prepared(host: Any, plan: Plan, cost: Any, objective: str) -> Prepared:
     dtype = jnp.zeros(()).dtype
-    vector = np.concatenate([
-        host.probability, np.zeros(host.num_rows) if cost is None else cost, [1.0, 0.0]])
+    vector = np.concatenate(
+        [host.probability, np.zeros(host.num_rows) if cost is None else cost, [1.0, 0.0]]
+    )
     if plan.loops is not None:
-        rest = np.bincount(plan.loops.group, host.probability[plan.loops.entry],
-                           plan.loops.groups)
+        rest = np.bincount(plan.loops.group, host.probability[plan.loops.entry], plan.loops.groups)
         scale = np.ones(host.num_rows)
         scale[plan.loops.row] = 1 / np.maximum(rest, 1e-300)[plan.loops.row_group]
         vector[: host.num_transitions] *= scale[host.row]
@@ -188,15 +194,25 @@ def _prepared(host: Any, plan: Plan, cost: Any, objective: str) -> Prepared:
     loops = None if plan.loops is None else tuple(x.astype(np.int32) for x in plan.loops[:4])
     circles = None if plan.circles is None else tuple(x.astype(np.int32) for x in plan.circles)
     found = Prepared(
-        segments=(blocks[0], blocks[1], blocks[2]), place=plan.place,
-        nodes=np.concatenate(nodes).astype(np.int32), own=plan.own, row=plan.row,
-        entry_row=host.row.astype(np.int32), row_state=host.state.astype(np.int32),
+        segments=(blocks[0], blocks[1], blocks[2]),
+        place=plan.place,
+        nodes=np.concatenate(nodes).astype(np.int32),
+        own=plan.own,
+        row=plan.row,
+        entry_row=host.row.astype(np.int32),
+        row_state=host.state.astype(np.int32),
         probability=host.probability.astype(dtype),
-        reward=None if cost is None else cost.astype(dtype), loops=loops, circles=circles,
-        question="probability" if cost is None else "reward", objective=objective,
-        cyclic=plan.schedule.segments[1].target.size > 0, levels=plan.schedule.levels,
-        choices=plan.schedule.choices, terms=plan.terms + blocks[0].target.shape[2],
-        groups=0 if plan.loops is None else plan.loops.groups)
+        reward=None if cost is None else cost.astype(dtype),
+        loops=loops,
+        circles=circles,
+        question="probability" if cost is None else "reward",
+        objective=objective,
+        cyclic=plan.schedule.segments[1].target.size > 0,
+        levels=plan.schedule.levels,
+        choices=plan.schedule.choices,
+        terms=plan.terms + blocks[0].target.shape[2],
+        groups=0 if plan.loops is None else plan.loops.groups,
+    )
     return to_jax(found)
 
 
@@ -259,8 +275,10 @@ def solve_prepared(
             shape = prepared.place if is_deterministic(policy) else prepared.row_state
             require_shape("policy", policy, shape.shape)
     elif policy is not None:
-        raise ValueError(f'a policy is given, but the question is the optimum: prepare it with '
-                         f'objective="policy", not {prepared.objective!r}.')
+        raise ValueError(
+            f"a policy is given, but the question is the optimum: prepare it with "
+            f'objective="policy", not {prepared.objective!r}.'
+        )
     dtype = prepared.probability.dtype
     if tolerance is None:
         tolerance = 1e-6 if dtype == jnp.float64 else 1e-3
@@ -274,8 +292,9 @@ def given_numbers(prepared: Prepared, probability: Any, reward: Any) -> tuple[An
         require_shape("probability", probability, prepared.probability.shape)
     if reward is not None:
         if prepared.reward is None:
-            raise ValueError("a reward is given, but the question is a probability: prepare it "
-                             "with a reward.")
+            raise ValueError(
+                "a reward is given, but the question is a probability: prepare it with a reward."
+            )
         require_shape("reward", reward, prepared.reward.shape)
     return probability, reward
 
@@ -321,7 +340,8 @@ def _shares(prepared: Prepared, policy: Any) -> tuple[_Shares | None, Any]:
         weight = policy.astype(dtype)
         used = weight > 0
     total = jax.ops.segment_sum(
-        weight, prepared.row_state, prepared.num_states, indices_are_sorted=True)
+        weight, prepared.row_state, prepared.num_states, indices_are_sorted=True
+    )
     slack = row_tolerance(dtype)
     valid = jnp.all(jnp.abs(total - 1) <= slack) & jnp.all(weight >= 0)
     finite = jnp.all(jnp.isfinite(weight))
@@ -337,7 +357,8 @@ def checked_numbers(
     if probability is not None:
         probability = lax.stop_gradient(probability).astype(prepared.probability.dtype)
         total = jax.ops.segment_sum(
-            probability, prepared.entry_row, prepared.num_rows, indices_are_sorted=True)
+            probability, prepared.entry_row, prepared.num_rows, indices_are_sorted=True
+        )
         finite &= jnp.all(jnp.isfinite(total))
         slack = row_tolerance(probability.dtype)
         valid &= jnp.all(probability > 0) & jnp.all(jnp.abs(total - 1) <= slack)
@@ -352,9 +373,7 @@ def checked_numbers(
     return finite, valid
 
 
-def refilled(
-    prepared: Prepared, probability: Any, reward: Any, share: _Shares | None
-) -> Prepared:
+def refilled(prepared: Prepared, probability: Any, reward: Any, share: _Shares | None) -> Prepared:
     """The same blocks with other weights."""
     dtype = prepared.probability.dtype
     p = prepared.probability if probability is None else jnp.asarray(probability, dtype)
@@ -375,7 +394,8 @@ def refilled(
     vector = jnp.concatenate([p, r, jnp.asarray([1, 0], dtype)])
     one, two, three = (
         replace(x, weight=vector.at[x.source].get(mode="promise_in_bounds"))
-        for x in prepared.segments)
+        for x in prepared.segments
+    )
     return replace(prepared, segments=(one, two, three))
 
 
@@ -405,7 +425,8 @@ def _decided(prepared: Prepared, reward: Any, share: _Shares | None) -> _Decided
     lost = meets(prepared.segments, support, never, prepared.cyclic)
     if prepared.question == "probability":
         return _Decided(
-            ~states | (reached & lost), states & reached & ~lost, jnp.zeros(size + 3, bool))
+            ~states | (reached & lost), states & reached & ~lost, jnp.zeros(size + 3, bool)
+        )
     paying = jnp.zeros(size + 3, bool).at[size].set(True)
     earns = meets(prepared.segments, support, paying, prepared.cyclic)
     return _Decided(~lost & earns, jnp.zeros(size + 3, bool), lost)
@@ -452,8 +473,13 @@ def _enclosed(
 
 
 def _circling(
-    prepared: Prepared, start: jax.Array, given: dict[str, Any], unit: float, least: float,
-    tolerance: jax.Array, max_steps: Any,
+    prepared: Prepared,
+    start: jax.Array,
+    given: dict[str, Any],
+    unit: float,
+    least: float,
+    tolerance: jax.Array,
+    max_steps: Any,
 ) -> _Found:
     """Bounds from both sides of what has circles."""
     before, core, after = prepared.segments
@@ -468,8 +494,15 @@ def _circling(
         return enclose_circles(problem, low, high, most)
 
     # How much work it is depends on the lane.
-    s = in_turn(enclosed, core, arrays, tolerance, down(before, start)[0], up(before, start)[0],
-                jnp.asarray(max_steps, jnp.int32))
+    s = in_turn(
+        enclosed,
+        core,
+        arrays,
+        tolerance,
+        down(before, start)[0],
+        up(before, start)[0],
+        jnp.asarray(max_steps, jnp.int32),
+    )
     low, high = down(after, s.low)[0], up(after, s.high)[0]
     rank = None
     if "keep" not in given:
@@ -506,8 +539,7 @@ def _attached(prepared: Prepared, found: _Found, decided: _Decided | None) -> ja
     def operator(x: jax.Array) -> jax.Array:
         return system.image(jnp.concatenate([x, one])) + put
 
-    return implicit(
-        operator, found.value, solve=fixed.solve, transpose_solve=fixed.transpose_solve)
+    return implicit(operator, found.value, solve=fixed.solve, transpose_solve=fixed.transpose_solve)
 
 
 def chosen_rows(prepared: Prepared, rank: jax.Array | None) -> Chosen:
@@ -518,13 +550,21 @@ def chosen_rows(prepared: Prepared, rank: jax.Array | None) -> Chosen:
         return Chosen(target[:, 0], weight[:, 0], prepared.cyclic)
     at = rank[:, None, None]
     return Chosen(
-        jnp.take_along_axis(target, at, 1)[:, 0], jnp.take_along_axis(weight, at, 1)[:, 0],
-        prepared.cyclic)
+        jnp.take_along_axis(target, at, 1)[:, 0],
+        jnp.take_along_axis(weight, at, 1)[:, 0],
+        prepared.cyclic,
+    )
 
 
 def _answer(
-    prepared: Prepared, found: _Found, decided: _Decided | None, value: jax.Array,
-    tolerance: jax.Array, finite: jax.Array, valid: jax.Array, taken: Any,
+    prepared: Prepared,
+    found: _Found,
+    decided: _Decided | None,
+    value: jax.Array,
+    tolerance: jax.Array,
+    finite: jax.Array,
+    valid: jax.Array,
+    taken: Any,
 ) -> Solution:
     """The answer of the states. All is judged and refused at the nodes, which may be few."""
     dtype, size = prepared.probability.dtype, prepared.size
@@ -550,10 +590,14 @@ def _answer(
         return x.at[prepared.place].get(mode="promise_in_bounds")
 
     return Solution(
-        value=everywhere(value, jnp.nan), lower=everywhere(lower, -jnp.inf),
+        value=everywhere(value, jnp.nan),
+        lower=everywhere(lower, -jnp.inf),
         upper=everywhere(upper, jnp.inf),
         policy=_policy(prepared, found) if taken is None else taken,
-        residual=jnp.where(good, found.residual, jnp.nan), num_steps=found.steps, status=status)
+        residual=jnp.where(good, found.residual, jnp.nan),
+        num_steps=found.steps,
+        status=status,
+    )
 
 
 def _policy(prepared: Prepared, found: _Found) -> jax.Array:
@@ -579,10 +623,15 @@ def _going_round(prepared: Prepared, rows: jax.Array) -> jax.Array:
 
     def further(carry: Any) -> Any:
         there, row, _ = carry
-        leads = jax.ops.segment_max(
-            there[successor].astype(jnp.int32), entry_row, many, indices_are_sorted=True) > 0
+        leads = (
+            jax.ops.segment_max(
+                there[successor].astype(jnp.int32), entry_row, many, indices_are_sorted=True
+            )
+            > 0
+        )
         first = jax.ops.segment_min(
-            jnp.where(leads, inside, last), owner, count, indices_are_sorted=True)
+            jnp.where(leads, inside, last), owner, count, indices_are_sorted=True
+        )
         new = ~there & (first < last)
         return there | new, jnp.where(new, first, row), jnp.any(new)
 

@@ -106,8 +106,14 @@ class PreparedInterval:
 
 
 def prepare_interval(
-    model: IntervalMDP, target: Any, *, stay: Any = None, reward: Any = None,
-    policy: Any = None, objective: str = "max", nature: str | None = None,
+    model: IntervalMDP,
+    target: Any,
+    *,
+    stay: Any = None,
+    reward: Any = None,
+    policy: Any = None,
+    objective: str = "max",
+    nature: str | None = None,
 ) -> PreparedInterval:
     """Decides what the graph of an interval model decides, once, for solves with other ends.
 
@@ -143,8 +149,10 @@ def prepare_interval(
       0.5
     """
     if is_traced((model, target, stay, reward, policy)):
-        raise ValueError("prepare_interval reads its model, so it works on concrete arrays only; "
-                         "call it before jit, and solve_prepared_interval inside.")
+        raise ValueError(
+            "prepare_interval reads its model, so it works on concrete arrays only; "
+            "call it before jit, and solve_prepared_interval inside."
+        )
     refuse_ball(require_interval(model), "prepare_interval has no rule for its derivatives")
     if stay is not None and reward is not None:
         raise ValueError("expected rewards are until the target alone: leave stay out.")
@@ -156,8 +164,10 @@ def prepare_interval(
     if policy is not None:
         policy = np.asarray(policy)
         if not is_deterministic(policy):
-            raise ValueError("prepare_interval takes a policy of rows, int[S]; weights are for "
-                             "the host's solvers.")
+            raise ValueError(
+                "prepare_interval takes a policy of rows, int[S]; weights are for "
+                "the host's solvers."
+            )
         row_weights(model.nominal, policy)  # checks it
         host, entry = host.chain(policy)
     up, large = objective == "max", nature == "max"
@@ -173,8 +183,13 @@ def prepare_interval(
 
 
 def _prepared(
-    model: IntervalMDP, host: HostInterval, entry: np.ndarray, plan: IntervalPlan, cost: Any,
-    policy: Any, directions: tuple[str, str, bool],
+    model: IntervalMDP,
+    host: HostInterval,
+    entry: np.ndarray,
+    plan: IntervalPlan,
+    cost: Any,
+    policy: Any,
+    directions: tuple[str, str, bool],
 ) -> PreparedInterval:
     """The arrays.
 
@@ -210,24 +225,42 @@ def _prepared(
     objective, nature, _ = directions
     answers = plan.answers
     found = PreparedInterval(
-        table=table, target=target, owner=owner.astype(np.int32),
-        row=origin[rows].astype(np.int32), choice=choice.astype(np.int32),
-        first=number[plan.row[open_]].astype(np.int32), node=node.astype(np.int32),
-        policy=origin[plan.row].astype(np.int32), entry_row=whole.row.astype(np.int32),
-        kept=inside, answers=(entry[answers.entry].astype(np.int32),
-                              answers.group.astype(np.int32), answers.room,
-                              np.diff(whole.entry_start)[origin[answers.row]].astype(np.int32)),
-        lower=np.asarray(model.lower, dtype), upper=np.asarray(model.upper, dtype),
+        table=table,
+        target=target,
+        owner=owner.astype(np.int32),
+        row=origin[rows].astype(np.int32),
+        choice=choice.astype(np.int32),
+        first=number[plan.row[open_]].astype(np.int32),
+        node=node.astype(np.int32),
+        policy=origin[plan.row].astype(np.int32),
+        entry_row=whole.row.astype(np.int32),
+        kept=inside,
+        answers=(
+            entry[answers.entry].astype(np.int32),
+            answers.group.astype(np.int32),
+            answers.room,
+            np.diff(whole.entry_start)[origin[answers.row]].astype(np.int32),
+        ),
+        lower=np.asarray(model.lower, dtype),
+        upper=np.asarray(model.upper, dtype),
         reward=None if cost is None else cost.astype(dtype),
-        question="probability" if cost is None else "reward", objective=objective, nature=nature,
-        num_rows=whole.num_rows, circling=plan.circling)
+        question="probability" if cost is None else "reward",
+        objective=objective,
+        nature=nature,
+        num_rows=whole.num_rows,
+        circling=plan.circling,
+    )
     return to_jax(found)
 
 
 def solve_prepared_interval(
-    prepared: PreparedInterval, *, lower: chex.Array | None = None,
-    upper: chex.Array | None = None, reward: chex.Array | None = None,
-    tolerance: chex.Array | float | None = None, max_steps: chex.Array | int = 100,
+    prepared: PreparedInterval,
+    *,
+    lower: chex.Array | None = None,
+    upper: chex.Array | None = None,
+    reward: chex.Array | None = None,
+    tolerance: chex.Array | float | None = None,
+    max_steps: chex.Array | int = 100,
 ) -> Solution:
     """The answer to a prepared question about intervals, with other ends where they are given.
 
@@ -270,9 +303,11 @@ def solve_prepared_interval(
         raise ValueError(f"prepared is {shown(prepared)}; give what prepare_interval returns.")
     shape = prepared.lower.shape
     lower, upper, reward = (
-        None if x is None else jnp.asarray(
-            x if is_traced(x) else numbers(name, x), prepared.lower.dtype)
-        for name, x in (("lower", lower), ("upper", upper), ("reward", reward)))
+        None
+        if x is None
+        else jnp.asarray(x if is_traced(x) else numbers(name, x), prepared.lower.dtype)
+        for name, x in (("lower", lower), ("upper", upper), ("reward", reward))
+    )
     if not is_traced(max_steps):
         max_steps = whole("max_steps", max_steps, most=2**31 - 1)
     if tolerance is not None and not is_traced(tolerance):
@@ -282,8 +317,9 @@ def solve_prepared_interval(
             require_shape(name, ends, shape)
     if reward is not None:
         if prepared.reward is None:
-            raise ValueError("a reward is given, but the question is a probability: prepare it "
-                             "with a reward.")
+            raise ValueError(
+                "a reward is given, but the question is a probability: prepare it with a reward."
+            )
         require_shape("reward", reward, prepared.reward.shape)
     if tolerance is None:
         tolerance = 1e-6 if prepared.lower.dtype == jnp.float64 else 1e-3
@@ -316,8 +352,12 @@ def _checked(
     if lower is not None or upper is not None:
         low = prepared.lower if lower is None else lower
         high = prepared.upper if upper is None else upper
-        total = partial(jax.ops.segment_sum, segment_ids=prepared.entry_row,
-                        num_segments=prepared.num_rows, indices_are_sorted=True)
+        total = partial(
+            jax.ops.segment_sum,
+            segment_ids=prepared.entry_row,
+            num_segments=prepared.num_rows,
+            indices_are_sorted=True,
+        )
         finite &= jnp.all(jnp.isfinite(low)) & jnp.all(jnp.isfinite(high))
         slack = max(_LOOSE, 128 * float(jnp.finfo(low.dtype).eps))
         valid &= jnp.all((low >= 0) & (low <= high) & (high <= 1 + slack))
@@ -328,8 +368,12 @@ def _checked(
         valid &= jnp.all((high > 0) == (prepared.upper > 0))
         entry, group, room, width = prepared.answers
         if room.shape[0]:
-            parts = partial(jax.ops.segment_sum, segment_ids=group,
-                            num_segments=room.shape[0], indices_are_sorted=True)
+            parts = partial(
+                jax.ops.segment_sum,
+                segment_ids=group,
+                num_segments=room.shape[0],
+                indices_are_sorted=True,
+            )
             asked = high[entry]
             given = parts(asked)
             # A sum near one has the right sign if no addition rounds, and the same one if nothing
@@ -354,14 +398,29 @@ def _contest(prepared: PreparedInterval, lower: Any, upper: Any, reward: Any) ->
     chain = prepared.choice.shape[1] == 1
     nature = prepared.nature == wanted
     return Contest(
-        prepared.target, prepared.owner, prepared.choice, prepared.first, low, high, cost,
-        policy_leads=nature if chain else prepared.objective == wanted, nature_leads=nature,
-        relative=is_reward, circling=prepared.circling)
+        prepared.target,
+        prepared.owner,
+        prepared.choice,
+        prepared.first,
+        low,
+        high,
+        cost,
+        policy_leads=nature if chain else prepared.objective == wanted,
+        nature_leads=nature,
+        relative=is_reward,
+        circling=prepared.circling,
+    )
 
 
 def _answer(
-    prepared: PreparedInterval, contest: Contest, found: Bounds, lower: jax.Array, upper: jax.Array,
-    tolerance: jax.Array, finite: jax.Array, valid: jax.Array,
+    prepared: PreparedInterval,
+    contest: Contest,
+    found: Bounds,
+    lower: jax.Array,
+    upper: jax.Array,
+    tolerance: jax.Array,
+    finite: jax.Array,
+    valid: jax.Array,
 ) -> Solution:
     """The answer of the states."""
     is_reward, dtype = contest.relative, contest.lower.dtype
@@ -393,18 +452,28 @@ def _answer(
     if prepared.size:
         mine = jnp.append(prepared.row[found.row], 0)[jnp.minimum(prepared.node, prepared.size)]
         row = jnp.where(prepared.node < prepared.size, mine, row)
-    total = partial(jax.ops.segment_sum, segment_ids=prepared.entry_row,
-                    num_segments=prepared.num_rows, indices_are_sorted=True)
+    total = partial(
+        jax.ops.segment_sum,
+        segment_ids=prepared.entry_row,
+        num_segments=prepared.num_rows,
+        indices_are_sorted=True,
+    )
     room = total(jnp.where(prepared.kept, free, 0))
     rest = jnp.maximum(1 - total(lower), 0)
     share = jnp.where(room > 0, jnp.minimum(rest / jnp.where(room > 0, room, 1), 1), 0)
     chance = jnp.where(prepared.kept, lower + free * share[prepared.entry_row], 0)
     chance = chance.at[prepared.table].set(found.probability, mode="drop")
     return Solution(
-        value=everywhere(value, jnp.nan), policy=row, nature=lax.stop_gradient(chance),
-        lower=everywhere(low, -jnp.inf), upper=everywhere(high, jnp.inf),
-        residual=jnp.where(good, residual, jnp.nan), num_steps=found.rounds, status=status,
-        method=Method("policy iteration with nature"))
+        value=everywhere(value, jnp.nan),
+        policy=row,
+        nature=lax.stop_gradient(chance),
+        lower=everywhere(low, -jnp.inf),
+        upper=everywhere(high, jnp.inf),
+        residual=jnp.where(good, residual, jnp.nan),
+        num_steps=found.rounds,
+        status=status,
+        method=Method("policy iteration with nature"),
+    )
 
 
 def _image(contest: Contest, x: jax.Array, sign: int) -> jax.Array:
@@ -429,5 +498,9 @@ def _attached(contest: Contest, found: Bounds, value: jax.Array, sign: int) -> j
 
     mass, share = lax.stop_gradient(leaving(target, p))
     solve, transposed = system(target, share)
-    return implicit(operator, value, solve=lambda b: solve(b / mass),
-                    transpose_solve=lambda b: transposed(b) / mass)
+    return implicit(
+        operator,
+        value,
+        solve=lambda b: solve(b / mass),
+        transpose_solve=lambda b: transposed(b) / mass,
+    )

@@ -122,13 +122,20 @@ def reachability_probability(
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
     if isinstance(model, IntervalMDP):
         return robust_reachability(
-            model, target, policy=policy, objective=objective, nature=nature, stay=stay,
-            tolerance=tolerance)
+            model,
+            target,
+            policy=policy,
+            objective=objective,
+            nature=nature,
+            stay=stay,
+            tolerance=tolerance,
+        )
     refuse_nature(nature)
     require_shape("target", target, model.state_shape)
     if is_sparse(model) or stay is not None:
         return reachability(
-            model, target, stay=stay, policy=policy, objective=objective, tolerance=tolerance)
+            model, target, stay=stay, policy=policy, objective=objective, tolerance=tolerance
+        )
     traced = is_traced((model, target, policy, tolerance, max_steps, start))
     traced |= is_sharded(model)
     readable = not traced and is_table(model)
@@ -188,14 +195,16 @@ def action_matrices(model: Any) -> list[Any]:
     model = model.mdp if isinstance(model, Game) else model
     world: Any = model.mdp if isinstance(model, Product) else model
     dense = isinstance(world, DenseMDP)
-    weight = np.where(support(world), np.asarray(world.transition if dense else world.probability),
-                      0)
+    weight = np.where(
+        support(world), np.asarray(world.transition if dense else world.probability), 0
+    )
     memory = np.zeros((world.num_states, 1), np.int32)
     if world is not model:
         memory = np.asarray(model.next_memory)
     on_entry = getattr(model, "label_on", "entry") == "entry"
     return host.transition_rows(
-        None if dense else np.asarray(world.successor), weight, memory, on_entry)
+        None if dense else np.asarray(world.successor), weight, memory, on_entry
+    )
 
 
 def _unit(model: Any) -> float:
@@ -216,9 +225,15 @@ def _host_solution(model: Any, found: host.Bounds, policy: Any, tolerance: Any) 
     if not (high - low <= 2 * goal).all():
         return None
     value = found.value.astype(dtype).clip(low, high)
-    arrays = (value.reshape(shape), policy, low.reshape(shape), high.reshape(shape),
-              np.asarray(found.residual, dtype), np.int32(found.rounds),
-              np.int32(Status.CONVERGED))
+    arrays = (
+        value.reshape(shape),
+        policy,
+        low.reshape(shape),
+        high.reshape(shape),
+        np.asarray(found.residual, dtype),
+        np.int32(found.rounds),
+        np.int32(Status.CONVERGED),
+    )
     return Solution(*to_jax(arrays))
 
 
@@ -230,9 +245,14 @@ def _by_layers(model: Any, target: Any, tolerance: Any, objective: str) -> Solut
     eps = float(np.finfo(np.dtype(model.dtype)).eps)
     width = max(4 * eps, 1e-11) if tolerance is None else 2 * float(tolerance) - 4 * eps
     beside = World(
-        np.asarray(world.successor), support(world), np.asarray(world.probability),
-        np.asarray(world.available), np.asarray(model.automaton.delta), np.asarray(model.letter),
-        None if model.allowed is None else np.asarray(model.allowed))
+        np.asarray(world.successor),
+        support(world),
+        np.asarray(world.probability),
+        np.asarray(world.available),
+        np.asarray(model.automaton.delta),
+        np.asarray(model.letter),
+        None if model.allowed is None else np.asarray(model.allowed),
+    )
     if not width > 0:
         return None
     found = layered(beside, np.asarray(target), maximize=objective == "max", tolerance=width)
@@ -241,8 +261,14 @@ def _by_layers(model: Any, target: Any, tolerance: Any, objective: str) -> Solut
     half = (found.upper - found.lower) / 2
     # The operator carries the bounds towards each other, so the value by half of what is between.
     bounds = host.Bounds(
-        found.lower + half, found.lower, found.upper, float(half.max()), found.sweeps,
-        found.action, half > 0)
+        found.lower + half,
+        found.lower,
+        found.upper,
+        float(half.max()),
+        found.sweeps,
+        found.action,
+        half > 0,
+    )
     return _host_solution(model, bounds, found.action, tolerance)
 
 
@@ -262,7 +288,11 @@ def _policy_on_host(model: Any, target: Any, policy: Any, tolerance: Any) -> Sol
 
 
 def _optimum_on_host(
-    model: Any, graph: Graph, sets: Sets, components: EndComponents | None, tolerance: Any,
+    model: Any,
+    graph: Graph,
+    sets: Sets,
+    components: EndComponents | None,
+    tolerance: Any,
     objective: str,
 ) -> tuple[Solution | None, Any]:
     """The optimum, if it could be found, and the actions that tie: ``bool[S, A]``."""
@@ -274,8 +304,14 @@ def _optimum_on_host(
         return None, False
     rows = action_matrices(model)
     found = host.optimum(
-        rows, allowed.reshape(len(group), -1), group, sets.one.ravel(), undecided.ravel(),
-        1 if objective == "max" else -1, _unit(model))
+        rows,
+        allowed.reshape(len(group), -1),
+        group,
+        sets.one.ravel(),
+        undecided.ravel(),
+        1 if objective == "max" else -1,
+        _unit(model),
+    )
     if found is None:
         return None, False
     exits, action = (x.reshape(sets.one.shape) for x in (found.exits, found.action))
@@ -303,7 +339,11 @@ def _ties(model: Any, rows: list[Any], found: host.Bounds, objective: str) -> An
 
 
 def _attaining(
-    graph: Graph, sets: Sets, components: EndComponents | None, policy: Any, ties: Any,
+    graph: Graph,
+    sets: Sets,
+    components: EndComponents | None,
+    policy: Any,
+    ties: Any,
     objective: str,
 ) -> Any:
     """Actions by which any policy that decides almost surely attains the bound: ``bool[S, A]``."""
@@ -316,9 +356,7 @@ def _attaining(
     return good & graph.available
 
 
-def attaining_actions(
-    model: Any, target: Any, *, objective: str
-) -> tuple[Any, Solution] | None:
+def attaining_actions(model: Any, target: Any, *, objective: str) -> tuple[Any, Solution] | None:
     """Actions by which every policy that takes them all now and then attains a bound.
 
     Where the probability is strictly between 0 and 1: those in end components, and those that do
@@ -359,7 +397,8 @@ def _quickest(model: Any, graph: Graph, good: Any, decided: Any, policy: Any) ->
         return policy
     action = np.where(decided, policy, start.action)
     found = quickest(
-        action_matrices(model), good.reshape(decided.size, -1), ~decided.ravel(), action.ravel())
+        action_matrices(model), good.reshape(decided.size, -1), ~decided.ravel(), action.ravel()
+    )
     return policy if found is None else found.reshape(decided.shape).astype(np.int32)
 
 
@@ -376,8 +415,7 @@ def _evaluate(model, target, policy, tolerance, max_steps, *, method) -> Solutio
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
     weight = action_columns(model.num_actions, policy)
-    system = lax.stop_gradient(
-        System(table(model), weight, undecided.ravel().astype(model.dtype)))
+    system = lax.stop_gradient(System(table(model), weight, undecided.ravel().astype(model.dtype)))
     linear = solver(system, method, max_steps=max_steps)
 
     def onward(y: jax.Array) -> jax.Array:
@@ -389,18 +427,27 @@ def _evaluate(model, target, policy, tolerance, max_steps, *, method) -> Solutio
     # Elimination can break down where rounding closes what leaves a set hardly ever.
     value = jnp.clip(jnp.where(jnp.isfinite(value), value, 0), 0, 1)
     error, residual, _ = lax.stop_gradient(
-        m_matrix_error(model, linear.solve, onward, value, undecided))
+        m_matrix_error(model, linear.solve, onward, value, undecided)
+    )
     goal = jnp.sqrt(jnp.finfo(model.dtype).eps) if tolerance is None else tolerance
     solution = Solution(
-        value=value, policy=still, lower=jnp.maximum(value - error, 0),
-        upper=jnp.minimum(value + error, 1), residual=residual, num_steps=n,
+        value=value,
+        policy=still,
+        lower=jnp.maximum(value - error, 0),
+        upper=jnp.minimum(value + error, 1),
+        residual=residual,
+        num_steps=n,
         # What elimination leaves is rounding.
         status=status_code(
-            jnp.max(error) <= goal, jnp.isfinite(residual), isinstance(linear, Inverse)),
+            jnp.max(error) <= goal, jnp.isfinite(residual), isinstance(linear, Inverse)
+        ),
     )
     found = implicit(
-        lambda y: one + onward(y), lax.stop_gradient(value), solve=linear.solve,
-        transpose_solve=linear.transpose_solve)
+        lambda y: one + onward(y),
+        lax.stop_gradient(value),
+        solve=linear.solve,
+        transpose_solve=linear.transpose_solve,
+    )
     solution = replace(lax.stop_gradient(solution), value=found, policy=policy)
     return refuse(solution, checked.given, checked.valid)
 
@@ -490,13 +537,15 @@ def _tighter(sign: int, finest: bool, table: None, carry: _Bounds, search: _Sear
 
     def sweeps() -> tuple[jax.Array, jax.Array]:
         step = lax.fori_loop(
-            0, _FAR_SWEEPS, lambda _, y: search.closer(sign, y, search.best(sign, y)[0]), far)
+            0, _FAR_SWEEPS, lambda _, y: search.closer(sign, y, search.best(sign, y)[0]), far
+        )
         return step, jnp.bool_(False)
 
     gain = jnp.max(jnp.abs(new_near - near))
     rests = close & (gain <= search.slack / 8)
     new_far, failed = lax.cond(
-        settled | rests, lambda: lax.cond(failed | ~settled, sweeps, guess), lambda: (far, failed))
+        settled | rests, lambda: lax.cond(failed | ~settled, sweeps, guess), lambda: (far, failed)
+    )
     far_gain = jnp.max(jnp.abs(new_far - far))
     rests &= ~failed & (far_gain <= search.slack / 8)
     return _Bounds(new_near, new_far, failed, (gain > 0) | (far_gain > 0) | failed, rests)
@@ -530,13 +579,21 @@ def _optimize(model, sets: Sets, components, tolerance, max_steps, start, *, obj
     goal = jnp.asarray(jnp.sqrt(eps) if tolerance is None else tolerance, model.dtype)
     search = _Search(model, undecided, one, components, goal)
     top = jnp.where(undecided, 1, one)
-    low, high = (one, top) if start is None else (
-        jnp.where(undecided, jnp.clip(x, 0, 1), one) for x in start)
+    low, high = (
+        (one, top)
+        if start is None
+        else (jnp.where(undecided, jnp.clip(x, 0, 1), one) for x in start)
+    )
     near, far = (low, high) if objective == "max" else (high, low)
     finest, no = tolerance is None, jnp.bool_(False)
     bounds, n = iterate(
-        partial(_tighter, sign, finest), partial(_ended, finest), None,
-        _Bounds(near, far, no, ~no, no), search, max_steps=max_steps)
+        partial(_tighter, sign, finest),
+        partial(_ended, finest),
+        None,
+        _Bounds(near, far, no, ~no, no),
+        search,
+        max_steps=max_steps,
+    )
     near, far = bounds.near, bounds.far
     still = lax.stop_gradient(search)
     action = still.best(sign, near)[1]
@@ -550,7 +607,12 @@ def _optimize(model, sets: Sets, components, tolerance, max_steps, start, *, obj
     residual = jnp.max(jnp.abs(still.best(sign, value)[0] - value))
     policy = jnp.where(undecided, action, sets.action)
     solution = Solution(
-        value=value, policy=policy, lower=lower, upper=upper, residual=residual, num_steps=n,
+        value=value,
+        policy=policy,
+        lower=lower,
+        upper=upper,
+        residual=residual,
+        num_steps=n,
         status=status_code(bounds.half <= goal, jnp.isfinite(residual)),
     )
     solution = jax.tree.map(lax.stop_gradient, solution)

@@ -34,8 +34,10 @@ def require_direction(nature: str | None, objective: str) -> str:
     if nature is None:
         return "min" if objective == "max" else "max"
     if not isinstance(nature, str) or nature not in ("max", "min"):
-        raise ValueError(f'nature={shown(nature)}; it must be "min" (nature makes the value '
-                         'small) or "max" (large).')
+        raise ValueError(
+            f'nature={shown(nature)}; it must be "min" (nature makes the value '
+            'small) or "max" (large).'
+        )
     return nature
 
 
@@ -59,13 +61,21 @@ def width_asked(tolerance: Any) -> float:
 def refuse_nature(nature: str | None) -> None:
     """Raises ValueError if a direction of nature is given where it has nothing to choose."""
     if nature is not None:
-        raise ValueError(f"nature={nature!r} is for models with intervals (make_interval); the "
-                         "probabilities of this one are given. Leave it out.")
+        raise ValueError(
+            f"nature={nature!r} is for models with intervals (make_interval); the "
+            "probabilities of this one are given. Leave it out."
+        )
 
 
 def robust_reachability(
-    model: Any, target: Any, *, policy: Any = None, objective: str = "max",
-    nature: str | None = None, stay: Any = None, tolerance: Any = None,
+    model: Any,
+    target: Any,
+    *,
+    policy: Any = None,
+    objective: str = "max",
+    nature: str | None = None,
+    stay: Any = None,
+    tolerance: Any = None,
 ) -> Solution:
     """Probability of reaching a target when probabilities lie in intervals.
 
@@ -108,14 +118,25 @@ def robust_reachability(
     if stay is not None:
         stay = sides.states(states(model.nominal, stay, "stay")) | sides.added
     found = interval_values.reachability(
-        sides.host, target, maximize=sides.maximize, helpful=sides.helpful, stay=stay,
-        tolerance=asked)
+        sides.host,
+        target,
+        maximize=sides.maximize,
+        helpful=sides.helpful,
+        stay=stay,
+        tolerance=asked,
+    )
     return robust_solution(sides, found, asked, relative=False)
 
 
 def robust_total_reward(
-    model: Any, reward: Any, target: Any, *, policy: Any = None, objective: str = "max",
-    nature: str | None = None, tolerance: Any = None,
+    model: Any,
+    reward: Any,
+    target: Any,
+    *,
+    policy: Any = None,
+    objective: str = "max",
+    nature: str | None = None,
+    tolerance: Any = None,
 ) -> Solution:
     """Expected reward until a target is reached when probabilities lie in intervals.
 
@@ -154,14 +175,20 @@ def robust_total_reward(
     target = sides.states(states(model.nominal, target, "target"))
     earned = sides.rows(interval_reward(model, reward))
     found = interval_values.total_reward(
-        sides.host, earned, target, maximize=sides.maximize, large=sides.helpful,
-        tolerance=asked)
+        sides.host, earned, target, maximize=sides.maximize, large=sides.helpful, tolerance=asked
+    )
     return robust_solution(sides, found, asked, relative=True)
 
 
 def robust_discounted_value(
-    model: Any, reward: Any, discount: float, *, policy: Any = None,
-    objective: str = "max", nature: str | None = None, tolerance: float | None = None,
+    model: Any,
+    reward: Any,
+    discount: float,
+    *,
+    policy: Any = None,
+    objective: str = "max",
+    nature: str | None = None,
+    tolerance: float | None = None,
 ) -> Solution:
     """Discounted value when probabilities lie in intervals.
 
@@ -202,8 +229,13 @@ def robust_discounted_value(
     largest = float(np.abs(earned).max(initial=0)) / (1 - float(discount))
     asked = 1e-8 * max(largest, 1e-300) if tolerance is None else width_asked(tolerance)
     found = discounted(
-        sides.host, earned, np.where(sides.choosing, 1.0, float(discount)),
-        maximize=sides.maximize, large=sides.helpful, tolerance=asked)
+        sides.host,
+        earned,
+        np.where(sides.choosing, 1.0, float(discount)),
+        maximize=sides.maximize,
+        large=sides.helpful,
+        tolerance=asked,
+    )
     return robust_solution(sides, found, asked, relative=False)
 
 
@@ -259,8 +291,10 @@ def entry_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
         earned = earned + np.asarray(given.transition, np.float64)
     if not np.isfinite(earned).all():
         row = int(host.row[np.flatnonzero(~np.isfinite(earned))[0]])
-        raise ValueError(f"the reward of state {host.state[row]}, choice "
-                         f"{row - int(host.row_start[host.state[row]])} is not finite.")
+        raise ValueError(
+            f"the reward of state {host.state[row]}, choice "
+            f"{row - int(host.row_start[host.state[row]])} is not finite."
+        )
     return earned
 
 
@@ -275,9 +309,11 @@ def interval_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
         state = int(model.nominal.host.state[row])
-        raise ValueError(f"the reward of state {state}, choice "
-                         f"{row - int(model.nominal.row_start[state])} is {earned[row]}; it must "
-                         "be finite and at least 0.")
+        raise ValueError(
+            f"the reward of state {state}, choice "
+            f"{row - int(model.nominal.row_start[state])} is {earned[row]}; it must "
+            "be finite and at least 0."
+        )
     of = reward_parts(model.nominal, reward).transition
     if of is not None:
         each = np.asarray(of)
@@ -288,13 +324,12 @@ def interval_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
             row = int(np.flatnonzero(differs & loose)[0])
             raise ValueError(
                 f"the reward of row {row} differs between its successors, whose probabilities are "
-                "intervals; put it on states that are entered, or on choices.")
+                "intervals; put it on states that are entered, or on choices."
+            )
     return earned
 
 
-def robust_solution(
-    sides: Sides, found: Robust, tolerance: float, *, relative: bool
-) -> Solution:
+def robust_solution(sides: Sides, found: Robust, tolerance: float, *, relative: bool) -> Solution:
     """What the host found, with its status."""
     size = sides.model.num_states
     value, lower, upper = (x[:size] for x in (found.value, found.lower, found.upper))
@@ -305,9 +340,15 @@ def robust_solution(
         chance = sides.spread.nature(chance, np.asarray(sides.model.nominal.probability))
     policy = np.asarray(row.astype(np.int32) if sides.policy is None else sides.policy)
     parts: dict[str, Any] = {
-        "value": value, "policy": policy, "nature": chance, "lower": lower, "upper": upper,
-        "residual": np.float64(found.residual), "num_steps": np.int32(found.rounds),
-        "status": np.int32(status)}
+        "value": value,
+        "policy": policy,
+        "nature": chance,
+        "lower": lower,
+        "upper": upper,
+        "residual": np.float64(found.residual),
+        "num_steps": np.int32(found.rounds),
+        "status": np.int32(status),
+    }
     return Solution(**parts, method=Method(found.method))
 
 
@@ -358,9 +399,7 @@ class Sides(NamedTuple):
         return np.where(self.choosing, 0, quantity[self.spread.row])
 
 
-def sides_of(
-    model: Any, policy: Any, objective: str, nature: str | None
-) -> Sides:
+def sides_of(model: Any, policy: Any, objective: str, nature: str | None) -> Sides:
     """Who chooses what, and what for.
 
     Args:
@@ -388,8 +427,10 @@ def world_of(model: Any) -> tuple[IntervalMDP, np.ndarray | None]:
     if isinstance(world, SparseMDP) and isinstance(model, Game):
         world = make_interval(world, world.probability, world.probability)
     if not isinstance(world, IntervalMDP):
-        raise ValueError(f"{type(world).__name__} has no intervals; give an IntervalMDP, or a game "
-                         "on one or on a SparseMDP.")
+        raise ValueError(
+            f"{type(world).__name__} has no intervals; give an IntervalMDP, or a game "
+            "on one or on a SparseMDP."
+        )
     return world, np.asarray(model.system, bool) if isinstance(model, Game) else None
 
 
@@ -414,8 +455,12 @@ def _under(model: IntervalMDP, policy: np.ndarray, where: Any) -> Spread:
         row_weights(model.nominal, policy)
         chain, entry = host.chain(policy)
         return Spread(
-            chain, np.arange(model.num_states), policy.astype(np.int64), entry,
-            np.full(entry.size, -1))
+            chain,
+            np.arange(model.num_states),
+            policy.astype(np.int64),
+            entry,
+            np.full(entry.size, -1),
+        )
     weight = row_weights(model.nominal, policy, where)
     total = host.mdp.over_choices(np.add, weight)
     weight = weight / np.where(total > 0, total, 1)[host.mdp.state]

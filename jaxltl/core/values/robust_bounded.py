@@ -46,12 +46,20 @@ def robust_next_probability(
     """
     nature = require_direction(nature, objective)
     chosen = states(require_interval(model).nominal, target, "target")
-    return _solution(interval_bounded.next_step(
-        model.host, chosen, maximize=objective == "max", helpful=nature == "max"))
+    return _solution(
+        interval_bounded.next_step(
+            model.host, chosen, maximize=objective == "max", helpful=nature == "max"
+        )
+    )
 
 
 def robust_bounded_reachability(
-    model: IntervalMDP, target: Any, num_steps: int, *, stay: Any = None, objective: str = "max",
+    model: IntervalMDP,
+    target: Any,
+    num_steps: int,
+    *,
+    stay: Any = None,
+    objective: str = "max",
     nature: str | None = None,
 ) -> Solution:
     """Probability to reach a set within so many steps, when probabilities lie in intervals.
@@ -84,13 +92,19 @@ def robust_bounded_reachability(
     nature, steps = require_direction(nature, objective), whole("num_steps", num_steps)
     goal = states(require_interval(model).nominal, target, "target")
     free = np.ones_like(goal) if stay is None else states(model.nominal, stay, "stay")
-    return _solution(interval_bounded.until(
-        model.host, goal, free, steps, maximize=objective == "max",
-        helpful=nature == "max"))
+    return _solution(
+        interval_bounded.until(
+            model.host, goal, free, steps, maximize=objective == "max", helpful=nature == "max"
+        )
+    )
 
 
 def robust_cumulative_reward(
-    model: IntervalMDP, reward: Any, num_steps: int, *, objective: str = "max",
+    model: IntervalMDP,
+    reward: Any,
+    num_steps: int,
+    *,
+    objective: str = "max",
     nature: str | None = None,
 ) -> Solution:
     """Expected reward of the next so many steps, when probabilities lie in intervals.
@@ -123,7 +137,11 @@ def robust_cumulative_reward(
 
 
 def robust_instantaneous_reward(
-    model: IntervalMDP, reward: Any, num_step: int, *, objective: str = "max",
+    model: IntervalMDP,
+    reward: Any,
+    num_step: int,
+    *,
+    objective: str = "max",
     nature: str | None = None,
 ) -> Solution:
     """Expected reward of the state in which one is after so many steps, with intervals.
@@ -156,18 +174,26 @@ def robust_instantaneous_reward(
 
 
 def _earned(
-    model: IntervalMDP, earned: Any, start: Any, num_steps: int, objective: str,
+    model: IntervalMDP,
+    earned: Any,
+    start: Any,
+    num_steps: int,
+    objective: str,
     nature: str | None,
 ) -> Solution:
     nature, steps = require_direction(nature, objective), whole("num_steps", num_steps)
-    return _solution(interval_bounded.total(
-        model.host, earned, start, steps, maximize=objective == "max", helpful=nature == "max"),
-        highest=math.inf)
+    return _solution(
+        interval_bounded.total(
+            model.host, earned, start, steps, maximize=objective == "max", helpful=nature == "max"
+        ),
+        highest=math.inf,
+    )
 
 
 def _solution(found: RobustSteps, highest: float = 1) -> Solution:
     """What sweeps found, enclosed."""
     nature: Any = found.probability
     solution = enclosed(
-        found.value, found.error, found.row.astype(np.int32), found.num_steps, highest=highest)
+        found.value, found.error, found.row.astype(np.int32), found.num_steps, highest=highest
+    )
     return replace(solution, nature=nature, method=Method("step by step"))

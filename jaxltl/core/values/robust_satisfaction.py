@@ -58,8 +58,13 @@ class RobustSatisfaction(NamedTuple):
 
 
 def robust_satisfaction(
-    model: Any, task: Task, *, objective: str = "max", nature: str | None = None,
-    states: Any = None, tolerance: float | None = None,
+    model: Any,
+    task: Task,
+    *,
+    objective: str = "max",
+    nature: str | None = None,
+    states: Any = None,
+    tolerance: float | None = None,
 ) -> RobustSatisfaction:
     """Largest or smallest probability of a formula that nature, for or against it, leaves.
 
@@ -98,18 +103,29 @@ def robust_satisfaction(
     yes, no = universal_states(automaton), ~live_states(automaton)
     initial = np.broadcast_to(automaton.initial, states.shape)
     product, host = _pairs(
-        model, np.asarray(automaton.delta), letter, states, initial, yes | no, False)
+        model, np.asarray(automaton.delta), letter, states, initial, yes | no, False
+    )
     priority = None
     if automaton.acceptance in ("buchi", "parity"):
         source = product.memory, letter[product.base_state]
         priority = np.asarray(automaton.priority)[source]
     moves = None if system is None else system[product.base_state]
     found = _solved(
-        host_sides(host, moves, objective, nature), host, yes[product.memory],
-        no[product.memory], priority, automaton.acceptance == "safety", asked)
+        host_sides(host, moves, objective, nature),
+        host,
+        yes[product.memory],
+        no[product.memory],
+        priority,
+        automaton.acceptance == "safety",
+        asked,
+    )
     solution = _solution(
-        found, asked, product.start.shape, product.start,
-        policy=product.base_row[found.row].astype(np.int32))
+        found,
+        asked,
+        product.start.shape,
+        product.start,
+        policy=product.base_row[found.row].astype(np.int32),
+    )
     return RobustSatisfaction(solution, automaton, letter, product, found.value)
 
 
@@ -120,14 +136,24 @@ def _solution(
     low, high = (x[states].reshape(shape) for x in (found.lower, found.upper))
     status = Status.CONVERGED if (high - low <= tolerance).all() else Status.PRECISION
     parts: dict[str, Any] = {
-        "value": found.value[states].reshape(shape), "policy": policy, "lower": low,
-        "upper": high, "nature": found.probability, "residual": np.float64(found.residual),
-        "num_steps": np.int32(found.rounds), "status": np.int32(status)}
+        "value": found.value[states].reshape(shape),
+        "policy": policy,
+        "lower": low,
+        "upper": high,
+        "nature": found.probability,
+        "residual": np.float64(found.residual),
+        "num_steps": np.int32(found.rounds),
+        "status": np.int32(status),
+    }
     return Solution(**parts, method=Method(found.method))
 
 
 def robust_product_satisfaction(
-    model: Product, *, policy: Any = None, objective: str = "max", nature: str | None = None,
+    model: Product,
+    *,
+    policy: Any = None,
+    objective: str = "max",
+    nature: str | None = None,
     tolerance: Any = None,
 ) -> Solution:
     """The same from every pair of a state and a memory of a product of an interval model.
@@ -148,11 +174,15 @@ def robust_product_satisfaction(
     Concrete arrays only, on the host; not differentiable.
     """
     if not isinstance(model, Product) or not isinstance(model.mdp, IntervalMDP):
-        raise ValueError(f"{type(model).__name__} is no product of an interval model; give "
-                         "product(model, formula).")
+        raise ValueError(
+            f"{type(model).__name__} is no product of an interval model; give "
+            "product(model, formula)."
+        )
     if model.allowed is not None:
-        raise ValueError("a product of an interval model takes no mask of actions; restrict the "
-                         "world by with_allowed(world, rows).")
+        raise ValueError(
+            "a product of an interval model takes no mask of actions; restrict the "
+            "world by with_allowed(world, rows)."
+        )
     asked = width_asked(tolerance)
     world: Any = model.mdp
     task, letter, shape = model.automaton, np.asarray(model.letter), model.state_shape
@@ -168,7 +198,8 @@ def robust_product_satisfaction(
         if on_entry:
             mdp = host.mdp
             read = priority[
-                product.memory[mdp.state[mdp.row]], letter[product.base_state[mdp.successor]]]
+                product.memory[mdp.state[mdp.row]], letter[product.base_state[mdp.successor]]
+            ]
             host, level, pair = _reading(host, read)
     sides = host_sides(host, None, objective, nature)
     if policy is not None:
@@ -179,7 +210,7 @@ def robust_product_satisfaction(
         solution = _solution(found, asked, shape, product.start, np.asarray(policy))
         return solution.replace(nature=None)  # type: ignore[attr-defined]
     policy = product.base_row[found.row[product.start]].astype(np.int32).reshape(shape)
-    found = found._replace(probability=found.probability[:product.host.num_transitions])
+    found = found._replace(probability=found.probability[: product.host.num_transitions])
     return _solution(found, asked, shape, product.start, policy)
 
 
@@ -203,37 +234,45 @@ def _reading(host: HostInterval, priority: Integers) -> tuple[HostInterval, Inte
         np.append(mdp.row_start, mdp.num_rows + more),
         np.append(mdp.entry_start, mdp.num_transitions + more),
         np.append(mdp.num_states + number, target).astype(np.int32),
-        np.append(mdp.probability, one))
+        np.append(mdp.probability, one),
+    )
     ball = host.ball
     if ball is not None:
         ball = Ball(np.append(ball.center, one), np.append(ball.most, one))
     level = np.append(np.full(mdp.num_states, most - 1), read)
-    return (HostInterval(inner, np.append(host.lower, one), np.append(host.upper, one), ball),
-            level, np.append(np.arange(mdp.num_states), target))
+    return (
+        HostInterval(inner, np.append(host.lower, one), np.append(host.upper, one), ball),
+        level,
+        np.append(np.arange(mdp.num_states), target),
+    )
 
 
 def _pairs(
-    model: IntervalMDP, delta: np.ndarray, letter: np.ndarray, state: Integers, memory: Integers,
-    still: Booleans, on_entry: bool,
+    model: IntervalMDP,
+    delta: np.ndarray,
+    letter: np.ndarray,
+    state: Integers,
+    memory: Integers,
+    still: Booleans,
+    on_entry: bool,
 ) -> tuple[HostProduct, HostInterval]:
     """What is reached of the product, with its intervals."""
     mdp = model.nominal.host
     # Entries travel by number, from 1; a loop of what stands still has 1 too.
-    numbered = HostMDP(mdp.row_start, mdp.entry_start, mdp.successor,
-                       np.arange(1.0, mdp.num_transitions + 1))
-    found = host_product(
-        numbered, delta, letter, state, memory, on_entry=on_entry, still=still)
+    numbered = HostMDP(
+        mdp.row_start, mdp.entry_start, mdp.successor, np.arange(1.0, mdp.num_transitions + 1)
+    )
+    found = host_product(numbered, delta, letter, state, memory, on_entry=on_entry, still=still)
     entry = found.host.probability.astype(np.int64) - 1
     loop = found.still[found.host.state[found.host.row]]
     chance, lower, upper = (
-        np.where(loop, 1.0, x[entry])
-        for x in (mdp.probability, model.host.lower, model.host.upper))
+        np.where(loop, 1.0, x[entry]) for x in (mdp.probability, model.host.lower, model.host.upper)
+    )
     ball = model.host.ball
     if ball is not None:
         ball = ball.of(entry, found.base_row)
         ball = ball._replace(center=np.where(loop, 1.0, ball.center))
-    host = HostMDP(
-        found.host.row_start, found.host.entry_start, found.host.successor, chance)
+    host = HostMDP(found.host.row_start, found.host.entry_start, found.host.successor, chance)
     return found._replace(host=host), HostInterval(host, lower, upper, ball)
 
 
@@ -260,8 +299,13 @@ def _fixed(
 
 
 def _solved(
-    sides: Sides, host: HostInterval, yes: Booleans, no: Booleans, priority: Integers | None,
-    safety: bool, tolerance: float,
+    sides: Sides,
+    host: HostInterval,
+    yes: Booleans,
+    no: Booleans,
+    priority: Integers | None,
+    safety: bool,
+    tolerance: float,
 ) -> Robust:
     """The probability from all states of a product, for those who choose in it."""
     maximize, helpful = sides.maximize, sides.helpful
@@ -269,27 +313,45 @@ def _solved(
         return _of_sides(host, yes, no, priority, maximize, helpful, safety, tolerance)
     source = sides.spread.source
     found = _of_sides(
-        sides.host, yes[source], no[source], None if priority is None else priority[source],
-        maximize, helpful, safety, tolerance)
+        sides.host,
+        yes[source],
+        no[source],
+        None if priority is None else priority[source],
+        maximize,
+        helpful,
+        safety,
+        tolerance,
+    )
     size = host.mdp.num_states
     return found._replace(
-        value=found.value[:size], lower=found.lower[:size], upper=found.upper[:size],
+        value=found.value[:size],
+        lower=found.lower[:size],
+        upper=found.upper[:size],
         row=sides.spread.policy(found.row, found.probability),
-        probability=sides.spread.nature(found.probability, host.mdp.probability))
+        probability=sides.spread.nature(found.probability, host.mdp.probability),
+    )
 
 
 def _of_sides(
-    host: HostInterval, yes: Booleans, no: Booleans, priority: Integers | None, maximize: bool,
-    helpful: bool, safety: bool, tolerance: float,
+    host: HostInterval,
+    yes: Booleans,
+    no: Booleans,
+    priority: Integers | None,
+    maximize: bool,
+    helpful: bool,
+    safety: bool,
+    tolerance: float,
 ) -> Robust:
     """The same where a policy and nature choose."""
     if priority is None:
         goal = no if safety else yes
         if safety:
-            return _opposite(reachability(
-                host, goal, maximize=not maximize, helpful=not helpful, tolerance=tolerance))
-        return reachability(
-            host, goal, maximize=maximize, helpful=helpful, tolerance=tolerance)
+            return _opposite(
+                reachability(
+                    host, goal, maximize=not maximize, helpful=not helpful, tolerance=tolerance
+                )
+            )
+        return reachability(host, goal, maximize=maximize, helpful=helpful, tolerance=tolerance)
     if not maximize:
         # The least probability is one minus the largest of the opposite.
         priority = np.where(no, 0, np.where(yes, 1, priority + 1))
@@ -298,9 +360,7 @@ def _of_sides(
     return _largest(host, priority, helpful, tolerance)
 
 
-def _largest(
-    host: HostInterval, priority: Integers, helpful: bool, tolerance: float
-) -> Robust:
+def _largest(host: HostInterval, priority: Integers, helpful: bool, tolerance: float) -> Robust:
     """The largest probability, and in doubt also if sums that miss one by rounding are one."""
     found = _as_read(host, priority, helpful, tolerance)
     wide = host.widened
@@ -309,22 +369,21 @@ def _largest(
     return found.covering(_as_read(wide, priority, helpful, tolerance))
 
 
-def _as_read(
-    host: HostInterval, priority: Integers, helpful: bool, tolerance: float
-) -> Robust:
+def _as_read(host: HostInterval, priority: Integers, helpful: bool, tolerance: float) -> Robust:
     if not helpful:
         return parity_against_nature(host, priority, tolerance=tolerance)
     mdp = host.mdp
     good = joint_accepting(host, priority[mdp.state[mdp.row]])
     found = reachability(host, good.region, maximize=True, helpful=True, tolerance=tolerance)
-    inside: Floats = np.where(
-        good.region[mdp.state[mdp.row]], good.probability, found.probability)
+    inside: Floats = np.where(good.region[mdp.state[mdp.row]], good.probability, found.probability)
     return found._replace(row=np.where(good.region, good.row, found.row), probability=inside)
 
 
 def _opposite(found: Robust) -> Robust:
     """One minus, rounded outwards; 0 and 1 stay what they are."""
-    lower, upper = (np.where((x == 0) | (x == 1), 1 - x, 1 - x + side * 1e-16)
-                    for x, side in ((found.upper, -1), (found.lower, 1)))
+    lower, upper = (
+        np.where((x == 0) | (x == 1), 1 - x, 1 - x + side * 1e-16)
+        for x, side in ((found.upper, -1), (found.lower, 1))
+    )
     lower, upper = np.clip(lower, 0, 1), np.clip(upper, 0, 1)
     return found._replace(value=np.clip(1 - found.value, lower, upper), lower=lower, upper=upper)

@@ -37,7 +37,12 @@ class Sensitivity(NamedTuple):
 
 
 def robust_sensitivity(
-    model: IntervalMDP, solution: Solution, target: Any, *, nature: str, stay: Any = None,
+    model: IntervalMDP,
+    solution: Solution,
+    target: Any,
+    *,
+    nature: str,
+    stay: Any = None,
     initial: Any = None,
 ) -> Sensitivity:
     """The derivative of the value from the initial distribution in each end of each interval.
@@ -79,21 +84,28 @@ def robust_sensitivity(
     require_direction(nature, "max")
     refuse_ball(require_interval(model), "robust_sensitivity is about ends")
     if not isinstance(solution, Solution) or solution.nature is None:
-        raise ValueError(f"solution is {shown(solution)}; give what a solver of interval models "
-                         "returned, reachability_probability, say.")
+        raise ValueError(
+            f"solution is {shown(solution)}; give what a solver of interval models "
+            "returned, reachability_probability, say."
+        )
     goal = states(model.nominal, target, "target")
     passed = np.ones(goal.size, bool) if stay is None else states(model.nominal, stay, "stay")
     weight = numbers("initial", model.initial if initial is None else initial)
     value, policy = np.asarray(solution.value, np.float64), np.asarray(solution.policy)
     if weight.shape != goal.shape or value.shape != goal.shape:
-        raise ValueError(f"initial has shape {weight.shape} and the solution's value "
-                         f"{value.shape}; expected {goal.shape}, one for each state.")
+        raise ValueError(
+            f"initial has shape {weight.shape} and the solution's value "
+            f"{value.shape}; expected {goal.shape}, one for each state."
+        )
     if policy.shape != goal.shape or not is_deterministic(policy):
-        raise ValueError("the solution's policy is no row for each state; weights have no single "
-                         "order of successors.")
+        raise ValueError(
+            "the solution's policy is no row for each state; weights have no single "
+            "order of successors."
+        )
     if not np.isfinite(value[weight > 0]).all():
-        raise ValueError("the value from an initial state is infinite, which no end changes a "
-                         "little.")
+        raise ValueError(
+            "the value from an initial state is infinite, which no end changes a little."
+        )
     host = model.host
     value = np.where(np.isfinite(value), value, 0)
     ahead = value[host.mdp.successor]
@@ -123,7 +135,8 @@ def _visits(chain: HostMDP, goal: Booleans, stay: Booleans, weight: Floats) -> F
     shape = (states.size, states.size)
     back = csc_array((chain.probability[kept], place), shape=shape)
     found[states] = splu((eye_array(states.size, format="csc") - back).tocsc()).solve(
-        weight[states])
+        weight[states]
+    )
     return found
 
 

@@ -81,8 +81,7 @@ def satisfaction_probability(
     """
     _require_product(model)
     if isinstance(model.mdp, IntervalMDP):
-        return robust_product_satisfaction(
-            model, policy=policy, nature=nature, tolerance=tolerance)
+        return robust_product_satisfaction(model, policy=policy, nature=nature, tolerance=tolerance)
     refuse_nature(nature)
     if is_sparse(model):
         return product_satisfaction(model, policy=policy, tolerance=tolerance)
@@ -169,7 +168,8 @@ def optimal_satisfaction(
     _require_product(model)
     if isinstance(model.mdp, IntervalMDP):
         return robust_product_satisfaction(
-            model, objective=objective, nature=nature, tolerance=tolerance)
+            model, objective=objective, nature=nature, tolerance=tolerance
+        )
     refuse_nature(nature)
     if objective in ("max", "min") and is_sparse(model):
         return product_satisfaction(model, objective=objective, tolerance=tolerance)
@@ -185,11 +185,17 @@ def _optimal(
         eps = np.finfo(model.dtype).eps
         start = 1 - start[1] - eps, 1 - start[0] + eps
     found = reachability_probability(
-        problem.model, problem.target, objective=problem.objective, tolerance=tolerance,
-        max_steps=max_steps, start=start)
+        problem.model,
+        problem.target,
+        objective=problem.objective,
+        tolerance=tolerance,
+        max_steps=max_steps,
+        start=start,
+    )
     if problem.accepting is not None:
         xp, region, action, chosen = namespace(
-            problem.accepting.region, _visiting(problem, found), found.policy)
+            problem.accepting.region, _visiting(problem, found), found.policy
+        )
         found = replace(found, policy=to_jax(xp.where(region, action, chosen).astype(xp.int32)))
     return opposite_event(found) if problem.opposite else found
 
@@ -291,5 +297,7 @@ def _one_hot(policy: Any, num_actions: int) -> Any:
 
 def _require_product(model: Any) -> None:
     if not hasattr(model, "automaton"):
-        raise ValueError(f"{type(model).__name__} is no product of a world and a task; give "
-                         "product(world, formula).")
+        raise ValueError(
+            f"{type(model).__name__} is no product of a world and a task; give "
+            "product(world, formula)."
+        )

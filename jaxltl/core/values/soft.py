@@ -76,22 +76,34 @@ def soft_value(
     if method not in ("newton", "value_iteration"):
         raise ValueError(f"method={method!r}; choose newton or value_iteration.")
     form, reward = compiled_form(model, reward)
-    return in_shape_of(model, _soft_value(
-        form, reward, discount, initial, tolerance, max_steps, method=method))
+    return in_shape_of(
+        model, _soft_value(form, reward, discount, initial, tolerance, max_steps, method=method)
+    )
 
 
 @partial(jax.jit, static_argnames=("method",))
 def _soft_value(
-    model: Any, reward: Any, discount: Any, initial: Any, tolerance: Any, max_steps: Any, *,
+    model: Any,
+    reward: Any,
+    discount: Any,
+    initial: Any,
+    tolerance: Any,
+    max_steps: Any,
+    *,
     method: str,
 ) -> Solution:
     given = parameters(model, reward, discount, tolerance)
     reward, over = expected_reward(model, reward), choices(model)
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
     value, image, n = newton.solve(
-        table(model), soft_maximum, judge,
+        table(model),
+        soft_maximum,
+        judge,
         newton.Backup(gains(model, reward), given.discount, jnp.zeros_like(given.discount), given),
-        start, newton=method == "newton", max_steps=max_steps)
+        start,
+        newton=method == "newton",
+        max_steps=max_steps,
+    )
     solution = solution_of(model, given, value, image, value, n)
 
     def backup(v: jax.Array) -> jax.Array:
@@ -186,7 +198,8 @@ def soft_policy_adjoint(
     def step(before, carry, given):
         (x, r), (weight, discount, _) = carry, given
         return x + r, push(
-            before, discount, jax.tree.map(jnp.multiply, weight, over.layout.spread(r, weight)))
+            before, discount, jax.tree.map(jnp.multiply, weight, over.layout.spread(r, weight))
+        )
 
     def finished(carry, given):
         return jnp.sum(jnp.abs(carry[1]), 0) <= given[2]
@@ -195,7 +208,13 @@ def soft_policy_adjoint(
     target = float(jnp.finfo(b.dtype).eps) ** 0.8 * jnp.sum(jnp.abs(b), 0)
     start = lax.stop_gradient((jnp.zeros_like(b), b))
     (x, r), _ = iterate(
-        step, finished, predecessors, start, lax.stop_gradient((weight, discount, target)),
-        max_steps=max_steps, every=_SWEEPS_BETWEEN,
-        lanes="mapped" if predecessors is None else "side by side")
+        step,
+        finished,
+        predecessors,
+        start,
+        lax.stop_gradient((weight, discount, target)),
+        max_steps=max_steps,
+        every=_SWEEPS_BETWEEN,
+        lanes="mapped" if predecessors is None else "side by side",
+    )
     return g + policy * over.spread((x + r).reshape(model.state_shape))

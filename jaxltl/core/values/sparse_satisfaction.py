@@ -106,7 +106,8 @@ def sparse_satisfaction(
     product = _product(model, automaton, letter, states, on_entry, yes | no)
     found, row = _best(product, automaton, letter, yes, no, on_entry, objective, tolerance)
     return Satisfaction(
-        at_states(found, product.start), automaton, letter, product, product.base_row[row])
+        at_states(found, product.start), automaton, letter, product, product.base_row[row]
+    )
 
 
 def starting_states(model: Any, states: Any) -> np.ndarray:
@@ -119,28 +120,40 @@ def starting_states(model: Any, states: Any) -> np.ndarray:
         return np.flatnonzero(np.asarray(model.initial) > 0)
     given = np.asarray(states)
     if not given.size or given.dtype.kind not in "iu":
-        raise ValueError(f"states is {given.dtype}{list(given.shape)}; give the numbers of states, "
-                         "at least one.")
+        raise ValueError(
+            f"states is {given.dtype}{list(given.shape)}; give the numbers of states, at least one."
+        )
     wrong = (given < 0) | (given >= model.num_states)
     if wrong.any():
-        raise ValueError(f"states has {given[wrong][0]}; the states are 0 to "
-                         f"{model.num_states - 1}.")
+        raise ValueError(
+            f"states has {given[wrong][0]}; the states are 0 to {model.num_states - 1}."
+        )
     return given.astype(np.int64)
 
 
 def _best(
-    product: HostProduct, automaton: Automaton, letter: np.ndarray, yes: np.ndarray,
-    no: np.ndarray, on_entry: bool, objective: str, tolerance: float | None, depth: int = 0,
+    product: HostProduct,
+    automaton: Automaton,
+    letter: np.ndarray,
+    yes: np.ndarray,
+    no: np.ndarray,
+    on_entry: bool,
+    objective: str,
+    tolerance: float | None,
+    depth: int = 0,
 ) -> tuple[Solution, np.ndarray]:
     """The best probability from all states of a product, and the rows that attain it."""
     opposite = automaton.acceptance == "safety" or (
-        automaton.acceptance in ("buchi", "parity") and objective == "min")
+        automaton.acceptance in ("buchi", "parity") and objective == "min"
+    )
     goal: Any = (no if opposite else yes)[product.memory]
     visiting = None
     if automaton.acceptance in ("buchi", "parity"):
         entry_letter = product.entry_letter(letter, on_entry)
-        priority = automaton.priority[product.memory[product.host.state[product.host.row]],
-                                      entry_letter] + opposite
+        priority = (
+            automaton.priority[product.memory[product.host.state[product.host.row]], entry_letter]
+            + opposite
+        )
         # What stands still has its verdict, and no end component of its own.
         priority[product.still[product.host.state[product.host.row]]] = 1
         visiting = accepting_region(product.host, priority)
@@ -151,9 +164,12 @@ def _best(
     whole = as_sparse(product)
     asked = default_tolerance(whole) if tolerance is None else float(tolerance)
     found = solution_of(
-        whole, whole, reachability(
-            product.host, goal, maximize=aim == "max", tolerance=asked, depth=depth),
-        asked, relative=False)
+        whole,
+        whole,
+        reachability(product.host, goal, maximize=aim == "max", tolerance=asked, depth=depth),
+        asked,
+        relative=False,
+    )
     row = np.asarray(found.policy)
     if visiting is not None:
         row = np.where(visiting.region, visiting.row, row)
@@ -188,29 +204,41 @@ def product_satisfaction(
       [0.5, 1.0, 0.0]
     """
     if model.allowed is not None:
-        raise ValueError("a product of a sparse model takes no mask of actions; restrict the world "
-                         "by with_allowed(world, rows), or write the product out by to_sparse.")
+        raise ValueError(
+            "a product of a sparse model takes no mask of actions; restrict the world "
+            "by with_allowed(world, rows), or write the product out by to_sparse."
+        )
     world: Any = model.mdp
     task = model.automaton
-    automaton = replace(
-        task, delta=np.asarray(task.delta), priority=np.asarray(task.priority))
+    automaton = replace(task, delta=np.asarray(task.delta), priority=np.asarray(task.priority))
     letter, shape = np.asarray(model.letter), model.state_shape
     on_entry = model.label_on == "entry"
     state, memory = (x.ravel() for x in np.indices(shape))
-    product = host_product(
-        world.host, automaton.delta, letter, state, memory, on_entry=on_entry)
+    product = host_product(world.host, automaton.delta, letter, state, memory, on_entry=on_entry)
     depth = 0
     if policy is not None:
         chain = _chain(product, model, policy)
         product, depth, objective = product._replace(host=chain.mdp), chain.depth, "max"
     found, row = _best(
-        product, automaton, letter, universal_states(automaton), ~live_states(automaton), on_entry,
-        objective, tolerance, depth)
+        product,
+        automaton,
+        letter,
+        universal_states(automaton),
+        ~live_states(automaton),
+        on_entry,
+        objective,
+        tolerance,
+        depth,
+    )
     parts: dict[str, Any] = {
         name: np.asarray(getattr(found, name)).reshape(shape)
-        for name in ("value", "lower", "upper")}
-    parts["policy"] = (np.asarray(policy) if policy is not None
-                       else product.base_row[row].astype(np.int32).reshape(shape))
+        for name in ("value", "lower", "upper")
+    }
+    parts["policy"] = (
+        np.asarray(policy)
+        if policy is not None
+        else product.base_row[row].astype(np.int32).reshape(shape)
+    )
     return replace(found, **parts)
 
 
@@ -231,7 +259,11 @@ def _chain(product: HostProduct, model: Product, policy: Any) -> Chain:
 
 
 def _product(
-    model: SparseMDP, automaton: Automaton, letter: np.ndarray, states: np.ndarray, on_entry: bool,
+    model: SparseMDP,
+    automaton: Automaton,
+    letter: np.ndarray,
+    states: np.ndarray,
+    on_entry: bool,
     still: np.ndarray,
 ) -> HostProduct:
     if still.size == 1 and not still.any():
@@ -239,7 +271,8 @@ def _product(
     initial = np.broadcast_to(automaton.initial, states.shape)
     memory = automaton.delta[initial, letter[states]] if on_entry else initial
     return host_product(
-        model.host, automaton.delta, letter, states, memory, on_entry=on_entry, still=still)
+        model.host, automaton.delta, letter, states, memory, on_entry=on_entry, still=still
+    )
 
 
 def automaton_of(model: SparseMDP, task: Task) -> tuple[Automaton, np.ndarray]:
@@ -252,8 +285,11 @@ def automaton_of(model: SparseMDP, task: Task) -> tuple[Automaton, np.ndarray]:
         shown, number = letters_of(model, task.propositions)
     index = np.array([letter_index(task, letter) for letter in shown], np.int64)
     automaton = replace(
-        task, delta=np.asarray(task.delta), priority=np.asarray(task.priority),
-        letters=np.asarray(task.letters))
+        task,
+        delta=np.asarray(task.delta),
+        priority=np.asarray(task.priority),
+        letters=np.asarray(task.letters),
+    )
     return automaton, index[number]
 
 
@@ -263,13 +299,19 @@ def as_sparse(product: HostProduct) -> SparseMDP:
     initial = np.zeros(host.num_states)
     initial[product.start] = 1
     return SparseMDP(
-        host.row_start, host.entry_start, host.successor, host.probability,
-        initial / initial.sum(), np.zeros((host.num_states, 0), bool))
+        host.row_start,
+        host.entry_start,
+        host.successor,
+        host.probability,
+        initial / initial.sum(),
+        np.zeros((host.num_states, 0), bool),
+    )
 
 
 def at_states(solution: Solution, states: np.ndarray) -> Solution:
     """A solution's value and bounds at some states."""
     taken: dict[str, Any] = {
         name: np.asarray(getattr(solution, name), np.float64)[states]
-        for name in ("value", "lower", "upper")}
+        for name in ("value", "lower", "upper")
+    }
     return replace(solution, **taken)

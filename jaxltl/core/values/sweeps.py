@@ -54,9 +54,15 @@ def _combined(target: jax.Array, weight: jax.Array, x: jax.Array) -> list[jax.Ar
 
 
 def sweep(
-    blocks: Blocks, x: jax.Array, *, maximize: bool, factor: float = 1.0,
+    blocks: Blocks,
+    x: jax.Array,
+    *,
+    maximize: bool,
+    factor: float = 1.0,
     shift: float | jax.Array = 0.0,
-    keep: jax.Array | None = None, put: jax.Array | None = None, choose: bool = False,
+    keep: jax.Array | None = None,
+    put: jax.Array | None = None,
+    choose: bool = False,
 ) -> tuple[jax.Array, jax.Array | None]:
     """One pass: ``x = opt_a sum_w weight * x`` from the first block on, in place.
 
@@ -127,6 +133,7 @@ def meets(
       x: ``bool[N + 3]``, where to get.
       cyclic: whether the second segment has circles.
     """
+
     def once(blocks: Blocks, has: jax.Array, x: jax.Array) -> jax.Array:
         count, _, _, size = blocks.target.shape
 
@@ -144,6 +151,7 @@ def meets(
 
     x = once(segments[0], support[0], x)
     if cyclic:
+
         def again(state: Any) -> Any:
             x, _ = state
             new = once(segments[1], support[1], x)

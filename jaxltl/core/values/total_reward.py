@@ -91,8 +91,14 @@ def total_reward(
         if target is None:
             raise ValueError("total rewards of interval models need a target; give one.")
         return robust_total_reward(
-            model, reward, target, policy=policy, objective=objective, nature=nature,
-            tolerance=tolerance)
+            model,
+            reward,
+            target,
+            policy=policy,
+            objective=objective,
+            nature=nature,
+            tolerance=tolerance,
+        )
     refuse_nature(nature)
     if is_sharded(model) or is_traced((model, reward, target, policy, tolerance)):
         return _by_sweeps(model, reward, target, policy, objective, tolerance)
@@ -102,7 +108,8 @@ def total_reward(
         r = int(np.flatnonzero(earned < 0)[0])
         raise ValueError(
             f"the reward of a choice of state {sparse.host.state[r]} is {earned[r]:.6g}; expected "
-            "total rewards need rewards of at least 0.")
+            "total rewards need rewards of at least 0."
+        )
     if target is not None:
         require_shape("target", target, model.state_shape)
         target = np.asarray(target, bool).ravel()
@@ -114,12 +121,13 @@ def total_reward(
         host, depth = chain.mdp, chain.depth
     if target is None:
         found = optimal.reward_forever(
-            host, earned, maximize=maximize, tolerance=asked, depth=depth)
+            host, earned, maximize=maximize, tolerance=asked, depth=depth
+        )
     else:
         found = optimal.total_reward(
-            host, earned, target, maximize=maximize, tolerance=asked, depth=depth)
-    return given_policy(
-        solution_of(model, sparse, found, asked, relative=True), policy)
+            host, earned, target, maximize=maximize, tolerance=asked, depth=depth
+        )
+    return given_policy(solution_of(model, sparse, found, asked, relative=True), policy)
 
 
 def _earned(model: Any, sparse: SparseMDP, reward: Any) -> np.ndarray:
@@ -146,11 +154,13 @@ def _by_sweeps(
     if not isinstance(world, MDP | DenseMDP | ShardedMDP):
         raise ValueError(
             f"inside jit, or over a mesh, total_reward needs an MDP, a DenseMDP, a ShardedMDP or a "
-            f"product of one, not {type(world).__name__}; inside jit use prepare(model, target).")
+            f"product of one, not {type(world).__name__}; inside jit use prepare(model, target)."
+        )
     if target is None:
         raise ValueError(
             "total rewards for ever are found on the host; inside jit, or over a mesh, give a "
-            "target.")
+            "target."
+        )
     require_shape("target", target, model.state_shape)
     reward = _on_choices(model, world, reward)
     _require_rewards(model, world, reward)
@@ -165,8 +175,9 @@ def _on_choices(model: Any, world: Any, reward: Any) -> Any:
         named = world.rewards if isinstance(world, ShardedMDP) else {}
         if reward not in named:
             known = f"; it has {', '.join(named)}" if named else ": give an array"
-            raise ValueError(f"reward={reward!r} is no reward of this {type(world).__name__}"
-                             f"{known}.")
+            raise ValueError(
+                f"reward={reward!r} is no reward of this {type(world).__name__}{known}."
+            )
         found = named[reward]
         return found if world is model else jnp.broadcast_to(found[:, None], actions)
     if np.shape(reward) == model.state_shape:
@@ -181,7 +192,8 @@ def _require_rewards(model: Any, world: Any, reward: Any) -> None:
     if not isinstance(least, jax.core.Tracer) and not least >= 0:
         raise ValueError(
             f"the reward of a choice of state {state} is {least:.6g}; expected total rewards need "
-            "rewards of at least 0.")
+            "rewards of at least 0."
+        )
 
 
 @jax.jit

@@ -156,7 +156,8 @@ def total_reward_by_sweeps(
     checked = None if policy is None else valid_policy(model, policy)
     weight = None if checked is None else checked.distribution
     found: Found = in_turn(
-        partial(_enclosed, objective=objective), model, reward, target, weight, tolerance)
+        partial(_enclosed, objective=objective), model, reward, target, weight, tolerance
+    )
     # The optimum's derivative is that of the policy that attains it (Danskin).
     chosen = found.policy if weight is None else weight
 
@@ -168,16 +169,28 @@ def total_reward_by_sweeps(
     value = implicit(follow, found.value, linear=_refined)
     value, lower, upper = (
         jnp.where(finite, x, jnp.where(earns, jnp.inf, bad))
-        for x, bad in ((value, jnp.nan), (found.lower, -jnp.inf), (found.upper, jnp.inf)))
+        for x, bad in ((value, jnp.nan), (found.lower, -jnp.inf), (found.upper, jnp.inf))
+    )
     none = status_code(earns, earns)
     solution = Solution(
-        value=value, policy=chosen, lower=lower, upper=upper, residual=found.residual,
-        num_steps=found.num_steps, status=jnp.maximum(found.status, none))
+        value=value,
+        policy=chosen,
+        lower=lower,
+        upper=upper,
+        residual=found.residual,
+        num_steps=found.num_steps,
+        status=jnp.maximum(found.status, none),
+    )
     return solution if checked is None else refuse(solution, checked.given, checked.valid)
 
 
 def _enclosed(
-    model: Any, reward: jax.Array, target: jax.Array, policy: Any, tolerance: Any, *,
+    model: Any,
+    reward: jax.Array,
+    target: jax.Array,
+    policy: Any,
+    tolerance: Any,
+    *,
     objective: str,
 ) -> Found:
     graph = TracedGraph(model)
@@ -196,8 +209,17 @@ def _of_policy(graph: TracedGraph, reward: jax.Array, target: jax.Array, policy:
     finite = policy_sets(graph, target, policy).one
     first = graph.first(taken)[1]
     return _Problem(
-        graph.model, 1, reward, policy, _earning(graph, reward, target, taken) & finite, finite,
-        taken, first, first, None)
+        graph.model,
+        1,
+        reward,
+        policy,
+        _earning(graph, reward, target, taken) & finite,
+        finite,
+        taken,
+        first,
+        first,
+        None,
+    )
 
 
 def _earning(graph: TracedGraph, reward: jax.Array, target: jax.Array, taken: Any) -> jax.Array:
@@ -221,7 +243,8 @@ def _largest(graph: TracedGraph, reward: jax.Array, target: jax.Array) -> _Probl
     decided = jnp.where(never, avoids, jnp.where(finite, first, doomed.action))
     open_ = _earning(graph, reward, target, graph.available) & finite
     return _Problem(
-        graph.model, 1, reward, None, open_, finite, graph.available, first, decided, None)
+        graph.model, 1, reward, None, open_, finite, graph.available, first, decided, None
+    )
 
 
 def _smallest(graph: TracedGraph, reward: jax.Array, target: jax.Array) -> _Problem:
@@ -234,8 +257,17 @@ def _smallest(graph: TracedGraph, reward: jax.Array, target: jax.Array) -> _Prob
     open_ = finite & ~nothing.region
     circles = components_within(graph, open_, free)
     return _Problem(
-        graph.model, -1, reward, None, open_, finite, allowed & ~circles.inside, sure.action,
-        nothing.action, circles)
+        graph.model,
+        -1,
+        reward,
+        None,
+        open_,
+        finite,
+        allowed & ~circles.inside,
+        sure.action,
+        nothing.action,
+        circles,
+    )
 
 
 # --- the operator -----------------------------------------------------------------------------
@@ -259,8 +291,11 @@ def _backup(problem: _Problem, value: jax.Array) -> _Point:
         image = problem.sign * best
     if problem.circles is not None:
         image, leaves = lax.cond(
-            jnp.any(problem.circles.inside), partial(_least, problem.circles.component),
-            lambda image: (image, leaves), image)
+            jnp.any(problem.circles.inside),
+            partial(_least, problem.circles.component),
+            lambda image: (image, leaves),
+            image,
+        )
     return _Point(value, jnp.where(problem.open, image, 0), action, leaves)
 
 
@@ -276,8 +311,7 @@ def _least(component: jax.Array, image: jax.Array) -> tuple[jax.Array, jax.Array
 def _where_it_leaves(problem: _Problem, at: _Point, x: jax.Array) -> jax.Array:
     if problem.circles is None:
         return x
-    return lax.cond(
-        jnp.any(problem.circles.inside), lambda x: x.ravel()[at.leaves], lambda x: x, x)
+    return lax.cond(jnp.any(problem.circles.inside), lambda x: x.ravel()[at.leaves], lambda x: x, x)
 
 
 def _onward(problem: _Problem, at: _Point) -> Callable[[jax.Array], jax.Array]:
@@ -314,7 +348,8 @@ def _improved(problem: _Problem, factor: jax.Array, at: _Point) -> tuple[jax.Arr
         if weight is None:
             weight = jax.nn.one_hot(at.action, model.num_actions, dtype=model.dtype)
         system = System(
-            table(model), action_columns(model.num_actions, weight), problem.open.ravel() * factor)
+            table(model), action_columns(model.num_actions, weight), problem.open.ravel() * factor
+        )
         eye = jnp.eye(change.size, dtype=model.dtype)
         moves = (eye - system.matrix())[at.leaves.ravel()]
         x = (inverse(eye - moves) @ change.ravel()).reshape(change.shape) / scale
@@ -324,8 +359,10 @@ def _improved(problem: _Problem, factor: jax.Array, at: _Point) -> tuple[jax.Arr
     left = norm((wanted - matvec(x)).ravel())
     solved = left <= _POOR * norm(wanted.ravel())  # false for NaN
     x = lax.cond(
-        solved, lambda: x,
-        lambda: lax.fori_loop(1, _SWEEPS, lambda _, x: x + (wanted - matvec(x)), wanted))
+        solved,
+        lambda: x,
+        lambda: lax.fori_loop(1, _SWEEPS, lambda _, x: x + (wanted - matvec(x)), wanted),
+    )
     return at.value + scale * x, n + jnp.where(solved, 1, _SWEEPS)
 
 
@@ -333,6 +370,7 @@ def _bicgstab(
     matvec: Callable[[jax.Array], jax.Array], b: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """x with ``matvec(x) = b``, nearly, and how often that was applied."""
+
     def flat(x: jax.Array) -> jax.Array:
         return matvec(x.reshape(b.shape)).ravel()
 
@@ -341,7 +379,8 @@ def _bicgstab(
     # are soon orthogonal to the first one, from which the method then learns nothing.
     shadow = jax.random.normal(jax.random.key(0), right.shape, right.dtype)
     start = start_bicgstab(jnp.zeros_like(right), right)._replace(
-        shadow=shadow, rho=dot(shadow, right))
+        shadow=shadow, rho=dot(shadow, right)
+    )
     goal, most = _FORCING * norm(right), min(_MOST_INNER, 8 * right.size + 64)
 
     def body(carry: tuple[Bicgstab, jax.Array]) -> tuple[Bicgstab, jax.Array]:
@@ -393,8 +432,13 @@ def _solved(
         found = error(new)
         waits = rest + jnp.where(jnp.all(new.action == at.action), _SAME, 1)
         halved = found < best / 2  # false for NaN
-        return (new, n + m + 1, found, jnp.where(halved, found, best),
-                jnp.where(halved, 0, waits).astype(jnp.int32))
+        return (
+            new,
+            n + m + 1,
+            found,
+            jnp.where(halved, found, best),
+            jnp.where(halved, 0, waits).astype(jnp.int32),
+        )
 
     def goes_on(carry: Any) -> jax.Array:
         _, n, found, _, rest = carry
@@ -455,8 +499,10 @@ def _tried(problem: _Problem, unit: jax.Array, tolerance: jax.Array, k: _Search)
     def kept(new: Any, old: Any, where: jax.Array) -> Any:
         return jax.tree.map(lambda x, y: jnp.where(where, x, y), new, old)
 
-    news = tuple(proven & side & (k.share <= old)
-                 for side, old in zip((~above, above), k.shares, strict=True))
+    news = tuple(
+        proven & side & (k.share <= old)
+        for side, old in zip((~above, above), k.shares, strict=True)
+    )
     bounds = tuple(kept(offered, old, new) for new, old in zip(news, k.bounds, strict=True))
     shares = tuple(kept(k.share, old, new) for new, old in zip(news, k.shares, strict=True))
     safe = kept(at, k.safe, news[0] if problem.sign > 0 else news[1])
@@ -477,12 +523,20 @@ def _solution(problem: _Problem, tolerance: jax.Array) -> Found:
     unit = jnp.asarray(rounding_unit(problem.model), zero.dtype)
     never = jnp.asarray(jnp.inf, zero.dtype)
     k = _Search(
-        start, jnp.sqrt(jnp.maximum(tolerance, 0) * _ROUNDINGS * unit),
-        (zero, jnp.where(problem.open, jnp.inf, zero)), (never, never), start, jnp.int32(0),
-        jnp.int32(0), jnp.bool_(False))
+        start,
+        jnp.sqrt(jnp.maximum(tolerance, 0) * _ROUNDINGS * unit),
+        (zero, jnp.where(problem.open, jnp.inf, zero)),
+        (never, never),
+        start,
+        jnp.int32(0),
+        jnp.int32(0),
+        jnp.bool_(False),
+    )
     k = lax.while_loop(
         lambda k: (_width(problem, k.bounds) > tolerance) & (k.tries < 2 * _ATTEMPTS) & ~k.ended,
-        partial(_tried, problem, unit, tolerance), k)
+        partial(_tried, problem, unit, tolerance),
+        k,
+    )
     policy, decides = _policy(problem, k.safe)
     lower, upper = k.bounds
     if problem.sign < 0:
@@ -495,8 +549,17 @@ def _solution(problem: _Problem, tolerance: jax.Array) -> Found:
     narrow = _width(problem, (lower, upper)) <= tolerance
     status = status_code(narrow, jnp.isfinite(residual), jnp.all(both) & k.ended)
     return Found(
-        value, lower, upper, policy, k.safe.leaves, problem.open, problem.finite, residual,
-        k.num_steps, status)
+        value,
+        lower,
+        upper,
+        policy,
+        k.safe.leaves,
+        problem.open,
+        problem.finite,
+        residual,
+        k.num_steps,
+        status,
+    )
 
 
 def _policy(problem: _Problem, safe: _Point) -> tuple[jax.Array, jax.Array]:
@@ -508,7 +571,8 @@ def _policy(problem: _Problem, safe: _Point) -> tuple[jax.Array, jax.Array]:
         circling, _ = graph.first(inside)
         exits = circling & (safe.leaves == _numbers(circling.shape))
         towards = lax.cond(
-            jnp.any(circling), lambda: attract(graph, exits, inside).action, lambda: action)
+            jnp.any(circling), lambda: attract(graph, exits, inside).action, lambda: action
+        )
         action = jnp.where(circling & ~exits, towards, action)
     if problem.sign < 0:
         taken = jax.nn.one_hot(action, problem.model.num_actions, dtype=problem.reward.dtype)

@@ -77,7 +77,11 @@ def span_iteration(
     dtype = game.dtype
     graph = _Graph(game.mdp.successor, allowed, jnp.where(game.system, 1, -1).astype(dtype))
     models = _Models(
-        gain, probability, value, jnp.asarray(discount, dtype), jnp.asarray(enough, dtype),
+        gain,
+        probability,
+        value,
+        jnp.asarray(discount, dtype),
+        jnp.asarray(enough, dtype),
         jnp.asarray(active),
     )
     return _iterate(graph, models)
@@ -94,8 +98,10 @@ class _Sweeps(NamedTuple):
 
 def _plain(graph: _Graph, models: _Models) -> tuple[jax.Array, jax.Array, jax.Array]:
     start = _Sweeps(
-        models.value, _change(graph, models, models.value),
-        jnp.full_like(models.enough, jnp.inf), jnp.int32(0),
+        models.value,
+        _change(graph, models, models.value),
+        jnp.full_like(models.enough, jnp.inf),
+        jnp.int32(0),
     )
     lanes = models.active.shape
     few = lanes[0] // (4 * _FEWEST) * _FEWEST if lanes else 0
@@ -140,7 +146,8 @@ def _last_lanes(graph: _Graph, models: _Models, found: _Sweeps, few: int) -> _Sw
     last = _swept(graph, narrow, rest)
     place = jnp.maximum(place, 0)
     return jax.tree.map(
-        lambda x, y: jnp.where(going, x[..., place], y) if y.ndim else x, last, found)
+        lambda x, y: jnp.where(going, x[..., place], y) if y.ndim else x, last, found
+    )
 
 
 def _beside(models: _Models, x: jax.Array) -> jax.Array:
@@ -163,7 +170,8 @@ def _quantities(graph: _Graph, models: _Models, value: jax.Array) -> list[jax.Ar
 
     def reached(*where: Any) -> jax.Array:
         return value.at[graph.successor[:, *where]].get(
-            mode="promise_in_bounds", wrap_negative_indices=False)
+            mode="promise_in_bounds", wrap_negative_indices=False
+        )
 
     columns = []
     for a in range(num_actions):

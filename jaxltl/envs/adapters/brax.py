@@ -60,17 +60,24 @@ def from_brax(
     make = "give brax.envs.get_environment(name), and limit its episodes by with_time_limit"
     require_environment("brax", env, envs.Env, "brax.envs.get_environment(name)")
     refuse_wrappers(
-        "brax", env, "env",
+        "brax",
+        env,
+        "env",
         (training.AutoResetWrapper, training.VmapWrapper, training.DomainRandomizationVmapWrapper),
-        make)
+        make,
+    )
     held, size = Held(env), int(env.action_size)
     length, repeat = getattr(env, "episode_length", None), getattr(env, "action_repeat", 1)
     with own_errors("brax", env):
         return make_environment(
-            Partial(_reset, held), Partial(_step, held), Partial(_observe),
-            actions=make_box(-1.0, 1.0, (size,), np.float32), labels=labels,
+            Partial(_reset, held),
+            Partial(_step, held),
+            Partial(_observe),
+            actions=make_box(-1.0, 1.0, (size,), np.float32),
+            labels=labels,
             propositions=propositions,
-            horizon=None if length is None else -(-int(length) // int(repeat)))
+            horizon=None if length is None else -(-int(length) // int(repeat)),
+        )
 
 
 def _reset(held: Held, key: chex.PRNGKey) -> Any:

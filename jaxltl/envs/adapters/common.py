@@ -63,7 +63,8 @@ def package(name: str) -> Any:
     except ImportError as problem:
         raise ImportError(
             f'from_{root} needs the package {root} ({problem}); pip install "jaxltl[{root}]".',
-            name=problem.name) from problem
+            name=problem.name,
+        ) from problem
 
 
 def require_environment(root: str, env: Any, kinds: Any, remedy: str) -> None:
@@ -72,7 +73,8 @@ def require_environment(root: str, env: Any, kinds: Any, remedy: str) -> None:
         kind = type(env)
         raise ValueError(
             f"from_{root}: env is a {kind.__module__}.{kind.__qualname__}, no environment of "
-            f"{root}; give {remedy}.")
+            f"{root}; give {remedy}."
+        )
 
 
 def params_of(root: str, params: Any, own: Any) -> Any:
@@ -82,7 +84,8 @@ def params_of(root: str, params: Any, own: Any) -> Any:
     if not isinstance(params, type(own)):
         raise ValueError(
             f"from_{root}: params is {given.shown(params)}; give a {type(own).__qualname__}, such "
-            "as the environment's own with params.replace(...), or None for its own.")
+            "as the environment's own with params.replace(...), or None for its own."
+        )
     return params
 
 
@@ -98,7 +101,8 @@ def own_errors(root: str, env: Any) -> Iterator[None]:
         raise ValueError(
             f"from_{root}: {type(env).__name__} cannot be traced with JAX {jax.__version__}: "
             f"{type(problem).__name__}: {first}. Take another version of {root} or of "
-            "JAX, or mend its labels.") from problem
+            "JAX, or mend its labels."
+        ) from problem
 
 
 def refuse_wrappers(root: str, env: Any, attribute: str, kinds: Any, remedy: str) -> None:
@@ -107,7 +111,8 @@ def refuse_wrappers(root: str, env: Any, attribute: str, kinds: Any, remedy: str
         if isinstance(layer, kinds):
             raise ValueError(
                 f"from_{root}: env is wrapped in {type(layer).__name__}; {remedy}. Episodes are "
-                "started anew by those who draw them, and many of them are a vmap.")
+                "started anew by those who draw them, and many of them are a vmap."
+            )
 
 
 def layers(env: Any, attribute: str) -> Iterator[Any]:
@@ -144,8 +149,12 @@ def arrays(tree: Any, like: Any = None) -> Any:
 def timestep(world: Any, before: Any, reward: Any, terminated: Any, truncated: Any) -> Timestep:
     """A :class:`Timestep` of the types that the protocol asks for; costs are zero."""
     return Timestep(
-        arrays(world, before), jnp.asarray(reward, jnp.result_type(float)),
-        jnp.asarray(terminated, bool), jnp.asarray(truncated, bool), jnp.zeros(()))
+        arrays(world, before),
+        jnp.asarray(reward, jnp.result_type(float)),
+        jnp.asarray(terminated, bool),
+        jnp.asarray(truncated, bool),
+        jnp.zeros(()),
+    )
 
 
 def labels_of_state(labels: Callable[..., jax.Array] | None) -> Partial | None:

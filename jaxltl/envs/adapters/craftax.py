@@ -59,16 +59,21 @@ def from_craftax(
     bases = package("craftax.environment_base.environment_bases")
     make = "craftax_env.make_craftax_env_from_name(name, auto_reset=False)"
     require_environment(
-        "craftax", env, (bases.EnvironmentNoAutoReset, bases.EnvironmentAutoReset), make)
+        "craftax", env, (bases.EnvironmentNoAutoReset, bases.EnvironmentAutoReset), make
+    )
     if isinstance(env, bases.EnvironmentAutoReset):
-        raise ValueError(
-            f"from_craftax: {type(env).__name__} starts anew by itself; give {make}.")
+        raise ValueError(f"from_craftax: {type(env).__name__} starts anew by itself; give {make}.")
     params = params_of("craftax", params, env.default_params)
     held, limit = Held(env), params.max_timesteps
     return make_environment(
-        Partial(_reset, held, params), Partial(_step, held, params), Partial(_observe, held),
-        actions=space_of_actions("craftax", env.action_space(params)), labels=labels,
-        propositions=propositions, horizon=limit if isinstance(limit, int) else None)
+        Partial(_reset, held, params),
+        Partial(_step, held, params),
+        Partial(_observe, held),
+        actions=space_of_actions("craftax", env.action_space(params)),
+        labels=labels,
+        propositions=propositions,
+        horizon=limit if isinstance(limit, int) else None,
+    )
 
 
 def _reset(held: Held, params: Any, key: chex.PRNGKey) -> Any:
@@ -81,8 +86,12 @@ def _step(held: Held, params: Any, world: Any, action: Any, key: chex.PRNGKey) -
     _, state, reward, _, _ = env.step_env(key, copied(world), action, params)
     endless = params.replace(max_timesteps=jnp.iinfo(jnp.int32).max)
     return timestep(
-        state, world, reward, env.is_terminal(state, endless),
-        state.timestep >= params.max_timesteps)
+        state,
+        world,
+        reward,
+        env.is_terminal(state, endless),
+        state.timestep >= params.max_timesteps,
+    )
 
 
 def _observe(held: Held, world: Any) -> Any:

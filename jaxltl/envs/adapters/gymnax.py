@@ -66,16 +66,23 @@ def from_gymnax(
     """
     module = package("gymnax.environments.environment")
     require_environment(
-        "gymnax", env, module.Environment,
-        "gymnax.make(name)[0], without wrappers, which start anew by themselves")
+        "gymnax",
+        env,
+        module.Environment,
+        "gymnax.make(name)[0], without wrappers, which start anew by themselves",
+    )
     params = params_of("gymnax", params, env.default_params)
     held, limit = Held(env), getattr(params, "max_steps_in_episode", None)
     known = type(env).is_truncated is module.Environment.is_truncated and isinstance(limit, int)
     return make_environment(
-        Partial(_reset, held, params), Partial(_step, held, params), Partial(observation_of),
+        Partial(_reset, held, params),
+        Partial(_step, held, params),
+        Partial(observation_of),
         actions=space_of_actions("gymnax", env.action_space(params)),
-        labels=labels_of_state(labels), propositions=propositions,
-        horizon=limit if known else None)
+        labels=labels_of_state(labels),
+        propositions=propositions,
+        horizon=limit if known else None,
+    )
 
 
 def space_of_actions(root: str, space: Any) -> Finite | Box:
@@ -95,6 +102,8 @@ def _reset(held: Held, params: Any, key: chex.PRNGKey) -> Seen:
 def _step(held: Held, params: Any, world: Seen, action: Any, key: chex.PRNGKey) -> Timestep:
     env = held.it
     observation, state, reward, terminated, _ = env.step_env(
-        key, copied(world.state), action, params)
+        key, copied(world.state), action, params
+    )
     return timestep(
-        Seen(state, observation), world, reward, terminated, env.is_truncated(state, params))
+        Seen(state, observation), world, reward, terminated, env.is_truncated(state, params)
+    )

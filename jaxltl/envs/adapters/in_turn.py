@@ -77,10 +77,15 @@ def in_turn(
     """
     held = Held(tuple(counts))
     return make_environment(
-        Partial(_begin, held, reset), Partial(_choose, held, step), Partial(_seen, held, observe),
-        actions=max(counts), labels=None if labels is None else Partial(_labels, labels),
-        propositions=propositions, allowed=Partial(_allowed, held, mask),
-        horizon=None if horizon is None else horizon * len(counts))
+        Partial(_begin, held, reset),
+        Partial(_choose, held, step),
+        Partial(_seen, held, observe),
+        actions=max(counts),
+        labels=None if labels is None else Partial(_labels, labels),
+        propositions=propositions,
+        allowed=Partial(_allowed, held, mask),
+        horizon=None if horizon is None else horizon * len(counts),
+    )
 
 
 def _nothing(counts: Held, world: Any) -> PartWorld:
@@ -99,8 +104,12 @@ def _choose(
 
     def wait() -> Timestep:
         return Timestep(
-            now.world, jnp.zeros((), jnp.result_type(float)), jnp.bool_(False), jnp.bool_(False),
-            jnp.zeros(()))
+            now.world,
+            jnp.zeros((), jnp.result_type(float)),
+            jnp.bool_(False),
+            jnp.bool_(False),
+            jnp.zeros(()),
+        )
 
     found = lax.cond(last, lambda: step(now.world, parts, key), wait)
     fresh, going = _nothing(counts, found.world), PartWorld(found.world, parts, now.turn + 1)
@@ -111,7 +120,8 @@ def _seen(counts: Held, observe: Callable[..., Any], now: PartWorld) -> PartObse
     number = jnp.arange(len(counts.it))
     chosen = jax.nn.one_hot(now.parts, max(counts.it), dtype=bool)
     return PartObservation(
-        observe(now.world), chosen & (number < now.turn)[:, None], number == now.turn)
+        observe(now.world), chosen & (number < now.turn)[:, None], number == now.turn
+    )
 
 
 def _labels(labels: Callable[..., jax.Array], now: PartWorld) -> jax.Array:
@@ -132,7 +142,8 @@ def _allowed(counts: Held, mask: Callable[..., jax.Array] | None, now: PartWorld
             found &= ((part >= now.turn) | own).reshape(shape)
         rows = [
             jnp.pad(found.any([i for i in range(found.ndim) if i != part]), (0, most - count))
-            for part, count in enumerate(counts.it)]
+            for part, count in enumerate(counts.it)
+        ]
         found = jnp.stack(rows)
     row = found[now.turn, :most] & inside
     return jnp.where(row.any(), row, inside)

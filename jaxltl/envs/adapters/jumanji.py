@@ -85,13 +85,17 @@ def from_jumanji(
     jumanji, wrappers = package("jumanji"), package("jumanji.wrappers")
     require_environment("jumanji", env, jumanji.Environment, "jumanji.make(name)")
     refuse_wrappers(
-        "jumanji", env, "_env",
+        "jumanji",
+        env,
+        "_env",
         (wrappers.AutoResetWrapper, wrappers.VmapWrapper, wrappers.VmapAutoResetWrapper),
-        "give what is in it")
+        "give what is in it",
+    )
     if env.reward_spec.shape != ():
         raise ValueError(
             f"from_jumanji: {type(env).__name__} has rewards of shape {env.reward_spec.shape}, "
-            "one for each agent; wrap it in jumanji.wrappers.MultiToSingleWrapper.")
+            "one for each agent; wrap it in jumanji.wrappers.MultiToSingleWrapper."
+        )
     held, endless, parts = Held(env), Held(_without_limit(env)), _parts(env)
     limit = next((x.time_limit for x in layers(env, "_env") if "time_limit" in vars(x)), None)
     limit = None if limit is None else int(limit)
@@ -99,16 +103,28 @@ def from_jumanji(
         if not parts:
             raise ValueError(
                 f"from_jumanji: in_turn=True, but an action of {type(env).__name__} has no parts "
-                "of finitely many values; leave it out.")
+                "of finitely many values; leave it out."
+            )
         return parts_in_turn(
-            parts, Partial(_reset, held), Partial(_moved, held, endless), Partial(observation_of),
-            labels=labels_of_state(labels), propositions=propositions,
-            mask=None if _mask(env, parts) is None else Partial(_mask_in), horizon=limit)
+            parts,
+            Partial(_reset, held),
+            Partial(_moved, held, endless),
+            Partial(observation_of),
+            labels=labels_of_state(labels),
+            propositions=propositions,
+            mask=None if _mask(env, parts) is None else Partial(_mask_in),
+            horizon=limit,
+        )
     return make_environment(
-        Partial(_reset, held), Partial(_step, held, endless, Held(parts)),
-        Partial(observation_of), actions=_actions(env.action_spec, parts),
-        labels=labels_of_state(labels), propositions=propositions,
-        allowed=_mask(env, parts), horizon=limit)
+        Partial(_reset, held),
+        Partial(_step, held, endless, Held(parts)),
+        Partial(observation_of),
+        actions=_actions(env.action_spec, parts),
+        labels=labels_of_state(labels),
+        propositions=propositions,
+        allowed=_mask(env, parts),
+        horizon=limit,
+    )
 
 
 def _without_limit(env: Any) -> Any:
@@ -146,7 +162,8 @@ def _actions(spec: Any, parts: tuple[int, ...] | None) -> Finite | Box:
             raise ValueError(
                 f"from_jumanji: parts of {list(parts)} values make {count} actions; at most "
                 f"{_MOST_ACTIONS} are numbered. Choose the parts one after the other, "
-                "in_turn=True, or take fewer agents or a smaller board.")
+                "in_turn=True, or take fewer agents or a smaller board."
+            )
         return Finite(count)
     if not (hasattr(spec, "minimum") and jnp.issubdtype(spec.dtype, jnp.floating)):
         raise ValueError(f"from_jumanji: actions are {spec!r}; they must be finite or in a box.")
@@ -169,7 +186,8 @@ def _mask(env: Any, parts: tuple[int, ...] | None) -> Partial | None:
     if not (together or apart):
         raise ValueError(
             f"from_jumanji: action_mask has the shape {list(mask.shape)}, for actions of "
-            f"{list(parts)} values.")
+            f"{list(parts)} values."
+        )
     return Partial(_allowed_together) if together else Partial(_allowed_apart, Held(parts))
 
 
@@ -211,5 +229,5 @@ def _moved(held: Held, endless: Held, world: Seen, action: Any, key: chex.PRNGKe
     _, further = endless.it.step(copied(world.state), action)
     terminated = further.last() & (further.discount == 0)
     return timestep(
-        Seen(state, found.observation), world, found.reward, terminated,
-        found.last() & ~terminated)
+        Seen(state, found.observation), world, found.reward, terminated, found.last() & ~terminated
+    )

@@ -60,9 +60,14 @@ def from_navix(
     require_environment("navix", env, navix.Environment, "navix.make(name)")
     held = Held(env)
     return make_environment(
-        Partial(_reset, held), Partial(_step, held), Partial(observation_of),
-        actions=len(env.action_set), labels=labels_of_state(labels), propositions=propositions,
-        horizon=int(env.max_steps))
+        Partial(_reset, held),
+        Partial(_step, held),
+        Partial(observation_of),
+        actions=len(env.action_set),
+        labels=labels_of_state(labels),
+        propositions=propositions,
+        horizon=int(env.max_steps),
+    )
 
 
 def _reset(held: Held, key: chex.PRNGKey) -> Any:

@@ -83,17 +83,24 @@ def from_pgx(
     require_environment("pgx", env, pgx.Env, "pgx.make(name)")
     if not (isinstance(player, int | np.integer) and 0 <= player < env.num_players):
         raise ValueError(
-            f"from_pgx: player={player!r}; {env.id} has the players 0 to {env.num_players - 1}.")
+            f"from_pgx: player={player!r}; {env.id} has the players 0 to {env.num_players - 1}."
+        )
     if (opponent is None) != (env.num_players == 1):
         raise ValueError(
             f"from_pgx: {env.id} is for {env.num_players} players; give an opponent, "
-            "(state, key) -> action, where there are several, and None where there is one.")
+            "(state, key) -> action, where there are several, and None where there is one."
+        )
     others = None if opponent is None else as_partial(opponent)
     game = Held(env), int(player), others
     return make_environment(
-        Partial(_reset, *game), Partial(_step, *game), Partial(_observe, *game[:2]),
-        actions=int(env.num_actions), labels=labels_of_state(labels), propositions=propositions,
-        allowed=Partial(_allowed))
+        Partial(_reset, *game),
+        Partial(_step, *game),
+        Partial(_observe, *game[:2]),
+        actions=int(env.num_actions),
+        labels=labels_of_state(labels),
+        propositions=propositions,
+        allowed=Partial(_allowed),
+    )
 
 
 def _reset(held: Held, player: Any, opponent: Any, key: chex.PRNGKey) -> Turn:
@@ -131,7 +138,8 @@ def _await_turn(
         if action.shape or action.dtype.kind not in "iu":
             raise ValueError(
                 f"opponent returns {action.dtype}{list(action.shape)}; it must return the number "
-                "of one action.")
+                "of one action."
+            )
         after = arrays(held.it.step(copied(state), action, go), state)
         return after, earned + after.rewards[player].astype(earned.dtype), key
 

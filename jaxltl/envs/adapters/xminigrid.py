@@ -59,17 +59,27 @@ def from_xminigrid(
     wrappers = package("xminigrid.wrappers")
     require_environment("xminigrid", env, module.Environment, "xminigrid.make(name)[0]")
     refuse_wrappers(
-        "xminigrid", env, "_env",
-        (wrappers.GymAutoResetWrapper, wrappers.DmEnvAutoResetWrapper), "give what is in it")
+        "xminigrid",
+        env,
+        "_env",
+        (wrappers.GymAutoResetWrapper, wrappers.DmEnvAutoResetWrapper),
+        "give what is in it",
+    )
     params = params_of("xminigrid", params, env.default_params())
     if params.max_steps is None:
         raise ValueError(
-            "from_xminigrid: params.max_steps is None; give params.replace(max_steps=...).")
+            "from_xminigrid: params.max_steps is None; give params.replace(max_steps=...)."
+        )
     held = Held(env)
     return make_environment(
-        Partial(_reset, held, params), Partial(_step, held, params), Partial(observation_of),
-        actions=int(env.num_actions(params)), labels=labels_of_state(labels),
-        propositions=propositions, horizon=int(params.max_steps))
+        Partial(_reset, held, params),
+        Partial(_step, held, params),
+        Partial(observation_of),
+        actions=int(env.num_actions(params)),
+        labels=labels_of_state(labels),
+        propositions=propositions,
+        horizon=int(params.max_steps),
+    )
 
 
 def _reset(held: Held, params: Any, key: chex.PRNGKey) -> Any:

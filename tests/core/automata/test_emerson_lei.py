@@ -42,8 +42,12 @@ def recurring(delta, marks, initial, prefix, cycle):
 
 def simulated(delta, colors, initial, condition, prefix, cycle):
     """Truth of the condition by the text of its definition, on sets of colors."""
-    met = {c for mask in recurring(delta, colors, initial, prefix, cycle)
-           for c in range(8) if mask >> c & 1}
+    met = {
+        c
+        for mask in recurring(delta, colors, initial, prefix, cycle)
+        for c in range(8)
+        if mask >> c & 1
+    }
 
     def true(f):
         match f[0]:
@@ -105,7 +109,9 @@ def test_parity_automaton_keeps_the_language(seed):
         condition = random_condition(rng, colors, rng.randint(1, 7))
         density = rng.choice([0.15, 0.5])
         delta, marks = random_tables(
-            rng, states, width,
+            rng,
+            states,
+            width,
             lambda colors=colors, density=density: sum(
                 (rng.random() < density) << c for c in range(colors)
             ),
@@ -131,9 +137,7 @@ def test_transient_transitions_have_priority_one():
     for _ in range(80):
         delta, marks = random_tables(rng, 5, 2, lambda: rng.randrange(4))
         new, priority, _, _ = to_parity(delta, marks, 0, random_condition(rng, 2, 3))
-        component = strong_components(
-            np.repeat(np.arange(len(new)), 2), new.ravel(), len(new)
-        )
+        component = strong_components(np.repeat(np.arange(len(new)), 2), new.ravel(), len(new))
         leaving = component[new] != component[:, None]
         assert (priority[leaving] == 1).all()
         seen += int(leaving.sum())
@@ -183,9 +187,7 @@ def test_generalised_buchi_on_one_state(count):
 )
 def test_small_conditions(condition, states, priorities):
     """One state that reads every set of three colors."""
-    new, priority, _, _ = to_parity(
-        np.zeros((1, 8), int), np.arange(8)[None], 0, condition
-    )
+    new, priority, _, _ = to_parity(np.zeros((1, 8), int), np.arange(8)[None], 0, condition)
     assert len(new) == states and set(priority.ravel().tolist()) == priorities
 
 

@@ -201,8 +201,9 @@ def test_found_words_are_short():
     turning = make_automaton(delta, 0, [[False], [True]], ["a"], priority=even_step)
     assert find_accepted(turning) == ([], [frozenset()])
     far = [[1 if q == 5 else 2, 2] for q in range(size)]
-    both = find_not_included(turning, make_automaton(delta, 0, [[False], [True]], ["a"],
-                                                     priority=far))
+    both = find_not_included(
+        turning, make_automaton(delta, 0, [[False], [True]], ["a"], priority=far)
+    )
     assert both == ([], [frozenset()])
 
 
@@ -253,8 +254,11 @@ def test_equal_languages_in_different_clothes():
         order = np.array(rng.sample(range(count), count))
         place = np.argsort(order)
         other = replace(
-            automaton, delta=place[automaton.delta[order]], priority=automaton.priority[order] + 2,
-            initial=place[int(automaton.initial)], acceptance="parity",
+            automaton,
+            delta=place[automaton.delta[order]],
+            priority=automaton.priority[order] + 2,
+            initial=place[int(automaton.initial)],
+            acceptance="parity",
         )
         assert is_equivalent(automaton, other) and find_difference(automaton, other) is None
         assert not is_equivalent(automaton, complement(other))
@@ -343,11 +347,16 @@ def test_too_many_or_no_joint_letters():
     with pytest.raises(ValueError, match=r"8192 joint letters; the limit is 4096. .*letters="):
         align(a, b)
     assert align(a, constant([f"b{i}" for i in range(6)]))[0].letters.shape == (4096, 12)
-    only = [
-        make_automaton([[0]], 0, [[value]], ["a"], accepting=[True]) for value in (False, True)
-    ]
-    for operation in (intersection, union, difference, is_included, is_equivalent,
-                      find_difference, find_not_included):
+    only = [make_automaton([[0]], 0, [[value]], ["a"], accepting=[True]) for value in (False, True)]
+    for operation in (
+        intersection,
+        union,
+        difference,
+        is_included,
+        is_equivalent,
+        find_difference,
+        find_not_included,
+    ):
         with pytest.raises(ValueError, match="Build both with the same letters="):
             operation(*only)
 
@@ -355,7 +364,10 @@ def test_too_many_or_no_joint_letters():
 def test_too_many_priorities():
     one = make_automaton(
         [[(q + 1) % 40] for q in range(40)],
-        0, [[True]], ["a"], priority=list(range(40)),
+        0,
+        [[True]],
+        ["a"],
+        priority=list(range(40)),
     )
     with pytest.raises(ValueError, match=r"78 priorities .* the limit is 62"):
         union(one, one)
@@ -409,10 +421,24 @@ def test_operations_over_different_propositions():
 
 def test_results_have_the_simplest_acceptance_and_names():
     rows, names = [[False], [True]], ["a"]
-    reach = make_automaton([[0, 1], [1, 1]], 0, rows, names, final=[False, True],
-                           acceptance="cosafe", state_names=["F a", "true"])
-    stay = make_automaton([[1, 0], [1, 1]], 0, rows, names, final=[True, False],
-                          acceptance="safety", state_names=["G a", "false"])
+    reach = make_automaton(
+        [[0, 1], [1, 1]],
+        0,
+        rows,
+        names,
+        final=[False, True],
+        acceptance="cosafe",
+        state_names=["F a", "true"],
+    )
+    stay = make_automaton(
+        [[1, 0], [1, 1]],
+        0,
+        rows,
+        names,
+        final=[True, False],
+        acceptance="safety",
+        state_names=["G a", "false"],
+    )
     assert union(reach, reach).acceptance == "cosafe"
     assert intersection(stay, stay).acceptance == "safety"
     assert union(reach, reach).state_names[0] == "(F a) | (F a)"

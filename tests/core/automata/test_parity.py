@@ -109,8 +109,13 @@ def residuals(automaton):
 
 
 CASES = [
-    (1, [0, 1, 2, 3], 25), (2, [0, 1], 60), (3, [0, 1], 60), (3, [1, 2], 40), (4, [0, 1, 2], 80),
-    (5, [0, 1, 2, 3], 60), (5, [0, 1], 40),
+    (1, [0, 1, 2, 3], 25),
+    (2, [0, 1], 60),
+    (3, [0, 1], 60),
+    (3, [1, 2], 40),
+    (4, [0, 1, 2], 80),
+    (5, [0, 1, 2, 3], 60),
+    (5, [0, 1], 40),
 ]
 
 
@@ -147,9 +152,12 @@ def test_weak_results_have_one_state_for_each_language():
     seen = []
     for _ in range(400):
         automaton = random_parity(rng, rng.randint(2, 6), [0, 1, 1, 2][: rng.choice([2, 4])])
-        automaton = replace(automaton, delta=np.maximum(
-            automaton.delta, np.arange(len(automaton.delta))[:, None] - rng.randint(0, 1)
-        ).astype(np.int32))  # many small components
+        automaton = replace(
+            automaton,
+            delta=np.maximum(
+                automaton.delta, np.arange(len(automaton.delta))[:, None] - rng.randint(0, 1)
+            ).astype(np.int32),
+        )  # many small components
         if rng.random() < 0.5:  # one color for each state
             automaton = replace(automaton, priority=automaton.priority[:, :1].repeat(2, axis=1))
         if weak(automaton):
@@ -180,18 +188,14 @@ def test_transient_states_do_not_spoil_safety():
         automaton = make_automaton([[2, 1], [2, 1], [2, 2]], 0, A, ["a"], priority=table)
         assert simplify(automaton).acceptance == "safety"
         table = [[priority, priority], [priority, priority], [0, 0], [1, 1]]
-        automaton = make_automaton(
-            [[3, 1], [2, 2], [3, 2], [3, 3]], 0, A, ["a"], priority=table
-        )
+        automaton = make_automaton([[3, 1], [2, 2], [3, 2], [3, 3]], 0, A, ["a"], priority=table)
         small = simplify(automaton)
         assert small.acceptance == "safety" and len(small.delta) == 4
         assert sorted(small.final.tolist()) == [False, True, True, True]
     # !a W (a & X a): the state after the first a is transient, below an accepting component.
     for priority in (0, 1):
         table = [[0, priority], [priority, priority], [0, 0], [1, 1]]
-        automaton = make_automaton(
-            [[0, 1], [3, 2], [2, 2], [3, 3]], 0, A, ["a"], priority=table
-        )
+        automaton = make_automaton([[0, 1], [3, 2], [2, 2], [3, 3]], 0, A, ["a"], priority=table)
         small = simplify(automaton)
         assert small.acceptance == "safety" and len(small.delta) == 4
         assert sorted(small.final.tolist()) == [False, True, True, True]
@@ -278,8 +282,12 @@ def test_base_states_have_the_language():
         table = Table(automaton.delta, automaton.priority, 0)
         for thorough in (True, False):
             (delta, priority, initial), kind, base = reduce_table(table, thorough)
-            small = replace(automaton, delta=delta.astype(np.int32), acceptance="parity",
-                            priority=priority.astype(np.int32))
+            small = replace(
+                automaton,
+                delta=delta.astype(np.int32),
+                acceptance="parity",
+                priority=priority.astype(np.int32),
+            )
             assert kind == simplify(automaton).acceptance and initial == 0
             for q, old in enumerate(base):
                 left = replace(small, initial=np.int32(q))
@@ -288,7 +296,11 @@ def test_base_states_have_the_language():
 
 def test_names_follow_their_states():
     automaton = make_automaton(
-        [[1, 1], [2, 2], [0, 0]], 0, A, ["a"], accepting=[[False, True]] * 3,
+        [[1, 1], [2, 2], [0, 0]],
+        0,
+        A,
+        ["a"],
+        accepting=[[False, True]] * 3,
         state_names=["x", "y", "z"],
     )
     small = simplify(automaton)

@@ -50,7 +50,7 @@ def test_who_follows_a_sequence_is_accepted(seed):
             assert done[states[-1]]
             assert not done[states[:-1]].any()
         else:  # it goes round a cycle whose least priority is even
-            assert min(priorities[len(priorities) // 2:]) % 2 == 0
+            assert min(priorities[len(priorities) // 2 :]) % 2 == 0
         for state, avoided in zip(states, found.avoid[q, m], strict=False):
             after = [automaton.delta[state, column(automaton, e)] for e in np.flatnonzero(~avoided)]
             assert live[after].all()  # what is not avoided loses nothing for good
@@ -66,15 +66,19 @@ def test_a_set_back_is_avoided_and_other_progress_is_not():
     assert found.avoid[task.initial, first, 1, 2]  # b between a and c sets back
 
 
-@pytest.mark.parametrize(("given", "said"), [
-    ({"events": [[0, 0]]}, "a column for each"),
-    ({"propositions": ("a", "b", "x")}, "mentions the proposition 'c'"),
-    ({"events": [[1, 1, 1]]}, r"does not read the event \{a, b, c\}"),
-    ({"depth": 0}, "depth=0"),
-    ({"most": 0}, "most=0"),
-])
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"events": [[0, 0]]}, "a column for each"),
+        ({"propositions": ("a", "b", "x")}, "mentions the proposition 'c'"),
+        ({"events": [[1, 1, 1]]}, r"does not read the event \{a, b, c\}"),
+        ({"depth": 0}, "depth=0"),
+        ({"most": 0}, "most=0"),
+    ],
+)
 def test_bad_input_is_named(given, said):
     task = to_automaton("F (a & F (b & F c))", letters=LETTERS)
     with pytest.raises(ValueError, match=said):
-        reach_avoid_sequences(**{"automaton": task, "events": EVENTS, "propositions": NAMES,
-                                 **given})
+        reach_avoid_sequences(
+            **{"automaton": task, "events": EVENTS, "propositions": NAMES, **given}
+        )

@@ -48,8 +48,10 @@ def random_letters(rng, names):
     return rng.sample(everything, rng.randint(1, len(everything)))
 
 
-@pytest.mark.parametrize("seed", [
-    pytest.param(seed, marks=[] if seed < 3 else pytest.mark.exhaustive) for seed in range(16)])
+@pytest.mark.parametrize(
+    "seed",
+    [pytest.param(seed, marks=[] if seed < 3 else pytest.mark.exhaustive) for seed in range(16)],
+)
 def test_automaton_accepts_what_the_formula_says(seed):
     rng = random.Random(seed)
     accepted = []
@@ -227,16 +229,27 @@ def test_deep_formula():
 @pytest.mark.parametrize(
     ("text", "acceptance", "parts"),
     [
-        ("G F a", "dfa", [
-            "G F a has no finite acceptance", "It fails on ({})^w", "It holds on ({a})^w",
-            'Ask for acceptance="auto"',
-        ]),
+        (
+            "G F a",
+            "dfa",
+            [
+                "G F a has no finite acceptance",
+                "It fails on ({})^w",
+                "It holds on ({a})^w",
+                'Ask for acceptance="auto"',
+            ],
+        ),
         ("F a & G b", "dfa", ["It fails on ({b})^w", "It holds on {a, b} ({b})^w"]),
         ("(a W b) U c", "dfa", ["It fails on ", "It holds on "]),
         ("F G a", "dfa", ["It fails on ({})^w", "It holds on ({a})^w"]),
-        ("F G a", "buchi", [
-            "F G a has no deterministic Buchi automaton", 'Ask for acceptance="parity"',
-        ]),
+        (
+            "F G a",
+            "buchi",
+            [
+                "F G a has no deterministic Buchi automaton",
+                'Ask for acceptance="parity"',
+            ],
+        ),
         ("F G a | G F b", "buchi", ["F G a | G F b has no deterministic Buchi"]),
         ("F a", "finite", ["acceptance = 'finite'", "auto, dfa, buchi, parity"]),
         ("F a", None, ["acceptance = None"]),
@@ -319,8 +332,9 @@ def same_tables_up_to_kind(left, right):
     return all(np.array_equal(getattr(left, n), getattr(right, n)) for n in names)
 
 
-@pytest.mark.parametrize("seed", [
-    100, *(pytest.param(seed, marks=pytest.mark.exhaustive) for seed in range(101, 104))])
+@pytest.mark.parametrize(
+    "seed", [100, *(pytest.param(seed, marks=pytest.mark.exhaustive) for seed in range(101, 104))]
+)
 def test_random_formulas_of_all_of_the_logic(seed):
     kinds, mean = check_random_formulas(seed, 60)
     assert set(kinds) == {"cosafe", "safety", "buchi", "parity"} and 0.2 < mean < 0.8
@@ -457,10 +471,19 @@ def test_acceptance_is_of_the_language_not_of_the_text(text, acceptance, plain):
         assert automaton.acceptance == expected.acceptance
 
 
-@pytest.mark.parametrize("text", [
-    "F G a", "F G a | G F b", "F G a & G F b", "a U G b", "G F a -> G F b", "F (a & G b)",
-    "F G (a | X b)", "(F a & G b) | F G c",
-])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "F G a",
+        "F G a | G F b",
+        "F G a & G F b",
+        "a U G b",
+        "G F a -> G F b",
+        "F (a & G b)",
+        "F G (a | X b)",
+        "(F a & G b) | F G c",
+    ],
+)
 def test_no_deterministic_buchi_automaton(text):
     """Landweber: parity only where a rejecting loop can hold an accepting one."""
     automaton = to_automaton(text)
@@ -492,9 +515,7 @@ def test_acceptance_asked_for(text):
             continue
         asked = to_automaton(text, acceptance=acceptance)
         assert is_equivalent(asked, automaton)
-        assert asked.acceptance in (
-            ("cosafe", "safety") if acceptance == "dfa" else (acceptance,)
-        )
+        assert asked.acceptance in (("cosafe", "safety") if acceptance == "dfa" else (acceptance,))
     assert to_automaton("F G a", acceptance="parity").acceptance == "parity"
 
 

@@ -23,7 +23,8 @@ from jaxltl.core.models.product import product
 def world():
     """Three states in a circle that show {}, {a} and {a, b}."""
     return jl.from_dense(
-        np.roll(np.eye(3), 1, axis=1)[:, None], label=[[0, 0], [1, 0], [1, 1]],
+        np.roll(np.eye(3), 1, axis=1)[:, None],
+        label=[[0, 0], [1, 0], [1, 1]],
         propositions=["a", "b"],
     )
 
@@ -35,8 +36,11 @@ def game():
 @pytest.mark.parametrize(
     ("condition", "expected"),
     [
-        ("a", [False, True, True]), ("a & !b", [False, True, False]),
-        ("a -> b", [True, False, True]), ("true", [True] * 3), ("false", [False] * 3),
+        ("a", [False, True, True]),
+        ("a & !b", [False, True, False]),
+        ("a -> b", [True, False, True]),
+        ("true", [True] * 3),
+        ("false", [False] * 3),
         (np.array([True, False, True]), [True, False, True]),
     ],
 )

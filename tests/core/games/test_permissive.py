@@ -42,7 +42,8 @@ def all_runs_win(strategy, objective):
     state = strategy.base_state[found.base_state]
     claim = SimpleNamespace(
         game=Game(found.model.mdp, jnp.zeros(states, bool)),
-        objective=objective_at(objective, state), region=np.ones(states, bool),
+        objective=objective_at(objective, state),
+        region=np.ones(states, bool),
         action=_zeros(objective, "guarantees", states),
         counter_action=_zeros(objective, "assumptions", states),
     )
@@ -83,9 +84,15 @@ def test_safety_is_maximal_and_gives_the_values_of_example_1(size, expected):
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("bound", "size", "best"),
-    [(4, 260, 8.092178), (10, 788, 9.464660), (20, 1668, 9.861597), *(
-        pytest.param(*row, marks=pytest.mark.exhaustive) for row in (
-            (6, 436, 8.865797), (8, 612, 9.244175), (14, 1140, 9.703373)))],
+    [
+        (4, 260, 8.092178),
+        (10, 788, 9.464660),
+        (20, 1668, 9.861597),
+        *(
+            pytest.param(*row, marks=pytest.mark.exhaustive)
+            for row in ((6, 436, 8.865797), (8, 612, 9.244175), (14, 1140, 9.703373))
+        ),
+    ],
 )
 def test_counters_of_example_3(bound, size, best):
     game = robots(3)
@@ -337,9 +344,7 @@ def test_bad_requests_are_refused():
     with pytest.raises(ValueError, match=r"counter.* is for Buchi"):
         permissive_strategy(game, goals.cobuchi(game, "!collision"), method="counter", bound=3)
     with pytest.raises(ValueError, match=r"rank.* is for Buchi"):
-        permissive_strategy(
-            game, goals.parity(game, jnp.where(game.system, 3, 2)), method="rank"
-        )
+        permissive_strategy(game, goals.parity(game, jnp.where(game.system, 3, 2)), method="rank")
     with pytest.raises(ValueError, match="memory states here; give a smaller bound"):
         budgets([2000, 2000], 4)
     with pytest.raises(ValueError, match="allows no move in any state"):

@@ -46,10 +46,14 @@ def episodes(keys, environment, num_steps):
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize(("formula", "options"), [
-    (SAFE, {"method": "stay"}), (OFTEN, {"method": "rank"}),
-    (OFTEN, {"method": "counter", "bound": 9}),
-])
+@pytest.mark.parametrize(
+    ("formula", "options"),
+    [
+        (SAFE, {"method": "stay"}),
+        (OFTEN, {"method": "rank"}),
+        (OFTEN, {"method": "counter", "bound": 9}),
+    ],
+)
 def test_whatever_is_allowed_satisfies_the_formula(formula, options):
     strategy = permissive_strategy(game(), formula, **options)
     table = tabulate(shield_environment(environment_of(game()), strategy))
@@ -70,7 +74,7 @@ def test_a_random_walk_inside_a_shield_never_collides():
         found = episodes(keys, environment, 100)
         world = found.world.world if isinstance(found.world, ShieldedWorld) else found.world
         violated.append(np.mean(world.verdict[:, -1] == Verdict.VIOLATED))
-    assert violated[0] > .5 and violated[1] == 0
+    assert violated[0] > 0.5 and violated[1] == 0
 
 
 def test_a_mask_follows_what_the_strategy_remembers():
@@ -106,13 +110,17 @@ def test_a_winning_region_is_not_left():
 def cliff():
     """From 0 by action 1 to the cliff 1, or by action 0 to 2; all stay there."""
     return from_dense(
-        [[[0, 0, 1.0], [0, .5, .5]], [[0, 1.0, 0], [0, 1, 0]], [[0, 0, 1.0], [1, 0, 0]]],
-        label=[[0], [1], [0]], propositions=["fall"], initial=[.5, .5, 0])
+        [[[0, 0, 1.0], [0, 0.5, 0.5]], [[0, 1.0, 0], [0, 1, 0]], [[0, 0, 1.0], [1, 0, 0]]],
+        label=[[0], [1], [0]],
+        propositions=["fall"],
+        initial=[0.5, 0.5, 0],
+    )
 
 
 def test_where_nothing_is_sure_the_world_decides():
     environment = shield_environment(
-        environment_of(cliff()), permissive_strategy(cliff(), "G !fall"))
+        environment_of(cliff()), permissive_strategy(cliff(), "G !fall")
+    )
     masks = {}
     for seed in range(8):
         world = environment.reset(jax.random.key(seed))
@@ -132,45 +140,60 @@ def test_where_nothing_is_sure_the_world_decides():
 def test_a_mask_is_looked_up():
     rng = np.random.default_rng(0)
     model = reference.random_model(rng, 5, 2, 2, certainty=0)
-    inner = environment_of(as_mdp(model, label=rng.random((5, 1)) < .5, propositions=["a"]))
+    inner = environment_of(as_mdp(model, label=rng.random((5, 1)) < 0.5, propositions=["a"]))
     task = task_environment(inner, "F (a & X a)")
-    table = rng.random((5, 3, 2)) < .6
+    table = rng.random((5, 3, 2)) < 0.6
     environment = shield_environment(task, table, lambda world: (world.world, world.memory))
     for world in range(5):
         for memory in range(3):
             at = task.reset(jax.random.key(0))._replace(
-                world=jnp.int32(world), memory=jnp.int32(memory))
+                world=jnp.int32(world), memory=jnp.int32(memory)
+            )
             sure = table[world, memory] & model.available[world]
             expected = sure if sure.any() else model.available[world]
             assert environment.allowed(at).tolist() == expected.tolist()
     assert shield_environment(inner, table[:, 0]).allowed(jnp.int32(2)).shape == (2,)
     bare = make_environment(
-        lambda key: jnp.int32(0), lambda s, a, k: Timestep(s, 0.0, False), lambda s: s[None],
-        actions=2)
+        lambda key: jnp.int32(0),
+        lambda s, a, k: Timestep(s, 0.0, False),
+        lambda s: s[None],
+        actions=2,
+    )
     assert shield_environment(bare, np.array([[False, True]])).allowed(0).tolist() == [False, True]
 
 
 def test_outcomes_are_those_of_the_steps():
     environment = shield_environment(
-        environment_of(cliff()), permissive_strategy(cliff(), "G !fall"))
+        environment_of(cliff()), permissive_strategy(cliff(), "G !fall")
+    )
     worlds, chance = environment.starts()
-    assert worlds.world.tolist() == [0, 1, 2] and chance.tolist() == [.5, .5, 0]
+    assert worlds.world.tolist() == [0, 1, 2] and chance.tolist() == [0.5, 0.5, 0]
     assert (worlds.state >= 0).tolist() == [True, False, False]
     told, chance = environment.outcomes(jax.tree.map(lambda x: x[0], worlds), 1)
-    assert dict(zip(told.world.world.tolist(), chance.tolist(), strict=True))[1] == .5
+    assert dict(zip(told.world.world.tolist(), chance.tolist(), strict=True))[1] == 0.5
     assert told.world.state.tolist()[told.world.world.tolist().index(1)] == -1
 
 
-@pytest.mark.parametrize(("make", "options", "text"), [
-    (lambda: np.ones((3, 3), bool), {}, "of 3 actions, and the world has 2"),
-    (lambda: np.ones((3, 2)), {}, r"float64\[3, 2\]; give bool"),
-    (lambda: np.ones(3, bool), {}, "give bool"),
-    (lambda: np.ones((3, 4, 2), bool), {}, "a tuple of 2 integers"),
-    (lambda: np.ones((3, 2), bool), {"state_of": lambda world: world * 1.0}, "return an integer"),
-    (lambda: permissive_strategy(game(), SAFE), {}, "of 5 actions, and the world has 2"),
-    (lambda: permissive_strategy(cliff(), "G !fall"), {"state_of": lambda world: (world, 0)},
-     "return an integer"),
-])
+@pytest.mark.parametrize(
+    ("make", "options", "text"),
+    [
+        (lambda: np.ones((3, 3), bool), {}, "of 3 actions, and the world has 2"),
+        (lambda: np.ones((3, 2)), {}, r"float64\[3, 2\]; give bool"),
+        (lambda: np.ones(3, bool), {}, "give bool"),
+        (lambda: np.ones((3, 4, 2), bool), {}, "a tuple of 2 integers"),
+        (
+            lambda: np.ones((3, 2), bool),
+            {"state_of": lambda world: world * 1.0},
+            "return an integer",
+        ),
+        (lambda: permissive_strategy(game(), SAFE), {}, "of 5 actions, and the world has 2"),
+        (
+            lambda: permissive_strategy(cliff(), "G !fall"),
+            {"state_of": lambda world: (world, 0)},
+            "return an integer",
+        ),
+    ],
+)
 def test_bad_shields_are_named(make, options, text):
     with pytest.raises(ValueError, match=text):
         shield_environment(environment_of(cliff()), make(), **options)
@@ -178,7 +201,10 @@ def test_bad_shields_are_named(make, options, text):
 
 def test_a_box_of_actions_has_no_mask():
     world = make_environment(
-        lambda key: jnp.zeros(()), lambda at, by, key: Timestep(at + by, 0.0, False),
-        lambda at: at[None], actions=make_box(-1, 1))
+        lambda key: jnp.zeros(()),
+        lambda at, by, key: Timestep(at + by, 0.0, False),
+        lambda at: at[None],
+        actions=make_box(-1, 1),
+    )
     with pytest.raises(ValueError, match="finitely many actions"):
         shield_environment(world, np.ones((1, 2), bool))

@@ -30,8 +30,8 @@ def games():
     rng = np.random.default_rng(0)
     for _ in range(GAMES):
         model = random_sparse(
-            rng, COUNT, most=4, width=2, label=rng.random((COUNT, 2)) < 0.4,
-            propositions=["a", "b"])
+            rng, COUNT, most=4, width=2, label=rng.random((COUNT, 2)) < 0.4, propositions=["a", "b"]
+        )
         system = rng.random(COUNT) < 0.5
         sets = {"priority": rng.integers(4, size=COUNT), "safe": rng.random(COUNT) < 0.8}
         found.append((jl.make_game(model, system), jl.make_game(jl.to_padded(model), system), sets))
@@ -40,8 +40,13 @@ def games():
 
 @cache
 def won(name):
-    return [(jl.winning_region(game, SPECS[name](game, x)),
-             jl.winning_region(padded, SPECS[name](padded, x))) for game, padded, x in games()]
+    return [
+        (
+            jl.winning_region(game, SPECS[name](game, x)),
+            jl.winning_region(padded, SPECS[name](padded, x)),
+        )
+        for game, padded, x in games()
+    ]
 
 
 @pytest.mark.few(2)
@@ -55,7 +60,8 @@ def test_regions_are_those_of_the_padded_game_and_strategies_win(name):
         for action in (found.action, found.counter_action):
             rows = np.asarray(action).reshape(form.num_states, -1)
             np.testing.assert_array_equal(
-                form.host.state[rows], np.arange(form.num_states)[:, None] + 0 * rows)
+                form.host.state[rows], np.arange(form.num_states)[:, None] + 0 * rows
+            )
         some.append(np.asarray(found.region).mean())
     assert 0 < np.mean(some) < 1
 
@@ -83,23 +89,25 @@ def test_the_checker_refutes_the_same_strategies_of_both(name):
                 parts = {f: np.asarray(getattr(found, f)) for f in ("action", "counter_action")}
                 parts[field] = shaped
                 one = jl.verify(found.replace(**{field: shaped}))
-                other = jl.verify(expected.replace(
-                    **{f: as_actions(x) for f, x in parts.items()}))
+                other = jl.verify(expected.replace(**{f: as_actions(x) for f, x in parts.items()}))
                 assert one[:2] == other[:2]
                 refuted += not one
     assert refuted
 
 
 def test_what_is_no_row_of_a_state_is_refused_by_name():
-    found, _ = next(x for x in won("parity") if (np.asarray(x[0].region)
-                                                & np.asarray(x[0].game.system)).any())
+    found, _ = next(
+        x for x in won("parity") if (np.asarray(x[0].region) & np.asarray(x[0].game.system)).any()
+    )
     inside = np.asarray(found.region & found.game.system & ~found.objective.won)
     state = int(np.flatnonzero(inside)[0])
     for row in (-1, found.game.mdp.num_rows, int(found.game.mdp.row_start[state] - 1)):
         action = np.array(found.action)
         action[state] = row
-        assert f"{row} is not available in state {state}" in jl.verify(
-            found.replace(action=action)).reason
+        assert (
+            f"{row} is not available in state {state}"
+            in jl.verify(found.replace(action=action)).reason
+        )
 
 
 @pytest.mark.few(1)
@@ -116,8 +124,10 @@ def test_inside_jit_the_answers_are_the_hosts(name):
 
 def test_adversarial_chance_pads():
     for game, padded, x in games()[:5]:
-        one, other = (jl.winning_region(g, SPECS["parity"](g, x), chance="adversarial")
-                      for g in (game, padded))
+        one, other = (
+            jl.winning_region(g, SPECS["parity"](g, x), chance="adversarial")
+            for g in (game, padded)
+        )
         np.testing.assert_array_equal(one.region, other.region)
 
 
@@ -136,8 +146,9 @@ def test_mean_payoffs_are_those_of_the_padded_game():
         np.testing.assert_array_equal(column[np.asarray(found.policy)], expected.policy)
 
 
-@pytest.mark.parametrize("name", ["attractor", "against chance", "avoidable", "almost surely",
-                                  "end components"])
+@pytest.mark.parametrize(
+    "name", ["attractor", "against chance", "avoidable", "almost surely", "end components"]
+)
 def test_graphs_inside_jit_are_the_hosts(name):
     ask = {
         "attractor": lambda m, x: jl.attractor(m, x),

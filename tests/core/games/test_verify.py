@@ -28,8 +28,11 @@ SYSTEM, ENVIRONMENT = True, False
 def claim(game, objective, region, action, counter_action=None):
     counter_action = action if counter_action is None else counter_action
     return SimpleNamespace(
-        game=game, objective=objective, region=np.asarray(region, bool),
-        action=np.asarray(action), counter_action=np.asarray(counter_action),
+        game=game,
+        objective=objective,
+        region=np.asarray(region, bool),
+        action=np.asarray(action),
+        counter_action=np.asarray(counter_action),
     )
 
 
@@ -50,8 +53,9 @@ def random_claim(rng, num_states):
     won = won & ~lost
     fixed = np.where(won, 0, np.where(lost, 1, priority))
     model = game.model
-    successor = np.where((won | lost)[:, None, None], np.arange(num_states)[:, None, None],
-                         model.successor)
+    successor = np.where(
+        (won | lost)[:, None, None], np.arange(num_states)[:, None, None], model.successor
+    )
     decided = reference_games.Play(
         reference.Model(successor, model.probability, model.available, model.initial), game.system
     )
@@ -96,7 +100,11 @@ def test_verdicts_with_memory_equal_brute_force():
         # The larger game's states are (s, i, j): the system knows j, the environment i.
         none = np.zeros(12, bool)
         expected = reference_games.claims(
-            larger, priority, none, none, np.repeat(region, 4),
+            larger,
+            priority,
+            none,
+            none,
+            np.repeat(region, 4),
             np.tile(action[:, None, :], (1, 2, 1)).ravel(),
             np.tile(counter[:, :, None], (1, 1, 2)).ravel(),
         )
@@ -156,29 +164,54 @@ def test_a_right_claim_is_accepted():
 @pytest.mark.parametrize(
     ("change", "holds", "reason"),
     [
-        ({"action": [0, 1, 0, 0]}, (False, True),
-         "from state 0 the strategy's action 0 leaves the region"),
-        ({"action": [1, 1, 1, 0]}, (False, True),
-         "the system's strategy has no valid action: 1 is not available in state 2"),
-        ({"action": [7, 1, 0, 0]}, (False, True),
-         "the system's strategy has no valid action: 7 is not available in state 0"),
-        ({"region": [1, 1, 1, 0]}, (False, True),
-         "from state 1 the environment's action 1 leaves the region"),
-        ({"region": [1, 0, 1, 1]}, (False, False),
-         "around state 3 the run can stay for ever with least priority 1, which is odd"),
-        ({"region": [0, 0, 0, 0]}, (True, False),
-         "around state 0, outside the region, the system can stay for ever with least priority 0, "
-         "which is even"),
-        ({"counter_action": [0, 2, 0, 0]}, (True, False),
-         "the environment's strategy has no valid action: 2 is not available in state 1"),
-        ({"counter_action": [0, -1, 0, 0]}, (True, False),
-         "the environment's strategy has no valid action: -1 is not available in state 1"),
-        ({"counter_action": [0, 0, 0, 0]}, (True, False),
-         "from state 1, outside the region, the system can enter the region almost surely"),
-        ({"won": [0, 1, 0, 0]}, (True, False),
-         "state 1 is already won but outside the region"),
-        ({"lost": [0, 0, 1, 0]}, (False, True),
-         "state 2 is in the region but already lost"),
+        (
+            {"action": [0, 1, 0, 0]},
+            (False, True),
+            "from state 0 the strategy's action 0 leaves the region",
+        ),
+        (
+            {"action": [1, 1, 1, 0]},
+            (False, True),
+            "the system's strategy has no valid action: 1 is not available in state 2",
+        ),
+        (
+            {"action": [7, 1, 0, 0]},
+            (False, True),
+            "the system's strategy has no valid action: 7 is not available in state 0",
+        ),
+        (
+            {"region": [1, 1, 1, 0]},
+            (False, True),
+            "from state 1 the environment's action 1 leaves the region",
+        ),
+        (
+            {"region": [1, 0, 1, 1]},
+            (False, False),
+            "around state 3 the run can stay for ever with least priority 1, which is odd",
+        ),
+        (
+            {"region": [0, 0, 0, 0]},
+            (True, False),
+            "around state 0, outside the region, the system can stay for ever with least priority 0, "
+            "which is even",
+        ),
+        (
+            {"counter_action": [0, 2, 0, 0]},
+            (True, False),
+            "the environment's strategy has no valid action: 2 is not available in state 1",
+        ),
+        (
+            {"counter_action": [0, -1, 0, 0]},
+            (True, False),
+            "the environment's strategy has no valid action: -1 is not available in state 1",
+        ),
+        (
+            {"counter_action": [0, 0, 0, 0]},
+            (True, False),
+            "from state 1, outside the region, the system can enter the region almost surely",
+        ),
+        ({"won": [0, 1, 0, 0]}, (True, False), "state 1 is already won but outside the region"),
+        ({"lost": [0, 0, 1, 0]}, (False, True), "state 2 is in the region but already lost"),
     ],
 )
 def test_each_reason_names_a_state(change, holds, reason):
@@ -187,9 +220,7 @@ def test_each_reason_names_a_state(change, holds, reason):
         if name in change:
             objective = objective.replace(**{name: np.array(change[name], bool)})
     start = {"region": [1, 0, 1, 0], "action": [1, 1, 0, 0], "counter_action": [0, 1, 0, 0]}
-    verdict = verify(claim(game, objective, **{
-        k: change.get(k, x) for k, x in start.items()
-    }))
+    verdict = verify(claim(game, objective, **{k: change.get(k, x) for k, x in start.items()}))
     assert not verdict
     assert verdict[:2] == holds
     assert verdict.reason.startswith(reason)
@@ -253,8 +284,9 @@ def test_what_follows_a_decided_state_does_not_matter():
 
 def test_chance_is_fair_but_not_sure():
     """From 1 a coin leads to 0 or back; from 2 it leads to 0 or to the trap 3."""
-    mdp = jl.from_dense([[[1.0, 0, 0, 0]], [[0.5, 0.5, 0, 0]], [[0.5, 0, 0, 0.5]],
-                         [[0, 0, 0, 1.0]]])
+    mdp = jl.from_dense(
+        [[[1.0, 0, 0, 0]], [[0.5, 0.5, 0, 0]], [[0.5, 0, 0, 0.5]], [[0, 0, 0, 1.0]]]
+    )
     objective = buchi(mdp, np.arange(4) == 0)
     assert verify(claim(mdp, objective, [1, 1, 0, 0], [0] * 4))
     assert not verify(claim(mdp, objective, [1, 0, 0, 0], [0] * 4)).environment

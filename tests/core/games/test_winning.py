@@ -59,12 +59,8 @@ OBJECTIVES = {
     "parity": lambda game, x: parity(
         game, x["priority"], safe=x["safe"], num_priorities=NUM_PRIORITIES
     ),
-    "gr1": lambda game, x: gr1(
-        game, list(x["assumptions"]), list(x["guarantees"]), safe=x["safe"]
-    ),
-    "generalized": lambda game, x: generalized_buchi(
-        game, list(x["guarantees"]), safe=x["safe"]
-    ),
+    "gr1": lambda game, x: gr1(game, list(x["assumptions"]), list(x["guarantees"]), safe=x["safe"]),
+    "generalized": lambda game, x: generalized_buchi(game, list(x["guarantees"]), safe=x["safe"]),
 }
 
 REFERENCES = {
@@ -73,9 +69,7 @@ REFERENCES = {
     "buchi": lambda play, x: reference_games.buchi(play, x["goal"], x["safe"]),
     "cobuchi": lambda play, x: reference_games.cobuchi(play, x["goal"], x["safe"]),
     "parity": lambda play, x: reference_games.parity(play, x["priority"], x["safe"]),
-    "gr1": lambda play, x: reference_games.gr1(
-        play, x["assumptions"], x["guarantees"], x["safe"]
-    ),
+    "gr1": lambda play, x: reference_games.gr1(play, x["assumptions"], x["guarantees"], x["safe"]),
     "generalized": lambda play, x: reference_games.gr1(
         play, np.ones((1, len(x["safe"])), bool), x["guarantees"], x["safe"]
     ),
@@ -167,9 +161,13 @@ def test_the_host_and_compiled_code_agree(kind, monkeypatch):
     assert any(0 < region.mean() < 1 for region in regions)
 
 
-@pytest.mark.parametrize(("kind", "count"), [
-    *((kind, 12) for kind in OBJECTIVES if kind not in ("parity", "gr1")),
-    *(pytest.param(kind, 72, marks=pytest.mark.exhaustive) for kind in OBJECTIVES)])
+@pytest.mark.parametrize(
+    ("kind", "count"),
+    [
+        *((kind, 12) for kind in OBJECTIVES if kind not in ("parity", "gr1")),
+        *(pytest.param(kind, 72, marks=pytest.mark.exhaustive) for kind in OBJECTIVES),
+    ],
+)
 def test_the_host_and_compiled_code_agree_on_hundreds_of_games(kind, count, monkeypatch):
     rng = np.random.default_rng(3)
     for play in larger_games(rng, count):
@@ -250,8 +248,11 @@ def test_single_precision_has_the_same_regions():
 
 def four_states():
     """From r half to f, half back; from g half to f, half to the trap d. The target is f."""
-    return jl.from_dense([[[1.0, 0, 0, 0]], [[0.5, 0.5, 0, 0]], [[0.5, 0, 0, 0.5]],
-                          [[0, 0, 0, 1.0]]], label=[[1], [0], [0], [0]], propositions=["f"])
+    return jl.from_dense(
+        [[[1.0, 0, 0, 0]], [[0.5, 0.5, 0, 0]], [[0.5, 0, 0, 0.5]], [[0, 0, 0, 1.0]]],
+        label=[[1], [0], [0], [0]],
+        propositions=["f"],
+    )
 
 
 @pytest.mark.parametrize("owner", [True, False])
@@ -356,8 +357,14 @@ def test_unknown_chance():
 # --- formulas ---------------------------------------------------------------------------------
 
 FORMULAS = (
-    "a U b", "G a", "G F a & G b", "G (a -> F b)", "G F a -> G F b", "F (a & X b)",
-    "(G F a) & (F G b)", "false",
+    "a U b",
+    "G a",
+    "G F a & G b",
+    "G (a -> F b)",
+    "G F a -> G F b",
+    "F (a & X b)",
+    "(G F a) & (F G b)",
+    "false",
 )
 
 
@@ -381,7 +388,10 @@ def test_formulas_equal_the_explicit_product(formula):
             for row in bit_labels(letter, 2)[:, columns]
         ]
         explicit = reference.explicit_product(
-            play.model, np.asarray(automaton.delta), int(automaton.initial), np.array(shown),
+            play.model,
+            np.asarray(automaton.delta),
+            int(automaton.initial),
+            np.array(shown),
             "exit",
         )
         num_memory = len(automaton.delta)
@@ -403,8 +413,10 @@ def test_formulas_equal_the_explicit_product(formula):
         ("F G a & G b", lambda g: cobuchi(g, "a", safe="b")),
         ("b U a", lambda g: reach(g, "a", safe="b")),
         ("G F a & G F b", lambda g: generalized_buchi(g, ["a", "b"])),
-        ("G !(a & b) & ((G F a & G F !b) -> (G F b & G F !a))",
-         lambda g: gr1(g, ["a", "!b"], ["b", "!a"], safe="!(a & b)")),
+        (
+            "G !(a & b) & ((G F a & G F !b) -> (G F b & G F !a))",
+            lambda g: gr1(g, ["a", "!b"], ["b", "!a"], safe="!(a & b)"),
+        ),
     ],
 )
 def test_objectives_are_the_formulas_that_they_stand_for(formula, objective):
@@ -467,14 +479,21 @@ def test_corrupted_answers_are_refused():
             verdict = verify(found.replace(region=found.region ^ (np.arange(5) == s)))
             assert not verdict
             reasons.append(verdict.reason)
-        for name, side in (("action", found.region & play.system),
-                           ("counter_action", ~found.region & ~play.system)):
+        for name, side in (
+            ("action", found.region & play.system),
+            ("counter_action", ~found.region & ~play.system),
+        ):
             undecided = side & ~found.objective.lost
             for _, changed in alternatives(found, game, undecided, name):
                 region, lost = found.region, found.objective.lost
                 expected = reference_games.claims(
-                    play, found.objective.priority, found.objective.won, lost, region,
-                    changed.action, changed.counter_action,
+                    play,
+                    found.objective.priority,
+                    found.objective.won,
+                    lost,
+                    region,
+                    changed.action,
+                    changed.counter_action,
                 )
                 verdict = verify(changed)
                 assert verdict[:2] == expected
@@ -482,17 +501,21 @@ def test_corrupted_answers_are_refused():
                 reasons.append(verdict.reason)
     assert refused > 20
     assert accepted > 20
-    for part in ("leaves the region", "which is odd", "which is even", "already lost",
-                 "not available", "enter the region almost surely"):
+    for part in (
+        "leaves the region",
+        "which is odd",
+        "which is even",
+        "already lost",
+        "not available",
+        "enter the region almost surely",
+    ):
         assert any(part in reason for reason in reasons), part
 
 
 # --- depth ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "length", [30_000, pytest.param(1_000_000, marks=pytest.mark.exhaustive)]
-)
+@pytest.mark.parametrize("length", [30_000, pytest.param(1_000_000, marks=pytest.mark.exhaustive)])
 def test_a_very_long_chain(length):
     """Every state leads on, the first may stay, and players take turns in moving."""
     states = np.arange(length)
@@ -504,7 +527,8 @@ def test_a_very_long_chain(length):
     assert winning_region(mine, safety(mine, ~last)).region.tolist() == (states == 0).tolist()
     assert not winning_region(yours, safety(yours, ~last)).region.any()
     for game, objective, region in (
-        (mine, reach(mine, last), states >= 0), (yours, buchi(yours, last), states > 0),
+        (mine, reach(mine, last), states >= 0),
+        (yours, buchi(yours, last), states > 0),
     ):
         found = winning_region(game, objective)
         np.testing.assert_array_equal(found.region, region)
@@ -524,8 +548,10 @@ def test_nested_depth_on_the_host(monkeypatch):
     solve = partial(winning_region, game)
     end = states == length - 1
     for objective, region in (
-        (buchi(game, end), states >= 0), (buchi(game, states == 0), states < 0),
-        (cobuchi(game, end), states >= 0), (safety(game, ~end), states < 0),
+        (buchi(game, end), states >= 0),
+        (buchi(game, states == 0), states < 0),
+        (cobuchi(game, end), states >= 0),
+        (safety(game, ~end), states < 0),
         (parity(game, np.where(end, 3, states % 2 * 2)), states < 0),
         (parity(game, np.where(end, 4, 1)), states >= 0),
     ):

@@ -27,11 +27,17 @@ def random_case(seed, label_on):
     weight = rng.random((S, A, K)) * (rng.random((S, A, K)) < 0.5)
     weight[..., 0] += 0.1
     world = make_mdp(
-        successor, weight / weight.sum(-1, keepdims=True), initial=np.full(S, 1 / S),
-        label=rng.random((S, 2)) < 0.5, propositions=["a", "b"],
+        successor,
+        weight / weight.sum(-1, keepdims=True),
+        initial=np.full(S, 1 / S),
+        label=rng.random((S, 2)) < 0.5,
+        propositions=["a", "b"],
     )
     automaton = make_automaton(
-        rng.integers(0, Q, (Q, L)), 0, LETTERS, ["a", "b"],
+        rng.integers(0, Q, (Q, L)),
+        0,
+        LETTERS,
+        ["a", "b"],
         priority=rng.integers(0, rng.integers(2, 5), (Q, L)),
     )
     return product(world, automaton, label_on=label_on)
@@ -81,8 +87,10 @@ def all_values(model):
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("label_on", ["entry", "exit"])
-@pytest.mark.parametrize("seed", [
-    pytest.param(seed, marks=[] if seed < 5 else pytest.mark.exhaustive) for seed in range(12)])
+@pytest.mark.parametrize(
+    "seed",
+    [pytest.param(seed, marks=[] if seed < 5 else pytest.mark.exhaustive) for seed in range(12)],
+)
 def test_optima_are_those_of_the_best_memoryless_policy(seed, label_on):
     model = random_case(seed, label_on)
     values = all_values(model)
@@ -116,7 +124,9 @@ def test_the_gradient_is_that_of_finite_differences():
     world = make_mdp(
         [[[0, 1], [0, 2]], stay, [[2, 2], [2, 2]]],
         [[[0.7, 0.3], [0.4, 0.6]], [[0.5, 0.5]] * 2, [[0.5, 0.5]] * 2],
-        initial=[1, 0, 0], label=[[False], [True], [False]], propositions=["a"],
+        initial=[1, 0, 0],
+        label=[[False], [True], [False]],
+        propositions=["a"],
     )
     model = product(world, to_automaton("G F a"))
     logits = jnp.array([0.2, -0.4])
@@ -138,9 +148,7 @@ def test_the_gradient_is_that_of_finite_differences():
 @pytest.mark.slow
 def test_inside_jit_and_vmap():
     models = [random_case(seed, "entry") for seed in range(3)]
-    plain = [
-        replace(model.automaton, acceptance="parity", state_names=()) for model in models
-    ]
+    plain = [replace(model.automaton, acceptance="parity", state_names=()) for model in models]
     models = [model.replace(automaton=a) for model, a in zip(models, plain, strict=True)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *models)
     solve = jax.jit(jax.vmap(lambda model: optimal_satisfaction(model, tolerance=1e-8).value))
@@ -154,8 +162,11 @@ def test_inside_jit_and_vmap():
 def test_the_policy_visits_for_ever():
     # Two rooms, each action goes to one of them: visiting both for ever takes memory.
     world = make_mdp(
-        [[[0], [1]], [[0], [1]]], np.ones((2, 2, 1)), initial=[1, 0],
-        label=[[True, False], [False, True]], propositions=["a", "b"],
+        [[[0], [1]], [[0], [1]]],
+        np.ones((2, 2, 1)),
+        initial=[1, 0],
+        label=[[True, False], [False, True]],
+        propositions=["a", "b"],
     )
     model = product(world, to_automaton("G F a & G F b", [{"a"}, {"b"}]))
     best = optimal_satisfaction(model)

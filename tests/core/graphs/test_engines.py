@@ -32,7 +32,10 @@ def random_model(rng, kind):
         return to_dense(mdp) if kind == "dense" else mdp
     names = ("a", "b")
     automaton = make_automaton(
-        rng.integers(2, size=(2, 4)), 0, bit_labels(np.arange(4), 2), names,
+        rng.integers(2, size=(2, 4)),
+        0,
+        bit_labels(np.arange(4), 2),
+        names,
         priority=rng.integers(PRIORITIES, size=(2, 4)),
     )
     letter = rng.integers(4, size=3)
@@ -49,10 +52,17 @@ def random_case(rng, kind):
     policy = rng.random((*shape, num_actions)) * (rng.random((*shape, num_actions)) < 0.7)
     won, lost = draw(0.15), draw(0.15)
     return {
-        "model": model, "goal": draw(0.3), "allowed": allowed, "rule": draw(0.5),
-        "among": draw(0.8), "region": draw(0.9), "policy": policy, "system": draw(0.5),
-        "parity": Parity(rng.integers(PRIORITIES, size=shape, dtype=np.int32), won, lost,
-                         PRIORITIES),
+        "model": model,
+        "goal": draw(0.3),
+        "allowed": allowed,
+        "rule": draw(0.5),
+        "among": draw(0.8),
+        "region": draw(0.9),
+        "policy": policy,
+        "system": draw(0.5),
+        "parity": Parity(
+            rng.integers(PRIORITIES, size=shape, dtype=np.int32), won, lost, PRIORITIES
+        ),
         "gr1": GR1(draw(0.4, 2), draw(0.4, 2), draw(0.1)),
     }
 
@@ -62,7 +72,8 @@ def answers(case, kind):
     model, goal, allowed = case["model"], case["goal"], case["allowed"]
     found = {
         f"attractor, {chance}": jl.attractor(
-            model, goal, allowed, rule=case["rule"], among=case["among"], chance=chance)
+            model, goal, allowed, rule=case["rule"], among=case["among"], chance=chance
+        )
         for chance in ("some", "all")
     }
     found["attractor"] = jl.attractor(model, goal)
@@ -150,6 +161,7 @@ def test_nothing_is_compiled_on_the_host():
     goal = np.arange(size) < 2
     done = []
     with counted_programs() as compiled:
+
         def settled(name, value):
             assert not compiled, f"{name}: {compiled}"
             done.append(name)
@@ -157,8 +169,9 @@ def test_nothing_is_compiled_on_the_host():
 
         world = settled("from_dense", from_dense(transition, label=label, propositions="ab"))
         game = settled("make_game", jl.make_game(world, rng.random(size) < 0.6))
-        settled("make_mdp", make_mdp(*(np.asarray(x) for x in (world.successor,
-                                                              world.probability))))
+        settled(
+            "make_mdp", make_mdp(*(np.asarray(x) for x in (world.successor, world.probability)))
+        )
         settled("to_dense", to_dense(world))
         settled("gridworld", jl.gridworld("S..\n.#.\n..g"))
         lazy = settled("product", product(world, "G F a & F b"))
@@ -176,22 +189,34 @@ def test_nothing_is_compiled_on_the_host():
         uniform = np.full((*lazy.state_shape, 3), 1 / 3)
         settled("accepting_bottom_components", accepting_bottom_components(lazy, uniform))
         reactive = jl.gr1(game, ["a"], ["b", "!a"])
-        specs = (jl.safety(game, "true"), jl.reach(game, "a", safe="!b | a"),
-                 jl.buchi(game, "a"), jl.cobuchi(game, "a | b"), reactive, "F G a | G F b", "F a",
-                 jl.parity(game, rng.integers(4, size=size)))
+        specs = (
+            jl.safety(game, "true"),
+            jl.reach(game, "a", safe="!b | a"),
+            jl.buchi(game, "a"),
+            jl.cobuchi(game, "a | b"),
+            reactive,
+            "F G a | G F b",
+            "F a",
+            jl.parity(game, rng.integers(4, size=size)),
+        )
         for spec in specs:
             found = settled("winning_region", jl.winning_region(game, spec))
             settled("realizable", found.realizable)
             settled("verify", jl.verify(found))
         settled("adversarial", jl.winning_region(game, "G F a", chance="adversarial"))
         settled("almost_sure_buchi", jl.almost_sure_buchi(world, "a"))
-        easy = jl.make_game(from_dense(np.roll(np.eye(size), 1, 0)[:, None], label=label,
-                                       propositions="ab"), np.ones(size, bool))
+        easy = jl.make_game(
+            from_dense(np.roll(np.eye(size), 1, 0)[:, None], label=label, propositions="ab"),
+            np.ones(size, bool),
+        )
         for spec, options in (
-            ("G (a | !a)", {}), (jl.buchi(easy, "a"), {"method": "rank"}),
+            ("G (a | !a)", {}),
+            (jl.buchi(easy, "a"), {"method": "rank"}),
             (jl.buchi(easy, "a"), {"method": "counter", "bound": 20}),
-            (jl.parity(easy, 1 - label[:, 0]), {"method": "parity"}), (jl.reach(easy, "a"), {}),
-            (jl.gr1(easy, ["a"], ["b"]), {"method": "rank"}), ("G F a & F b", {}),
+            (jl.parity(easy, 1 - label[:, 0]), {"method": "parity"}),
+            (jl.reach(easy, "a"), {}),
+            (jl.gr1(easy, ["a"], ["b"]), {"method": "rank"}),
+            ("G F a & F b", {}),
         ):
             strategy = settled("permissive", jl.permissive_strategy(easy, spec, **options))
             settled("apply_strategy", jl.apply_strategy(strategy))
@@ -203,6 +228,7 @@ def test_nothing_is_compiled_on_the_host():
 
 def test_a_model_of_ones_own_is_asked_by_its_primitives():
     """What is no world of rows is answered by the sweeps, outside of ``jit`` too."""
+
     class Line:
         """States in a row, the last one a loop; the only action goes on."""
 

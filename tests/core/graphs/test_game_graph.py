@@ -112,8 +112,10 @@ def test_parallel_edges_count_once_each(sweeps, monkeypatch):
     """A move with two entries for one successor surely leads there when that one joins."""
     monkeypatch.setattr(host_attract, "SWEEPS", sweeps)
     model = reference.Model(
-        np.array([[[1, 1]], [[2, 2]], [[2, 2]], [[2, 3]]]), np.full((4, 1, 2), 0.5),
-        np.ones((4, 1), bool), np.full(4, 0.25),
+        np.array([[[1, 1]], [[2, 2]], [[2, 2]], [[2, 3]]]),
+        np.full((4, 1, 2), 0.5),
+        np.ones((4, 1), bool),
+        np.full(4, 0.25),
     )
     goal = jnp.arange(4) == 2
     found = attractor(as_mdp(model), goal, chance="all")

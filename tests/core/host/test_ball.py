@@ -62,12 +62,14 @@ def wide(rng, most):
     row_start = np.concatenate([np.arange(12), np.full(states - 12, 12) + np.arange(states - 12)])
     more = np.arange(12, states)
     return interval_rows(
-        np.append(row_start, states), np.append(start, start[-1] + 1 + np.arange(more.size)),
+        np.append(row_start, states),
+        np.append(start, start[-1] + 1 + np.arange(more.size)),
         np.append(successor, more),
         np.append(np.maximum(center - low, 0), more > 0),
         np.append(np.minimum(center + high, 1), more > 0),
         center=np.append(center, more > 0),
-        radius=np.append(rng.choice([0, 0.05, 0.2, 0.6, 2.0], 12), np.zeros(more.size))).host
+        radius=np.append(rng.choice([0, 0.05, 0.2, 0.6, 2.0], 12), np.zeros(more.size)),
+    ).host
 
 
 @pytest.mark.parametrize("most", [3, 8, 60])
@@ -87,8 +89,10 @@ def test_nature_is_extreme(most):
                 sign * np.append(quantity[of], none),
                 A_ub=np.block([[one, -one], [-one, -one], [none[None], none[None] + 1]]),
                 b_ub=np.concatenate([center, -center, [2 * model.ball.most[r]]]),
-                A_eq=np.append(none + 1, none)[None], b_eq=[1],
-                bounds=[*zip(model.lower[of], model.upper[of], strict=True), *[(0, None)] * k])
+                A_eq=np.append(none + 1, none)[None],
+                b_eq=[1],
+                bounds=[*zip(model.lower[of], model.upper[of], strict=True), *[(0, None)] * k],
+            )
             assert best.status == 0
             assert abs(sign * best.fun - (p * quantity)[of].sum()) < 1e-7
 
@@ -107,8 +111,11 @@ def test_supports(count):
         within_ball(model, p)
         for r in range(mdp.num_rows):
             of = slice(mdp.entry_start[r], mdp.entry_start[r + 1])
-            corners = np.array(ball_vertices(
-                model.lower[of], model.upper[of], model.ball.center[of], 2 * model.ball.most[r]))
+            corners = np.array(
+                ball_vertices(
+                    model.lower[of], model.upper[of], model.ball.center[of], 2 * model.ball.most[r]
+                )
+            )
             keeps = (corners[:, ~entries[of]] == 0).all(1)
             assert may[r] == keeps.any()
             if may[r]:
@@ -133,8 +140,11 @@ def test_faces(count):
         np.testing.assert_allclose(model.total(p * rank), best, atol=1e-12)
         for r in range(mdp.num_rows):
             of = slice(mdp.entry_start[r], mdp.entry_start[r + 1])
-            corners = np.array(ball_vertices(
-                model.lower[of], model.upper[of], model.ball.center[of], 2 * model.ball.most[r]))
+            corners = np.array(
+                ball_vertices(
+                    model.lower[of], model.upper[of], model.ball.center[of], 2 * model.ball.most[r]
+                )
+            )
             corners = corners[np.abs(corners @ rank[of] - best[r]) < 1e-9]
             keeps = (corners[:, ~entries[of]] == 0).all(1)
             assert may[r] == keeps.any()
@@ -158,8 +168,11 @@ def test_probabilities_and_rewards(count):
             p = found.probability
             within_ball(model, p)
             part, entry = model.chain(found.row)
-            alone = (reachability(part.fixed(p[entry]), goal, maximize=True) if maximize == large
-                     else reachability(model.fixed(p), goal, maximize=maximize))
+            alone = (
+                reachability(part.fixed(p[entry]), goal, maximize=True)
+                if maximize == large
+                else reachability(model.fixed(p), goal, maximize=maximize)
+            )
             np.testing.assert_allclose(alone.value, value, atol=1e-6)
             halted, _ = model.halted(goal)
             sure = decided(halted, goal, maximize=maximize, helpful=large)
@@ -204,17 +217,16 @@ def test_discounted_and_steps():
         gain = rng.normal(size=mdp.num_transitions)
         rate = np.full(mdp.num_rows, 0.9)
         for maximize, large in DIRECTIONS:
-            found = discounted(
-                model, gain, rate, maximize=maximize, large=large, tolerance=1e-9)
+            found = discounted(model, gain, rate, maximize=maximize, large=large, tolerance=1e-9)
             assert (found.upper - found.lower <= 1e-9).all()
             ahead = gain + 0.9 * found.value[mdp.successor]
             np.testing.assert_allclose(
-                backup(model, ahead, maximize, large), found.value, atol=1e-8)
+                backup(model, ahead, maximize, large), found.value, atol=1e-8
+            )
             value = goal * 1.0
             for _ in range(3):
                 value = np.where(goal, 1, backup(model, value[mdp.successor], maximize, large))
-            steps = interval_bounded.until(
-                model, goal, ~goal, 3, maximize=maximize, helpful=large)
+            steps = interval_bounded.until(model, goal, ~goal, 3, maximize=maximize, helpful=large)
             assert (np.abs(steps.value - value) <= steps.error + 1e-15).all()
             np.testing.assert_array_equal(steps.value > 0, value > 0)
 
@@ -224,7 +236,10 @@ def backup(model, ahead, maximize, large):
     mdp, worth = model.mdp, []
     for r in range(mdp.num_rows):
         of = slice(mdp.entry_start[r], mdp.entry_start[r + 1])
-        each = np.array(ball_vertices(
-            model.lower[of], model.upper[of], model.ball.center[of], 2 * model.ball.most[r]))
+        each = np.array(
+            ball_vertices(
+                model.lower[of], model.upper[of], model.ball.center[of], 2 * model.ball.most[r]
+            )
+        )
         worth.append((max if large else min)(each @ ahead[of]))
     return mdp.over_choices(np.maximum if maximize else np.minimum, np.array(worth))

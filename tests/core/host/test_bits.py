@@ -20,20 +20,29 @@ def unpacked(words, num_memory):
 def graph_of(model):
     world = model.mdp
     return bits.bit_graph(
-        np.asarray(world.successor), support(world), np.asarray(world.available),
-        np.asarray(model.automaton.delta), np.asarray(model.letter))
+        np.asarray(world.successor),
+        support(world),
+        np.asarray(world.available),
+        np.asarray(model.automaton.delta),
+        np.asarray(model.letter),
+    )
 
 
 def models(num_memory, count):
     rng = np.random.default_rng(num_memory)
     for i in range(count):
         model, _ = random_product(
-            rng, num_states=int(rng.integers(2, 20)), num_actions=3, num_successors=2,
-            num_memory=num_memory)
+            rng,
+            num_states=int(rng.integers(2, 20)),
+            num_actions=3,
+            num_successors=2,
+            num_memory=num_memory,
+        )
         if i % 2:
             delta = np.maximum(np.asarray(model.automaton.delta), np.arange(num_memory)[:, None])
             model = dataclasses.replace(
-                model, automaton=dataclasses.replace(model.automaton, delta=delta))
+                model, automaton=dataclasses.replace(model.automaton, delta=delta)
+            )
         yield model, rng.random(model.state_shape) < 0.1
 
 
@@ -45,8 +54,7 @@ def test_sets(num_memory, block, monkeypatch):
     for model, target in models(num_memory, 12):
         graph = host_graph(model)
         for maximize, reference in ((True, max_sets), (False, min_sets)):
-            found = bits.decided(
-                graph_of(model), bits.pack(target), num_memory, maximize=maximize)
+            found = bits.decided(graph_of(model), bits.pack(target), num_memory, maximize=maximize)
             sets = reference(graph, target)
             one, zero = (unpacked(x, num_memory) for x in (found.one, found.zero))
             np.testing.assert_array_equal(one, sets.one)
@@ -58,8 +66,7 @@ def test_sets(num_memory, block, monkeypatch):
             available = np.take_along_axis(graph.available, found.action[..., None], -1)[..., 0]
             assert available.all()
             if not maximize:
-                stays = np.take_along_axis(
-                    graph.forall(zero), found.action[..., None], -1)[..., 0]
+                stays = np.take_along_axis(graph.forall(zero), found.action[..., None], -1)[..., 0]
                 assert stays[zero].all()
 
 

@@ -56,7 +56,8 @@ def test_intervals_are_the_written_out_sums():
         half = (np.log(2 / failure) + spread) / weights
         ends = weighted / weights - half, weighted / weights + half
         np.testing.assert_allclose(
-            bounded_mean(x, failure, planned=planned), np.clip(ends, 0, 1), atol=1e-12)
+            bounded_mean(x, failure, planned=planned), np.clip(ends, 0, 1), atol=1e-12
+        )
 
 
 def test_small_variance_is_used():

@@ -7,8 +7,12 @@ from jaxltl.core.host import choices
 from jaxltl.core.host.choices import choices_of
 
 COUNTS = {
-    "none": [], "a chain": [1, 1, 1], "few": [2, 1, 4, 2, 1, 3], "one of many": [1, 2, 900, 1, 3],
-    "all of many": [40] * 7, "one state": [5],
+    "none": [],
+    "a chain": [1, 1, 1],
+    "few": [2, 1, 4, 2, 1, 3],
+    "one of many": [1, 2, 900, 1, 3],
+    "all of many": [40] * 7,
+    "one state": [5],
 }
 
 
@@ -22,7 +26,8 @@ def test_optima_and_the_first_that_attains_them(count, slices, operation, monkey
     count = np.array(count, np.int32)
     found = choices_of(count)
     assert (found.further.size > 0) == (slices == "dear" and count.max(initial=1) > 1) or (
-        slices == "as it is")
+        slices == "as it is"
+    )
     assert sorted(found.order.tolist()) == list(range(count.sum()))
     assert sorted(found.states.tolist()) == list(range(count.size))
     start = count.cumsum() - count

@@ -87,9 +87,11 @@ def rings(size, rng):
     down = np.where(i < size, size + rng.integers(0, size, 2 * size), 2 * size)
     entry = np.append(3 * np.arange(2 * size + 1), 6 * size + 1)
     return make_sparse(
-        np.append(np.arange(2 * size + 1), 2 * size + 1), entry,
+        np.append(np.arange(2 * size + 1), 2 * size + 1),
+        entry,
         np.append(np.stack([right, left, down], 1).ravel(), 2 * size),
-        np.append(np.tile([0.55, 0.44, 0.01], 2 * size), 1.0)).host
+        np.append(np.tile([0.55, 0.44, 0.01], 2 * size), 1.0),
+    ).host
 
 
 def test_nothing_fills_between_large_components():
@@ -123,7 +125,8 @@ def test_what_would_fill_is_swept(converges, monkeypatch):
     open_ = stay & ~goal
     dense = host.matrix.toarray()
     expected = np.linalg.solve(
-        np.eye(60)[open_[:60]][:, open_[:60]] - dense[open_][:, open_], dense[open_][:, 60])
+        np.eye(60)[open_[:60]][:, open_[:60]] - dense[open_][:, open_], dense[open_][:, 60]
+    )
     assert (found.lower[open_] <= expected + 1e-12).all()
     assert (found.upper[open_] >= expected - 1e-12).all()
     width = (found.upper - found.lower).max()
@@ -140,7 +143,8 @@ def test_sweeps_end_where_the_solution_is_far_larger_than_the_right_side():
     weight = rng.dirichlet(np.ones(3), size)
     weight[0] /= 2  # the only way out
     matrix = sparse.csr_array(
-        (weight.ravel(), target.ravel(), np.arange(0, 3 * size + 1, 3)), shape=(size, size))
+        (weight.ravel(), target.ravel(), np.arange(0, 3 * size + 1, 3)), shape=(size, size)
+    )
     found = elimination._swept(matrix, np.ones(size))
     exact = np.linalg.solve(np.eye(size) - matrix.toarray(), np.ones(size))
     assert exact.max() > 1e5

@@ -38,8 +38,9 @@ def test_nature_is_extreme(most):
         for r in range(12):
             of = slice(model.mdp.entry_start[r], model.mdp.entry_start[r + 1])
             bounds = list(zip(model.lower[of], model.upper[of], strict=True))
-            best = linprog(sign * quantity[of], A_eq=np.ones((1, len(bounds))), b_eq=[1],
-                           bounds=bounds)
+            best = linprog(
+                sign * quantity[of], A_eq=np.ones((1, len(bounds))), b_eq=[1], bounds=bounds
+            )
             assert abs(sign * best.fun - (p * quantity)[of].sum()) < 1e-9
 
 
@@ -47,7 +48,9 @@ def test_decimals_that_add_up_to_one_are_one_if_ends_are_widened():
     """``.1 + .2 + .7`` is less than one in binary; nature may nearly drop the fourth successor."""
     model = HostInterval(
         HostMDP(np.array([0, 1]), np.array([0, 4]), np.arange(4), np.full(4, 0.25)),
-        np.zeros(4), np.array([0.7, 0.2, 0.1, 0.5]))
+        np.zeros(4),
+        np.array([0.7, 0.2, 0.1, 0.5]),
+    )
     p = model.nature(np.array([0.0, 1.0, 2.0, 3.0]), maximize=False)
     assert p.tolist() == [0.7, 0.2, 0.1, 0.0]
     assert not model.may_stay(np.array([True, True, True, False])).any()
@@ -77,7 +80,8 @@ def test_what_is_certain_is_decided():
         goal = np.arange(4) == rng.integers(4)
         halted, _ = model.halted(goal)
         for (maximize, helpful), value in optima(
-                [reach(p, goal) for _, p in chains(model, goal)]).items():
+            [reach(p, goal) for _, p in chains(model, goal)]
+        ).items():
             found = decided(halted, goal, maximize=maximize, helpful=helpful)
             assert (found.zero == (value < 1e-12)).all()
             assert (found.one == (value > 1 - 1e-12)).all()

@@ -50,12 +50,18 @@ def exact_backup(model, value, policy, nature, earned=None):
         images = []
         for r in range(host.row_start[s], host.row_start[s + 1]):
             entry = range(host.entry_start[r], host.entry_start[r + 1])
-            points = vertices(*([Fraction(float(x[e])) for e in entry]
-                                for x in (model.lower, model.upper)))
-            images.append(nature(
-                sum(p * (earned[e] + value[host.successor[e]])
-                    for p, e in zip(point, entry, strict=True))
-                for point in points))
+            points = vertices(
+                *([Fraction(float(x[e])) for e in entry] for x in (model.lower, model.upper))
+            )
+            images.append(
+                nature(
+                    sum(
+                        p * (earned[e] + value[host.successor[e]])
+                        for p, e in zip(point, entry, strict=True)
+                    )
+                    for point in points
+                )
+            )
         found.append(policy(images))
     return found
 
@@ -73,8 +79,10 @@ def test_bounds_hold_the_exact_value(seed):
             found = until(model.host, target, stay, steps, maximize=maximize, helpful=helpful)
             assert_holds(found, value)
             ahead = exact_backup(model, value, policy, nature)
-            value = [Fraction(1) if t else a if ok else Fraction(0)
-                     for t, ok, a in zip(target, stay, ahead, strict=True)]
+            value = [
+                Fraction(1) if t else a if ok else Fraction(0)
+                for t, ok, a in zip(target, stay, ahead, strict=True)
+            ]
         found = next_step(model.host, target, maximize=maximize, helpful=helpful)
         assert_holds(found, exact_backup(model, [Fraction(int(x)) for x in target], policy, nature))
 
@@ -89,8 +97,14 @@ def test_bounds_hold_the_exact_reward(seed):
         policy, nature = (max if x else min for x in (maximize, helpful))
         value = [Fraction(int(x)) for x in start]
         for steps in range(5):
-            found = total(model.host, earned.astype(float), start.astype(float), steps,
-                          maximize=maximize, helpful=helpful)
+            found = total(
+                model.host,
+                earned.astype(float),
+                start.astype(float),
+                steps,
+                maximize=maximize,
+                helpful=helpful,
+            )
             for approximate, error, true in zip(found.value, found.error, value, strict=True):
                 assert abs(Fraction(float(approximate)) - true) <= Fraction(float(error)) <= 1e-10
             value = exact_backup(model, value, policy, nature, earned)
@@ -98,8 +112,10 @@ def test_bounds_hold_the_exact_reward(seed):
 
 def test_a_reward_that_changes_no_more_keeps_its_rounding():
     model = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
-    few, many = (total(model.host, np.zeros(3), np.array([0, 1.0]), n, maximize=True,
-                       helpful=False) for n in (2000, 10**9))
+    few, many = (
+        total(model.host, np.zeros(3), np.array([0, 1.0]), n, maximize=True, helpful=False)
+        for n in (2000, 10**9)
+    )
     assert few.value.tolist() == many.value.tolist() and many.num_steps < 200
     assert 0 < few.error[0] < many.error[0] < 1e-3
     nothing = total(model.host, np.zeros(3), np.zeros(2), 10**9, maximize=True, helpful=False)
@@ -126,8 +142,10 @@ def test_what_nature_picks_lies_in_the_intervals_and_attains_the_value():
         image = model.host.total(p * target[model.host.mdp.successor])
         attained = np.where(target, 1, image[found.row])
         np.testing.assert_allclose(attained, found.value, atol=1e-15)
-        assert (np.maximum.reduceat(image, model.host.mdp.row_start[:-1])[~target]
-                <= found.value[~target] + 1e-15).all()
+        assert (
+            np.maximum.reduceat(image, model.host.mdp.row_start[:-1])[~target]
+            <= found.value[~target] + 1e-15
+        ).all()
 
 
 def test_many_steps_are_as_few_that_changed_something():

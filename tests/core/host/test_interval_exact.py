@@ -64,10 +64,12 @@ def test_bounds_are_those_of_the_numbers_as_they_are(kind, count):
         for earned in (None, cost):
             if earned is None:
                 found = interval_values.reachability(
-                    host, goal, maximize=maximize, helpful=large, stay=~ends)
+                    host, goal, maximize=maximize, helpful=large, stay=~ends
+                )
             else:
                 found = interval_values.total_reward(
-                    host, cost, ends, maximize=maximize, large=large)
+                    host, cost, ends, maximize=maximize, large=large
+                )
             exact = values(host, goal, ends, earned, maximize=maximize, large=large)
             for low, high, x in zip(found.lower, found.upper, exact, strict=True):
                 if x is None:
@@ -86,7 +88,8 @@ def test_the_only_way_out_is_one_in_2_to_the_50():
     """Nature may leave a state by masses that are smaller than the rounding of its row."""
     d = 2.0**-50
     host = interval_rows(
-        None, [0, 3, 4, 5], [0, 1, 2, 1, 2], [0.5, d / 4, d / 4, 1, 1], [1 - d, d, d, 1, 1]).host
+        None, [0, 3, 4, 5], [0, 1, 2, 1, 2], [0.5, d / 4, d / 4, 1, 1], [1 - d, d, d, 1, 1]
+    ).host
     goal = np.arange(3) == 1
     for large, value in ((True, 0.8), (False, 0.2)):
         found = interval_values.reachability(host, goal, maximize=large, helpful=large)
@@ -97,7 +100,8 @@ def test_what_nature_may_drop_is_decided_by_the_last_bit():
     """Ends that sum to one exactly have room for all; one unit less leaves it to the third."""
     for less, keeps in ((0, True), (2.0**-53, False)):
         host = interval_rows(
-            None, [0, 3, 4, 5], [0, 1, 2, 1, 2], [0, 0, 0, 1, 1], [0.5 - less, 0.5, 1, 1, 1]).host
+            None, [0, 3, 4, 5], [0, 1, 2, 1, 2], [0, 0, 0, 1, 1], [0.5 - less, 0.5, 1, 1, 1]
+        ).host
         assert host.may_stay(np.array([True, True, False]))[0] == keeps
         assert host.must_enter(np.array([0]), np.arange(3) == 2)[0] == (not keeps)
 
@@ -105,15 +109,23 @@ def test_what_nature_may_drop_is_decided_by_the_last_bit():
 def test_where_decimals_are_in_doubt_both_are_enclosed():
     """``.7 + .3`` is less than one in binary: then the third must be entered some day."""
     host = interval_rows(
-        None, [0, 3, 6, 7], [0, 1, 2, 0, 1, 2, 2], [0.7, 0.2, 0, 0.7, 0.2, 0, 1],
-        [0.7, 0.3, 0.5, 0.7, 0.3, 0.5, 1]).host
+        None,
+        [0, 3, 6, 7],
+        [0, 1, 2, 0, 1, 2, 2],
+        [0.7, 0.2, 0, 0.7, 0.2, 0, 1],
+        [0.7, 0.3, 0.5, 0.7, 0.3, 0.5, 1],
+    ).host
     goal = np.arange(3) == 2
     assert Fraction(0.7) + Fraction(0.3) < 1
     found = interval_values.reachability(host, goal, maximize=False, helpful=False)
     assert (found.upper == 1).all() and (found.lower[:2] < 1e-6).all()
     enough = interval_rows(
-        None, [0, 3, 6, 7], [0, 1, 2, 0, 1, 2, 2], [0.7, 0.2, 0, 0.7, 0.2, 0, 1],
-        [0.8, 0.3, 0.5, 0.8, 0.3, 0.5, 1]).host
+        None,
+        [0, 3, 6, 7],
+        [0, 1, 2, 0, 1, 2, 2],
+        [0.7, 0.2, 0, 0.7, 0.2, 0, 1],
+        [0.8, 0.3, 0.5, 0.8, 0.3, 0.5, 1],
+    ).host
     found = interval_values.reachability(enough, goal, maximize=False, helpful=False)
     assert found.upper.tolist() == [0, 0, 1]
 
@@ -121,8 +133,9 @@ def test_where_decimals_are_in_doubt_both_are_enclosed():
 def test_rows_without_a_distribution_are_in_proportion():
     """Three thirds, upper ends and lower ends that miss one by rounding, a center of tenths."""
     third = 1 / 3
-    short = interval_rows(None, [0, 3, 4, 5], [0, 1, 2, 1, 2], [0, 0, 0, 1, 1],
-                          [third, third, third, 1, 1]).host
+    short = interval_rows(
+        None, [0, 3, 4, 5], [0, 1, 2, 1, 2], [0, 0, 0, 1, 1], [third, third, third, 1, 1]
+    ).host
     assert Fraction(third) * 3 < 1 and short.lower.tolist() == short.upper.tolist()
     goal = np.arange(3) == 1
     for large in (True, False):
@@ -130,8 +143,14 @@ def test_rows_without_a_distribution_are_in_proportion():
         assert found.lower[0] <= 0.5 <= found.upper[0] <= found.lower[0] + 1e-6
         assert not short.may_stay(np.array([True, True, False]))[0]
     tenths = interval_rows(
-        None, [0, 3, 4, 5], [0, 1, 2, 1, 2], [0, 0, 0, 1, 1], [1.0] * 5,
-        center=[0.7, 0.2, 0.1, 1, 1], radius=[0.0, 0, 0]).host
+        None,
+        [0, 3, 4, 5],
+        [0, 1, 2, 1, 2],
+        [0, 0, 0, 1, 1],
+        [1.0] * 5,
+        center=[0.7, 0.2, 0.1, 1, 1],
+        radius=[0.0, 0, 0],
+    ).host
     found = interval_values.reachability(tenths, goal, maximize=True, helpful=True)
     assert found.lower[0] <= 2 / 3 <= found.upper[0] <= found.lower[0] + 1e-6
 

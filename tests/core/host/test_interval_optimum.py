@@ -16,7 +16,7 @@ def walks(size, rng, drift):
     """A walk on a line with two choices, which some of both keep in the middle; ends absorb."""
     rows, lower, upper = [], [], []
     for s in range(size):
-        for up in ((0.5,) if s in (0, size - 1) else (0.5 + drift, 0.5 - drift)):
+        for up in (0.5,) if s in (0, size - 1) else (0.5 + drift, 0.5 - drift):
             rows.append([s] if s in (0, size - 1) else [s - 1, s, s + 1])
             p = np.array([1.0] if len(rows[-1]) == 1 else [0.9 * (1 - up), 0.1, 0.9 * up])
             wide = 0 if p.size == 1 else 0.1 * rng.random(p.size)
@@ -25,7 +25,8 @@ def walks(size, rng, drift):
     starts = np.cumsum([0, *map(len, rows)])
     many = np.cumsum([0, *(1 if s in (0, size - 1) else 2 for s in range(size))])
     return interval_rows(
-        many, starts, np.concatenate(rows), np.concatenate(lower), np.concatenate(upper)).host
+        many, starts, np.concatenate(rows), np.concatenate(lower), np.concatenate(upper)
+    ).host
 
 
 @pytest.mark.parametrize("maximize", (True, False))
@@ -79,12 +80,18 @@ def test_systems_on_which_a_krylov_method_breaks_down():
 def test_who_may_stay_for_ever_proves_nothing(maximize):
     """Nature may stay in state 0, where nothing is gained or lost; what is claimed is false."""
     host = interval_rows(
-        [0, 1, 2, 3, 4], [0, 2, 4, 5, 6], [0, 1, 2, 3, 2, 3], [0, 0, 0.5, 0.5, 1, 1],
-        [1, 1, 0.5, 0.5, 1, 1]).host
+        [0, 1, 2, 3, 4],
+        [0, 2, 4, 5, 6],
+        [0, 1, 2, 3, 2, 3],
+        [0, 0, 0.5, 0.5, 1, 1],
+        [1, 1, 0.5, 0.5, 1, 1],
+    ).host
     open_, known = np.array([True, True, False, False]), np.array([0, 0, 1.0, 0])
     nodes = interval_optimum._nodes(
         interval_optimum.Joint(host, open_, known, np.zeros(4), np.arange(4)),
-        1 if maximize else -1, True)
+        1 if maximize else -1,
+        True,
+    )
     here = Choice(np.array([0, 1]), nodes.anything(), np.zeros(2), np.ones(2))
     if maximize:  # nature stays, and the target is never reached
         assert not nodes.attains(np.array([0.3, 0.4]), here)
@@ -95,11 +102,16 @@ def test_who_may_stay_for_ever_proves_nothing(maximize):
 
 @pytest.mark.parametrize("against", (True, False))
 def test_what_is_nearly_certain_is_proven_too(against):
-    host = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.9999, 1e-4, 1, 1],
-                         [0.9999, 1e-4, 1, 1]).host
+    host = interval_rows(
+        None, [0, 2, 3, 4], [1, 2, 1, 2], [0.9999, 1e-4, 1, 1], [0.9999, 1e-4, 1, 1]
+    ).host
     nodes = interval_optimum._nodes(
-        interval_optimum.Joint(host, np.arange(3) == 0, np.array([0, 1.0, 0]), np.zeros(3),
-                               np.arange(3)), 1, against)
+        interval_optimum.Joint(
+            host, np.arange(3) == 0, np.array([0, 1.0, 0]), np.zeros(3), np.arange(3)
+        ),
+        1,
+        against,
+    )
     assert nodes.proves(np.array([0.9995])) is None
     assert nodes.proves(np.array([0.99995])) is not None
     assert nodes.proves(np.array([1.0])) is not None
@@ -117,17 +129,30 @@ def test_what_rows_gain_is_bounded_with_its_rounding(against):
     lower = np.append(np.column_stack([1 - leave * 1.5, low]).ravel(), [1, 1])
     upper = np.append(np.column_stack([stays, high + leave[:, None]]).ravel(), [1, 1])
     host = interval_rows(
-        [0, many, many + 1, many + 2], [*range(0, 3 * many + 1, 3), 3 * many + 1, 3 * many + 2],
-        [0, 1, 2] * many + [1, 2], lower, upper).host
-    nodes = interval_optimum._nodes(interval_optimum.Joint(
-        host, np.array([True, False, False]), np.array([0, 0.83, 0.1]), rng.random(many + 2) * 1e-9,
-        np.arange(3)), 1, against)
+        [0, many, many + 1, many + 2],
+        [*range(0, 3 * many + 1, 3), 3 * many + 1, 3 * many + 2],
+        [0, 1, 2] * many + [1, 2],
+        lower,
+        upper,
+    ).host
+    nodes = interval_optimum._nodes(
+        interval_optimum.Joint(
+            host,
+            np.array([True, False, False]),
+            np.array([0, 0.83, 0.1]),
+            rng.random(many + 2) * 1e-9,
+            np.arange(3),
+        ),
+        1,
+        against,
+    )
     value = rng.random(1)
     (block,) = nodes.blocks
     gain = block.gain(nodes.values(value), 0.0)
     least, most = (
         nodes._sums(block, gain, nodes.answer(block, gain), sign, every=(sign > 0) != against)
-        for sign in (-1, 1))
+        for sign in (-1, 1)
+    )
     ahead = [Fraction(float(x)) - Fraction(float(value[0])) for x in (value[0], 0.83, 0.1)]
     order = sorted(range(3), key=lambda k: ahead[k], reverse=not against)
     for i, r in enumerate(block.table.row):
@@ -144,8 +169,12 @@ def test_who_goes_round_where_nothing_is_lacking_attains_that(monkeypatch):
     size, goal = 60, np.arange(60) == 59
     model = walks(size, np.random.default_rng(5), 0.1)
     problem = interval_optimum.Joint(
-        model, (np.arange(size) > 0) & ~goal, goal.astype(float),
-        np.zeros(model.mdp.num_rows), np.arange(size))
+        model,
+        (np.arange(size) > 0) & ~goal,
+        goal.astype(float),
+        np.zeros(model.mdp.num_rows),
+        np.arange(size),
+    )
     nodes = interval_optimum._nodes(problem, 1, False)
     search = interval_optimum._Search(nodes, 1e-6, False)
     chosen, p = nodes.nearer(worth=True)

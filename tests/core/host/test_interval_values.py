@@ -33,9 +33,9 @@ def test_probabilities(count):
         model = random_model(rng)
         goal = np.arange(4) == rng.integers(4)
         for (maximize, helpful), value in optima(
-                [reach(p, goal) for _, p in chains(model, goal)]).items():
-            found = interval_values.reachability(
-                model, goal, maximize=maximize, helpful=helpful)
+            [reach(p, goal) for _, p in chains(model, goal)]
+        ).items():
+            found = interval_values.reachability(model, goal, maximize=maximize, helpful=helpful)
             enclosed(found, value)
             checks_out(model, found, goal, maximize, helpful)
 
@@ -61,9 +61,12 @@ def test_total_rewards(count):
         goal = np.arange(4) == rng.integers(4)
         cost = rng.integers(0, 3, model.mdp.num_rows).astype(float)
         for (maximize, large), value in optima(
-                [reward(p, goal, cost[list(rows)]) for rows, p in chains(model, goal)]).items():
-            enclosed(interval_values.total_reward(
-                model, cost, goal, maximize=maximize, large=large), value)
+            [reward(p, goal, cost[list(rows)]) for rows, p in chains(model, goal)]
+        ).items():
+            enclosed(
+                interval_values.total_reward(model, cost, goal, maximize=maximize, large=large),
+                value,
+            )
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -100,8 +103,12 @@ def test_slow_chains_keep_their_precision():
     from tests.reference_intervals import HostInterval, HostMDP
 
     eps = 1e-9
-    mdp = HostMDP(np.array([0, 1, 2, 3]), np.array([0, 3, 4, 5]), np.array([0, 1, 2, 1, 2]),
-                  np.array([1 - 2 * eps, eps, eps, 1, 1]))
+    mdp = HostMDP(
+        np.array([0, 1, 2, 3]),
+        np.array([0, 3, 4, 5]),
+        np.array([0, 1, 2, 1, 2]),
+        np.array([1 - 2 * eps, eps, eps, 1, 1]),
+    )
     lower = np.array([0.5, eps, eps, 1, 1])
     upper = np.array([1 - 2 * eps, 3 * eps, 0.5, 1, 1])
     model = HostInterval(mdp, lower, upper)
@@ -132,11 +139,16 @@ def test_a_reward_whose_first_way_there_would_hardly_end():
     slips = np.stack([np.roll(to, -k, 1) for k in (0, 1, 3)], 2)
     size = slips.size
     model = interval_rows(
-        np.arange(0, 4 * n * n + 1, 4), np.arange(0, size + 1, 3), slips.ravel(),
-        np.resize([0.7, 0.05, 0.05], size), np.resize([0.9, 0.15, 0.15], size)).host
+        np.arange(0, 4 * n * n + 1, 4),
+        np.arange(0, size + 1, 3),
+        slips.ravel(),
+        np.resize([0.7, 0.05, 0.05], size),
+        np.resize([0.9, 0.15, 0.15], size),
+    ).host
     goal = np.arange(n * n) == n * n - 1
     found = interval_values.total_reward(
-        model, np.ones(4 * n * n), goal, maximize=False, large=True)
+        model, np.ones(4 * n * n), goal, maximize=False, large=True
+    )
     value = np.zeros(n * n)
     for _ in range(400):
         ahead = value[model.mdp.successor]
@@ -153,6 +165,8 @@ def test_who_stops_when_bounds_are_near(monkeypatch):
         model = random_model(rng)
         goal = np.arange(4) == rng.integers(4)
         for (maximize, helpful), value in optima(
-                [reach(p, goal) for _, p in chains(model, goal)]).items():
-            enclosed(interval_values.reachability(
-                model, goal, maximize=maximize, helpful=helpful), value)
+            [reach(p, goal) for _, p in chains(model, goal)]
+        ).items():
+            enclosed(
+                interval_values.reachability(model, goal, maximize=maximize, helpful=helpful), value
+            )

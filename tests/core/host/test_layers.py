@@ -18,12 +18,17 @@ def cases(count, seed, num_memory=4):
     rng = np.random.default_rng(seed)
     for i in range(count):
         model, _ = random_product(
-            rng, num_states=int(rng.integers(5, 15)), num_actions=3, num_successors=3,
-            num_memory=num_memory)
+            rng,
+            num_states=int(rng.integers(5, 15)),
+            num_actions=3,
+            num_successors=3,
+            num_memory=num_memory,
+        )
         if i % 3:  # often all components are single states, as in tasks that end
             delta = np.maximum(np.asarray(model.automaton.delta), np.arange(num_memory)[:, None])
             model = dataclasses.replace(
-                model, automaton=dataclasses.replace(model.automaton, delta=delta))
+                model, automaton=dataclasses.replace(model.automaton, delta=delta)
+            )
         target = np.asarray(model.final)
         if i % 2:
             target = rng.random(target.shape) < 0.2
@@ -62,7 +67,8 @@ def check(model, target, objective, monkeypatch, tolerance):
     for bound in (0, 1):  # exact where the graph says so, and nowhere else
         np.testing.assert_array_equal(
             (np.asarray(ours.lower) == bound) & (np.asarray(ours.upper) == bound),
-            (np.asarray(other.lower) == bound) & (np.asarray(other.upper) == bound))
+            (np.asarray(other.lower) == bound) & (np.asarray(other.upper) == bound),
+        )
     goal = np.sqrt(eps) if tolerance is None else tolerance
     assert (np.asarray(ours.upper) - np.asarray(ours.lower)).max() <= 2 * goal
     assert ((ours.lower <= ours.value) & (ours.value <= ours.upper)).all()
@@ -81,8 +87,10 @@ def check(model, target, objective, monkeypatch, tolerance):
 @pytest.mark.parametrize("count", [20, pytest.param(5000, marks=pytest.mark.exhaustive)])
 def test_bounds_and_policies(objective, single, count, monkeypatch):
     with jax.enable_x64(not single):
-        done = [check(*case, objective, monkeypatch, 1e-5 if single else 1e-8)
-                for case in cases(count, 5)]
+        done = [
+            check(*case, objective, monkeypatch, 1e-5 if single else 1e-8)
+            for case in cases(count, 5)
+        ]
     assert np.mean(done) > 0.8
 
 

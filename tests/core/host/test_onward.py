@@ -17,11 +17,11 @@ def test_along_a_chain_one_call_is_enough():
     size = 80
     target, wait = np.arange(size) - 1, 2.0 * size
     matrix = sparse.csr_array(
-        (np.ones(size - 1), (2 * np.arange(1, size) + 1, target[1:])), shape=(2 * size, size))
+        (np.ones(size - 1), (2 * np.arange(1, size) + 1, target[1:])), shape=(2 * size, size)
+    )
     known = np.where(np.arange(2 * size) % 2 == 0, wait, 1.0)
     owner = np.repeat(np.arange(size), 2)
-    chosen = carried_on(
-        matrix, known, owner, np.full(size, wait), 2 * np.arange(size), -1, 1e-9)
+    chosen = carried_on(matrix, known, owner, np.full(size, wait), 2 * np.arange(size), -1, 1e-9)
     np.testing.assert_array_equal(chosen, 2 * np.arange(size) + 1)
 
 
@@ -36,7 +36,8 @@ def test_no_state_is_worse_off(sign):
         chosen = most * np.arange(size)
         before = value_of(matrix, known, chosen)
         after = carried_on(
-            matrix, known, np.repeat(np.arange(size), most), before, chosen, sign, 1e-12)
+            matrix, known, np.repeat(np.arange(size), most), before, chosen, sign, 1e-12
+        )
         np.testing.assert_array_equal(after // most, np.arange(size))
         gain = sign * (value_of(matrix, known, after) - before)
         assert (gain >= -1e-12).all()

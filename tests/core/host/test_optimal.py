@@ -254,8 +254,9 @@ def test_many(seed):
 def chain_of_rows(rows):
     """A chain from lists of successors and probabilities."""
     starts = np.concatenate([[0], np.cumsum([len(t) for t, _ in rows])])
-    return make_sparse(None, starts, np.concatenate([t for t, _ in rows]),
-                       np.concatenate([p for _, p in rows])).host
+    return make_sparse(
+        None, starts, np.concatenate([t for t, _ in rows]), np.concatenate([p for _, p in rows])
+    ).host
 
 
 @pytest.mark.parametrize("back", [None, 0, 1], ids=["straight on", "with a loop", "by a circle"])

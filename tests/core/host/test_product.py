@@ -16,16 +16,22 @@ def random_host(rng, num_states, most_rows=2, most_entries=3) -> HostMDP:
     width = rng.integers(1, min(most_entries, num_states) + 1, rows.sum())
     successor = [np.sort(rng.choice(num_states, w, replace=False)) for w in width]
     return HostMDP(
-        np.append(0, rows.cumsum()).astype(np.int32), np.append(0, width.cumsum()),
-        np.concatenate(successor).astype(np.int32), np.repeat(1 / width, width))
+        np.append(0, rows.cumsum()).astype(np.int32),
+        np.append(0, width.cumsum()),
+        np.concatenate(successor).astype(np.int32),
+        np.repeat(1 / width, width),
+    )
 
 
 def lines(mdp: HostMDP, state: int) -> list[dict]:
     """The choices of a state, each a distribution."""
     return [
-        {int(mdp.successor[e]): float(mdp.probability[e])
-         for e in range(mdp.entry_start[r], mdp.entry_start[r + 1])}
-        for r in range(mdp.row_start[state], mdp.row_start[state + 1])]
+        {
+            int(mdp.successor[e]): float(mdp.probability[e])
+            for e in range(mdp.entry_start[r], mdp.entry_start[r + 1])
+        }
+        for r in range(mdp.row_start[state], mdp.row_start[state + 1])
+    ]
 
 
 def searched(mdp, delta, letter, starts, on_entry, still):
@@ -40,7 +46,8 @@ def searched(mdp, delta, letter, starts, on_entry, still):
             continue
         found[pair] = [
             {(t, int(delta[q, letter[t if on_entry else s]])): p for t, p in line.items()}
-            for line in lines(mdp, s)]
+            for line in lines(mdp, s)
+        ]
         todo += [pair for line in found[pair] for pair in line]
     return found
 
@@ -86,8 +93,12 @@ def test_products_are_what_a_search_finds(on_entry, way, monkeypatch):
 def test_a_deep_product_is_handed_over():
     """A line of states, one a round; the search takes over and finds the same."""
     size = 5000
-    mdp = HostMDP(np.arange(size + 1, dtype=np.int32), np.arange(size + 1),
-                  np.append(np.arange(1, size), 0).astype(np.int32), np.ones(size))
+    mdp = HostMDP(
+        np.arange(size + 1, dtype=np.int32),
+        np.arange(size + 1),
+        np.append(np.arange(1, size), 0).astype(np.int32),
+        np.ones(size),
+    )
     found = host_product(mdp, np.array([[1], [0]]), np.zeros(size, int), [0], [0])
     assert found.base_state.size == size  # an even ring: memory goes with the place
     assert (found.memory == found.base_state % 2).all()
@@ -96,8 +107,12 @@ def test_a_deep_product_is_handed_over():
 
 def test_products_beyond_all_bounds_are_refused():
     size = 2**20
-    mdp = HostMDP(np.arange(size + 1, dtype=np.int32), np.arange(size + 1),
-                  np.arange(size, dtype=np.int32), np.ones(size))
+    mdp = HostMDP(
+        np.arange(size + 1, dtype=np.int32),
+        np.arange(size + 1),
+        np.arange(size, dtype=np.int32),
+        np.ones(size),
+    )
     with pytest.raises(ValueError, match="smaller formula"):
         host_product(mdp, np.zeros((4096, 1), int), np.zeros(size, int), [0], [0])
 
@@ -107,6 +122,7 @@ def test_products_beyond_all_bounds_are_refused():
 
 def joined(states, edges) -> bool:
     """Whether edges lead from each of some states to each other."""
+
     def reach(start):
         seen, todo = {start}, [start]
         while todo:
@@ -124,12 +140,16 @@ def accepted_by_subsets(mdp, priority):
     """The states of all end components, of any rows, whose least priority is even."""
     found = set()
     for rows in itertools.chain.from_iterable(
-            itertools.combinations(range(mdp.num_rows), k) for k in range(1, mdp.num_rows + 1)):
+        itertools.combinations(range(mdp.num_rows), k) for k in range(1, mdp.num_rows + 1)
+    ):
         entries = [e for r in rows for e in range(mdp.entry_start[r], mdp.entry_start[r + 1])]
         states = {int(mdp.state[r]) for r in rows}
         edges = {(int(mdp.state[mdp.row[e]]), int(mdp.successor[e])) for e in entries}
-        if {t for _, t in edges} <= states and joined(states, edges) and (
-                priority[entries].min() % 2 == 0):
+        if (
+            {t for _, t in edges} <= states
+            and joined(states, edges)
+            and (priority[entries].min() % 2 == 0)
+        ):
             found |= states
     return found
 
@@ -148,12 +168,13 @@ def test_accepting_regions_are_those_of_all_end_components(most):
         inside = np.flatnonzero(found.region)
         taken = found.row[inside]
         assert (mdp.state[found.row] == np.arange(mdp.num_states)).all()
-        chain = HostMDP(
-            np.arange(mdp.num_states + 1, dtype=np.int32), *_rows(mdp, found.row))
+        chain = HostMDP(np.arange(mdp.num_states + 1, dtype=np.int32), *_rows(mdp, found.row))
         entry = np.concatenate([_entries(mdp, r) for r in found.row])
         bottom = _bottom_components(chain, set(inside.tolist()))
-        assert np.isin(mdp.successor[np.concatenate(
-            [_entries(mdp, r) for r in taken] or [[]]).astype(int)], inside).all()
+        assert np.isin(
+            mdp.successor[np.concatenate([_entries(mdp, r) for r in taken] or [[]]).astype(int)],
+            inside,
+        ).all()
         for component in bottom:
             read = [priority[entry[e]] for s in component for e in _entries(chain, s)]
             assert min(read) % 2 == 0
@@ -176,8 +197,7 @@ def _bottom_components(chain, states):
     after = {s: set(chain.successor[_entries(chain, s)].tolist()) for s in states}
     for _ in states:
         after = {s: {s} | a | {u for t in a for u in after.get(t, ())} for s, a in after.items()}
-    return {frozenset(a) for s, a in after.items() if a <= states and all(
-        after[t] == a for t in a)}
+    return {frozenset(a) for s, a in after.items() if a <= states and all(after[t] == a for t in a)}
 
 
 def test_ways_lead_nearer():

@@ -36,8 +36,9 @@ def agree(ours, other, relative=False):
     finite = np.isfinite(other.upper)
     assert (np.isfinite(ours.upper) == finite).all()
     slack = 1e-13 * size
-    assert (np.maximum(ours.lower, other.lower) <= np.minimum(ours.upper, other.upper)
-            + slack)[finite].all()
+    assert (np.maximum(ours.lower, other.lower) <= np.minimum(ours.upper, other.upper) + slack)[
+        finite
+    ].all()
     assert ((ours.lower <= ours.value) & (ours.value <= ours.upper))[finite].all()
 
 
@@ -95,7 +96,8 @@ def test_only_what_spreads_is_swept():
         kept = np.diff(target, axis=-1, prepend=-1) > 0
         weight = np.where(kept, 1 / kept.sum(-1, keepdims=True), 0)
         host = make_sparse(
-            None, np.concatenate([[0], kept.sum(-1).cumsum()]), target[kept], weight[kept]).host
+            None, np.concatenate([[0], kept.sum(-1).cumsum()]), target[kept], weight[kept]
+        ).host
         assert mixing._spreads(host, np.ones(size, bool)) == spreads
 
 
@@ -105,7 +107,8 @@ def test_small_models_of_wide_rows_are_swept_too():
     size, width = 500, 60
     target = np.sort(np.stack([rng.permutation(size)[:width] for _ in range(size)]), -1)
     host = make_sparse(
-        None, width * np.arange(size + 1), target.ravel(), np.full(target.size, 1 / width)).host
+        None, width * np.arange(size + 1), target.ravel(), np.full(target.size, 1 / width)
+    ).host
     goal = np.arange(size) < 50
     ours = optimal.total_reward(host, np.ones(size), goal, maximize=False)
     assert ours.method == "sweeps in place"
@@ -123,9 +126,11 @@ def test_what_mixes_slowly_is_left_to_others():
     size = 300
     where = np.arange(1, size - 1)
     host = make_sparse(
-        None, [0, 1, *(2 * where + 1), 2 * size - 2],
+        None,
+        [0, 1, *(2 * where + 1), 2 * size - 2],
         [0, *np.stack([where - 1, where + 1], -1).ravel(), size - 1],
-        [1, *[0.5] * (2 * size - 4), 1]).host
+        [1, *[0.5] * (2 * size - 4), 1],
+    ).host
     open_ = (np.arange(size) > 0) & (np.arange(size) < size - 1)
     goal = (np.arange(size) == 0).astype(float)
     problem = transient.Transient(host, open_, goal, np.zeros(size))
@@ -139,8 +144,10 @@ def test_what_sweeps_leave_unsolved_is_not_proven(always, maximize, monkeypatch)
     """Sweeps that end much too early find bounds that hold, or none."""
     sweep = relaxation._Search.sweep
     monkeypatch.setattr(
-        relaxation._Search, "sweep",
-        lambda self, value, extra, rough: sweep(self, value, extra, max(rough, 0.2)))
+        relaxation._Search,
+        "sweep",
+        lambda self, value, extra, rough: sweep(self, value, extra, max(rough, 0.2)),
+    )
     for rng, host, goal in cases(40, 4):
         stay = rng.random(goal.size) < 0.8
         asked = {"maximize": maximize, "stay": stay, "tolerance": 1e-7}

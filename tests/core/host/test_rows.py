@@ -37,7 +37,8 @@ def test_reductions_equal_loops(large, wide, monkeypatch):
         some = rng.permutation(12)[:5]
         part = rows.take(some)
         assert np.split(part.successor, part.entry_start[1:-1])[2].tolist() == (
-            lists[some[2]].tolist())
+            lists[some[2]].tolist()
+        )
         start, row = rows.predecessors
         for t in range(NUM_STATES):
             into = np.repeat(np.arange(12), [np.sum(x == t) for x in lists])

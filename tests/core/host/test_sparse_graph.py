@@ -101,8 +101,12 @@ def test_what_stands_still_holds_nothing_together(monkeypatch):
             target += row
             entry.append(len(target))
     row_start = np.concatenate([[0], 1 + 2 * np.arange(size - 1), [2 * size - 2]])
-    host = HostMDP(row_start, np.array(entry), np.array(target, np.int32),
-                   np.where(np.repeat(np.diff(entry), np.diff(entry)) == 1, 1.0, 0.5))
+    host = HostMDP(
+        row_start,
+        np.array(entry),
+        np.array(target, np.int32),
+        np.where(np.repeat(np.diff(entry), np.diff(entry)) == 1, 1.0, 0.5),
+    )
     labels = sparse_graph._labels
     monkeypatch.setattr(sparse_graph, "_labels", lambda *x: rounds.append(0) or labels(*x))
     inner = np.ones(size, bool)
@@ -111,7 +115,8 @@ def test_what_stands_still_holds_nothing_together(monkeypatch):
     assert len(rounds) <= 1
     np.testing.assert_array_equal(found.component, np.arange(size))
     np.testing.assert_array_equal(
-        found.inside, inner[host.state] & (np.diff(host.entry_start) == 1))
+        found.inside, inner[host.state] & (np.diff(host.entry_start) == 1)
+    )
 
 
 def test_attractors_of_rows_are_those_of_actions():
@@ -129,15 +134,20 @@ def test_attractors_of_rows_are_those_of_actions():
             np.testing.assert_array_equal(ours.rank[joined], theirs.rank[joined])
             moves = joined & ~goal & (rule | allowed.any(-1))
             np.testing.assert_array_equal(
-                np.asarray(sparse.action)[ours.action][moves], theirs.action[moves])
+                np.asarray(sparse.action)[ours.action][moves], theirs.action[moves]
+            )
         np.testing.assert_array_equal(avoidable(sparse, goal), avoidable(padded, goal))
         np.testing.assert_array_equal(
-            almost_surely_reaching(sparse, goal).region,
-            almost_surely_reaching(padded, goal).region)
+            almost_surely_reaching(sparse, goal).region, almost_surely_reaching(padded, goal).region
+        )
         mine, other = (on_host(end_components(m, goal)) for m in (sparse, padded))
         np.testing.assert_array_equal(mine.component, other.component)
         np.testing.assert_array_equal(mine.inside, on_rows(sparse, other.inside))
-        mine, other = on_host((bottom_components(sparse, on_rows(sparse, allowed)),
-                               bottom_components(padded, allowed)))
+        mine, other = on_host(
+            (
+                bottom_components(sparse, on_rows(sparse, allowed)),
+                bottom_components(padded, allowed),
+            )
+        )
         np.testing.assert_array_equal(mine.component, other.component)
         np.testing.assert_array_equal(mine.inside, on_rows(sparse, other.inside))

@@ -21,12 +21,14 @@ def random_function(rng, diagrams, size):
     left, of_left = random_function(rng, diagrams, size - 1)
     right, of_right = random_function(rng, diagrams, rng.randrange(size))
     test, of_test = random_function(rng, diagrams, 0)
-    return rng.choice([
-        (diagrams.both(left, right), of_left & of_right),
-        (diagrams.either(left, right), of_left | of_right),
-        (diagrams.negation(left), EVERYTHING & ~of_left),
-        (diagrams.choice(test, left, right), of_test & of_left | ~of_test & of_right),
-    ])
+    return rng.choice(
+        [
+            (diagrams.both(left, right), of_left & of_right),
+            (diagrams.either(left, right), of_left | of_right),
+            (diagrams.negation(left), EVERYTHING & ~of_left),
+            (diagrams.choice(test, left, right), of_test & of_left | ~of_test & of_right),
+        ]
+    )
 
 
 def value(diagrams, diagram, row):
@@ -38,7 +40,8 @@ def value(diagrams, diagram, row):
 
 def table_of(cubes):
     return sum(
-        1 << i for i, row in enumerate(ROWS)
+        1 << i
+        for i, row in enumerate(ROWS)
         if any(all(row[variable] == said for variable, said in cube) for cube in cubes)
     )
 

@@ -38,9 +38,10 @@ def random_cases(seed, count, largest=14):
     rng = random.Random(seed)
     for _ in range(count):
         names = "abc"[: rng.randint(1, 3)]
-        yield random_formula(rng, rng.randint(1, largest), names), [
-            random_lasso(rng, subsets(names)) for _ in range(12)
-        ]
+        yield (
+            random_formula(rng, rng.randint(1, largest), names),
+            [random_lasso(rng, subsets(names)) for _ in range(12)],
+        )
 
 
 def test_simplify_keeps_truth():
@@ -123,10 +124,18 @@ def test_deeply_mixed_formulas():
     """Alternations beyond the second level, which are what the rewriting is for."""
     rng = random.Random(3)
     texts = [
-        "G (a -> F (b & G (c | F a)))", "F (a & G (b | F (c & G a)))", "(a U (G b)) W (c U a)",
-        "((a W b) U c) W (b U (a W c))", "G (a U (b W (c U a)))", "F (a W (b U (c W a)))",
-        "(G a) U (F b W G c)", "((a R b) M c) R (b M a)", "G F (a & X G F (b | G c))",
-        "G ((a W b) U c)", "F ((a U b) W c)", "X G (a | X F G b)",
+        "G (a -> F (b & G (c | F a)))",
+        "F (a & G (b | F (c & G a)))",
+        "(a U (G b)) W (c U a)",
+        "((a W b) U c) W (b U (a W c))",
+        "G (a U (b W (c U a)))",
+        "F (a W (b U (c W a)))",
+        "(G a) U (F b W G c)",
+        "((a R b) M c) R (b M a)",
+        "G F (a & X G F (b | G c))",
+        "G ((a W b) U c)",
+        "F ((a U b) W c)",
+        "X G (a | X F G b)",
     ]
     for text in texts:
         formula = parse_ltl(text)

@@ -49,8 +49,13 @@ READ_AS = {
 @pytest.mark.parametrize("nature", ["max", "min"])
 def test_two_directions_are_of_the_policy_and_of_nature(policy, nature):
     for operator, rest in (
-        ("P", 'F "a"'), ("R", 'F "a"'), ('R{"x"}', 'F "a"'), ('R {"x"} ', "C"), ("T", 'F "a"'),
-        ("LRA", '"a"'), ("P ", 'G F "a"'),
+        ("P", 'F "a"'),
+        ("R", 'F "a"'),
+        ('R{"x"}', 'F "a"'),
+        ('R {"x"} ', "C"),
+        ("T", 'F "a"'),
+        ("LRA", '"a"'),
+        ("P ", 'G F "a"'),
     ):
         found = parse_property(f"{operator}{policy}{nature}=? [ {rest} ]")
         assert (found.objective, found.nature) == (policy, nature)
@@ -90,10 +95,10 @@ BOUNDS = {
     'G<=4 "a"': Bounded("R", FALSE, parse_ltl("a"), 0, 4),
     '"a" R<=4 "b"': Bounded("R", parse_ltl("a"), parse_ltl("b"), 0, 4),
     '"a" W<=4 "b"': Bounded("R", parse_ltl("b"), parse_ltl("a | b"), 0, 4),
-    'F{"time"}<=5.5 "a"': Bounded(
-        "U", TRUE, parse_ltl("a"), reward="time", limit=Fraction(11, 2)),
+    'F{"time"}<=5.5 "a"': Bounded("U", TRUE, parse_ltl("a"), reward="time", limit=Fraction(11, 2)),
     '"b" U rew{"x"}<5 "a"': Bounded(
-        "U", parse_ltl("b"), parse_ltl("a"), reward="x", limit=Fraction(5), strict=True),
+        "U", parse_ltl("b"), parse_ltl("a"), reward="x", limit=Fraction(5), strict=True
+    ),
 }
 
 
@@ -104,10 +109,23 @@ def test_bounds(text):
     assert again.replace(" ", "").startswith(("F", "G", "(a&b)U", "aR", "bR", "bU"))
 
 
-@pytest.mark.parametrize("text", [
-    'F<=2 "a"', 'F[1,2] "a"', 'F=2 "a"', 'F>=2 "a"', '"a" U<=2 "b"', '"a" U[1,3] "b"', 'G<=2 "a"',
-    'G[1,2] "a"', '"a" R<=2 "b"', '"a" R[1,2] "b"', '"a" W<=2 "b"', '"a" W[1,2] "b"',
-])
+@pytest.mark.parametrize(
+    "text",
+    [
+        'F<=2 "a"',
+        'F[1,2] "a"',
+        'F=2 "a"',
+        'F>=2 "a"',
+        '"a" U<=2 "b"',
+        '"a" U[1,3] "b"',
+        'G<=2 "a"',
+        'G[1,2] "a"',
+        '"a" R<=2 "b"',
+        '"a" R[1,2] "b"',
+        '"a" W<=2 "b"',
+        '"a" W[1,2] "b"',
+    ],
+)
 def test_unfolded_bounds_mean_what_the_steps_say(text):
     """Against the definition, read off the word."""
     bound = path(text)
@@ -115,8 +133,9 @@ def test_unfolded_bounds_mean_what_the_steps_say(text):
     rng = np.random.default_rng(len(text))
     for _ in range(60):
         word = [{x for x in "ab" if rng.random() < 0.6} for _ in range(6)]
-        left, right = ([holds_on_lasso(f, [], [letter]) for letter in word]
-                       for f in (bound.left, bound.right))
+        left, right = (
+            [holds_on_lasso(f, [], [letter]) for letter in word] for f in (bound.left, bound.right)
+        )
         upper = 5 if bound.upper is None else bound.upper
         steps = range(bound.lower, upper + 1)
         if bound.operator == "U":
@@ -149,16 +168,38 @@ def test_operators_thresholds_and_names():
     assert [p.operator for p in found] == [*"PPPPPPRRRRRT", "LRA", "LRA"]
     assert [p.name for p in found] == ["p1"] + [None] * 13
     assert [p.direction for p in found] == [
-        "max", "min", "min", "max", "max", "min", "min", "max", None, "max", "min", "min", "max",
-        None]
+        "max",
+        "min",
+        "min",
+        "max",
+        "max",
+        "min",
+        "min",
+        "max",
+        None,
+        "max",
+        "min",
+        "min",
+        "max",
+        None,
+    ]
     assert [p.relation for p in found[1:6]] == [">=", ">", "<=", ">=", "<"]
     assert [p.threshold for p in found[1:6]] == [
-        Fraction(9, 10), Fraction(1, 3), Fraction(1, 1000), Fraction(9, 10), Fraction(3, 10)]
+        Fraction(9, 10),
+        Fraction(1, 3),
+        Fraction(1, 1000),
+        Fraction(9, 10),
+        Fraction(3, 10),
+    ]
     assert found[9].threshold == Fraction(-5, 2)
     assert [p.reward for p in found[6:11]] == ["steps taken", None, None, None, "x"]
     assert [p.path for p in found[6:11]] == [
-        Earned("cumulative", 10), Earned("total"), Earned("instantaneous", 5), Earned("average"),
-        Earned("average")]
+        Earned("cumulative", 10),
+        Earned("total"),
+        Earned("instantaneous", 5),
+        Earned("average"),
+        Earned("average"),
+    ]
     assert found[0].text == str(found[0]) == 'Pmax=? [ F "a" ]'
     assert found[11].path == parse_ltl("F (a | b)")
 
@@ -172,15 +213,17 @@ def test_several_objectives():
         parse_property('multi(multi(Pmax=? [ F "a" ]))')
 
 
-@pytest.mark.parametrize("name", ["goal", "a b", "x=1 & y", "F", "ä", 'say "hi"', "back\\slash",
-                                  "// no comment", "P=? ["])
+@pytest.mark.parametrize(
+    "name",
+    ["goal", "a b", "x=1 & y", "F", "ä", 'say "hi"', "back\\slash", "// no comment", "P=? ["],
+)
 def test_labels_hold_any_characters(name):
     quoted = name.replace("\\", "\\\\").replace('"', '\\"')
     assert path(f'F "{quoted}"') == Formula("F", (Formula("ap", proposition=name),))
 
 
 WRONG = {
-    'P=? [ F goal ]': ("'goal'", "a label in double quotes"),
+    "P=? [ F goal ]": ("'goal'", "a label in double quotes"),
     'P=? [ F "a" ': ("the end", "']'"),
     'P=? F "a"': ("'F'", "'\\['"),
     'P [ F "a" ]': ("'\\['", "=\\? or a threshold"),
@@ -197,20 +240,20 @@ WRONG = {
     'P=? [ F{"x"}>=5 "a" ]': ("'>='", "upper bounds"),
     'P=? [ F{"x"}<=5,{"y"}<=2 "a" ]': ("','", "one bound"),
     'P=? [ F{"x"}<0 "a" ]': ("'0'", "some reward"),
-    'R{x}=? [ C ]': ("'x'", "double quotes"),
+    "R{x}=? [ C ]": ("'x'", "double quotes"),
     'R=? [ G "a" ]': ("'G'", "F and a state formula"),
     'R=? [ F G "a" ]': ("'F'", "F and a state formula"),
-    'R=? [ I<=5 ]': ("'<='", "'='"),
-    'T=? [ C ]': ("'C'", "a label"),
+    "R=? [ I<=5 ]": ("'<='", "'='"),
+    "T=? [ C ]": ("'C'", "a label"),
     'P=? [ F P>=1 [ F "a" ] ]': ("'P'", "not nested"),
     'LRA=? [ F "a" ]': ("'F'", "a state formula"),
-    'const int k = 3;': ("'const'", "constants"),
+    "const int k = 3;": ("'const'", "constants"),
     'Q=? [ F "a" ]': ("'Q'", "a property"),
     'P=? [ F "a': ("'\"'", "never closed"),
-    'P=? [ F # ]': ("'#'", "signs"),
-    '': ("the end", "a property"),
-    '// nothing': ("the end", "a property"),
-    'P=? [ ]': ("'\\]'", "a label"),
+    "P=? [ F # ]": ("'#'", "signs"),
+    "": ("the end", "a property"),
+    "// nothing": ("the end", "a property"),
+    "P=? [ ]": ("'\\]'", "a label"),
     'P=? [ "" ]': ("'\"\"'", "name between"),
 }
 
@@ -233,9 +276,17 @@ def test_the_place_is_in_its_line():
 
 def test_hostile_text_ends_soon():
     begin = time.process_time()
-    for text in ("(" * 10_000, "!" * 10_000, '"' + "\\" * 10_000, "P=? [" + "X" * 10_000,
-                 'P=? [ F<=' + "9" * 10_000, "P>=1e999999999 [", 'P=? [ F<=1e300 X "a" ]',
-                 'P=? [' + '"a" &' * 5_000 + "]", "P=? [" + "(" * 5_000 + '"a"' + ")" * 5_000):
+    for text in (
+        "(" * 10_000,
+        "!" * 10_000,
+        '"' + "\\" * 10_000,
+        "P=? [" + "X" * 10_000,
+        "P=? [ F<=" + "9" * 10_000,
+        "P>=1e999999999 [",
+        'P=? [ F<=1e300 X "a" ]',
+        "P=? [" + '"a" &' * 5_000 + "]",
+        "P=? [" + "(" * 5_000 + '"a"' + ")" * 5_000,
+    ):
         with pytest.raises(ValueError):
             parse_properties(text)
     assert time.process_time() - begin < 20

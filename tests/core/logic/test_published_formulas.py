@@ -11,8 +11,9 @@ from jaxltl.core.logic.ltl import holds_on_lasso
 
 def by_hand(propositions, step, accepting):
     """A Buchi automaton on states, from a function of state and letter."""
-    letters = [[bool(n >> p & 1) for p in range(len(propositions))]
-               for n in range(2 ** len(propositions))]
+    letters = [
+        [bool(n >> p & 1) for p in range(len(propositions))] for n in range(2 ** len(propositions))
+    ]
     held = [{p for p, holds in zip(propositions, row, strict=True) if holds} for row in letters]
     delta = [[step(q, letter) for letter in held] for q in range(len(accepting))]
     return make_automaton(delta, 0, letters, propositions, accepting=accepting)
@@ -45,17 +46,36 @@ def posting(q, letter):
 @pytest.mark.parametrize(
     ("text", "drawn", "acceptance", "states"),
     [
-        ("G safe_region",
-         by_hand(["safe_region"], lambda q, x: q or int("safe_region" not in x), [True, False]),
-         "safety", 2),
-        ("F goal", by_hand(["goal"], lambda q, x: q or int("goal" in x), [False, True]),
-         "cosafe", 2),
-        ("G (request -> F response)",
-         by_hand(["request", "response"], answering, [True, False]), "buchi", 2),
-        ("G (!charge U battery_low)",
-         by_hand(["battery_low", "charge"], charging, [True, False, False]), "buchi", 2),
-        ("G F p1 & G F p2", by_hand(["p1", "p2"], posting, [False, False, False, True]),
-         "buchi", 2),
+        (
+            "G safe_region",
+            by_hand(["safe_region"], lambda q, x: q or int("safe_region" not in x), [True, False]),
+            "safety",
+            2,
+        ),
+        (
+            "F goal",
+            by_hand(["goal"], lambda q, x: q or int("goal" in x), [False, True]),
+            "cosafe",
+            2,
+        ),
+        (
+            "G (request -> F response)",
+            by_hand(["request", "response"], answering, [True, False]),
+            "buchi",
+            2,
+        ),
+        (
+            "G (!charge U battery_low)",
+            by_hand(["battery_low", "charge"], charging, [True, False, False]),
+            "buchi",
+            2,
+        ),
+        (
+            "G F p1 & G F p2",
+            by_hand(["p1", "p2"], posting, [False, False, False, True]),
+            "buchi",
+            2,
+        ),
     ],
 )
 def test_the_drawn_automata(text, drawn, acceptance, states):
@@ -82,8 +102,9 @@ def test_two_robots_apart():
         {p for p, holds in zip(automaton.propositions, row, strict=True) if holds}
         for row in automaton.letters
     ]
-    clash = np.array([{x[1:] for x in row if x[0] == "x"} == {x[1:] for x in row if x[0] == "y"}
-                      for row in held])
+    clash = np.array(
+        [{x[1:] for x in row if x[0] == "x"} == {x[1:] for x in row if x[0] == "y"} for row in held]
+    )
     assert np.array_equal(automaton.delta[0], clash.astype(int))
 
 

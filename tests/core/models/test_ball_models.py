@@ -33,15 +33,25 @@ DIRECTIONS = list(itertools.product(("max", "min"), repeat=2))
 def three():
     """A choice among three ends, of which the last was hardly seen."""
     return make_sparse(
-        None, [0, 3, 4, 5, 6], [1, 2, 3, 1, 2, 3], [0.5, 0.4, 0.1, 1, 1, 1],
-        initial=[1, 0, 0, 0], label=[[0, 0], [1, 0], [0, 0], [0, 1]], propositions=["a", "b"])
+        None,
+        [0, 3, 4, 5, 6],
+        [1, 2, 3, 1, 2, 3],
+        [0.5, 0.4, 0.1, 1, 1, 1],
+        initial=[1, 0, 0, 0],
+        label=[[0, 0], [1, 0], [0, 0], [0, 1]],
+        propositions=["a", "b"],
+    )
 
 
 def around(model, radius):
     every = np.ones(model.num_transitions)
     return make_interval(
-        model, 0 * every, every, center=model.probability,
-        radius=np.append(radius, np.zeros(model.num_rows - 1)))
+        model,
+        0 * every,
+        every,
+        center=model.probability,
+        radius=np.append(radius, np.zeros(model.num_rows - 1)),
+    )
 
 
 def test_half_of_the_radius_moves():
@@ -57,8 +67,12 @@ def test_half_of_the_radius_moves():
     model = around(three(), 0.4)
     assert robust_expectation(model, ahead, nature="min")[0][0] == pytest.approx(0.86 - 0.2)
     model = make_interval(  # an end that may gain little leaves the rest to the next
-        three(), np.zeros(6), [1, 1, 0.15, 1, 1, 1], center=three().probability,
-        radius=[0.4, 0, 0, 0])
+        three(),
+        np.zeros(6),
+        [1, 1, 0.15, 1, 1, 1],
+        center=three().probability,
+        radius=[0.4, 0, 0, 0],
+    )
     least = 0.86 - 0.05 * 1 - 0.15 * 0.1
     assert robust_expectation(model, ahead, nature="min")[0][0] == pytest.approx(least)
 
@@ -66,8 +80,14 @@ def test_half_of_the_radius_moves():
 def test_in_its_box_more_is_possible():
     """With four successors two may gain and two may lose as much as one of them may."""
     model = interval_rows(
-        None, [0, 4, 5, 6, 7], [0, 1, 2, 3, 1, 2, 3], [0] * 4 + [1] * 3, np.ones(7),
-        center=[0.25, 0.25, 0.25, 0.25, 1, 1, 1], radius=[0.2, 0, 0, 0])
+        None,
+        [0, 4, 5, 6, 7],
+        [0, 1, 2, 3, 1, 2, 3],
+        [0] * 4 + [1] * 3,
+        np.ones(7),
+        center=[0.25, 0.25, 0.25, 0.25, 1, 1, 1],
+        radius=[0.2, 0, 0, 0],
+    )
     ahead = np.array([1.0, 1.0, 0.0, 0.0])
     assert robust_expectation(model, ahead, nature="max")[0][0] == pytest.approx(0.6)
     assert robust_expectation(model.box, ahead, nature="max")[0][0] == pytest.approx(0.7)
@@ -81,8 +101,14 @@ def test_what_a_radius_removes():
         assert (found.upper[0] == 0) == zero
         # Who is not known to be left out is entered sooner or later.
         again = interval_rows(
-            None, [0, 3, 4, 5], [0, 1, 2, 1, 2], [0, 0, 0, 1, 1], np.ones(5),
-            center=[0.5, 0.4, 0.1, 1, 1], radius=[radius + 0.8, 0, 0])
+            None,
+            [0, 3, 4, 5],
+            [0, 1, 2, 1, 2],
+            [0, 0, 0, 1, 1],
+            np.ones(5),
+            center=[0.5, 0.4, 0.1, 1, 1],
+            radius=[radius + 0.8, 0, 0],
+        )
         least = robust_reachability(again, [False, True, True], nature="min")
         assert least.lower[0] == (0 if zero else 1)
     never = around(three().replace(probability=np.array([0.5, 0.5, 0, 1, 1, 1])), 0.0)
@@ -98,8 +124,10 @@ def test_a_full_radius_is_a_box():
         box = make_interval(model, low, high)
         ball = make_interval(model, low, high, center=p, radius=np.full(model.num_rows, 2.0))
         for objective, nature in DIRECTIONS:
-            one, other = (robust_satisfaction(x, task, objective=objective, nature=nature)
-                          for x in (box, ball))
+            one, other = (
+                robust_satisfaction(x, task, objective=objective, nature=nature)
+                for x in (box, ball)
+            )
             np.testing.assert_allclose(one.value, other.value, atol=1e-9)
 
 
@@ -109,9 +137,9 @@ def test_products_policies_and_games():
     for task in TASKS:
         model = labelled(rng)
         ball = intervals_from_counts(
-            drawn(rng, model, 30), 0.9, method="weissman", entry_start=model.entry_start)
-        world = make_interval(
-            model, ball.lower, ball.upper, center=ball.center, radius=ball.radius)
+            drawn(rng, model, 30), 0.9, method="weissman", entry_start=model.entry_start
+        )
+        world = make_interval(model, ball.lower, ball.upper, center=ball.center, radius=ball.radius)
         for nature in ("min", "max"):
             found = robust_satisfaction(world, task, nature=nature)
             assert found.solution.status == 0
@@ -138,7 +166,8 @@ def test_restricted_and_written(tmp_path):
     rng = np.random.default_rng(2)
     model = labelled(rng)
     sets = intervals_from_counts(
-        drawn(rng, model, 30), 0.9, method="weissman", entry_start=model.entry_start)
+        drawn(rng, model, 30), 0.9, method="weissman", entry_start=model.entry_start
+    )
     world = make_interval(model, sets.lower, sets.upper, center=sets.center, radius=sets.radius)
     write_model(tmp_path / "world.npz", world)
     same = read_model(tmp_path / "world.npz")
@@ -158,8 +187,10 @@ def test_restricted_and_written(tmp_path):
     near = robust_reachability(part.model, "a", nature="min").value
     far = robust_reachability(world, "a", nature="min").value
     np.testing.assert_allclose(near, far[np.asarray(part.base_state)], atol=1e-9)
-    for solve in (lambda: prepare_interval(world, "a"),
-                  lambda: robust_sensitivity(world, kept, "a", nature="min")):
+    for solve in (
+        lambda: prepare_interval(world, "a"),
+        lambda: robust_sensitivity(world, kept, "a", nature="min"),
+    ):
         with pytest.raises(ValueError, match=r"the model has a radius, .* model.box"):
             solve()
 
@@ -168,29 +199,45 @@ def test_padded_models_and_successors_that_repeat():
     mdp = from_dense([[[0.0, 0.6, 0.4]], [[0, 1, 0]], [[0, 0, 1]]])
     size = np.shape(mdp.probability)
     model = make_interval(
-        mdp, np.zeros(size), np.asarray(mdp.probability) > 0, center=mdp.probability,
-        radius=[[0.2], [0], [0]])
+        mdp,
+        np.zeros(size),
+        np.asarray(mdp.probability) > 0,
+        center=mdp.probability,
+        radius=[[0.2], [0], [0]],
+    )
     goal = [False, True, False]
     assert robust_reachability(model, goal, nature="min").value[0] == pytest.approx(0.5)
     twice = interval_rows(
-        None, [0, 3, 4, 5], [1, 1, 2, 1, 2], [0, 0, 0, 1, 1], [1, 1, 1, 1, 1],
-        center=[0.2, 0.4, 0.4, 1, 1], radius=[0.2, 0, 0])
+        None,
+        [0, 3, 4, 5],
+        [1, 1, 2, 1, 2],
+        [0, 0, 0, 1, 1],
+        [1, 1, 1, 1, 1],
+        center=[0.2, 0.4, 0.4, 1, 1],
+        radius=[0.2, 0, 0],
+    )
     assert twice.num_transitions == 4
     assert robust_reachability(twice, goal, nature="min").value[0] == pytest.approx(0.5)
     gain = robust_discounted_value(twice, [0.0, 1.0, 0.0], 0.5)
     assert gain.value[0] == pytest.approx(0.5 * 0.5 * 2)
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"radius": None}, "center is given alone"),
-    ({"center": None}, "radius is given alone"),
-    ({"radius": [0.1]}, r"radius \(1,\); expected \(6,\) and \(4,\)"),
-    ({"center": [0.5, 0.5]}, r"center has shape \(2,\); expected \(6,\)"),
-    ({"radius": [0, 0, -0.1, 0]}, r"state 2, choice 0: the radius is -0.1"),
-    ({"radius": [np.nan, 0, 0, 0]}, r"state 0, choice 0: the radius is nan"),
-    ({"center": [0.5, 0.4, 0.2, 1, 1, 1]}, r"state 0, choice 0: the center sums to 1.1"),
-    ({"center": [0.3, 0.6, 0.1, 1, 1, 1]}, r"the center has 0.6 where the interval is \[0, 0.5\]"),
-])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"radius": None}, "center is given alone"),
+        ({"center": None}, "radius is given alone"),
+        ({"radius": [0.1]}, r"radius \(1,\); expected \(6,\) and \(4,\)"),
+        ({"center": [0.5, 0.5]}, r"center has shape \(2,\); expected \(6,\)"),
+        ({"radius": [0, 0, -0.1, 0]}, r"state 2, choice 0: the radius is -0.1"),
+        ({"radius": [np.nan, 0, 0, 0]}, r"state 0, choice 0: the radius is nan"),
+        ({"center": [0.5, 0.4, 0.2, 1, 1, 1]}, r"state 0, choice 0: the center sums to 1.1"),
+        (
+            {"center": [0.3, 0.6, 0.1, 1, 1, 1]},
+            r"the center has 0.6 where the interval is \[0, 0.5\]",
+        ),
+    ],
+)
 def test_what_is_no_ball(change, message):
     given = {"center": three().probability, "radius": [0.1, 0, 0, 0]} | change
     upper = np.array([0.5, 0.5, 0.5, 1, 1, 1])
@@ -202,9 +249,14 @@ def spreading(rng, num_states=8):
     """Rows with six successors each."""
     successor = [np.sort(rng.choice(num_states, 6, replace=False)) for _ in range(12)]
     return make_sparse(
-        [0, 2, 4, 6, 8, 9, 10, 11, 12], np.arange(0, 73, 6), np.concatenate(successor),
-        rng.dirichlet(np.ones(6), 12).ravel(), initial=np.eye(num_states)[0],
-        label=rng.random((num_states, 2)) < 0.3, propositions=["a", "b"])
+        [0, 2, 4, 6, 8, 9, 10, 11, 12],
+        np.arange(0, 73, 6),
+        np.concatenate(successor),
+        rng.dirichlet(np.ones(6), 12).ravel(),
+        initial=np.eye(num_states)[0],
+        label=rng.random((num_states, 2)) < 0.3,
+        propositions=["a", "b"],
+    )
 
 
 def test_the_ball_guarantees_more_than_its_box():
@@ -214,7 +266,8 @@ def test_the_ball_guarantees_more_than_its_box():
     for i in range(20):
         model, task = spreading(rng), TASKS[i % len(TASKS)]
         found = learn_guarantee(
-            model, drawn(rng, model, int(rng.integers(20, 500))), task, 0.9, method="weissman")
+            model, drawn(rng, model, int(rng.integers(20, 500))), task, 0.9, method="weissman"
+        )
         assert found.model.radius is not None
         box = robust_satisfaction(found.model.box, task, nature="min").solution
         assert box.lower[0] <= found.satisfaction.solution.upper[0] + 1e-9

@@ -38,8 +38,11 @@ def large_world():
     world = jl.gridworld("h b . .\n. . . g", slip=0.2)
     order = [world.propositions.index(p) for p in ("h", "b", "g")]
     return make_mdp(
-        world.successor, world.probability, initial=world.initial,
-        label=np.asarray(world.label)[:, order], propositions=("h", "b", "g"),
+        world.successor,
+        world.probability,
+        initial=world.initial,
+        label=np.asarray(world.label)[:, order],
+        propositions=("h", "b", "g"),
     )
 
 
@@ -55,7 +58,8 @@ def test_a_stacked_world_is_its_own_product(label_on):
         alone = jl.product(one, automaton, label_on=label_on)
         size = one.num_states
         np.testing.assert_allclose(
-            found[i][:size], jax.jit(expectation)(alone, jnp.asarray(value[:size])), rtol=1e-12)
+            found[i][:size], jax.jit(expectation)(alone, jnp.asarray(value[:size])), rtol=1e-12
+        )
         lane = world(stacked, i)
         np.testing.assert_array_equal(lane.initial[:size], alone.initial)
         assert float(lane.initial[size:].sum()) == 0
@@ -86,8 +90,10 @@ def test_a_task_over_nothing_is_the_memoryless_one():
     [
         ([jl.gridworld("g . b\n. . .")], "world 1 does not have the propositions.*lacks h"),
         ([jl.gridworld("g h b\n. . x")], "world 1 does not have the propositions.*has x besides"),
-        ([small_world(), make_mdp(np.zeros((1, 1, 1), int), np.ones((1, 1, 1)))],
-         "world 2 has 1 actions and world 0 has 4"),
+        (
+            [small_world(), make_mdp(np.zeros((1, 1, 1), int), np.ones((1, 1, 1)))],
+            "world 2 has 1 actions and world 0 has 4",
+        ),
         ([to_dense(small_world())], "world 1 is a DenseMDP"),
     ],
 )
@@ -134,8 +140,13 @@ def random_words(rng, propositions, count):
 
 @pytest.mark.parametrize(
     ("memory", "task"),
-    [("F a", "!b U a"), ("!b U a", "G !c"), ("true", "G F a"), ("F (a & F b)", "F G a | G F c"),
-     ("G a", "F b")],
+    [
+        ("F a", "!b U a"),
+        ("!b U a", "G !c"),
+        ("true", "G F a"),
+        ("F (a & F b)", "F G a | G F c"),
+        ("G a", "F b"),
+    ],
 )
 def test_both_run_and_the_second_decides(memory, task):
     first, second = jl.to_automaton(memory), jl.to_automaton(task)
@@ -157,7 +168,8 @@ def test_both_run_and_the_second_decides(memory, task):
 def test_automata_without_a_common_letter_are_refused():
     with pytest.raises(ValueError, match="no letter of one automaton agrees"):
         synchronize(
-            jl.to_automaton("F a", letters=[{"a"}]), jl.to_automaton("F a", letters=[set()]))
+            jl.to_automaton("F a", letters=[{"a"}]), jl.to_automaton("F a", letters=[set()])
+        )
 
 
 def probability(model, policy):
@@ -172,8 +184,7 @@ def test_a_lifted_policy_is_judged_by_the_other_task(label_on):
     direct = jl.product(world, TASK, label_on=label_on)
     rng = np.random.default_rng(1)
     policy = jnp.asarray(rng.dirichlet(np.ones(4), size=direct.state_shape))
-    both = jl.product(
-        world, synchronize(direct.automaton, direct.automaton), label_on=label_on)
+    both = jl.product(world, synchronize(direct.automaton, direct.automaton), label_on=label_on)
     lifted = lift_memory(policy, direct.automaton)
     one, other = probability(direct, policy), probability(both, lifted)
     start, pair = (m.initial_memory for m in (direct, both))
@@ -181,12 +192,15 @@ def test_a_lifted_policy_is_judged_by_the_other_task(label_on):
     np.testing.assert_allclose(other[s, pair], one[s, start], atol=1e-12)
     actions = jnp.asarray(rng.integers(4, size=direct.state_shape))
     np.testing.assert_array_equal(
-        lift_memory(actions, 3)[:, 3 * 2 : 3 * 3], np.repeat(actions[:, 2:3], 3, axis=1))
+        lift_memory(actions, 3)[:, 3 * 2 : 3 * 3], np.repeat(actions[:, 2:3], 3, axis=1)
+    )
     memoryless = jl.product(world, synchronize("true", direct.automaton), label_on=label_on)
     flat = jnp.asarray(rng.dirichlet(np.ones(4), size=(world.num_states, 1)))
     np.testing.assert_allclose(
         probability(memoryless, lift_memory(flat, direct.automaton)),
-        probability(direct, jl.lift_policy(direct, flat[:, 0])), atol=1e-12)
+        probability(direct, jl.lift_policy(direct, flat[:, 0])),
+        atol=1e-12,
+    )
 
 
 # --- demonstrations -----------------------------------------------------------------------------
@@ -219,7 +233,8 @@ def test_pairs_are_counted_in_each_world():
 def test_pairs_are_those_of_lifted_trajectories(label_on):
     model = jl.product(small_world(), TASK, label_on=label_on)
     runs = jl.rollout(
-        small_world(), jnp.full((6, 4), 0.25), jax.random.key(0), num_trajectories=20, num_steps=15)
+        small_world(), jnp.full((6, 4), 0.25), jax.random.key(0), num_trajectories=20, num_steps=15
+    )
     lifted = jl.lift_trajectories(model, runs)
     expected = np.zeros((15, model.num_states, 4))
     np.add.at(expected, (np.arange(15), np.asarray(lifted.state), np.asarray(lifted.action)), 1)

@@ -27,13 +27,21 @@ def reductions(model, x, w, rows):
     over = choices(model)
     condition = x > 0.5
     return {
-        "sum": over.sum(x), "max": over.max(x), "argmax": over.argmax(x)[1],
-        "top": over.top(over.logits(x)), "logsumexp": over.logsumexp(over.logits(x)),
-        "softmax": over.softmax(over.logits(x)), "mean": over.mean(w, x),
-        "of rows": over.mean(rows, x), "first": over.first(condition),
-        "all": over.all(condition), "some": over.max(x, condition),
-        "spread": over.spread(over.sum(x)), "one hot": over.one_hot(rows, x.dtype),
-        "best": over.best(x)[1], "count": over.sum(condition),
+        "sum": over.sum(x),
+        "max": over.max(x),
+        "argmax": over.argmax(x)[1],
+        "top": over.top(over.logits(x)),
+        "logsumexp": over.logsumexp(over.logits(x)),
+        "softmax": over.softmax(over.logits(x)),
+        "mean": over.mean(w, x),
+        "of rows": over.mean(rows, x),
+        "first": over.first(condition),
+        "all": over.all(condition),
+        "some": over.max(x, condition),
+        "spread": over.spread(over.sum(x)),
+        "one hot": over.one_hot(rows, x.dtype),
+        "best": over.best(x)[1],
+        "count": over.sum(condition),
     }
 
 
@@ -46,9 +54,11 @@ def test_reductions_equal_loops():
     groups, weights = by_state(model, x), by_state(model, w)
     hits = [np.flatnonzero(g > 0.5) for g in groups]
     expected = {
-        "sum": [g.sum() for g in groups], "max": [g.max() for g in groups],
+        "sum": [g.sum() for g in groups],
+        "max": [g.max() for g in groups],
         "argmax": [g.argmax() for g in groups] + model.row_start[:-1],
-        "top": [g.max() for g in groups], "logsumexp": [np.log(np.exp(g).sum()) for g in groups],
+        "top": [g.max() for g in groups],
+        "logsumexp": [np.log(np.exp(g).sum()) for g in groups],
         "softmax": np.concatenate([np.exp(g) / np.exp(g).sum() for g in groups]),
         "mean": [a @ b for a, b in zip(weights, groups, strict=True)],
         "of rows": [g[-1] for g in groups],
@@ -103,8 +113,14 @@ def test_padded_actions_are_reduced_alike():
     def some(model, x):
         over = choices(model)
         logits = over.logits(x)
-        return (over.max(x), over.logsumexp(logits), over.softmax(logits), over.argmax(x)[1],
-                over.layout.max(over.columns(logits)), over.whole(over.columns(x)))
+        return (
+            over.max(x),
+            over.logsumexp(logits),
+            over.softmax(logits),
+            over.argmax(x)[1],
+            over.layout.max(over.columns(logits)),
+            over.whole(over.columns(x)),
+        )
 
     found, expected = some(model, x), [np.asarray(y) for y in some(padded, wide)]
     for i in (0, 1, 4):

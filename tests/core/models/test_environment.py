@@ -28,11 +28,16 @@ def reset(length, key):
 
 
 def step(length, place, action, key):
-    slip = jax.random.bernoulli(key, .25)
+    slip = jax.random.bernoulli(key, 0.25)
     after = jnp.clip(place + jnp.where(slip, 0, 2 * action - 1), 0, length)
     return Timestep(
-        after, reward=after / length, terminated=after == length, truncated=after == 0,
-        cost=jnp.where(slip, 1.0, 0.0), discount=jnp.where(slip, 1.0, .5))
+        after,
+        reward=after / length,
+        terminated=after == length,
+        truncated=after == 0,
+        cost=jnp.where(slip, 1.0, 0.0),
+        discount=jnp.where(slip, 1.0, 0.5),
+    )
 
 
 def observe(length, place):
@@ -48,19 +53,29 @@ def allowed(length, place):
 
 
 def corridor(length=6, **changes):
-    parts = {name: Partial(f, jnp.int32(length)) for name, f in (
-        ("reset", reset), ("step", step), ("observe", observe), ("labels", labels),
-        ("allowed", allowed))}
-    return make_environment(
-        **{**parts, "actions": 2, "propositions": ["home", "goal"], **changes})
+    parts = {
+        name: Partial(f, jnp.int32(length))
+        for name, f in (
+            ("reset", reset),
+            ("step", step),
+            ("observe", observe),
+            ("labels", labels),
+            ("allowed", allowed),
+        )
+    }
+    return make_environment(**{**parts, "actions": 2, "propositions": ["home", "goal"], **changes})
 
 
 def plain_step(place, action, key):
     return Timestep(place + action, 0.0, False)
 
 
-WORLD = {"reset": lambda key: jnp.int32(0), "step": plain_step,
-         "observe": lambda place: place[None], "actions": 2}
+WORLD = {
+    "reset": lambda key: jnp.int32(0),
+    "step": plain_step,
+    "observe": lambda place: place[None],
+    "actions": 2,
+}
 
 
 def made(**changes):
@@ -75,8 +90,12 @@ def test_what_is_made():
     assert float(world.observations["share"].low) == -np.inf
     bare = made()
     assert bare.labels(jnp.int32(0)).shape == (0,) and allowed_in(bare, 0) is None
-    assert made(actions=make_box(-1, 1, [2]), step=lambda place, action, key: Timestep(
-        place + action.sum().astype(jnp.int32), 0.0, False)).actions.shape == (2,)
+    assert made(
+        actions=make_box(-1, 1, [2]),
+        step=lambda place, action, key: Timestep(
+            place + action.sum().astype(jnp.int32), 0.0, False
+        ),
+    ).actions.shape == (2,)
 
 
 # --- bad input ------------------------------------------------------------------------------------
@@ -97,30 +116,49 @@ def branches(place, action, key):
     return Timestep(place + 1 if action == 0 else place, 0.0, False)
 
 
-@pytest.mark.parametrize(("changes", "text"), [
-    ({"propositions": ["a"]}, "no labels"),
-    ({"propositions": ["a", "a"], "labels": lambda place: jnp.zeros(2, bool)}, "given twice"),
-    ({"propositions": [3]}, "3 is no name"),
-    ({"labels": lambda place: jnp.zeros(2, bool), "propositions": ["a"]}, r"return bool\[1\]"),
-    ({"labels": lambda place: jnp.zeros(1), "propositions": ["a"]}, r"float64\[1\]"),
-    ({"labels": lambda place: place == 0, "propositions": ["a"]}, r"bool\[\]; return bool\[1\]"),
-    ({"horizon": 0}, "horizon=0"), ({"actions": 0}, r"Finite\(0\)"),
-    ({"actions": "two"}, "give Finite"), ({"actions": True}, None),
-    ({"observe": lambda place: ()}, "observe returns no array"),
-    ({"observations": make_box(0, 1, [3])}, r"observations is of float64\[3\]"),
-    ({"step": lambda place, action, key: (place, 0.0)}, "step must return Timestep"),
-    ({"step": lambda place, action, key: Timestep(place, jnp.zeros(3), False)},
-     r"reward of shape \[3\]"),
-    ({"step": lambda place, action, key: Timestep(place, 0.0, 1.0)}, "return a Boolean"),
-    ({"step": lambda place, action, key: Timestep(place * 1.0, 0.0, False)}, "the same structure"),
-    ({"allowed": lambda place: jnp.ones(3, bool)}, "allowed"),
-    ({"allowed": lambda place: jnp.ones(2)}, "return Booleans"),
-    ({"allowed": lambda place: jnp.ones(2, bool), "actions": make_box(0, 1),
-      "step": lambda place, action, key: Timestep(place, action, False)}, "clip those of a box"),
-    pytest.param({"step": remembers}, "step is not pure: it keeps", marks=pytest.mark.slow),
-    ({"step": draws_by_itself}, "step is not pure: called twice"),
-    ({"step": branches}, "step cannot be traced"),
-])
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"propositions": ["a"]}, "no labels"),
+        ({"propositions": ["a", "a"], "labels": lambda place: jnp.zeros(2, bool)}, "given twice"),
+        ({"propositions": [3]}, "3 is no name"),
+        ({"labels": lambda place: jnp.zeros(2, bool), "propositions": ["a"]}, r"return bool\[1\]"),
+        ({"labels": lambda place: jnp.zeros(1), "propositions": ["a"]}, r"float64\[1\]"),
+        (
+            {"labels": lambda place: place == 0, "propositions": ["a"]},
+            r"bool\[\]; return bool\[1\]",
+        ),
+        ({"horizon": 0}, "horizon=0"),
+        ({"actions": 0}, r"Finite\(0\)"),
+        ({"actions": "two"}, "give Finite"),
+        ({"actions": True}, None),
+        ({"observe": lambda place: ()}, "observe returns no array"),
+        ({"observations": make_box(0, 1, [3])}, r"observations is of float64\[3\]"),
+        ({"step": lambda place, action, key: (place, 0.0)}, "step must return Timestep"),
+        (
+            {"step": lambda place, action, key: Timestep(place, jnp.zeros(3), False)},
+            r"reward of shape \[3\]",
+        ),
+        ({"step": lambda place, action, key: Timestep(place, 0.0, 1.0)}, "return a Boolean"),
+        (
+            {"step": lambda place, action, key: Timestep(place * 1.0, 0.0, False)},
+            "the same structure",
+        ),
+        ({"allowed": lambda place: jnp.ones(3, bool)}, "allowed"),
+        ({"allowed": lambda place: jnp.ones(2)}, "return Booleans"),
+        (
+            {
+                "allowed": lambda place: jnp.ones(2, bool),
+                "actions": make_box(0, 1),
+                "step": lambda place, action, key: Timestep(place, action, False),
+            },
+            "clip those of a box",
+        ),
+        pytest.param({"step": remembers}, "step is not pure: it keeps", marks=pytest.mark.slow),
+        ({"step": draws_by_itself}, "step is not pure: called twice"),
+        ({"step": branches}, "step cannot be traced"),
+    ],
+)
 def test_bad_worlds_are_named(changes, text):
     if text is None:  # a number in disguise
         assert made(**changes).actions == Finite(1)
@@ -134,7 +172,8 @@ def test_a_step_may_leave_out_what_has_a_default():
         return place, 1.0, place == 3
 
     episode = run_episode(
-        jax.random.key(0), made(step=short), agent_of(lambda seen, key: 0), num_steps=2)
+        jax.random.key(0), made(step=short), agent_of(lambda seen, key: 0), num_steps=2
+    )
     assert episode.discount.tolist() == [1, 1] and episode.cost.tolist() == [0, 0]
 
 
@@ -146,11 +185,17 @@ def test_worlds_are_made_of_traced_arrays_too():
     assert bool(length(jnp.int32(4)))
 
 
-@pytest.mark.parametrize(("arguments", "text"), [
-    ((1, 0), "low is above high"), ((0, [1, np.nan]), "give numbers"),
-    (([0, 0], [1, 1, 1]), "do not fit"), ((0, [1, 1], [3]), r"the shape \[3\]"),
-    (("a", 1), "give numbers"), (([0, 2], [1, 1]), r"at \[1\]"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ((1, 0), "low is above high"),
+        ((0, [1, np.nan]), "give numbers"),
+        (([0, 0], [1, 1, 1]), "do not fit"),
+        ((0, [1, 1], [3]), r"the shape \[3\]"),
+        (("a", 1), "give numbers"),
+        (([0, 2], [1, 1]), r"at \[1\]"),
+    ],
+)
 def test_bad_boxes_are_named(arguments, text):
     with pytest.raises(ValueError, match=text):
         make_box(*arguments)
@@ -175,7 +220,7 @@ def test_random_actions_are_those_that_may_be_taken():
     space = make_box([-1, 0, -np.inf], [1, np.inf, np.inf])
     some = np.asarray(jax.vmap(lambda key: random_action(key, space))(keys))
     assert some.shape == (200, 3) and (some >= space.low).all() and (some[:, 0] <= 1).all()
-    assert some[:, 2].min() < 0 and np.abs(some[:, 0].mean()) < .2
+    assert some[:, 2].min() < 0 and np.abs(some[:, 0].mean()) < 0.2
 
 
 # --- episodes -------------------------------------------------------------------------------------
@@ -196,8 +241,14 @@ def by_hand(key, environment, agent, num_steps):
         mask = allowed_in(environment, world)
         action, memory = agent.act(memory, environment.observe(world), mask, act)
         found = environment.step(world, action, move)
-        rows.append((int(world), int(action), *map(float, (
-            found.reward, found.cost, found.discount)), *map(bool, found[2:4])))
+        rows.append(
+            (
+                int(world),
+                int(action),
+                *map(float, (found.reward, found.cost, found.discount)),
+                *map(bool, found[2:4]),
+            )
+        )
         world = found.world
         if rows[-1][-1] or rows[-1][-2]:
             break
@@ -205,7 +256,7 @@ def by_hand(key, environment, agent, num_steps):
 
 
 def test_an_episode_is_its_steps_one_by_one():
-    environment, agent = corridor(), Agent(Partial(seeks, .7), jnp.int32(0))
+    environment, agent = corridor(), Agent(Partial(seeks, 0.7), jnp.int32(0))
     ends = set()
     episodes = jax.jit(jax.vmap(partial(run_episode, num_steps=8), (0, None, None)))
     keys = jax.random.split(jax.random.key(3), 24)
@@ -218,8 +269,11 @@ def test_an_episode_is_its_steps_one_by_one():
         assert lane.valid.tolist() == [t < count for t in range(8)]
         assert lane.world.tolist() == [*world, *[last] * (9 - count)]
         assert lane.action[:count].tolist() == list(action)
-        for name, values, rest in (("reward", reward, 0), ("cost", cost, 0),
-                                   ("discount", discount, 1)):
+        for name, values, rest in (
+            ("reward", reward, 0),
+            ("cost", cost, 0),
+            ("discount", discount, 1),
+        ):
             row = getattr(lane, name)
             np.testing.assert_allclose(row, [*values, *[rest] * (8 - count)], err_msg=name)
         assert (bool(lane.terminated), bool(lane.truncated)) == (terminated[-1], truncated[-1])
@@ -230,8 +284,10 @@ def test_an_episode_is_its_steps_one_by_one():
 
 
 def test_episodes_need_a_step():
-    for run in (partial(run_episode, jax.random.key(0), corridor(), agent_of(lambda o, k: 0)),
-                partial(with_time_limit, corridor())):
+    for run in (
+        partial(run_episode, jax.random.key(0), corridor(), agent_of(lambda o, k: 0)),
+        partial(with_time_limit, corridor()),
+    ):
         with pytest.raises(ValueError, match="num_steps=0"):
             run(num_steps=0)
 
@@ -243,7 +299,7 @@ def test_new_numbers_do_not_recompile():
     def total(environment, key):
         nonlocal count
         count += 1
-        agent = Agent(Partial(seeks, .7), jnp.int32(0))
+        agent = Agent(Partial(seeks, 0.7), jnp.int32(0))
         return run_episode(key, environment, agent, num_steps=4).reward.sum()
 
     values = [float(total(corridor(n), jax.random.key(0))) for n in (6, 8)]
@@ -260,8 +316,9 @@ def test_a_step_or_a_fresh_start():
         return world, found, environment.step(place, action, step_key), environment.reset(reset_key)
 
     keys = jax.random.split(jax.random.key(5), 40)
-    world, found, expected, fresh = jax.tree.map(np.asarray, both(
-        jnp.arange(40) % 5 + 1, jnp.arange(40) % 2, keys))
+    world, found, expected, fresh = jax.tree.map(
+        np.asarray, both(jnp.arange(40) % 5 + 1, jnp.arange(40) % 2, keys)
+    )
     for x, y in zip(found, expected, strict=True):
         np.testing.assert_array_equal(x, y)
     over = expected.terminated | expected.truncated

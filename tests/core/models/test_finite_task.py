@@ -59,11 +59,18 @@ def test_random_formulas_against_the_automatons_reading():
         automaton = to_automaton(formula)
         columns = rng.sample([*names, "other"], 4)
         task = make_finite_task(rng.choice([formula, str(formula), automaton]), columns)
-        label = np.array([[[rng.random() < 0.5 for _ in columns] for _ in range(3)]
-                          for _ in range(6)], bool)
+        label = np.array(
+            [[[rng.random() < 0.5 for _ in columns] for _ in range(3)] for _ in range(6)], bool
+        )
         expected = [
-            verdict(automaton, [{p for p, holds in zip(columns, row, strict=True) if holds}
-                                & set(automaton.propositions) for row in word])
+            verdict(
+                automaton,
+                [
+                    {p for p, holds in zip(columns, row, strict=True) if holds}
+                    & set(automaton.propositions)
+                    for row in word
+                ],
+            )
             for word in label
         ]
         found = finite_verdicts(task, jnp.asarray(label))
@@ -134,8 +141,9 @@ def test_unknown_propositions_are_refused():
 
 
 def test_automata_must_read_every_letter():
-    both_orders = make_automaton([[1, 0], [1, 1]], 0, [[True], [False]], ["goal"],
-                                 final=[False, True], acceptance="cosafe")
+    both_orders = make_automaton(
+        [[1, 0], [1, 1]], 0, [[True], [False]], ["goal"], final=[False, True], acceptance="cosafe"
+    )
     task = make_finite_task(both_orders, COLUMNS)
     assert finite_verdicts(task, rows("..g")) == YES
     assert finite_verdicts(task, rows("...")) == OPEN

@@ -196,9 +196,7 @@ def test_without_a_mask_a_game_keeps_its_moves():
 
 
 def test_an_empty_mask_is_an_error_only_where_it_is_reached():
-    world = jl.from_dense(
-        [[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]], initial=[1.0, 0]
-    )
+    world = jl.from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]], initial=[1.0, 0])
     game = make_game(world, [True, False])
     mask = np.array([[True, False], [False, False]])
     assert jl.restrict(game, allowed=mask).base_state.tolist() == [0]
@@ -240,9 +238,7 @@ def test_the_product_of_a_game_keeps_its_owners(label_on):
         for q in range(joint.state_shape[1]):
             np.testing.assert_array_equal(joint.system[:, q], play.system)
         value = jnp.asarray(rng.normal(size=joint.state_shape))
-        np.testing.assert_array_equal(
-            jl.expectation(joint, value), jl.expectation(alone, value)
-        )
+        np.testing.assert_array_equal(jl.expectation(joint, value), jl.expectation(alone, value))
         np.testing.assert_array_equal(joint.initial, alone.initial)
 
 

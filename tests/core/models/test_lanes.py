@@ -19,12 +19,16 @@ P = PartitionSpec
 def mesh_of(*sizes, explicit=False):
     kind = AxisType.Explicit if explicit else AxisType.Auto
     return jax.make_mesh(
-        sizes, ("lanes", "more")[: len(sizes)], axis_types=(kind,) * len(sizes),
-        devices=jax.devices()[: np.prod(sizes)])
+        sizes,
+        ("lanes", "more")[: len(sizes)],
+        axis_types=(kind,) * len(sizes),
+        devices=jax.devices()[: np.prod(sizes)],
+    )
 
 
 def wander(key, state, shared, *, more=1):
     """A loop as long as the lane's number says; draws, shared numbers, a key that comes out."""
+
     def body(carry):
         step, place = carry
         place = place * shared["keep"] + jax.random.normal(jax.random.fold_in(key, step), (2,))
@@ -37,8 +41,10 @@ def wander(key, state, shared, *, more=1):
 
 def some(number):
     keys = jax.random.split(jax.random.key(1), number)
-    state = {"place": np.arange(2.0 * number).reshape(number, 2),
-             "most": np.arange(number, dtype=np.int32)}
+    state = {
+        "place": np.arange(2.0 * number).reshape(number, 2),
+        "most": np.arange(number, dtype=np.int32),
+    }
     return keys, state, {"keep": 0.5}
 
 
@@ -50,20 +56,31 @@ def alone(number, **options):
 
 
 def assert_same(found, expected):
-    for x, y in zip(jax.tree.leaves(jl.on_host(found)), jax.tree.leaves(jl.on_host(expected)),
-                    strict=True):
-        x, y = (jax.random.key_data(z) if jnp.issubdtype(z.dtype, jax.dtypes.prng_key) else z
-                for z in (x, y))
+    for x, y in zip(
+        jax.tree.leaves(jl.on_host(found)), jax.tree.leaves(jl.on_host(expected)), strict=True
+    ):
+        x, y = (
+            jax.random.key_data(z) if jnp.issubdtype(z.dtype, jax.dtypes.prng_key) else z
+            for z in (x, y)
+        )
         assert x.dtype == y.dtype
         np.testing.assert_array_equal(x, y)
 
 
 @pytest.mark.few(4)
-@pytest.mark.parametrize(("sizes", "axis", "number", "spec"), [
-    ((1,), None, 8, P()), ((2,), "lanes", 8, P("lanes")), ((4,), None, 8, P("lanes")),
-    ((4,), None, 6, P()), ((4,), None, 1, P()), ((2, 2), "more", 6, P("more")),
-    ((2, 2), None, 8, P(("lanes", "more"))), ((2, 2), ("more", "lanes"), 4, P(("more", "lanes"))),
-])
+@pytest.mark.parametrize(
+    ("sizes", "axis", "number", "spec"),
+    [
+        ((1,), None, 8, P()),
+        ((2,), "lanes", 8, P("lanes")),
+        ((4,), None, 8, P("lanes")),
+        ((4,), None, 6, P()),
+        ((4,), None, 1, P()),
+        ((2, 2), "more", 6, P("more")),
+        ((2, 2), None, 8, P(("lanes", "more"))),
+        ((2, 2), ("more", "lanes"), 4, P(("more", "lanes"))),
+    ],
+)
 def test_lanes_are_those_of_vmap(sizes, axis, number, spec):
     """Bit for bit; whether their number divides or not; and where they lie."""
     mesh = mesh_of(*sizes)
@@ -139,22 +156,35 @@ def test_a_lane_is_differentiated():
 
     x = np.arange(8.0).reshape(4, 2)
     np.testing.assert_allclose(
-        jax.grad(loss)(0.3, x), np.mean(np.sum(x * np.cos(0.3 * x), 1)), rtol=1e-12)
+        jax.grad(loss)(0.3, x), np.mean(np.sum(x * np.cos(0.3 * x), 1)), rtol=1e-12
+    )
 
 
-@pytest.mark.parametrize(("make", "message"), [
-    (lambda: jl.vmap_over_mesh(wander, "cpu"), "mesh is .*str; give a jax.sharding.Mesh"),
-    (lambda: jl.vmap_over_mesh(wander, mesh_of(2), "seeds"), "axis='seeds'; the mesh has the axes"),
-    (lambda: jl.vmap_over_mesh(wander, mesh_of(2), ("lanes", "lanes")), "each once"),
-    (lambda: jl.vmap_over_mesh(wander, mesh_of(2), in_axes=(0, 0))(*some(4)),
-     r"in_axes=\(0, 0\) has 2 entries for 3 arguments"),
-    (lambda: jl.vmap_over_mesh(wander, mesh_of(2), in_axes=(0, 1, None))(*some(4)),
-     "in_axes has an entry 1; lanes lie along the first"),
-    (lambda: jl.vmap_over_mesh(wander, mesh_of(2), in_axes=AXES)(some(4)[0], *some(5)[1:]),
-     r"first axes \[\[4\], \[5\]\]; give one"),
-    (lambda: jl.vmap_over_mesh(wander, mesh_of(2))(*some(4)), r"first axes \[\[\], \[4\]\]"),
-    (lambda: jl.vmap_over_mesh(jnp.sin, mesh_of(2))(np.zeros((0, 2))), "at least 1"),
-])
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: jl.vmap_over_mesh(wander, "cpu"), "mesh is .*str; give a jax.sharding.Mesh"),
+        (
+            lambda: jl.vmap_over_mesh(wander, mesh_of(2), "seeds"),
+            "axis='seeds'; the mesh has the axes",
+        ),
+        (lambda: jl.vmap_over_mesh(wander, mesh_of(2), ("lanes", "lanes")), "each once"),
+        (
+            lambda: jl.vmap_over_mesh(wander, mesh_of(2), in_axes=(0, 0))(*some(4)),
+            r"in_axes=\(0, 0\) has 2 entries for 3 arguments",
+        ),
+        (
+            lambda: jl.vmap_over_mesh(wander, mesh_of(2), in_axes=(0, 1, None))(*some(4)),
+            "in_axes has an entry 1; lanes lie along the first",
+        ),
+        (
+            lambda: jl.vmap_over_mesh(wander, mesh_of(2), in_axes=AXES)(some(4)[0], *some(5)[1:]),
+            r"first axes \[\[4\], \[5\]\]; give one",
+        ),
+        (lambda: jl.vmap_over_mesh(wander, mesh_of(2))(*some(4)), r"first axes \[\[\], \[4\]\]"),
+        (lambda: jl.vmap_over_mesh(jnp.sin, mesh_of(2))(np.zeros((0, 2))), "at least 1"),
+    ],
+)
 def test_bad_input_is_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()
@@ -173,7 +203,8 @@ def test_running_sums_are_those_of_all_devices(number):
 
     def sums(sharding):
         one = lanes.apart(
-            partial(lanes.running_sum, sharding=sharding), sharding, (0, 0), (0, None))
+            partial(lanes.running_sum, sharding=sharding), sharding, (0, 0), (0, None)
+        )
         return jax.jit(jax.vmap(one, (0, None)))(counted, lanes.ranks(sharding))
 
     sharded, last = sums(over(number))
@@ -190,7 +221,8 @@ def test_what_is_split_within_lanes_that_are():
     def one(key, sharding=None):
         x = lanes.split(jax.random.normal(key, (4, 3)), sharding)
         sums = lanes.apart(
-            partial(lanes.running_sum, sharding=sharding), sharding, (0, 0), (0, None))
+            partial(lanes.running_sum, sharding=sharding), sharding, (0, 0), (0, None)
+        )
         number, last = sums(x[:, 0] > 0, lanes.ranks(sharding))
         return lanes.whole(x.sum(1), sharding), number, last
 
@@ -200,12 +232,17 @@ def test_what_is_split_within_lanes_that_are():
     assert found[0].sharding.spec == P("lanes")
 
 
-@pytest.mark.parametrize(("sharding", "message"), [
-    ("cpu", "sharding is .*str; give a jax.sharding.NamedSharding"),
-    (lambda: NamedSharding(mesh_of(2), P()), "splits nothing; name a mesh axis"),
-    (lambda: over(4), "sharding splits over 4 devices, but num_envs is 6; choose a multiple, such "
-                      "as 8"),
-])
+@pytest.mark.parametrize(
+    ("sharding", "message"),
+    [
+        ("cpu", "sharding is .*str; give a jax.sharding.NamedSharding"),
+        (lambda: NamedSharding(mesh_of(2), P()), "splits nothing; name a mesh axis"),
+        (
+            lambda: over(4),
+            "sharding splits over 4 devices, but num_envs is 6; choose a multiple, such as 8",
+        ),
+    ],
+)
 def test_what_does_not_split_is_named(sharding, message):
     with pytest.raises(ValueError, match=message):
         lanes.require_split("sharding", sharding() if callable(sharding) else sharding, num_envs=6)

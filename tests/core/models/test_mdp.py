@@ -71,8 +71,10 @@ def test_successors_without_probability_are_padding():
         ({"label": {"a": [-1]}}, r"label\['a'\] has the state -1"),
         ({"label": {"a": [True, False]}}, r"label\['a'\] has dtype bool .* numbers of the states"),
         ({"label": {"a": 1}}, r"label\['a'\] has dtype int64 and shape \(\); it must be a list"),
-        ({"label": {"a": [1]}, "propositions": ("a", "b")},
-         r"label names \('a',\), propositions are \('a', 'b'\); give the states of each"),
+        (
+            {"label": {"a": [1]}, "propositions": ("a", "b")},
+            r"label names \('a',\), propositions are \('a', 'b'\); give the states of each",
+        ),
     ],
 )
 def test_bad_arguments(arguments, message):
@@ -127,9 +129,7 @@ def test_rows_that_nearly_sum_to_one_are_scaled():
 
 
 def test_rows_of_unavailable_actions_are_cleared_and_need_not_sum_to_one():
-    mdp = make_mdp(
-        SUCCESSOR, changed((0, 0, 1), 0.1), available=[[False, True], [True, True]]
-    )
+    mdp = make_mdp(SUCCESSOR, changed((0, 0, 1), 0.1), available=[[False, True], [True, True]])
     assert not mdp.probability[0, 0].any()
     assert not mdp.successor[0, 0].any()
     assert mdp.available.tolist() == [[False, True], [True, True]]
@@ -162,8 +162,11 @@ def test_dense_and_sparse_are_the_same_process():
         assert isinstance(dense, DenseMDP)
         np.testing.assert_array_equal(dense.transition, model.transition)
         again = from_dense(
-            dense.transition, available=dense.available, initial=dense.initial,
-            label=dense.label, propositions=dense.propositions,
+            dense.transition,
+            available=dense.available,
+            initial=dense.initial,
+            label=dense.label,
+            propositions=dense.propositions,
         )
         np.testing.assert_array_equal(to_dense(again).transition, model.transition)
         for field in ("available", "initial", "label"):

@@ -40,8 +40,10 @@ def expected(automaton):
     """The verdict in each state, by the naive reference."""
     accepting, rejecting = may([automaton], (EVEN,)), may([automaton], (ODD,))
     return [
-        Verdict.SATISFIED if (q,) not in rejecting
-        else Verdict.VIOLATED if (q,) not in accepting
+        Verdict.SATISFIED
+        if (q,) not in rejecting
+        else Verdict.VIOLATED
+        if (q,) not in accepting
         else Verdict.UNDECIDED
         for q in range(len(automaton.delta))
     ]

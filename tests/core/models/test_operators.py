@@ -25,10 +25,18 @@ def whole(function):
 
 
 expectation, pushforward, exists_successor, forall_successor = map(
-    whole, (jl.expectation, jl.pushforward, jl.exists_successor, jl.forall_successor))
-least_successor, transition_matrix, induced_chain, action_argmax, action_max = map(whole, (
-    operators.least_successor, operators.transition_matrix, operators.induced_chain,
-    operators.action_argmax, operators.action_max))
+    whole, (jl.expectation, jl.pushforward, jl.exists_successor, jl.forall_successor)
+)
+least_successor, transition_matrix, induced_chain, action_argmax, action_max = map(
+    whole,
+    (
+        operators.least_successor,
+        operators.transition_matrix,
+        operators.induced_chain,
+        operators.action_argmax,
+        operators.action_max,
+    ),
+)
 following = whole(lambda model, policy, value: operators.following(model, policy)(value))
 
 
@@ -76,7 +84,8 @@ def test_products_with_few_and_many_memory_states(label_on, num_memory):
     )
     np.testing.assert_allclose(
         pushforward(model, mass.reshape(found.shape)).ravel(),
-        reference.pushforward(explicit, mass), atol=1e-14,
+        reference.pushforward(explicit, mass),
+        atol=1e-14,
     )
 
 
@@ -120,9 +129,7 @@ def test_induced_chain_follows_the_policy(kind):
     chain = induced_chain(model, policy.reshape(model.state_shape))
     value = rng.normal(size=explicit.num_states)
     expected = reference.expectation(explicit, value)[np.arange(policy.size), policy]
-    np.testing.assert_allclose(
-        expectation(chain, value)[:, 0], expected, atol=1e-14
-    )
+    np.testing.assert_allclose(expectation(chain, value)[:, 0], expected, atol=1e-14)
     np.testing.assert_array_equal(chain.initial, explicit.initial)
 
 
@@ -132,8 +139,9 @@ def test_samples_have_the_rows_frequencies(kind):
     transition = explicit.transition
     s, a = np.argwhere((transition > 0).sum(-1) > 1)[0]
     keys = jax.random.split(jax.random.key(0), 20_000)
-    draw = jax.jit(jax.vmap(
-        lambda key: jl.sample_successor(model, key, jnp.int32(s), jnp.int32(a))))
+    draw = jax.jit(
+        jax.vmap(lambda key: jl.sample_successor(model, key, jnp.int32(s), jnp.int32(a)))
+    )
     frequency = np.bincount(draw(keys), minlength=explicit.num_states) / len(keys)
     # Five standard deviations of a frequency.
     assert np.abs(frequency - transition[s, a]).max() < 5 * np.sqrt(0.25 / len(keys))
@@ -176,9 +184,7 @@ def test_actions_maximum_for_few_and_many_actions():
         best, action = action_argmax(quantity, available)
         np.testing.assert_array_equal(best, masked.max(axis=1))
         np.testing.assert_array_equal(action, masked.argmax(axis=1))
-        np.testing.assert_array_equal(
-            action_max(quantity, available), best
-        )
+        np.testing.assert_array_equal(action_max(quantity, available), best)
 
 
 def test_deterministic_and_stochastic_policies_mean_the_same():
@@ -219,22 +225,26 @@ def test_primitives_of_rows_equal_those_of_the_padded_model(count):
         place = model.host.state, np.arange(model.num_rows) - model.row_start[model.host.state]
         value, region = rng.normal(size=9), rng.random(9) < 0.5
         np.testing.assert_allclose(
-            expectation(model, value), expectation(padded, value)[place], rtol=0, atol=1e-14)
+            expectation(model, value), expectation(padded, value)[place], rtol=0, atol=1e-14
+        )
         mass = rng.random(model.num_rows)
         wide = np.zeros((9, padded.num_actions))
         wide[place] = mass
         np.testing.assert_allclose(
-            pushforward(model, mass), pushforward(padded, wide), rtol=0, atol=1e-14)
+            pushforward(model, mass), pushforward(padded, wide), rtol=0, atol=1e-14
+        )
         np.testing.assert_allclose(
-            transition_matrix(model, mass), transition_matrix(padded, wide),
-            rtol=0, atol=1e-14)
-        for primitive, x in ((exists_successor, region), (forall_successor, region),
-                             (least_successor, value)):
+            transition_matrix(model, mass), transition_matrix(padded, wide), rtol=0, atol=1e-14
+        )
+        for primitive, x in (
+            (exists_successor, region),
+            (forall_successor, region),
+            (least_successor, value),
+        ):
             np.testing.assert_array_equal(primitive(model, x), primitive(padded, x)[place])
         assert not exists_successor(model.replace(probability=0 * model.probability), region).any()
         rows = np.asarray(model.row_start[1:] - 1)
-        np.testing.assert_allclose(
-            following(model, rows, value), expectation(model, value)[rows])
+        np.testing.assert_allclose(following(model, rows, value), expectation(model, value)[rows])
 
 
 def test_expectation_of_rows_is_differentiable():
@@ -242,8 +252,10 @@ def test_expectation_of_rows_is_differentiable():
     model = random_sparse(rng, 5, most=3, width=4)
     point = {"probability": model.probability, "value": rng.normal(size=5)}
     assert_gradients(
-        lambda x: jl.expectation(model.replace(probability=x["probability"]), x["value"]), point,
-        {name: rng.normal(size=x.shape) for name, x in point.items()})
+        lambda x: jl.expectation(model.replace(probability=x["probability"]), x["value"]),
+        point,
+        {name: rng.normal(size=x.shape) for name, x in point.items()},
+    )
 
 
 def test_draws_from_a_row_follow_its_probabilities():
@@ -274,8 +286,14 @@ def test_policies_of_rows():
     valid = jax.jit(lambda policy, where: operators.valid_policy(model, policy, where).valid)
     everywhere, wrong = np.ones(4, bool), rows.copy()
     wrong[0] = rows[1]
-    for policy, good in ((rows, True), (weight, True), (wrong, False), (2 * weight, False),
-                         (weight - 1, False), (np.where(weight > 0, np.nan, 0), False)):
+    for policy, good in (
+        (rows, True),
+        (weight, True),
+        (wrong, False),
+        (2 * weight, False),
+        (weight - 1, False),
+        (np.where(weight > 0, np.nan, 0), False),
+    ):
         assert bool(valid(policy, everywhere)) == good
         if good:
             operators.require_policy(model, policy)

@@ -13,8 +13,14 @@ from jaxltl.core.models.sparse import Rewards, make_sparse
 def triangle():
     """Three ways on from state 0, to states that stay."""
     return make_sparse(
-        None, [0, 3, 4, 5, 6], [1, 2, 3, 1, 2, 3], [0.2, 0.3, 0.5, 1, 1, 1], initial=[1, 0, 0, 0],
-        label={"goal": [1]}, rewards={"toll": Rewards(state=np.array([1.0, 0, 0, 0]))})
+        None,
+        [0, 3, 4, 5, 6],
+        [1, 2, 3, 1, 2, 3],
+        [0.2, 0.3, 0.5, 1, 1, 1],
+        initial=[1, 0, 0, 0],
+        label={"goal": [1]},
+        rewards={"toll": Rewards(state=np.array([1.0, 0, 0, 0]))},
+    )
 
 
 def shares(x):
@@ -24,7 +30,8 @@ def shares(x):
 def test_a_model_at_a_point():
     names = {"p": 0.1, "q": 0.2}
     found = make_parametric(
-        triangle(), lambda x: (shares(x), {"steps": 2 * jnp.array([x[0], 0, 0, 0])}), names, 0.4)
+        triangle(), lambda x: (shares(x), {"steps": 2 * jnp.array([x[0], 0, 0, 0])}), names, 0.4
+    )
     assert found.parameters == ("p", "q")
     for values in ({"q": 0.25, "p": 0.125}, np.array([0.125, 0.25])):
         model = found.at(values)
@@ -39,7 +46,8 @@ def test_a_model_at_a_point():
 def test_rewards_of_states_are_those_of_their_choices():
     model = make_sparse([0, 2, 3], [0, 1, 2, 3], [0, 1, 1], [1, 1, 1])
     found = make_parametric(
-        model, lambda x: (jnp.ones(3), {"cost": jnp.array([x[0], 0])}), [0.0], [1.0])
+        model, lambda x: (jnp.ones(3), {"cost": jnp.array([x[0], 0])}), [0.0], [1.0]
+    )
     assert found.at([0.5]).rewards["cost"].choice.tolist() == [0.5, 0.5, 0]
 
 
@@ -63,33 +71,45 @@ def test_a_box_may_reach_beyond_where_there_is_a_model():
         found.at([0.75, 0.75])
 
 
-@pytest.mark.parametrize(("changed", "message"), [
-    ({"low": [0.5, 0.1]}, r"interval of p0 is \[0.5, 0.4\]; low must be below high"),
-    ({"low": [0.4, 0.1]}, "low must be below high"),
-    ({"low": [np.nan, 0.1]}, "low of p0 is nan; give a finite number"),
-    ({"high": [0.4, np.inf]}, "high of p1 is inf"),
-    ({"high": [0.4, 0.4, 0.4]}, r"low has shape \(2,\); expected \(3,\), a number for each of"),
-    ({"high": {"p0": 0.4}}, "high: p1 is missing; the parameters are p0, p1"),
-    ({"high": {"p0": 0.4, "p1": 0.4, "r": 1, "s": 2}}, "high: r, s are unknown"),
-    ({"parameters": ["p", "p"]}, "name each once"),
-    ({"low": 0.6, "high": 0.9, "parameters": ["p", "q"]}, "no model at any of 64 points of the"),
-    ({"numbers": lambda x: x}, r"probabilities of numbers have shape \(2,\); expected \(6,\)"),
-    ({"numbers": lambda x: (shares(x), {"r": jnp.ones((4, 2))})}, "reward 'r' of numbers have sh"),
-    ({"numbers": lambda x: shares(x) * jnp.log(x[0] - 1)}, "is nan; it must be positive"),
-    ({"numbers": lambda x: shares(x) * 0.9}, "sum to 0.9"),
-])
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"low": [0.5, 0.1]}, r"interval of p0 is \[0.5, 0.4\]; low must be below high"),
+        ({"low": [0.4, 0.1]}, "low must be below high"),
+        ({"low": [np.nan, 0.1]}, "low of p0 is nan; give a finite number"),
+        ({"high": [0.4, np.inf]}, "high of p1 is inf"),
+        ({"high": [0.4, 0.4, 0.4]}, r"low has shape \(2,\); expected \(3,\), a number for each of"),
+        ({"high": {"p0": 0.4}}, "high: p1 is missing; the parameters are p0, p1"),
+        ({"high": {"p0": 0.4, "p1": 0.4, "r": 1, "s": 2}}, "high: r, s are unknown"),
+        ({"parameters": ["p", "p"]}, "name each once"),
+        (
+            {"low": 0.6, "high": 0.9, "parameters": ["p", "q"]},
+            "no model at any of 64 points of the",
+        ),
+        ({"numbers": lambda x: x}, r"probabilities of numbers have shape \(2,\); expected \(6,\)"),
+        (
+            {"numbers": lambda x: (shares(x), {"r": jnp.ones((4, 2))})},
+            "reward 'r' of numbers have sh",
+        ),
+        ({"numbers": lambda x: shares(x) * jnp.log(x[0] - 1)}, "is nan; it must be positive"),
+        ({"numbers": lambda x: shares(x) * 0.9}, "sum to 0.9"),
+    ],
+)
 def test_what_is_no_parametric_model_is_refused(changed, message):
     given = {"numbers": shares, "low": [0.1, 0.1], "high": [0.4, 0.4], **changed}
     with pytest.raises(ValueError, match=message):
         make_parametric(triangle(), given.pop("numbers"), **given)
 
 
-@pytest.mark.parametrize(("values", "message"), [
-    ({"p0": 0.2}, "values: p1 is missing"),
-    (0.2, r"values has shape \(\)"),
-    ([0.2, np.nan], "values of p1 is nan"),
-    ([0.2, 0.05], r"p1 = 0.05 is outside of its interval \[0.1, 0.4\]"),
-])
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"p0": 0.2}, "values: p1 is missing"),
+        (0.2, r"values has shape \(\)"),
+        ([0.2, np.nan], "values of p1 is nan"),
+        ([0.2, 0.05], r"p1 = 0.05 is outside of its interval \[0.1, 0.4\]"),
+    ],
+)
 def test_points_that_are_none(values, message):
     found = make_parametric(triangle(), shares, [0.1, 0.1], [0.4, 0.4])
     with pytest.raises(ValueError, match=message):

@@ -39,8 +39,11 @@ def test_the_lazy_product_is_the_explicit_one(label_on, acceptance):
 
 def test_the_two_readings_by_hand():
     world = jl.make_mdp(
-        [[[1]], [[2]], [[2]]], np.ones((3, 1, 1)), initial=[1, 0, 0],
-        label=[[False], [True], [False]], propositions=("g",),
+        [[[1]], [[2]], [[2]]],
+        np.ones((3, 1, 1)),
+        initial=[1, 0, 0],
+        label=[[False], [True], [False]],
+        propositions=("g",),
     )
     wait = make_automaton(
         [[0, 1], [1, 1]], 0, [[False], [True]], ["g"], final=[False, True], acceptance="cosafe"
@@ -120,8 +123,12 @@ def test_lifted_trajectories_are_runs_of_the_automaton(label_on):
 
 def reference_world(lazy):
     world = lazy.mdp
-    return reference.Model(*(np.asarray(x) for x in (
-        world.successor, world.probability, world.available, world.initial)))
+    return reference.Model(
+        *(
+            np.asarray(x)
+            for x in (world.successor, world.probability, world.available, world.initial)
+        )
+    )
 
 
 @pytest.mark.parametrize("label_on", READINGS)
@@ -136,8 +143,10 @@ def test_a_projected_policy_visits_what_the_product_does(label_on):
         runner = jl.project_policy(lazy, jnp.asarray(policy))
         world = reference_world(lazy)
         follow = [
-            [np.asarray(runner.update(jnp.arange(lazy.num_memory), s, t))
-             for t in range(world.num_states)]
+            [
+                np.asarray(runner.update(jnp.arange(lazy.num_memory), s, t))
+                for t in range(world.num_states)
+            ]
             for s in range(world.num_states)
         ]
         now = np.zeros(lazy.state_shape)
@@ -198,8 +207,10 @@ def test_projected_policies_must_fit():
 
 def labelled_world():
     return jl.make_mdp(
-        [[[1]], [[2]], [[0]]], np.ones((3, 1, 1)),
-        label=[[True, False], [False, True], [False, False]], propositions=("goal", "danger"),
+        [[[1]], [[2]], [[0]]],
+        np.ones((3, 1, 1)),
+        label=[[True, False], [False, True], [False, False]],
+        propositions=("goal", "danger"),
     )
 
 

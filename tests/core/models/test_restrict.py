@@ -19,7 +19,8 @@ def narrowed(seed, kind, **options):
     alone = np.argmax(explicit.available & (rng.random(allowed.shape) < 2), axis=1)
     allowed[np.arange(len(allowed)), alone] |= ~allowed.any(1)
     flat = jl.make_mdp(
-        explicit.successor, explicit.probability, available=allowed, initial=explicit.initial)
+        explicit.successor, explicit.probability, available=allowed, initial=explicit.initial
+    )
     mask = allowed.reshape(*model.state_shape, -1)
     return rng, jl.with_allowed(model, mask), flat
 
@@ -31,18 +32,22 @@ def questions(model, region, value, reward, policy, *, compiled=True):
     """
     attractor = jl.core.graphs.attractor
     components = jl.end_components(model, jnp.ones(model.state_shape, bool))
-    solved = {
-        "expectation": jl.expectation(model, value),
-        "exists": jl.exists_successor(model, region),
-        "forall": jl.forall_successor(model, region),
-        "least": least_successor(model, jnp.arange(region.size).reshape(region.shape)),
-        "pushforward": jl.pushforward(model, jnp.where(model.available, reward, 0)),
-        "optimal": jl.optimal_value(model, reward, 0.9).value,
-        "soft": jl.soft_value(model, reward, 0.9).policy,
-        "boltzmann": jl.boltzmann_value(model, reward, 0.5).policy,
-        "policy": jl.policy_value(model, policy, reward, 0.9).value,
-        "occupancy": jl.occupancy_measure(model, policy, 0.9).value,
-    } if compiled else {}
+    solved = (
+        {
+            "expectation": jl.expectation(model, value),
+            "exists": jl.exists_successor(model, region),
+            "forall": jl.forall_successor(model, region),
+            "least": least_successor(model, jnp.arange(region.size).reshape(region.shape)),
+            "pushforward": jl.pushforward(model, jnp.where(model.available, reward, 0)),
+            "optimal": jl.optimal_value(model, reward, 0.9).value,
+            "soft": jl.soft_value(model, reward, 0.9).policy,
+            "boltzmann": jl.boltzmann_value(model, reward, 0.5).policy,
+            "policy": jl.policy_value(model, policy, reward, 0.9).value,
+            "occupancy": jl.occupancy_measure(model, policy, 0.9).value,
+        }
+        if compiled
+        else {}
+    )
     return {
         "available": model.available,
         "surely": attractor.almost_surely_reaching(model, region).region,
@@ -55,16 +60,21 @@ def questions(model, region, value, reward, policy, *, compiled=True):
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("kind", [
-    *sorted(REPRESENTATIONS), pytest.param("product on exit", marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize(
+    "kind",
+    [*sorted(REPRESENTATIONS), pytest.param("product on exit", marks=pytest.mark.exhaustive)],
+)
 def test_a_narrowed_model_has_no_other_actions(kind):
     options = {"label_on": "exit"} if "exit" in kind else {}
     if "product" not in kind:
         options["num_states"] = 12  # as many as products have, so that all are one program's
     rng, model, flat = narrowed(3, kind.split()[0], **options)
     shape = model.state_shape
-    arrays = [rng.random(flat.num_states) < 0.3, rng.random(flat.num_states),
-              rng.random((flat.num_states, flat.num_actions))]
+    arrays = [
+        rng.random(flat.num_states) < 0.3,
+        rng.random(flat.num_states),
+        rng.random((flat.num_states, flat.num_actions)),
+    ]
     policy = np.where(flat.available, rng.random(flat.available.shape) + 0.1, 0)
     arrays.append(policy / policy.sum(1, keepdims=True))
     lazily = [x.reshape(*shape, *x.shape[1:]) for x in arrays]
@@ -95,17 +105,21 @@ def test_games_are_narrowed_too():
     system = jnp.arange(flat.num_states) % 2 == 0
     reward = jnp.ones(flat.available.shape).at[:, 0].set(0.5)
     game = jl.with_allowed(
-        jl.Game(model.replace(available=jnp.ones_like(model.available)), system), model.available)
+        jl.Game(model.replace(available=jnp.ones_like(model.available)), system), model.available
+    )
     expected = jl.minimax_value(jl.Game(flat, system), reward, 0.9).value
     np.testing.assert_allclose(jl.minimax_value(game, reward, 0.9).value, expected, atol=1e-9)
 
 
-@pytest.mark.parametrize(("mask", "message"), [
-    (np.ones((2, 2), int), r"allowed is int64\[2, 2\]; expected bool\[2, 2\]"),
-    (np.ones((2, 3), bool), r"allowed is bool\[2, 3\]; expected bool\[2, 2\]"),
-    (np.array([[True, True], [True, True]]), "action 1 is not available in state 1"),
-    (np.array([[False, False], [True, False]]), "no action is left in state 0; allow one"),
-])
+@pytest.mark.parametrize(
+    ("mask", "message"),
+    [
+        (np.ones((2, 2), int), r"allowed is int64\[2, 2\]; expected bool\[2, 2\]"),
+        (np.ones((2, 3), bool), r"allowed is bool\[2, 3\]; expected bool\[2, 2\]"),
+        (np.array([[True, True], [True, True]]), "action 1 is not available in state 1"),
+        (np.array([[False, False], [True, False]]), "no action is left in state 0; allow one"),
+    ],
+)
 def test_masks_that_fit_no_model_are_refused(mask, message):
     model = jl.from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]])
     with pytest.raises(ValueError, match=message):

@@ -26,18 +26,25 @@ STEPS = 12
 
 def letters_at_random():
     """Every step shows one of the events at random."""
+
     def step(event, action, key):
         return Timestep(jax.random.randint(key, (), 0, 4), reward=7.0, terminated=False)
 
     return make_environment(
-        lambda key: jax.random.randint(key, (), 0, 4), step, lambda event: event[None] * 1.0,
-        actions=2, labels=lambda event: jnp.asarray(EVENTS)[event], propositions=NAMES)
+        lambda key: jax.random.randint(key, (), 0, 4),
+        step,
+        lambda event: event[None] * 1.0,
+        actions=2,
+        labels=lambda event: jnp.asarray(EVENTS)[event],
+        propositions=NAMES,
+    )
 
 
 @pytest.fixture(scope="module")
 def episodes():
     world = sequence_environment(
-        letters_at_random(), EVENTS, SAMPLER, violation=-0.5, progress=0.25)
+        letters_at_random(), EVENTS, SAMPLER, violation=-0.5, progress=0.25
+    )
 
     def one(key):
         return run_episode(key, world, agent_of(lambda seen, key: 0), num_steps=STEPS)
@@ -75,7 +82,7 @@ def test_what_is_observed_is_what_is_left(episodes):
     for n, t in np.argwhere(episodes.valid):
         index = world.stage[n, t]
         assert (seen.reach[n, t, : 3 - index] == world.sequence.reach[n, 0, index:]).all()
-        assert not seen.reach[n, t, 3 - index:].any()
+        assert not seen.reach[n, t, 3 - index :].any()
         assert seen.length[n, t] == world.sequence.length[n, 0] - index
     drawn = draw_sequence(jax.random.key(0), SAMPLER)
     assert not np.asarray(remaining(drawn, drawn.length).reach).any()
@@ -118,11 +125,17 @@ def test_events_are_told_by_their_labels():
     assert events_of(NAMES, 3).shape == (8, 3)
 
 
-@pytest.mark.parametrize(("given", "said"), [
-    ({"length": [0, 0]}, "length="), ({"reach": [-1]}, "reach="), ({"avoid": [np.nan]}, "avoid="),
-    ({"sets": [1, 0]}, "sets has type"), ({"avoid": [0, 0, 0, 1]}, "up to 5 sets"),
-    ({"sets": [[True], [False]]}, "row 1 has no event"),
-])
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"length": [0, 0]}, "length="),
+        ({"reach": [-1]}, "reach="),
+        ({"avoid": [np.nan]}, "avoid="),
+        ({"sets": [1, 0]}, "sets has type"),
+        ({"avoid": [0, 0, 0, 1]}, "up to 5 sets"),
+        ({"sets": [[True], [False]]}, "row 1 has no event"),
+    ],
+)
 def test_bad_samplers_are_named(given, said):
     weights = {"length": [1], "reach": [1, 1], "avoid": [1], "sets": [False, True, True, True]}
     with pytest.raises(ValueError, match=said):
@@ -140,8 +153,12 @@ def test_starts_of_the_inner_world_are_not_those_of_sequences_and_discounts_are_
     inner = make_environment(
         lambda key: jnp.int32(0),
         lambda place, action, key: Timestep(place, 0.0, False, discount=0.5),
-        lambda place: place[None], actions=2, labels=lambda place: place[None] > 0,
-        propositions=["a"], starts=lambda: (jnp.zeros(1, jnp.int32), jnp.ones(1)))
+        lambda place: place[None],
+        actions=2,
+        labels=lambda place: place[None] > 0,
+        propositions=["a"],
+        starts=lambda: (jnp.zeros(1, jnp.int32), jnp.ones(1)),
+    )
     events = events_of(["a"])
     sampler = sequence_sampler([1], [1], [1], [False, True])
     made = sequence_environment(inner, events, sampler)

@@ -21,7 +21,7 @@ from tests.support import as_mdp
 S, A, K = 6, 2, 3
 COUNT = 4000
 MODEL = reference.random_model(np.random.default_rng(1), S, A, K, certainty=0)
-LABEL = np.random.default_rng(3).random((S, 2)) < .4
+LABEL = np.random.default_rng(3).random((S, 2)) < 0.4
 
 
 def world():
@@ -30,6 +30,7 @@ def world():
 
 def transitions(environment):
     """``float[S, A, S]``, by what the environment tells."""
+
     def row(state, action):
         found, probability = environment.outcomes(state, action)
         return jnp.zeros(S).at[found.world].add(probability)
@@ -40,8 +41,11 @@ def transitions(environment):
 
 @pytest.mark.parametrize("kind", ["padded", "dense", "sparse"])
 def test_what_is_told_is_the_model(kind):
-    model = {"padded": world, "dense": lambda: to_dense(world()),
-             "sparse": lambda: to_sparse(world())}[kind]()
+    model = {
+        "padded": world,
+        "dense": lambda: to_dense(world()),
+        "sparse": lambda: to_sparse(world()),
+    }[kind]()
     environment = environment_of(model)
     np.testing.assert_allclose(transitions(environment), MODEL.transition)
     states, chance = environment.starts()
@@ -56,8 +60,12 @@ def drawn_and_told(environment, told):
     """How far the shares of what is drawn are from ``float[S, A, S]``, at most."""
     keys = jax.random.split(jax.random.key(0), COUNT)
     states, actions = np.argwhere(MODEL.available).T
-    draw = jax.jit(jax.vmap(jax.vmap(
-        lambda s, a, key: environment.step(s, a, key).world, (None, None, 0)), (0, 0, None)))
+    draw = jax.jit(
+        jax.vmap(
+            jax.vmap(lambda s, a, key: environment.step(s, a, key).world, (None, None, 0)),
+            (0, 0, None),
+        )
+    )
     drawn = np.asarray(draw(states, actions, keys))
     share = (drawn[..., None] == np.arange(S)).mean(1)
     return np.abs(share - told[states, actions]).max()
@@ -65,9 +73,9 @@ def drawn_and_told(environment, told):
 
 def test_what_is_drawn_is_as_likely_as_told():
     environment = environment_of(world())
-    assert drawn_and_told(environment, MODEL.transition) < 4 * .5 / np.sqrt(COUNT)
+    assert drawn_and_told(environment, MODEL.transition) < 4 * 0.5 / np.sqrt(COUNT)
     first = np.asarray(jax.vmap(environment.reset)(jax.random.split(jax.random.key(0), COUNT)))
-    assert np.abs(np.bincount(first, minlength=S) / COUNT - MODEL.initial).max() < .04
+    assert np.abs(np.bincount(first, minlength=S) / COUNT - MODEL.initial).max() < 0.04
 
 
 def test_rewards_are_of_states_or_actions():
@@ -109,13 +117,14 @@ def test_success_by_simulation_is_the_probability_by_the_solver():
     expected = float((np.asarray(joint.initial) * value).sum())
     task = task_environment(environment_of(world()), formula)
     agent = agent_of(lambda seen, key: 0)
-    agent = agent.replace(act=lambda memory, seen, allowed, key: (
-        random_action(key, task.actions, allowed), memory))
+    agent = agent.replace(
+        act=lambda memory, seen, allowed, key: (random_action(key, task.actions, allowed), memory)
+    )
     run = jax.jit(jax.vmap(lambda key: run_episode(key, task, agent, num_steps=60).reward.sum()))
     rewards = np.asarray(run(jax.random.split(jax.random.key(7), count)))
-    assert .05 < expected < .95
+    assert 0.05 < expected < 0.95
     # What the first label decides is satisfied with the first step, hence no difference in reward.
-    assert abs(rewards.mean() - expected) < 4 * .5 / np.sqrt(count)
+    assert abs(rewards.mean() - expected) < 4 * 0.5 / np.sqrt(count)
 
 
 # --- games ----------------------------------------------------------------------------------------
@@ -133,18 +142,22 @@ def test_a_game_is_played_against_its_opponent():
         replies = (share[:, :, None] * MODEL.transition).sum(1)
         for s, a in np.ndindex(S, A):
             np.testing.assert_allclose(
-                told[s, a], MODEL.transition[s, a] if system[s] else replies[s], atol=1e-12)
-    assert drawn_and_told(environment, told) < 4 * .5 / np.sqrt(COUNT)
+                told[s, a], MODEL.transition[s, a] if system[s] else replies[s], atol=1e-12
+            )
+    assert drawn_and_told(environment, told) < 4 * 0.5 / np.sqrt(COUNT)
 
 
-@pytest.mark.parametrize(("model", "options", "text"), [
-    (lambda: product(world(), "F a"), {}, "Product is no world"),
-    (lambda: make_game(product(world(), "F a"), [[True] * 2] * S), {}, "Product is no world"),
-    (world, {"opponent": np.ones((S, A))}, "opponent is for games"),
-    (lambda: make_game(world(), [True] * S), {"opponent": np.ones(S)}, r"weights \[6, 2\]"),
-    (lambda: make_game(world(), [True] * S), {"opponent": -np.ones((S, A))}, "give weights"),
-    (lambda: make_game(world(), [False] * S), {"opponent": np.zeros((S, A))}, "state 0"),
-])
+@pytest.mark.parametrize(
+    ("model", "options", "text"),
+    [
+        (lambda: product(world(), "F a"), {}, "Product is no world"),
+        (lambda: make_game(product(world(), "F a"), [[True] * 2] * S), {}, "Product is no world"),
+        (world, {"opponent": np.ones((S, A))}, "opponent is for games"),
+        (lambda: make_game(world(), [True] * S), {"opponent": np.ones(S)}, r"weights \[6, 2\]"),
+        (lambda: make_game(world(), [True] * S), {"opponent": -np.ones((S, A))}, "give weights"),
+        (lambda: make_game(world(), [False] * S), {"opponent": np.zeros((S, A))}, "state 0"),
+    ],
+)
 def test_bad_models_are_named(model, options, text):
     with pytest.raises(ValueError, match=text):
         environment_of(model(), **options)

@@ -19,8 +19,9 @@ def random_padded(rng, num_states, num_actions=3, width=3) -> MDP:
     available = rng.random((num_states, num_actions)) < 0.6
     available[:, 0] |= ~available.any(-1)
     label = rng.random((num_states, 2)) < 0.3
-    return make_mdp(successor, probability, available=available, label=label,
-                    propositions=["a", "b"])
+    return make_mdp(
+        successor, probability, available=available, label=label, propositions=["a", "b"]
+    )
 
 
 def matrix(model) -> np.ndarray:
@@ -71,8 +72,12 @@ def test_products_are_written_out(label_on):
 
 def test_repeated_successors_become_one():
     model = make_sparse(
-        None, [0, 3, 4], [1, 0, 1, 1], [0.25, 0.5, 0.25, 1.0],
-        rewards={"r": Rewards(state=[1, 0], choice=[2, 0], transition=[4, 0, 8, 0])})
+        None,
+        [0, 3, 4],
+        [1, 0, 1, 1],
+        [0.25, 0.5, 0.25, 1.0],
+        rewards={"r": Rewards(state=[1, 0], choice=[2, 0], transition=[4, 0, 8, 0])},
+    )
     assert model.successor.tolist() == [0, 1, 1]
     assert model.probability.tolist() == [0.5, 0.5, 1.0]
     assert model.rewards["r"].transition.tolist() == [0, 6, 0]
@@ -93,18 +98,21 @@ def test_a_model_passes_through_jit():
     assert found.tolist() == [4.0]
 
 
-@pytest.mark.parametrize(("arrays", "message"), [
-    (([0, 1], [0, 1], [3], [1.0]), "state 0, choice 0: successor 3 is out of range"),
-    (([0, 1], [0, 1], [0], [0.5]), "state 0, choice 0: the probabilities sum to 0.5"),
-    (([0, 1], [0, 1], [0], [np.nan]), "probability nan"),
-    (([0, 1], [0, 1], [0], [-1.0]), "probability -1"),
-    (([0, 0, 1], [0, 1], [0], [1.0]), "state 0 has no choice"),
-    (([0, 2], [0, 0, 1], [0], [1.0]), "state 0, choice 0 leads nowhere"),
-    (([0, 2, 1, 2], [0, 1, 2], [0, 0], [1.0, 1.0]), "row_start falls from 2 to 1"),
-    (([0, 2], [0, 1], [0], [1.0]), "row_start goes from 0 to 2"),
-    (([0, 1], [0, 1], [0.5], [1.0]), "it must hold integers"),
-    (([0, 1], [0, 2], [0, 0], [0.0, 0.0]), "sum to 0, not 1"),
-])
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        (([0, 1], [0, 1], [3], [1.0]), "state 0, choice 0: successor 3 is out of range"),
+        (([0, 1], [0, 1], [0], [0.5]), "state 0, choice 0: the probabilities sum to 0.5"),
+        (([0, 1], [0, 1], [0], [np.nan]), "probability nan"),
+        (([0, 1], [0, 1], [0], [-1.0]), "probability -1"),
+        (([0, 0, 1], [0, 1], [0], [1.0]), "state 0 has no choice"),
+        (([0, 2], [0, 0, 1], [0], [1.0]), "state 0, choice 0 leads nowhere"),
+        (([0, 2, 1, 2], [0, 1, 2], [0, 0], [1.0, 1.0]), "row_start falls from 2 to 1"),
+        (([0, 2], [0, 1], [0], [1.0]), "row_start goes from 0 to 2"),
+        (([0, 1], [0, 1], [0.5], [1.0]), "it must hold integers"),
+        (([0, 1], [0, 2], [0, 0], [0.0, 0.0]), "sum to 0, not 1"),
+    ],
+)
 def test_what_is_wrong_is_named(arrays, message):
     with pytest.raises(ValueError, match=message):
         make_sparse(*arrays)

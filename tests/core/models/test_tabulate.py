@@ -39,38 +39,53 @@ def random_process(seed):
     initial = random.dirichlet(np.ones(S)) * (random.random(S) < 0.4)
     initial[0] += 0.1
     over = random.choice(3, size=S, p=[0.6, 0.2, 0.2])
-    return Random(random.integers(S, size=(S, A, K)), probability, random.normal(size=(S, A, K)),
-                  allowed, over, initial / initial.sum())
+    return Random(
+        random.integers(S, size=(S, A, K)),
+        probability,
+        random.normal(size=(S, A, K)),
+        allowed,
+        over,
+        initial / initial.sum(),
+    )
 
 
 def simulated(p, told=True, **changes):
     """The process as a world of a state and of minus zeros."""
+
     def world(state):
         return {"state": state, "rest": jnp.where(state % 2 == 0, 0.0, -0.0)}
 
     def finish(successor, reward):
         over = jnp.asarray(p.over)[successor]
-        return Timestep(world(successor), reward, over == 1, over == 2, cost=reward ** 2)
+        return Timestep(world(successor), reward, over == 1, over == 2, cost=reward**2)
 
     def step(x, action, key):
         k = jax.random.categorical(key, jnp.log(jnp.asarray(p.probability)[x["state"], action]))
-        return finish(jnp.asarray(p.successor)[x["state"], action, k],
-                      jnp.asarray(p.reward)[x["state"], action, k])
+        return finish(
+            jnp.asarray(p.successor)[x["state"], action, k],
+            jnp.asarray(p.reward)[x["state"], action, k],
+        )
 
     def outcomes(x, action):
         at = x["state"], action
         return jax.vmap(finish)(jnp.asarray(p.successor)[at], jnp.asarray(p.reward)[at]), (
-            jnp.asarray(p.probability)[at])
+            jnp.asarray(p.probability)[at]
+        )
 
     def starts():
         return jax.vmap(world)(jnp.arange(S)), jnp.asarray(p.initial)
 
     parts = {"starts": starts, "outcomes": outcomes} if told else {}
     return make_environment(
-        lambda key: world(jax.random.categorical(key, jnp.log(jnp.asarray(p.initial)))), step,
-        lambda x: x["state"] / S, actions=A, labels=lambda x: (x["state"] % 3 == jnp.arange(2)),
-        propositions=["zero", "one"], allowed=lambda x: jnp.asarray(p.allowed)[x["state"]],
-        **(parts | changes))
+        lambda key: world(jax.random.categorical(key, jnp.log(jnp.asarray(p.initial)))),
+        step,
+        lambda x: x["state"] / S,
+        actions=A,
+        labels=lambda x: x["state"] % 3 == jnp.arange(2),
+        propositions=["zero", "one"],
+        allowed=lambda x: jnp.asarray(p.allowed)[x["state"]],
+        **(parts | changes),
+    )
 
 
 def reference(p):
@@ -115,8 +130,10 @@ def test_a_told_world_is_its_process(seed):
             found[pairs[s], int(model.action[r])] = {
                 pairs[model.successor[e]]: (
                     model.probability[e],
-                    model.probability[e] * model.rewards["reward"].transition[e])
-                for e in entries}
+                    model.probability[e] * model.rewards["reward"].transition[e],
+                )
+                for e in entries
+            }
     assert found.keys() == rows.keys()
     for name, row in rows.items():
         assert found[name].keys() == row.keys()
@@ -191,10 +208,16 @@ def test_what_depends_on_a_key():
     assert reads_key(lambda x, key: jitted(x, key)[1], 0.0, key)
     assert not reads_key(lambda x, key: jitted(x, key)[0], 0.0, key)
     assert not reads_key(lambda x, key: (jax.random.split(key), x)[1], 0.0, key)
-    assert reads_key(lambda x, key: jax.lax.fori_loop(
-        0, 2, lambda i, y: y + jax.random.normal(key), x), 0.0, key)
-    reads = tabulate(counter(lambda x, a, key: Timestep(
-        jnp.clip(x + a + (jax.random.uniform(key) > 2), 0, 3), 0.0, x == 2)))
+    assert reads_key(
+        lambda x, key: jax.lax.fori_loop(0, 2, lambda i, y: y + jax.random.normal(key), x), 0.0, key
+    )
+    reads = tabulate(
+        counter(
+            lambda x, a, key: Timestep(
+                jnp.clip(x + a + (jax.random.uniform(key) > 2), 0, 3), 0.0, x == 2
+            )
+        )
+    )
     assert reads.evidence == "keys" and reads.model.num_states == 5
     assert reads.terminated.sum() == 2  # from 2 one comes to 2 or 3, and it is over
 
@@ -206,8 +229,13 @@ def test_what_tells_worlds_apart():
         return Timestep(((place + action) % 3, seen + 1, carried), 0.0, False)
 
     world = make_environment(
-        lambda key: (jnp.int32(0), jnp.int32(0), jax.random.key(5)), step, lambda x: x[0] / 2,
-        actions=2, labels=lambda x: jnp.array([x[0] == 1]), propositions=["one"])
+        lambda key: (jnp.int32(0), jnp.int32(0), jax.random.key(5)),
+        step,
+        lambda x: x[0] / 2,
+        actions=2,
+        labels=lambda x: jnp.array([x[0] == 1]),
+        propositions=["one"],
+    )
     table = tabulate(world, distinct=lambda x: x[0])
     assert table.world[0].tolist() == [0, 1, 2] and table.evidence == "keyless"
     assert jax.dtypes.issubdtype(table.world[2].dtype, jax.dtypes.prng_key)
@@ -232,9 +260,10 @@ def test_what_distinct_leaves_out_is_idle_or_the_callers_word():
         return jnp.int32(0), jax.random.key(5)
 
     def evidence(step, reset=start, distinct=lambda x: x[0], **options):
-        return tabulate(make_environment(
-            reset, step, lambda x: jnp.float32(x[0]), actions=2, **options),
-            distinct=distinct).evidence
+        return tabulate(
+            make_environment(reset, step, lambda x: jnp.float32(x[0]), actions=2, **options),
+            distinct=distinct,
+        ).evidence
 
     def idle(world, action, key):
         return Timestep(((world[0] + action) % 3, world[1]), 0.0, False)
@@ -242,16 +271,32 @@ def test_what_distinct_leaves_out_is_idle_or_the_callers_word():
     assert evidence(drawn) == "distinct"  # of 2^n draws one was listed, as if it were sure
     assert evidence(idle) == "keyless"
     assert evidence(idle, distinct=lambda x: x[0] * 2) == "distinct"  # may be, but is not shown
-    assert evidence(
-        lambda x, a, key: idle(x, a, key)._replace(reward=1.0 * x[1]),
-        lambda key: (jnp.int32(0), jnp.int32(1))) == "distinct"
-    assert evidence(
-        idle, lambda key: (jnp.int32(0), jnp.int32(1)),
-        labels=lambda x: x[1][None] == 1, propositions=["one"]) == "distinct"
+    assert (
+        evidence(
+            lambda x, a, key: idle(x, a, key)._replace(reward=1.0 * x[1]),
+            lambda key: (jnp.int32(0), jnp.int32(1)),
+        )
+        == "distinct"
+    )
+    assert (
+        evidence(
+            idle,
+            lambda key: (jnp.int32(0), jnp.int32(1)),
+            labels=lambda x: x[1][None] == 1,
+            propositions=["one"],
+        )
+        == "distinct"
+    )
     by_key = jax.random.bernoulli
-    assert evidence(lambda x, a, key: told(x, a)[0]._replace(
-        world=((x[0] + by_key(key)) % 3, x[1]), reward=0.0, terminated=False),
-        outcomes=told) == "told"
+    assert (
+        evidence(
+            lambda x, a, key: told(x, a)[0]._replace(
+                world=((x[0] + by_key(key)) % 3, x[1]), reward=0.0, terminated=False
+            ),
+            outcomes=told,
+        )
+        == "told"
+    )
 
 
 def test_another_layout_is_not_compiled_anew():
@@ -288,21 +333,41 @@ def without_one(p):
 
 
 @pytest.mark.few(4)
-@pytest.mark.parametrize(("world", "options", "said"), [
-    (lambda: simulated(P, told=False), {}, "reset is random, .* make_environment"),
-    (lambda: simulated(P, outcomes=None), {}, "step is random: action . in world"),
-    (lambda: simulated(P, starts=lambda: ({"state": jnp.array([3]), "rest": jnp.zeros(1)},
-                                          jnp.ones(1))), {}, "starts does not tell"),
-    (lambda: simulated(P, starts=lambda: ({"state": jnp.arange(S), "rest": jnp.zeros(S)},
-                                          jnp.ones(S))), {}, "sum to 12"),
-    (lambda: without_one(P), {"num_keys": 40}, "leads to a world that they do not tell"),
-    (lambda: simulated(P._replace(probability=P.probability * 2)), {}, "must be a distribution"),
-    (lambda: simulated(P), {"max_states": 3}, "more than max_states=3"),
-    (lambda: simulated(P._replace(allowed=np.zeros((S, A), bool))), {}, "no action is allowed"),
-    (lambda: simulated(P), {"worlds": {"state": jnp.arange(3), "rest": jnp.zeros(2)}},
-     "worlds: give worlds as reset"),
-    (lambda: replace(simulated(P), actions=make_box(0.0, 1.0)), {}, "the actions are a box"),
-])
+@pytest.mark.parametrize(
+    ("world", "options", "said"),
+    [
+        (lambda: simulated(P, told=False), {}, "reset is random, .* make_environment"),
+        (lambda: simulated(P, outcomes=None), {}, "step is random: action . in world"),
+        (
+            lambda: simulated(
+                P, starts=lambda: ({"state": jnp.array([3]), "rest": jnp.zeros(1)}, jnp.ones(1))
+            ),
+            {},
+            "starts does not tell",
+        ),
+        (
+            lambda: simulated(
+                P, starts=lambda: ({"state": jnp.arange(S), "rest": jnp.zeros(S)}, jnp.ones(S))
+            ),
+            {},
+            "sum to 12",
+        ),
+        (lambda: without_one(P), {"num_keys": 40}, "leads to a world that they do not tell"),
+        (
+            lambda: simulated(P._replace(probability=P.probability * 2)),
+            {},
+            "must be a distribution",
+        ),
+        (lambda: simulated(P), {"max_states": 3}, "more than max_states=3"),
+        (lambda: simulated(P._replace(allowed=np.zeros((S, A), bool))), {}, "no action is allowed"),
+        (
+            lambda: simulated(P),
+            {"worlds": {"state": jnp.arange(3), "rest": jnp.zeros(2)}},
+            "worlds: give worlds as reset",
+        ),
+        (lambda: replace(simulated(P), actions=make_box(0.0, 1.0)), {}, "the actions are a box"),
+    ],
+)
 def test_what_cannot_be_listed_is_named(world, options, said):
     with pytest.raises(ValueError, match=said):
         tabulate(world(), **options)
@@ -313,6 +378,8 @@ def test_a_reward_that_is_drawn_is_refused():
     world = make_environment(
         lambda key: jnp.int32(0),
         lambda place, action, key: Timestep((place + action) % 2, jax.random.normal(key), False),
-        lambda place: place[None], actions=2)
+        lambda place: place[None],
+        actions=2,
+    )
     with pytest.raises(ValueError, match="step is random: action 0 in world 0 leads to 4 outcomes"):
         tabulate(world)

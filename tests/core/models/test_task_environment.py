@@ -30,8 +30,15 @@ from tests import reference
 from tests.support import as_mdp, lane
 
 NAMES = ("a", "b", "c")
-FORMULAS = ("!b U (a & X c)", "G (a -> X !b)", "G F a & G !(b & c)", "F G a | c",
-            "G F a -> G F b", "true", "c")
+FORMULAS = (
+    "!b U (a & X c)",
+    "G (a -> X !b)",
+    "G F a & G !(b & c)",
+    "F G a | c",
+    "G F a -> G F b",
+    "true",
+    "c",
+)
 
 
 def ends(share, state, action, key):
@@ -40,8 +47,13 @@ def ends(share, state, action, key):
     after = jax.random.randint(where, (), 0, 8, jnp.int32)
     chance = jax.random.uniform(end)
     return Timestep(
-        after, reward=7.0, terminated=chance < share, truncated=chance > 1 - share, cost=after / 8,
-        discount=jnp.where(after == 3, .5, 1.0))
+        after,
+        reward=7.0,
+        terminated=chance < share,
+        truncated=chance > 1 - share,
+        cost=after / 8,
+        discount=jnp.where(after == 3, 0.5, 1.0),
+    )
 
 
 def bits(state):
@@ -49,11 +61,16 @@ def bits(state):
 
 
 @cache
-def walk(share=.05):
+def walk(share=0.05):
     return make_environment(
-        lambda key: jax.random.randint(key, (), 0, 8, jnp.int32), Partial(ends, jnp.float64(share)),
-        lambda state: {"state": state[None] / 8}, actions=2, labels=bits, propositions=NAMES,
-        allowed=lambda state: jnp.array([True, True]) & (state != 3))
+        lambda key: jax.random.randint(key, (), 0, 8, jnp.int32),
+        Partial(ends, jnp.float64(share)),
+        lambda state: {"state": state[None] / 8},
+        actions=2,
+        labels=bits,
+        propositions=NAMES,
+        allowed=lambda state: jnp.array([True, True]) & (state != 3),
+    )
 
 
 def random_agent():
@@ -64,7 +81,8 @@ def random_agent():
 def episodes(keys, environments, num_steps=12):
     """``[E, N]``: N episodes of each of a stack of environments."""
     one = jax.vmap(
-        lambda key, e: run_episode(key, e, random_agent(), num_steps=num_steps), (0, None))
+        lambda key, e: run_episode(key, e, random_agent(), num_steps=num_steps), (0, None)
+    )
     return jax.vmap(one, (None, 0))(keys, environments)
 
 
@@ -85,17 +103,26 @@ def test_world_and_automaton_step_together(ending):
         for n in range(len(keys)):
             one = jax.tree.map(lambda x, at=(e, n): x[at], found)
             length = int(one.valid.sum())
-            word = word_of(one.label[:length + 1])
+            word = word_of(one.label[: length + 1])
             states = run(automaton, word)
             world = one.world
-            assert world.memory[:length + 1].tolist() == states[1:].tolist()
+            assert world.memory[: length + 1].tolist() == states[1:].tolist()
             assert world.memory[0] == run(automaton, word[:1])[-1]
-            reads = [automaton.letters.tolist().index(
-                [name in letter for name in automaton.propositions]) for letter in word]
-            accepted = [bool(final[q]) for q in states[1:]] if final is not None else [
-                bool(automaton.accepting[q, x]) for q, x in zip(states[:-1], reads, strict=True)]
-            assert world.accepted[:length + 1].tolist() == accepted
-            assert world.visits[:length + 1].tolist() == np.cumsum(accepted).tolist()
+            reads = [
+                automaton.letters.tolist().index(
+                    [name in letter for name in automaton.propositions]
+                )
+                for letter in word
+            ]
+            accepted = (
+                [bool(final[q]) for q in states[1:]]
+                if final is not None
+                else [
+                    bool(automaton.accepting[q, x]) for q, x in zip(states[:-1], reads, strict=True)
+                ]
+            )
+            assert world.accepted[: length + 1].tolist() == accepted
+            assert world.visits[: length + 1].tolist() == np.cumsum(accepted).tolist()
             early = [told[q] for q in states[1:]]
             assert world.verdict[:length].tolist() == early[:-1]
             assert not any(early[1:-1]), "an episode goes on although it is decided"
@@ -118,7 +145,7 @@ def test_the_last_letter_repeats_for_ever():
     for _ in range(20):
         delta, priority = rng.integers(7, size=(7, 2)), rng.integers(4, size=(7, 2))
         automaton = make_automaton(delta, 0, letters, ["a"], priority=priority)
-        found = make_task_tables(automaton, NAMES, discount=.5).repeated
+        found = make_task_tables(automaton, NAMES, discount=0.5).repeated
         for state, letter in np.ndindex(7, 2):
             start = make_automaton(delta, state, letters, ["a"], priority=priority)
             accepts = accepts_lasso(start, [], [{"a"} if letter else {}])
@@ -136,10 +163,11 @@ def test_resets_are_joint():
 
 
 def test_what_the_inner_world_says_is_kept():
-    task = task_environment(walk(.3), "G F a", reward="two-discount", discount=.9, ratio=.5)
+    task = task_environment(walk(0.3), "G F a", reward="two-discount", discount=0.9, ratio=0.5)
     world, cut = task.reset(jax.random.key(2)), 0
-    both = jax.jit(lambda world, key: (
-        walk(.3).step(world.world, 0, key), task.step(world, 0, key)))
+    both = jax.jit(
+        lambda world, key: (walk(0.3).step(world.world, 0, key), task.step(world, 0, key))
+    )
     for key in jax.random.split(jax.random.key(3), 40):
         inner, found = both(world, key)
         accepting = bool(bits(inner.world)[0])
@@ -147,10 +175,11 @@ def test_what_the_inner_world_says_is_kept():
         assert found.truncated == inner.truncated
         assert found.terminated == inner.terminated
         assert float(found.discount) == pytest.approx(
-            float(inner.discount) * (.9 if accepting else .95))
+            float(inner.discount) * (0.9 if accepting else 0.95)
+        )
         if not found.terminated:
-            assert float(found.reward) == pytest.approx(.1 if accepting else 0)
-        assert task.allowed(found.world).tolist() == walk(.3).allowed(inner.world).tolist()
+            assert float(found.reward) == pytest.approx(0.1 if accepting else 0)
+        assert task.allowed(found.world).tolist() == walk(0.3).allowed(inner.world).tolist()
         cut += int(found.truncated)
         world = found.world
     assert cut
@@ -179,8 +208,10 @@ def test_what_the_first_label_decides_ends_with_the_first_step():
 
 
 def test_a_time_limit_decides_nothing():
-    for task in (task_environment(with_time_limit(walk(0), 3), "F (a & !a)"),
-                 with_time_limit(task_environment(walk(0), "G F a"), 3)):
+    for task in (
+        task_environment(with_time_limit(walk(0), 3), "F (a & !a)"),
+        with_time_limit(task_environment(walk(0), "G F a"), 3),
+    ):
         episode = run_episode(jax.random.key(0), task, random_agent(), num_steps=5)
         assert int(episode.valid.sum()) in (1, 3) and task.horizon == 3
     assert bool(episode.truncated) and not bool(episode.terminated)
@@ -200,11 +231,11 @@ def test_each_of_a_stack_is_as_by_itself():
     assert stacked.observations.memory.shape == (max(sizes),)
     i = 3
     assert sizes[i] < max(sizes)
-    alone = lane(episodes(keys, stack_tasks(tasks[i:i + 1])), 0)
+    alone = lane(episodes(keys, stack_tasks(tasks[i : i + 1])), 0)
     mine = jax.tree.map(np.asarray, lane(found, i))
     memory = mine.observation.memory
-    assert not memory[..., sizes[i]:].any()
-    mine = mine._replace(observation=mine.observation._replace(memory=memory[..., :sizes[i]]))
+    assert not memory[..., sizes[i] :].any()
+    mine = mine._replace(observation=mine.observation._replace(memory=memory[..., : sizes[i]]))
     jax.tree.map(np.testing.assert_array_equal, mine, alone)
 
 
@@ -226,10 +257,10 @@ def test_tables_are_exchanged_within_one_program():
 
 
 def test_tables_that_are_made_are_taken():
-    tables = make_task_tables("F a", NAMES, discount=.5)
+    tables = make_task_tables("F a", NAMES, discount=0.5)
     task = task_environment(walk(), tables)
     assert task_tables(task) is tables
-    assert float(task.step(task.reset(jax.random.key(0)), 0, jax.random.key(0)).discount) == .5
+    assert float(task.step(task.reset(jax.random.key(0)), 0, jax.random.key(0)).discount) == 0.5
 
 
 # --- texts ----------------------------------------------------------------------------------------
@@ -255,7 +286,7 @@ def test_what_is_left_of_a_formula():
 def test_outcomes_are_those_of_the_steps():
     rng = np.random.default_rng(3)
     model = reference.random_model(rng, 5, 2, 3, certainty=0)
-    label = rng.random((5, 3)) < .5
+    label = rng.random((5, 3)) < 0.5
     inner = environment_of(as_mdp(model, label=label, propositions=NAMES))
     task = task_environment(inner, "G F a & F (b & X c)", reward="two-discount")
     worlds, probability = task.starts()
@@ -267,7 +298,8 @@ def test_outcomes_are_those_of_the_steps():
     before = jax.tree.map(lambda x: x[state], worlds)
     told, chance = jax.jit(jax.vmap(task.outcomes))(before, action)
     drawn = jax.jit(jax.vmap(jax.vmap(task.step, (None, None, 0)), (0, 0, None)))(
-        before, action, keys)
+        before, action, keys
+    )
     np.testing.assert_allclose(chance.sum(1), 1)
     told, drawn, chance = jax.tree.map(np.asarray, (told, drawn, chance))
     for row, i in np.ndindex(len(state), len(keys)):
@@ -280,6 +312,7 @@ def test_outcomes_are_those_of_the_steps():
 
 # --- bad input ------------------------------------------------------------------------------------
 
+
 def draws_by_itself(state, action, key):
     return Timestep(state + int(np.random.default_rng().integers(1 << 30)), 0.0, False)
 
@@ -288,20 +321,28 @@ def impure():
     return walk().replace(step=Partial(draws_by_itself))
 
 
-@pytest.mark.parametrize(("arguments", "options", "text"), [
-    ((walk, "F goal"), {}, "the formula 'F goal' mentions the proposition 'goal'"),
-    ((walk, to_automaton("F goal")), {}, "the automaton mentions the proposition 'goal'"),
-    ((walk, to_automaton("F a & F b", [{"a"}, {}])), {}, "does not read the letter"),
-    ((walk, "F a"), {"labels": lambda state: bits(state)[:2]}, r"labels returns bool\[2\]"),
-    ((walk, "F a"), {"labels": lambda state: state[None] * 1.0, "propositions": ["a"]}, "labels"),
-    ((walk, "F a"), {"propositions": ["a"]}, r"return bool\[1\]"),
-    ((impure, "F a"), {}, "step is not pure"),
-    ((walk, "F a"), {"ending": "never"}, "choose one of repeat, violated, undecided"),
-    ((walk, "F a"), {"embedding": np.zeros((3, 2))}, r"numbers \[2, ...\]"),
-    ((walk, "F a"), {"embedding": np.zeros(2)}, "a row for each state"),
-    ((walk, "F a"), {"discount": 2}, "discount=2"), ((walk, "G a"), {"reward": "reach"}, "safety"),
-    ((walk, make_task_tables("F a", ["a"])), {}, "of 1 propositions, and the world has 3"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "options", "text"),
+    [
+        ((walk, "F goal"), {}, "the formula 'F goal' mentions the proposition 'goal'"),
+        ((walk, to_automaton("F goal")), {}, "the automaton mentions the proposition 'goal'"),
+        ((walk, to_automaton("F a & F b", [{"a"}, {}])), {}, "does not read the letter"),
+        ((walk, "F a"), {"labels": lambda state: bits(state)[:2]}, r"labels returns bool\[2\]"),
+        (
+            (walk, "F a"),
+            {"labels": lambda state: state[None] * 1.0, "propositions": ["a"]},
+            "labels",
+        ),
+        ((walk, "F a"), {"propositions": ["a"]}, r"return bool\[1\]"),
+        ((impure, "F a"), {}, "step is not pure"),
+        ((walk, "F a"), {"ending": "never"}, "choose one of repeat, violated, undecided"),
+        ((walk, "F a"), {"embedding": np.zeros((3, 2))}, r"numbers \[2, ...\]"),
+        ((walk, "F a"), {"embedding": np.zeros(2)}, "a row for each state"),
+        ((walk, "F a"), {"discount": 2}, "discount=2"),
+        ((walk, "G a"), {"reward": "reach"}, "safety"),
+        ((walk, make_task_tables("F a", ["a"])), {}, "of 1 propositions, and the world has 3"),
+    ],
+)
 def test_bad_input_is_named(arguments, options, text):
     environment, formula = arguments
     with pytest.raises(ValueError, match=text):
@@ -319,14 +360,20 @@ def test_what_cannot_be_stacked_is_named():
     with pytest.raises(ValueError, match="embeddings of shapes"):
         stack_tables([first, wide])
     with pytest.raises(ValueError, match="different structure"):
-        stack_tasks([task_environment(walk(), "F a"),
-                     task_environment(with_time_limit(walk(), 9), "F a")])
+        stack_tasks(
+            [task_environment(walk(), "F a"), task_environment(with_time_limit(walk(), 9), "F a")]
+        )
 
 
 def test_boxes_of_actions_do_as_well():
     world = make_environment(
-        lambda key: jnp.zeros(2), lambda at, by, key: Timestep(at + by, 0.0, False), lambda at: at,
-        actions=make_box(-1, 1, [2]), labels=lambda at: (at[:1] > 1), propositions=["far"])
+        lambda key: jnp.zeros(2),
+        lambda at, by, key: Timestep(at + by, 0.0, False),
+        lambda at: at,
+        actions=make_box(-1, 1, [2]),
+        labels=lambda at: at[:1] > 1,
+        propositions=["far"],
+    )
     task = task_environment(world, "F far")
     found = task.step(task.reset(jax.random.key(0)), jnp.array([2.0, 0]), jax.random.key(0))
     assert bool(found.terminated) and float(found.reward) == 1 and task.allowed is None

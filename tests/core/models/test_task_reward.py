@@ -32,20 +32,28 @@ FORMULAS = {
     "cosafe": ("F a", "!b U a", "F (a & F b)", "F (a & X b)", "F a & F (b & c)"),
     "safety": ("G !b", "G (a -> X !b)", "!a W b", "G a | b"),
     "buchi": ("G F a", "G F a & G F b", "G F a & G !b", "G F (a & X b)", "G F a & (!b U c)"),
-    "parity": ("F G a", "G F a -> G F b", "F G a & G F b", "(F G a) | (G F b & F !b)",
-               "(G F a & F G !b) | G F c"),
+    "parity": (
+        "F G a",
+        "G F a -> G F b",
+        "F G a & G F b",
+        "(F G a) | (G F b & F !b)",
+        "(G F a & F G !b) | G F c",
+    ),
 }
 KINDS = {formula: kind for kind, formulas in FORMULAS.items() for formula in formulas}
 # Near enough to the limits for models in eighths.
 EXACT = {
-    "reach": {"discount": 1.0}, "keep": {"discount": 1 - 1e-5},
-    "eventual": {"discount": 1 - 1e-5}, "two-discount": {"discount": 1 - 1e-4},
+    "reach": {"discount": 1.0},
+    "keep": {"discount": 1 - 1e-5},
+    "eventual": {"discount": 1 - 1e-5},
+    "two-discount": {"discount": 1 - 1e-4},
     "parity": {"discount": 1 - 1e-4, "ratio": 1e-3},
 }
 OF_KIND = {
     "cosafe": ("reach", "eventual", "two-discount", "parity"),
     "safety": ("keep", "eventual", "two-discount", "parity"),
-    "buchi": ("eventual", "two-discount", "parity"), "parity": ("parity",),
+    "buchi": ("eventual", "two-discount", "parity"),
+    "parity": ("parity",),
 }
 
 
@@ -73,8 +81,13 @@ def make_inner():
 
     tables = jnp.zeros((S, A * K), jnp.int32), jnp.zeros(S, bool), jnp.zeros((S, 3), bool)
     return make_environment(
-        Partial(reset, *tables), Partial(step, *tables), lambda state: state[None],
-        actions=A * K, labels=Partial(labels, tables[2]), propositions=NAMES)
+        Partial(reset, *tables),
+        Partial(step, *tables),
+        lambda state: state[None],
+        actions=A * K,
+        labels=Partial(labels, tables[2]),
+        propositions=NAMES,
+    )
 
 
 @cache
@@ -103,8 +116,7 @@ def every_step(tables, successor, ends, label):
     step = Partial(environment.step.func, tables, inner_labels, inner_step)
 
     def one(state, memory, action):
-        world = TaskWorld(
-            state, memory, tables.verdict[memory], jnp.bool_(False), jnp.int32(0))
+        world = TaskWorld(state, memory, tables.verdict[memory], jnp.bool_(False), jnp.int32(0))
         found = step(world, action, jax.random.key(0))
         return Steps(found.reward, found.discount, found.terminated, found.world.memory)
 
@@ -125,11 +137,11 @@ def random_problem(seed):
     rng = np.random.default_rng(seed)
     model = reference.random_model(rng, S, A, K)
     ends = np.zeros(S, bool)
-    if rng.random() < .5:
+    if rng.random() < 0.5:
         end = rng.integers(S)
         ends[end] = True
         model.successor[end] = end
-    return Problem(model, ends, rng.random((S, 3)) < .4)
+    return Problem(model, ends, rng.random((S, 3)) < 0.4)
 
 
 def steps_of(problem, tables, num_memory):
@@ -210,10 +222,11 @@ def check_optimal(name, count):
         optimum, reached, value = attained(seed, formula, tables)
         np.testing.assert_allclose(reached, optimum, atol=1e-6, err_msg=f"{seed}: {formula}")
         np.testing.assert_allclose(
-            value + (name == "keep"), optimum, atol=5e-3, err_msg=f"{seed}: {formula}")
+            value + (name == "keep"), optimum, atol=5e-3, err_msg=f"{seed}: {formula}"
+        )
         if name == "eventual":
             assert (value > optimum - 1e-9).all(), f"{seed}: {formula}"
-        undone += ((optimum > .01) & (optimum < .99)).sum()
+        undone += ((optimum > 0.01) & (optimum < 0.99)).sum()
     assert undone > count / 8, "most problems are decided anyway"
 
 
@@ -230,10 +243,11 @@ def test_what_is_best_by_the_reward_is_best_by_the_formula_in_300_products(name)
 
 
 SHAPED = {
-    "reach": {"discount": .9}, "keep": {"discount": .9},
-    "eventual": {"discount": .9, "learner_discount": .95},
-    "two-discount": {"discount": .9, "ratio": .5},
-    "parity": {"discount": .8, "ratio": .5, "learner_discount": .95},
+    "reach": {"discount": 0.9},
+    "keep": {"discount": 0.9},
+    "eventual": {"discount": 0.9, "learner_discount": 0.95},
+    "two-discount": {"discount": 0.9, "ratio": 0.5},
+    "parity": {"discount": 0.8, "ratio": 0.5, "learner_discount": 0.95},
 }
 
 
@@ -244,8 +258,9 @@ def check_shaping(name, count):
     potentials = {f: rng.normal(size=len(automaton_of(f).delta)) for f in formulas}
 
     def options(shaping):
-        return lambda f: dict(
-            reward=name, shaping=shaping(f), **SHAPED[name]) if f in formulas else {}
+        return lambda f: (
+            dict(reward=name, shaping=shaping(f), **SHAPED[name]) if f in formulas else {}
+        )
 
     plain = all_tables(options(lambda f: None))
     shaped = [all_tables(options(x)) for x in (lambda f: "distance", potentials.get)]
@@ -261,8 +276,8 @@ def check_shaping(name, count):
             potential = np.tile(tables.potential[:size], S)[:, None]
             # Every action is worth less by the potential, hence each order of actions is kept.
             np.testing.assert_allclose(
-                found[open_], (expected - potential)[open_], atol=1e-5,
-                err_msg=f"{seed}: {formula}")
+                found[open_], (expected - potential)[open_], atol=1e-5, err_msg=f"{seed}: {formula}"
+            )
 
 
 @pytest.mark.parametrize("name", SHAPED)
@@ -282,16 +297,18 @@ def test_distances_in_the_automaton():
         return pay_of(automaton, verdicts(automaton), shaping="distance", **options).potential
 
     assert potential("F (a & F b)").tolist() == [0, 0, 1]  # a and b may come at once
-    assert potential("F (a & X b)").tolist() == [0, .5, 1]
-    assert potential("G (a -> X !b)").tolist() == [1, .5, 0]
-    assert potential("G F (a & X b)", reward="two-discount").tolist() == [0, .5]
+    assert potential("F (a & X b)").tolist() == [0, 0.5, 1]
+    assert potential("G (a -> X !b)").tolist() == [1, 0.5, 0]
+    assert potential("G F (a & X b)", reward="two-discount").tolist() == [0, 0.5]
     assert (potential("F a & F (b & c)") >= 0).all()
 
 
 def test_parity_with_two_priorities_is_two_discount():
     automaton = automaton_of("G F a & G F b")
-    first, second = (pay_of(automaton, verdicts(automaton), reward=name, discount=.9, ratio=.5)
-                     for name in ("parity", "two-discount"))
+    first, second = (
+        pay_of(automaton, verdicts(automaton), reward=name, discount=0.9, ratio=0.5)
+        for name in ("parity", "two-discount")
+    )
     np.testing.assert_array_equal(first.reward, second.reward)
     np.testing.assert_array_equal(first.discount, second.discount)
 
@@ -299,29 +316,36 @@ def test_parity_with_two_priorities_is_two_discount():
 def test_priorities_of_one_parity_are_one():
     automaton = automaton_of("(G F a & F G !b) | G F c")
     decisions = verdicts(automaton)
-    pay = pay_of(automaton, decisions, discount=.5, ratio=.5)
-    assert set(pay.discount.ravel()) == {.5, .75, .875, .9375}
+    pay = pay_of(automaton, decisions, discount=0.5, ratio=0.5)
+    assert set(pay.discount.ravel()) == {0.5, 0.75, 0.875, 0.9375}
     # Two more are one rank more, and those of the negation are as many but odd.
-    other = pay_of(complement(complement(automaton)), decisions, discount=.5, ratio=.5)
+    other = pay_of(complement(complement(automaton)), decisions, discount=0.5, ratio=0.5)
     np.testing.assert_array_equal(pay.reward, other.reward)
     assert pay_of(complement(automaton), decisions).reward.max() < 1e-3
 
 
-@pytest.mark.parametrize(("formula", "options", "text"), [
-    ("F a", {"reward": "gold"}, "choose one of auto, reach"),
-    ("G a", {"reward": "reach"}, "'reach' is for cosafe tasks, and this one has safety"),
-    ("G F a", {"reward": "keep"}, "'auto' takes it"),
-    ("F G a", {"reward": "eventual"}, "take 'parity'"),
-    ("F a", {"discount": 0}, "discount=0"), ("F a", {"discount": 1.5}, "at most 1"),
-    ("G F a", {"discount": 1}, "below 1"), ("G F a", {"discount": float("nan")}, "discount=nan"),
-    ("F a", {"ratio": .5}, "not of 'reach'"), ("F G a", {"ratio": 1}, "ratio=1;"),
-    ("F a", {"learner_discount": 2}, "learner_discount=2"),
-    ("F a", {"shaping": "far"}, "give None, 'distance' or an array"),
-    ("F a", {"shaping": [1.0]}, r"numbers \[2\]"), ("F a", {"shaping": [1, np.inf]}, "finite"),
-    ("F a", {"discount": 1, "shaping": "distance"}, "Give discount below 1"),
-    ("G F a", {"shaping": "distance"}, "Give the reward 'two-discount'"),
-    ("F G a & G F b", {"discount": 1 - 1e-9}, "float64 does not tell from none"),
-])
+@pytest.mark.parametrize(
+    ("formula", "options", "text"),
+    [
+        ("F a", {"reward": "gold"}, "choose one of auto, reach"),
+        ("G a", {"reward": "reach"}, "'reach' is for cosafe tasks, and this one has safety"),
+        ("G F a", {"reward": "keep"}, "'auto' takes it"),
+        ("F G a", {"reward": "eventual"}, "take 'parity'"),
+        ("F a", {"discount": 0}, "discount=0"),
+        ("F a", {"discount": 1.5}, "at most 1"),
+        ("G F a", {"discount": 1}, "below 1"),
+        ("G F a", {"discount": float("nan")}, "discount=nan"),
+        ("F a", {"ratio": 0.5}, "not of 'reach'"),
+        ("F G a", {"ratio": 1}, "ratio=1;"),
+        ("F a", {"learner_discount": 2}, "learner_discount=2"),
+        ("F a", {"shaping": "far"}, "give None, 'distance' or an array"),
+        ("F a", {"shaping": [1.0]}, r"numbers \[2\]"),
+        ("F a", {"shaping": [1, np.inf]}, "finite"),
+        ("F a", {"discount": 1, "shaping": "distance"}, "Give discount below 1"),
+        ("G F a", {"shaping": "distance"}, "Give the reward 'two-discount'"),
+        ("F G a & G F b", {"discount": 1 - 1e-9}, "float64 does not tell from none"),
+    ],
+)
 def test_bad_rewards_are_named(formula, options, text):
     automaton = automaton_of(formula)
     with pytest.raises(ValueError, match=text):
@@ -331,4 +355,4 @@ def test_bad_rewards_are_named(formula, options, text):
 def test_in_single_precision_a_reward_that_would_never_stop_is_refused():
     automaton = automaton_of("(G F a & F G !b) | G F c")
     with jax.enable_x64(False), pytest.raises(ValueError, match="float32 does not tell"):
-        pay_of(automaton, verdicts(automaton), discount=.999)
+        pay_of(automaton, verdicts(automaton), discount=0.999)

@@ -62,8 +62,11 @@ def test_rollouts_are_runs_of_the_model(kind):
     model, explicit = random_representation(rng, kind, certainty=0.1)
     policy = reference.random_policy(rng, explicit)
     runs = jl.rollout(
-        model, jnp.asarray(policy.reshape(model.available.shape)), jax.random.key(0),
-        num_trajectories=50, num_steps=12,
+        model,
+        jnp.asarray(policy.reshape(model.available.shape)),
+        jax.random.key(0),
+        num_trajectories=50,
+        num_steps=12,
     )
     assert runs.state.shape == runs.action.shape == (50, 12)
     assert runs.length.tolist() == [12] * 50

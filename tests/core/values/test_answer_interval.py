@@ -24,8 +24,15 @@ def opposite(directions):
 
 def drn(tmp_path, rows, *, kind="MDP", rewards="", labels=None):
     """A model from what each state's choices lead to, in the DRN format."""
-    lines = [f"@type: {kind}", "@value_type: double-interval", "@reward_models", rewards,
-             "@nr_states", str(len(rows)), "@model"]
+    lines = [
+        f"@type: {kind}",
+        "@value_type: double-interval",
+        "@reward_models",
+        rewards,
+        "@nr_states",
+        str(len(rows)),
+        "@model",
+    ]
     for s, choices in enumerate(rows):
         reward = " [[1, 1]]" if rewards else ""
         lines.append(f"state {s}{reward} {'init ' if s == 0 else ''}{(labels or {}).get(s, '')}")
@@ -39,14 +46,19 @@ def drn(tmp_path, rows, *, kind="MDP", rewards="", labels=None):
 
 def robot(tmp_path, p="[0.45, 0.55]", south="[0.1, 0.1]", rest="[0.8, 0.8]", hazard="[0.1, 0.1]"):
     """The robot of PRISM's lectures; `p` both ways out of the hazard."""
-    return drn(tmp_path, [
-        [{0: 0.4, 1: 0.6}, {1: hazard, 2: rest, 3: south}],
-        [{1: "[0.1, 0.2]", 4: "[0.8, 0.9]"}, {3: p, 4: p}],
-        [{2: 1}],
-        [{5: 1}, {2: 0.6, 3: 0.4}],
-        [{4: 1}],
-        [{4: 0.9, 5: 0.1}, {3: 1}],
-    ], rewards="time", labels={1: "hazard", 2: "goal2", 4: "goal2", 5: "goal1"})
+    return drn(
+        tmp_path,
+        [
+            [{0: 0.4, 1: 0.6}, {1: hazard, 2: rest, 3: south}],
+            [{1: "[0.1, 0.2]", 4: "[0.8, 0.9]"}, {3: p, 4: p}],
+            [{2: 1}],
+            [{5: 1}, {2: 0.6, 3: 0.4}],
+            [{4: 1}],
+            [{4: 0.9, 5: 0.1}, {3: 1}],
+        ],
+        rewards="time",
+        labels={1: "hazard", 2: "goal2", 4: "goal2", 5: "goal1"},
+    )
 
 
 def assert_enclosed(model, prop, value, *, width=1e-6, near=1e-9):
@@ -81,10 +93,18 @@ def test_formulas_of_the_robot(tmp_path):
 
 SMALL = {
     "one": ([[{1: "[0.4, 0.5]", 2: "[0.5, 0.6]"}], [{1: 1}], [{2: 1}]], (0.4, 0.5, 0.5, 0.4)),
-    "two": ([[{1: "[0.4, 0.5]", 2: "[0.5, 0.6]"}, {1: "[0.3, 0.6]", 2: "[0.4, 0.7]"}],
-             [{1: 1}], [{2: 1}]], (0.4, 0.6, 0.5, 0.3)),
-    "loop": ([[{1: 1}, {0: "[0.5, 0.51]", 1: 0.21, 2: "[0.28, 0.29]"}], [{1: 1}], [{2: 1}]],
-             (1, 1, 3 / 7, 0.42)),
+    "two": (
+        [
+            [{1: "[0.4, 0.5]", 2: "[0.5, 0.6]"}, {1: "[0.3, 0.6]", 2: "[0.4, 0.7]"}],
+            [{1: 1}],
+            [{2: 1}],
+        ],
+        (0.4, 0.6, 0.5, 0.3),
+    ),
+    "loop": (
+        [[{1: 1}, {0: "[0.5, 0.51]", 1: 0.21, 2: "[0.28, 0.29]"}], [{1: 1}], [{2: 1}]],
+        (1, 1, 3 / 7, 0.42),
+    ),
     "open": ([[{1: "[0.3, 0.4]", 2: "[0, 1]"}], [{1: 1}], [{2: 1}]], (0.3, 0.4, 0.4, 0.3)),
 }
 
@@ -93,8 +113,12 @@ SMALL = {
 def test_small_models_with_published_values(name, tmp_path):
     rows, (robust_max, helped_max, robust_min, helped_min) = SMALL[name]
     model = drn(tmp_path, rows, labels={1: "goal"})
-    for directions, value in (("maxmin", robust_max), ("maxmax", helped_max),
-                              ("minmax", robust_min), ("minmin", helped_min)):
+    for directions, value in (
+        ("maxmin", robust_max),
+        ("maxmax", helped_max),
+        ("minmax", robust_min),
+        ("minmin", helped_min),
+    ):
         assert_enclosed(model, f'P{directions}=? [ F "goal" ]', value)
         assert_enclosed(model, f'P{directions}=? [ true U "goal" ]', value)
         assert_enclosed(model, f'P{opposite(directions)}=? [ G !"goal" ]', 1 - value)
@@ -134,9 +158,11 @@ def consensus(lower, upper, bound=2):
         counter, place, coin = s
         found = []
         for i in range(2):
+
             def moved(pc, side, count=counter, i=i, place=place, coin=coin):
                 def put(x, v):
                     return (v, x[1]) if i == 0 else (x[0], v)
+
                 return state((count, put(place, pc), put(coin, side)))
 
             if place[i] == 0:
@@ -164,13 +190,20 @@ def consensus(lower, upper, bound=2):
     initial = np.eye(1, len(states))[0]
     finished = [i for i, s in enumerate(states) if s[1] == (3, 3)]
     return interval_rows(
-        rows, entry, [t for row in flat for t in row], [a for a, _ in ends], [b for _, b in ends],
+        rows,
+        entry,
+        [t for row in flat for t in row],
+        [a for a, _ in ends],
+        [b for _, b in ends],
         initial=initial,
-        label={"finished": finished,
-               "zeros": [i for i, s in enumerate(states) if s[2] == (0, 0)],
-               "ones": [i for i, s in enumerate(states) if s[2] == (1, 1)],
-               "agree": [i for i, s in enumerate(states) if s[2][0] == s[2][1]]},
-        rewards={"steps": Rewards(state=np.ones(len(states)))})
+        label={
+            "finished": finished,
+            "zeros": [i for i, s in enumerate(states) if s[2] == (0, 0)],
+            "ones": [i for i, s in enumerate(states) if s[2] == (1, 1)],
+            "agree": [i for i, s in enumerate(states) if s[2][0] == s[2][1]],
+        },
+        rewards={"steps": Rewards(state=np.ones(len(states)))},
+    )
 
 
 def test_the_consensus_protocol_of_prism():
@@ -181,8 +214,12 @@ def test_the_consensus_protocol_of_prism():
     assert_enclosed(model, 'Pminmax=? [ F "finished" & "ones" ]', 0.418800, near=near)
     assert_enclosed(model, 'Pmaxmin=? [ F "finished" & !"agree" ]', 0.101786, near=near)
     assert_enclosed(model, 'Pmaxmax=? [ F "finished" & !"agree" ]', 0.3249961130231, near=1e-12)
-    for directions, steps in (("minmin", 280 / 9), ("minmax", 48), ("maxmin", 75),
-                              ("maxmax", 162.375)):
+    for directions, steps in (
+        ("minmin", 280 / 9),
+        ("minmax", 48),
+        ("maxmin", 75),
+        ("maxmax", 162.375),
+    ):
         assert_enclosed(model, f'R{{"steps"}}{directions}=? [ F "finished" ]', steps)
 
 
@@ -194,31 +231,56 @@ def labelled(rng, **options):
     label = rng.random((4, 2)) < 0.5
     nominal = model.nominal
     return interval_rows(
-        nominal.row_start, nominal.entry_start, nominal.successor, model.lower, model.upper,
-        initial=np.eye(1, 4)[0], label=label, propositions=["a", "b"])
+        nominal.row_start,
+        nominal.entry_start,
+        nominal.successor,
+        model.lower,
+        model.upper,
+        initial=np.eye(1, 4)[0],
+        label=label,
+        propositions=["a", "b"],
+    )
 
 
 def members(model):
     """Models in which nature keeps to one vertex of each row; policies are left open."""
     host = model.host.mdp
-    points = [vertices(model.lower[a:b], model.upper[a:b])
-              for a, b in zip(host.entry_start[:-1], host.entry_start[1:], strict=True)]
+    points = [
+        vertices(model.lower[a:b], model.upper[a:b])
+        for a, b in zip(host.entry_start[:-1], host.entry_start[1:], strict=True)
+    ]
     for chosen in product(*points):
         p = np.array([x for row in chosen for x in row])
         yield make_sparse(
-            host.row_start, host.entry_start, host.successor, p,
-            initial=np.asarray(model.initial), label=np.asarray(model.label),
-            propositions=model.propositions)
+            host.row_start,
+            host.entry_start,
+            host.successor,
+            p,
+            initial=np.asarray(model.initial),
+            label=np.asarray(model.label),
+            propositions=model.propositions,
+        )
 
 
 # Neither side needs a memory for these.
-PLAIN = ('F "a"', '"a" U "b"', 'G "a"', '"a" W "b"', '"a" R "b"', 'X "a"', 'G F "a"', 'F G "b"',
-         '(G F "a") => (G F "b")', '"b" | X "a"')
+PLAIN = (
+    'F "a"',
+    '"a" U "b"',
+    'G "a"',
+    '"a" W "b"',
+    '"a" R "b"',
+    'X "a"',
+    'G F "a"',
+    'F G "b"',
+    '(G F "a") => (G F "b")',
+    '"b" | X "a"',
+)
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("seed", [
-    *range(3), *(pytest.param(x, marks=pytest.mark.exhaustive) for x in range(3, 60))])
+@pytest.mark.parametrize(
+    "seed", [*range(3), *(pytest.param(x, marks=pytest.mark.exhaustive) for x in range(3, 60))]
+)
 def test_any_formula_beside_all_that_nature_may_keep_to(seed):
     rng = np.random.default_rng(seed)
     worlds = []
@@ -226,8 +288,10 @@ def test_any_formula_beside_all_that_nature_may_keep_to(seed):
         model = labelled(rng)
         worlds = list(islice(members(model), 17))
     for text in (*PLAIN, 'F ("a" & X "b")'):
-        each = {aim: [float(solve_property(w, f"P{aim}=? [ {text} ]").value[0]) for w in worlds]
-                for aim in ("max", "min")}
+        each = {
+            aim: [float(solve_property(w, f"P{aim}=? [ {text} ]").value[0]) for w in worlds]
+            for aim in ("max", "min")
+        }
         for directions in BOTH:
             found = solve_property(model, f"P{directions}=? [ {text} ]")
             assert found.status == Status.CONVERGED
@@ -241,8 +305,9 @@ def test_any_formula_beside_all_that_nature_may_keep_to(seed):
             assert not below or found.lower[0] <= best + 1e-6, (text, directions)
 
 
-@pytest.mark.parametrize("seed", [
-    *range(4), *(pytest.param(x, marks=pytest.mark.exhaustive) for x in range(4, 80))])
+@pytest.mark.parametrize(
+    "seed", [*range(4), *(pytest.param(x, marks=pytest.mark.exhaustive) for x in range(4, 80))]
+)
 def test_rewards_beside_all_that_nature_may_keep_to(seed):
     rng = np.random.default_rng(1000 + seed)
     worlds = []
@@ -290,29 +355,36 @@ def test_rewards_of_so_many_steps(tmp_path):
         assert_enclosed(model, f'R{{"time"}}{directions}=? [ I=7 ]', 1)
         once = solve_property(model, f'P{directions}=? [ F<=1 "goal2" ]')
         assert once.lower[0] <= (0.8 if directions[:3] == "max" else 0) <= once.upper[0]
-    assert solve_property(model, f'Rminmax<=1.3 [ {first} ]').holds == [True]
-    assert solve_property(model, 'Rmaxmin<=7 [ C<=7 ]').holds in ([True], [None])
+    assert solve_property(model, f"Rminmax<=1.3 [ {first} ]").holds == [True]
+    assert solve_property(model, "Rmaxmin<=7 [ C<=7 ]").holds in ([True], [None])
 
 
 def test_what_has_no_intervals_takes_one_direction():
-    coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
-                       label={"a": [1]})
+    coin = make_sparse(
+        None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0], label={"a": [1]}
+    )
     with pytest.raises(ValueError, match=r"no intervals from which nature .* ask for Pmax=\?"):
         solve_property(coin, 'Pmaxmin=? [ F "a" ]')
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ('P=? [ F "goal1" ]', r"ask for Pmaxmin=\?, Pmaxmax=\?, Pminmin=\? or Pminmax=\?"),
-    ('Pmax=? [ F "goal1" ]', r"ask for Pmaxmin=\? or Pmaxmax=\?"),
-    ('Pmin>0.5 [ F "goal1" ]', r"ask for Pminmin=\? or Pminmax=\?"),
-    ('R{"time"}min=? [ F "goal1" ]', r'ask for R\{"time"\}minmin=\? or R\{"time"\}minmax=\?'),
-    ('Rminmax=? [ C ]', r"rewards for ever \(C\) are not solved for where probabilities are int"),
-    ('Rminmax=? [ S ]', r"averages in the long run"),
-    ('LRAminmax=? [ "goal1" ]', r"averages in the long run"),
-    ('Pmaxmin=? [ F{"time"}<=5 "goal1" ]', r"bounds on rewards"),
-    ('Pmaxmin=? [ F "nowhere" ]', r"'nowhere'"),
-    ('R{"fuel"}minmax=? [ F "goal1" ]', r"no reward 'fuel'"),
-])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('P=? [ F "goal1" ]', r"ask for Pmaxmin=\?, Pmaxmax=\?, Pminmin=\? or Pminmax=\?"),
+        ('Pmax=? [ F "goal1" ]', r"ask for Pmaxmin=\? or Pmaxmax=\?"),
+        ('Pmin>0.5 [ F "goal1" ]', r"ask for Pminmin=\? or Pminmax=\?"),
+        ('R{"time"}min=? [ F "goal1" ]', r'ask for R\{"time"\}minmin=\? or R\{"time"\}minmax=\?'),
+        (
+            "Rminmax=? [ C ]",
+            r"rewards for ever \(C\) are not solved for where probabilities are int",
+        ),
+        ("Rminmax=? [ S ]", r"averages in the long run"),
+        ('LRAminmax=? [ "goal1" ]', r"averages in the long run"),
+        ('Pmaxmin=? [ F{"time"}<=5 "goal1" ]', r"bounds on rewards"),
+        ('Pmaxmin=? [ F "nowhere" ]', r"'nowhere'"),
+        ('R{"fuel"}minmax=? [ F "goal1" ]', r"no reward 'fuel'"),
+    ],
+)
 def test_what_is_not_offered_is_named(text, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         solve_property(robot(tmp_path), text)
@@ -336,14 +408,25 @@ def test_storm_finds_the_same():
         model = labelled(rng)
         lower = np.maximum(model.lower, np.minimum(model.upper, 1 / 128))  # Storm wants a graph
         model = interval_rows(
-            model.nominal.row_start, model.nominal.entry_start, model.nominal.successor, lower,
-            model.upper, initial=model.initial, label=model.label,
-            propositions=model.propositions)
+            model.nominal.row_start,
+            model.nominal.entry_start,
+            model.nominal.successor,
+            lower,
+            model.upper,
+            initial=model.initial,
+            label=model.label,
+            propositions=model.propositions,
+        )
         there = to_stormpy(model)
         for text, directions in product(('F "a"', '"b" U "a"', 'F<=4 "a"', 'X "b"'), BOTH):
             (prop,) = storm.parse_properties(f"P{directions[:3]}=? [ {text} ]")
             mode = getattr(storm.UncertaintyResolutionMode, f"{directions[3:]}imize".upper())
-            value = float(storm.model_checking(
-                there, prop, only_initial_states=True, uncertainty_resolution_mode=mode,
-            ).get_value(0))
+            value = float(
+                storm.model_checking(
+                    there,
+                    prop,
+                    only_initial_states=True,
+                    uncertainty_resolution_mode=mode,
+                ).get_value(0)
+            )
             assert_enclosed(model, f"P{directions}=? [ {text} ]", value, near=1e-4)

@@ -13,22 +13,33 @@ from jaxltl.core.values.answer_on_mesh import first_bounds, question_on_mesh
 
 S = 13
 PROPERTIES = (
-    'Pmax=? [ F "win" ]', 'Pmin=? [ !"mid" U "win" ]', 'Pmax=? [ G !"lose" ]',
-    'R{"games"}max=? [ F "over" ]', 'Tmin=? [ F "over" ]', 'P>=0.2 [ F "win" ]')
+    'Pmax=? [ F "win" ]',
+    'Pmin=? [ !"mid" U "win" ]',
+    'Pmax=? [ G !"lose" ]',
+    'R{"games"}max=? [ F "over" ]',
+    'Tmin=? [ F "over" ]',
+    'P>=0.2 [ F "win" ]',
+)
 
 
 def gambler():
     """Two stakes to play for, from two starts, with a reward for each game."""
-    rows = [[({s: 1.0})] if s in (0, S - 1) else
-            [{s - 1: 0.5, s + 1: 0.5}, {max(s - 2, 0): 0.6, min(s + 3, S - 1): 0.4}]
-            for s in range(S)]
+    rows = [
+        [({s: 1.0})]
+        if s in (0, S - 1)
+        else [{s - 1: 0.5, s + 1: 0.5}, {max(s - 2, 0): 0.6, min(s + 3, S - 1): 0.4}]
+        for s in range(S)
+    ]
     flat = [row for state in rows for row in state]
     return make_sparse(
-        np.cumsum([0] + [len(x) for x in rows]), np.cumsum([0] + [len(x) for x in flat]),
-        [t for row in flat for t in row], [p for row in flat for p in row.values()],
+        np.cumsum([0] + [len(x) for x in rows]),
+        np.cumsum([0] + [len(x) for x in flat]),
+        [t for row in flat for t in row],
+        [p for row in flat for p in row.values()],
         initial=np.eye(S)[5] / 2 + np.eye(S)[3] / 2,
         label={"win": [S - 1], "lose": [0], "over": [0, S - 1], "mid": [7]},
-        rewards={"games": Rewards(state=np.r_[0, np.ones(S - 2), 0])})
+        rewards={"games": Rewards(state=np.r_[0, np.ones(S - 2), 0])},
+    )
 
 
 @pytest.fixture(scope="module")
@@ -77,15 +88,18 @@ def test_bounds_are_gone_on_from(model, sharded, text):
     assert there.status == Status.CONVERGED
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ('Pmax=? [ F<=3 "win" ]', "bounds on steps or rewards are not solved for over a mesh"),
-    ('R{"games"}max=? [ C<=3 ]', r"rewards \[ C<=3 \] are not solved for over a mesh"),
-    ('LRAmax=? [ "win" ]', "averages in the long run are not solved for over a mesh"),
-    ('R{"coins"}max=? [ F "over" ]', "which reward 'coins'. The model has 'games'"),
-    ('P=? [ F "win" ]', r"ask for Pmax=\? or Pmin=\?"),
-    ('Pmax=? [ F "gold" ]', "gold"),
-    ('Pmaxmin=? [ F "win" ]', "no intervals"),
-])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('Pmax=? [ F<=3 "win" ]', "bounds on steps or rewards are not solved for over a mesh"),
+        ('R{"games"}max=? [ C<=3 ]', r"rewards \[ C<=3 \] are not solved for over a mesh"),
+        ('LRAmax=? [ "win" ]', "averages in the long run are not solved for over a mesh"),
+        ('R{"coins"}max=? [ F "over" ]', "which reward 'coins'. The model has 'games'"),
+        ('P=? [ F "win" ]', r"ask for Pmax=\? or Pmin=\?"),
+        ('Pmax=? [ F "gold" ]', "gold"),
+        ('Pmaxmin=? [ F "win" ]', "no intervals"),
+    ],
+)
 def test_what_is_not_answered_is_named(sharded, text, message):
     with pytest.raises(ValueError, match=message):
         question_on_mesh(sharded, parse_property(text))

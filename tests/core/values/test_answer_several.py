@@ -14,18 +14,26 @@ from tests.storm_oracle import storm_model, storm_values
 def fork(chance=0.5):
     """To a, to b, or by a coin to either."""
     return make_sparse(
-        [0, 3, 4, 5], [0, 1, 2, 4, 5, 6], [1, 2, 1, 2, 1, 2], [1, 1, chance, 1 - chance, 1, 1],
-        initial=[1, 0, 0], label={"a": [1], "b": [2]})
+        [0, 3, 4, 5],
+        [0, 1, 2, 4, 5, 6],
+        [1, 2, 1, 2, 1, 2],
+        [1, 1, chance, 1 - chance, 1, 1],
+        initial=[1, 0, 0],
+        label={"a": [1], "b": [2]},
+    )
 
 
-@pytest.mark.parametrize(("text", "verdict"), [
-    ('multi(P>=0.5 [ F "a" ], P>=0.5 [ F "b" ])', True),
-    ('multi(P>=0.5 [ F "a" ], P>=0.51 [ F "b" ])', False),
-    ('multi(P>=1 [ F "a" ], P<=0 [ F "b" ])', True),
-    ('multi(P>=1/3 [ F "a" ], P>=0.6 [ F "b" ], T<=1.01 [ F "a" | "b" ])', True),
-    ('multi(P>=0.9 [ G !"b" ], P>=0.2 [ X "b" ])', False),
-    ('multi(P>=0.3 [ F<=1 "a" ], P>=0.6 [ (G F "b") & (X "b") ])', True),
-])
+@pytest.mark.parametrize(
+    ("text", "verdict"),
+    [
+        ('multi(P>=0.5 [ F "a" ], P>=0.5 [ F "b" ])', True),
+        ('multi(P>=0.5 [ F "a" ], P>=0.51 [ F "b" ])', False),
+        ('multi(P>=1 [ F "a" ], P<=0 [ F "b" ])', True),
+        ('multi(P>=1/3 [ F "a" ], P>=0.6 [ F "b" ], T<=1.01 [ F "a" | "b" ])', True),
+        ('multi(P>=0.9 [ G !"b" ], P>=0.2 [ X "b" ])', False),
+        ('multi(P>=0.3 [ F<=1 "a" ], P>=0.6 [ (G F "b") & (X "b") ])', True),
+    ],
+)
 def test_what_can_be_met(text, verdict):
     found = answer_several(fork(), text)
     assert isinstance(found, Achievable)
@@ -48,8 +56,7 @@ def test_a_threshold_that_no_double_is_is_not_guessed():
     assert found.holds is None and found.status == Status.PRECISION
     np.testing.assert_allclose(found.nearest.lower, [1 / 3, 2 / 3], rtol=1e-14)
     assert (found.nearest.gap <= 1e-14).all() and found.nearest.gap.any()
-    best = answer_several(
-        fork(), 'multi(Pmin=? [ F "b" ], P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])')
+    best = answer_several(fork(), 'multi(Pmin=? [ F "b" ], P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])')
     assert best.holds is None and (best.nearest.gap <= 1e-14).all()
     assert best.nearest.gap[0] == 0 and best.nearest.lower[0] <= 2 / 3 <= best.nearest.upper[0]
 
@@ -60,15 +67,18 @@ def test_the_curve():
     np.testing.assert_allclose(found.points, [[0, 1], [1, 0]], atol=1e-6)
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ('multi(P>0.5 [ F "a" ], P>=0.5 [ F "b" ])', "write >="),
-    ('multi(Pmin>=0.5 [ F "a" ], P>=0.5 [ F "b" ])', "write P>="),
-    ('multi(P=? [ F "a" ], P>=0.5 [ F "b" ])', "Pmax=\\?"),
-    ('multi(LRAmax=? [ "a" ], P>=0.5 [ F "b" ])', "T are solved for"),
-    ('multi(Pmax=? [ F "c" ], P>=0.5 [ F "b" ])', "'c'"),
-    ('multi(Pmax=? [ F{"x"}<=3 "a" ], P>=0.5 [ F "b" ])', "at most 100 steps"),
-    ('Pmax=? [ F "a" ]', "use answer"),
-])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('multi(P>0.5 [ F "a" ], P>=0.5 [ F "b" ])', "write >="),
+        ('multi(Pmin>=0.5 [ F "a" ], P>=0.5 [ F "b" ])', "write P>="),
+        ('multi(P=? [ F "a" ], P>=0.5 [ F "b" ])', "Pmax=\\?"),
+        ('multi(LRAmax=? [ "a" ], P>=0.5 [ F "b" ])', "T are solved for"),
+        ('multi(Pmax=? [ F "c" ], P>=0.5 [ F "b" ])', "'c'"),
+        ('multi(Pmax=? [ F{"x"}<=3 "a" ], P>=0.5 [ F "b" ])', "at most 100 steps"),
+        ('Pmax=? [ F "a" ]', "use answer"),
+    ],
+)
 def test_what_is_not_solved_is_named(text, message):
     with pytest.raises(ValueError, match=message):
         answer_several(fork(), text)
@@ -82,9 +92,11 @@ def test_storm_agrees(seed):
     initial[0] = 1
     model = model.replace(initial=initial)
     storm = storm_model(model)
-    for text in ('multi(Pmax=? [ F "a" & "b" & "c" ], P>=0.3 [ G !("a" & "c") ])',
-                 'multi(Pmax=? [ X "a" ], P>=0.25 [ "c" U "b" ])',
-                 'multi(Pmin=? [ F "a" & "b" ], P>=0.5 [ F "c" ])'):
+    for text in (
+        'multi(Pmax=? [ F "a" & "b" & "c" ], P>=0.3 [ G !("a" & "c") ])',
+        'multi(Pmax=? [ X "a" ], P>=0.25 [ "c" U "b" ])',
+        'multi(Pmin=? [ F "a" & "b" ], P>=0.5 [ F "c" ])',
+    ):
         try:
             (wanted,) = storm_values(storm, text)
         except RuntimeError:  # what Storm does not take

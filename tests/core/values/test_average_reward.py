@@ -25,22 +25,28 @@ def exact_average(chain, reward):
     size = len(reward)
     source, target = np.nonzero(np.array([[bool(x) for x in row] for row in chain]))
     label = strong_components(source, target, size)
-    closed = [c for c in np.unique(label)
-              if all(label[t] == c for s, t in zip(source, target, strict=True) if label[s] == c)]
+    closed = [
+        c
+        for c in np.unique(label)
+        if all(label[t] == c for s, t in zip(source, target, strict=True) if label[s] == c)
+    ]
     value = [Fraction(0)] * size
     for c in closed:
         states = np.flatnonzero(label == c)
         # The stationary distribution: one balance equation gives way to the sum of all.
         rows = [[chain[t][s] - (s == t) for t in states] for s in states[1:]]
-        share = exact_solve([[Fraction(1)] * len(states), *rows],
-                            [Fraction(1)] + [Fraction(0)] * (len(states) - 1))
+        share = exact_solve(
+            [[Fraction(1)] * len(states), *rows], [Fraction(1)] + [Fraction(0)] * (len(states) - 1)
+        )
         for s in states:
             value[s] = sum((p * reward[t] for p, t in zip(share, states, strict=True)), Fraction(0))
     rest = [s for s in range(size) if label[s] not in closed]
     if rest:
         system = [[Fraction(s == t) - chain[s][t] for t in rest] for s in rest]
-        known = [sum((chain[s][t] * value[t] for t in range(size) if t not in rest), Fraction(0))
-                 for s in rest]
+        known = [
+            sum((chain[s][t] * value[t] for t in range(size) if t not in rest), Fraction(0))
+            for s in rest
+        ]
         for s, x in zip(rest, exact_solve(system, known), strict=True):
             value[s] = x
     return value
@@ -49,8 +55,10 @@ def exact_average(chain, reward):
 def exact_optimum(model, reward, best):
     matrix = exact_matrix(model)
     choices = [range(*model.row_start[s : s + 2]) for s in range(model.num_states)]
-    values = [exact_average([matrix[r] for r in policy], [reward[r] for r in policy])
-              for policy in itertools.product(*choices)]
+    values = [
+        exact_average([matrix[r] for r in policy], [reward[r] for r in policy])
+        for policy in itertools.product(*choices)
+    ]
     return [best(x) for x in zip(*values, strict=True)]
 
 
@@ -59,7 +67,8 @@ def test_bounds_enclose_the_best_of_all_policies(seed):
     rng = np.random.default_rng(seed)
     size = int(rng.integers(2, 5))
     model = random_sparse(
-        rng, size, chain=seed % 5 == 0, width=int(rng.integers(1, 3)), fractions=8)
+        rng, size, chain=seed % 5 == 0, width=int(rng.integers(1, 3)), fractions=8
+    )
     reward = rng.integers(-2, 3, model.num_rows) / (1 + seed % 3)
     exact = [Fraction(float(x)) for x in reward]
     matrix = exact_matrix(model)
@@ -70,7 +79,8 @@ def test_bounds_enclose_the_best_of_all_policies(seed):
             assert Fraction(float(low)) <= x <= Fraction(float(high))
             assert high - low <= 2e-6 * max(abs(x), 1e-6)
         attained = exact_average(
-            [matrix[r] for r in found.policy], [exact[r] for r in found.policy])
+            [matrix[r] for r in found.policy], [exact[r] for r in found.policy]
+        )
         for low, x, high in zip(found.lower, attained, found.upper, strict=True):
             assert low - 1e-12 <= x <= high + 1e-12
 
@@ -91,8 +101,7 @@ def test_bounds_enclose_however_narrow(seed):
 
 def test_a_component_is_left_where_that_is_best():
     """From the state where it can be left; the others go there, not round and round."""
-    model = make_sparse(
-        [0, 2, 4, 6, 7], np.arange(8), [0, 1, 1, 2, 0, 3, 3], np.ones(7))
+    model = make_sparse([0, 2, 4, 6, 7], np.arange(8), [0, 1, 1, 2, 0, 3, 3], np.ones(7))
     reward = Rewards(choice=np.array([1.0, 0, 1.0, 0, 0, 0, 5.0]))
     found = check(average_reward(model, reward))
     assert found.policy.tolist() == [1, 3, 5, 6]
@@ -111,8 +120,9 @@ def ring(num_states, leave):
             rows.append(sorted(row.items()))
     start = np.concatenate([[0], np.cumsum([len(row) for row in rows])])
     entries = [x for row in rows for x in row]
-    return make_sparse(np.arange(num_states + 1) * 2, start, [t for t, _ in entries],
-                       [p for _, p in entries])
+    return make_sparse(
+        np.arange(num_states + 1) * 2, start, [t for t, _ in entries], [p for _, p in entries]
+    )
 
 
 @pytest.mark.parametrize("leave", [0.4, 1e-3, 1e-9])
@@ -157,8 +167,11 @@ def lazy(model):
     start = mdp.entry_start + np.arange(model.num_rows + 1)
     first = mdp.entry_start[:-1]
     return make_sparse(
-        model.row_start, start, np.insert(mdp.successor, first, mdp.state),
-        np.insert(mdp.probability * 0.75, first, 0.25))
+        model.row_start,
+        start,
+        np.insert(mdp.successor, first, mdp.state),
+        np.insert(mdp.probability * 0.75, first, 0.25),
+    )
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -178,8 +191,10 @@ def test_sweeps_that_would_not_end_are_not_waited_for():
     """A walk of many states mixes too slowly; that is seen after some sweeps."""
     size = 300
     states = np.arange(size)
-    entry, target = 2 * np.arange(size + 1), np.stack(
-        [np.maximum(states - 1, 0), np.minimum(states + 1, size - 1)], 1)
+    entry, target = (
+        2 * np.arange(size + 1),
+        np.stack([np.maximum(states - 1, 0), np.minimum(states + 1, size - 1)], 1),
+    )
     model = make_sparse(None, entry, target.ravel(), np.full(2 * size, 0.5))
     reward = states / size
     found = average(model.host, reward, reward, tolerance=1e-6, max_steps=10**6)

@@ -26,8 +26,10 @@ def exact_until(model, target, stay, num_steps, best):
     for _ in range(num_steps):
         ahead = []
         for s in range(model.num_states):
-            sums = [sum((p * x for p, x in zip(matrix[r], value, strict=True)), Fraction(0))
-                    for r in range(*model.row_start[s : s + 2])]
+            sums = [
+                sum((p * x for p, x in zip(matrix[r], value, strict=True)), Fraction(0))
+                for r in range(*model.row_start[s : s + 2])
+            ]
             ahead.append(Fraction(1) if target[s] else best(sums) if stay[s] else Fraction(0))
         value = ahead
     return value
@@ -42,8 +44,9 @@ def test_bounds_of_steps_enclose_exact_fractions(seed, monkeypatch):
     num_steps = int(rng.integers(0, 7))
     for objective, best in (("max", max), ("min", min)):
         exact = exact_until(model, target, stay, num_steps, best)
-        found = check(bounded_reachability(model, target, num_steps, stay=stay,
-                                           objective=objective))
+        found = check(
+            bounded_reachability(model, target, num_steps, stay=stay, objective=objective)
+        )
         for low, x, high in zip(found.lower, exact, found.upper, strict=True):
             assert Fraction(float(low)) <= x <= Fraction(float(high))
             assert high - low < 1e-12
@@ -66,9 +69,14 @@ def test_rewards_of_so_many_steps_are_what_a_loop_finds(seed):
     mdp, matrix = model.host, model.host.matrix.toarray()
     state, choice = rng.normal(size=7), rng.normal(size=model.num_rows)
     entry = rng.normal(size=model.num_transitions) * (seed % 2)
-    earned = state[mdp.state] + choice + [
-        sum(mdp.probability[e] * entry[e] for e in range(*mdp.entry_start[r : r + 2]))
-        for r in range(mdp.num_rows)]
+    earned = (
+        state[mdp.state]
+        + choice
+        + [
+            sum(mdp.probability[e] * entry[e] for e in range(*mdp.entry_start[r : r + 2]))
+            for r in range(mdp.num_rows)
+        ]
+    )
     for objective, best in BEST.items():
         total, now = np.zeros(7), state
         for _ in range(5):
@@ -76,8 +84,9 @@ def test_rewards_of_so_many_steps_are_what_a_loop_finds(seed):
             now = mdp.over_choices(best, matrix @ now)
         reward = Rewards(state=state, choice=choice, transition=entry)
         for found, expected in (
-                (cumulative_reward(model, reward, 5, objective=objective), total),
-                (instantaneous_reward(model, reward, 5, objective=objective), now)):
+            (cumulative_reward(model, reward, 5, objective=objective), total),
+            (instantaneous_reward(model, reward, 5, objective=objective), now),
+        ):
             check(found)
             np.testing.assert_allclose(found.value, expected, rtol=1e-10, atol=1e-12)
             assert (found.lower <= expected + 1e-14).all()
@@ -101,7 +110,8 @@ def test_choices_of_all_steps_attain_the_value(seed):
         first = bounded_reachability(model, target, num_steps, objective=objective).policy
         assert (first == found.policy[0]).all()
         found = cumulative_reward(
-            model, Rewards(choice=reward), num_steps, objective=objective, by_step=True)
+            model, Rewards(choice=reward), num_steps, objective=objective, by_step=True
+        )
         value = np.zeros(8)
         for row in found.policy[::-1]:
             value = (reward + mdp.expectation(value))[row]
@@ -154,9 +164,17 @@ def test_rewards_are_spent_level_by_level(seed):
     most = int(rng.integers(0, 5))
     for objective, best in BEST.items():
         expected = by_levels(model, target, stay, cost, most, best)
-        found = check(reward_bounded_reachability(
-            model, target, Rewards(transition=cost * 0.1), most * 0.1, stay=stay,
-            objective=objective, by_level=True))
+        found = check(
+            reward_bounded_reachability(
+                model,
+                target,
+                Rewards(transition=cost * 0.1),
+                most * 0.1,
+                stay=stay,
+                objective=objective,
+                by_level=True,
+            )
+        )
         np.testing.assert_allclose(found.value, expected[-1], atol=1e-8)
         assert (found.lower <= expected[-1] + 1e-9).all()
         assert (found.upper >= expected[-1] - 1e-9).all()
@@ -177,13 +195,13 @@ def test_padded_models_are_taken_too():
     padded = to_padded(model)
     target = np.arange(6) == 3
     found = bounded_reachability(padded, target, 4)
-    np.testing.assert_allclose(
-        found.value, bounded_reachability(model, target, 4).value, atol=1e-6)
+    np.testing.assert_allclose(found.value, bounded_reachability(model, target, 4).value, atol=1e-6)
 
 
 def test_what_is_wrong_is_named():
-    model = make_sparse(None, [0, 1, 2], [1, 1], [1.0, 1.0],
-                        rewards={"r": Rewards(choice=[1.0, 0])})
+    model = make_sparse(
+        None, [0, 1, 2], [1, 1], [1.0, 1.0], rewards={"r": Rewards(choice=[1.0, 0])}
+    )
     goal = np.array([False, True])
     with pytest.raises(ValueError, match="target is float"):
         bounded_reachability(model, [0.0, 1.0], 3)
@@ -224,12 +242,16 @@ def test_storm_finds_the_same(seed):
         ours = {
             f'P{objective}=? [ X "goal" ]': next_probability(model, target, objective=objective),
             f'P{objective}=? [ F<=5 "goal" ]': bounded_reachability(
-                model, target, 5, objective=objective),
+                model, target, 5, objective=objective
+            ),
             f'R{{"r"}}{objective}=? [ C<=5 ]': cumulative_reward(
-                model, Rewards(state=reward), 5, objective=objective),
+                model, Rewards(state=reward), 5, objective=objective
+            ),
             f'R{{"r"}}{objective}=? [ I=4 ]': instantaneous_reward(
-                model, Rewards(state=reward), 4, objective=objective),
+                model, Rewards(state=reward), 4, objective=objective
+            ),
         }
         for text, found in ours.items():
             np.testing.assert_allclose(
-                found.value, storm_values(storm, text), atol=1e-6, err_msg=text)
+                found.value, storm_values(storm, text), atol=1e-6, err_msg=text
+            )

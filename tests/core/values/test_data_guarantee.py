@@ -20,16 +20,24 @@ TASKS = ["F a", "!b U a", "G F a", "F G a | F b", "G !b"]
 def labelled(rng, num_states=5):
     host = random_model(rng, num_states, unit=12).mdp
     return make_sparse(
-        host.row_start, host.entry_start, host.successor, host.probability,
-        initial=np.eye(num_states)[0], label=rng.random((num_states, 2)) < 0.4,
-        propositions=["a", "b"])
+        host.row_start,
+        host.entry_start,
+        host.successor,
+        host.probability,
+        initial=np.eye(num_states)[0],
+        label=rng.random((num_states, 2)) < 0.4,
+        propositions=["a", "b"],
+    )
 
 
 def drawn(rng, model, size):
     """So many samples of each choice."""
-    return np.concatenate([
-        rng.multinomial(size, model.probability[i:j] / model.probability[i:j].sum())
-        for i, j in zip(model.entry_start[:-1], model.entry_start[1:], strict=True)])
+    return np.concatenate(
+        [
+            rng.multinomial(size, model.probability[i:j] / model.probability[i:j].sum())
+            for i, j in zip(model.entry_start[:-1], model.entry_start[1:], strict=True)
+        ]
+    )
 
 
 @pytest.mark.few(2)
@@ -42,7 +50,8 @@ def test_guarantees_hold(method, count):
     for i in range(count):
         model, task = labelled(rng), TASKS[i % len(TASKS)]
         found = learn_guarantee(
-            model, drawn(rng, model, int(rng.integers(1, 300))), task, 0.9, method=method)
+            model, drawn(rng, model, int(rng.integers(1, 300))), task, 0.9, method=method
+        )
         true = sparse_satisfaction(model, task).solution.value[0]
         own = under(model, found)
         failed += found.bound > own + 1e-9 or found.optimistic < true - 1e-9
@@ -65,15 +74,20 @@ def under(model, found):
     state, memory = product.base_state, product.memory
     letter = found.satisfaction.letter[state]
     chain = make_sparse(
-        None, np.concatenate([[0], np.diff(host.entry_start)[rows].cumsum()]),
-        host.successor[entries], host.probability[entries],
-        initial=np.eye(state.size)[product.start[0]])
+        None,
+        np.concatenate([[0], np.diff(host.entry_start)[rows].cumsum()]),
+        host.successor[entries],
+        host.probability[entries],
+        initial=np.eye(state.size)[product.start[0]],
+    )
     automaton = found.satisfaction.automaton
     if automaton.acceptance in ("buchi", "parity"):
         # Labels name the priorities that are read.
         level = np.asarray(automaton.priority)[memory, letter]
-        good = [f"(G F p{p})" + "".join(f" & F G !p{q}" for q in range(p))
-                for p in range(0, level.max() + 1, 2)]
+        good = [
+            f"(G F p{p})" + "".join(f" & F G !p{q}" for q in range(p))
+            for p in range(0, level.max() + 1, 2)
+        ]
         label = level[:, None] == np.arange(level.max() + 1)
         names = [f"p{p}" for p in range(level.max() + 1)]
         task = " | ".join(f"({x})" for x in good)
@@ -82,8 +96,14 @@ def under(model, found):
         label, names = final[:, None], ["final"]
         task = "F final" if automaton.acceptance == "cosafe" else "G final"
     chain = make_sparse(
-        None, chain.entry_start, chain.successor, chain.probability, initial=chain.initial,
-        label=label, propositions=names)
+        None,
+        chain.entry_start,
+        chain.successor,
+        chain.probability,
+        initial=chain.initial,
+        label=label,
+        propositions=names,
+    )
     return sparse_satisfaction(chain, task).solution.value[0]
 
 
@@ -104,8 +124,14 @@ def test_more_data_guarantee_more():
 def coins():
     """Two tosses in a row, of which one was seen more often."""
     return make_sparse(
-        None, [0, 2, 4, 5, 6], [1, 3, 2, 3, 2, 3], [0.9, 0.1, 0.8, 0.2, 1, 1],
-        initial=[1, 0, 0, 0], label=[[0], [0], [1], [0]], propositions=["a"])
+        None,
+        [0, 2, 4, 5, 6],
+        [1, 3, 2, 3, 2, 3],
+        [0.9, 0.1, 0.8, 0.2, 1, 1],
+        initial=[1, 0, 0, 0],
+        label=[[0], [0], [1], [0]],
+        propositions=["a"],
+    )
 
 
 def test_where_more_samples_help():
@@ -135,8 +161,11 @@ def test_the_curve_of_a_log():
     with pytest.raises(ValueError, match=r"sizes\[1\] is 20001; there are 20000 transitions"):
         guarantee_curve(coins(), counts, "F a", 0.9, [5, 20_001])
     for numbers, sizes, message in (
-            (counts, [0.5], "sizes is float64"), (counts, 5, "sizes is int64"),
-            (counts + 0.5, [5], "counts is float64"), (-counts, [5], "none is negative")):
+        (counts, [0.5], "sizes is float64"),
+        (counts, 5, "sizes is int64"),
+        (counts + 0.5, [5], "counts is float64"),
+        (-counts, [5], "none is negative"),
+    ):
         with pytest.raises(ValueError, match=message):
             guarantee_curve(coins(), numbers, "F a", 0.9, sizes)
 

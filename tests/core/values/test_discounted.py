@@ -72,26 +72,31 @@ SINGLE = 200  # lanes that are repeated in single precision
 def some(usual, other):
     """Methods and tolerances; that of the usual method without one is compiled below, too."""
     more = [(usual, None), (other, 1e-6)]
-    return [(usual, 1e-6), (other, None),
-            *(pytest.param(*x, marks=pytest.mark.exhaustive) for x in more)]
+    return [
+        (usual, 1e-6),
+        (other, None),
+        *(pytest.param(*x, marks=pytest.mark.exhaustive) for x in more),
+    ]
 
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("tolerance", [None, 1e-6])
 def test_policy_values_are_enclosed(batch, exact_policy, tolerance):
-    solution = jax.jit(jax.vmap(
-        lambda m, p, r, d: jl.policy_value(m, p, r, d, tolerance=tolerance)))(*batch)
+    solution = jax.jit(
+        jax.vmap(lambda m, p, r, d: jl.policy_value(m, p, r, d, tolerance=tolerance))
+    )(*batch)
     assert_certified(solution, exact_policy, tolerance)
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize(("method", "tolerance"), some(
-    "modified_policy_iteration", "value_iteration"))
+@pytest.mark.parametrize(
+    ("method", "tolerance"), some("modified_policy_iteration", "value_iteration")
+)
 def test_optimal_values_are_enclosed(cases, batch, exact_optimal, method, tolerance):
     mdps, _, rewards, discounts = batch
-    solution = jax.jit(jax.vmap(
-        lambda m, r, d: jl.optimal_value(m, r, d, method=method, tolerance=tolerance)
-    ))(mdps, rewards, discounts)
+    solution = jax.jit(
+        jax.vmap(lambda m, r, d: jl.optimal_value(m, r, d, method=method, tolerance=tolerance))
+    )(mdps, rewards, discounts)
     assert_certified(solution, exact_optimal, tolerance)
     for i in range(100):
         model, _, reward, discount = cases[i]
@@ -115,8 +120,12 @@ def test_values_are_enclosed_in_single_precision(cases, exact_policy, exact_opti
 
 def smooth_reference(cases, discounts, operator, num_steps):
     return reference.iterate_values(
-        np.stack([m.transition for m, *_ in cases]), np.stack([m.available for m, *_ in cases]),
-        np.stack([r for _, _, r, _ in cases]), discounts[:, None, None], operator, num_steps,
+        np.stack([m.transition for m, *_ in cases]),
+        np.stack([m.available for m, *_ in cases]),
+        np.stack([r for _, _, r, _ in cases]),
+        discounts[:, None, None],
+        operator,
+        num_steps,
     )
 
 
@@ -131,9 +140,9 @@ def soft(cases):
 def test_soft_values_are_enclosed(batch, soft, method, tolerance):
     mdps, _, rewards, _ = batch
     discounts, exact = soft
-    solution = jax.jit(jax.vmap(
-        lambda m, r, d: jl.soft_value(m, r, d, method=method, tolerance=tolerance)
-    ))(mdps, rewards, jnp.asarray(discounts))
+    solution = jax.jit(
+        jax.vmap(lambda m, r, d: jl.soft_value(m, r, d, method=method, tolerance=tolerance))
+    )(mdps, rewards, jnp.asarray(discounts))
     assert_certified(solution, exact, tolerance)
     np.testing.assert_allclose(solution.policy.sum(-1), 1, atol=1e-12)
     assert not np.asarray(solution.policy)[~np.asarray(mdps.available)].any()
@@ -207,7 +216,8 @@ def test_bad_arguments_are_named():
 # --- the Boltzmann operator --------------------------------------------------------------------
 
 LOOP_OR_END = jl.make_mdp(
-    [[[0], [1]], [[1], [1]]], [[[1.0], [1.0]], [[1.0], [0.0]]],
+    [[[0], [1]], [[1], [1]]],
+    [[[1.0], [1.0]], [[1.0], [0.0]]],
 )  # state 0: action 0 loops, action 1 ends in state 1
 LOOP_REWARD = jnp.array([[0.2, 0.0], [0.0, 0.0]])
 CYCLE = jl.make_mdp([[[1], [0]], [[1], [0]]], np.ones((2, 2, 1)))
@@ -239,7 +249,9 @@ def test_the_answer_depends_on_the_start_where_there_are_several():
 
 def test_a_fixed_point_that_plain_iteration_misses():
     model = reference.Model(
-        np.array([[[1], [0]], [[1], [0]]]), np.ones((2, 2, 1)), np.ones((2, 2), bool),
+        np.array([[[1], [0]], [[1], [0]]]),
+        np.ones((2, 2, 1)),
+        np.ones((2, 2), bool),
         np.ones(2) / 2,
     )
     value = np.zeros(2)
@@ -266,7 +278,9 @@ def test_random_models_beyond_contraction():
     reward = rng.normal(size=(150, 6, 4)) * 3
     available = np.ones((150, 6, 4), bool)
     dense = jl.DenseMDP(
-        jnp.asarray(transition), jnp.asarray(available), jnp.full((150, 6), 1 / 6),
+        jnp.asarray(transition),
+        jnp.asarray(available),
+        jnp.full((150, 6), 1 / 6),
         jnp.zeros((150, 6, 0), bool),
     )
     solution = jax.jit(jax.vmap(jl.boltzmann_value, (0, 0, None)))(dense, jnp.asarray(reward), 0.95)
@@ -344,7 +358,9 @@ def test_sensitivities_equal_the_explicit_equations(adjoint):
         zero = jnp.zeros_like(reward), jnp.zeros_like(mdp.probability)
         backward = jax.linear_transpose(forward, reward, mdp.probability)
         return (
-            found, forward(toward_reward, zero[1]), forward(zero[0], toward_probability),
+            found,
+            forward(toward_reward, zero[1]),
+            forward(zero[0], toward_probability),
             backward((jnp.asarray(cotangent), zero[0])),
         )
 
@@ -354,7 +370,10 @@ def test_sensitivities_equal_the_explicit_equations(adjoint):
         q = np.where(model.available, reward + discount * (model.transition @ value), 0)
         change = discount * (toward_probability * value[model.successor]).sum(-1)
         along = zip(
-            (toward_reward, change), forward, (toward_reward, toward_probability), backward,
+            (toward_reward, change),
+            forward,
+            (toward_reward, toward_probability),
+            backward,
             strict=True,
         )
         for direction, (dvalue, dpolicy), input_direction, gradient in along:
@@ -380,8 +399,7 @@ def test_sensitivities_equal_the_explicit_equations(adjoint):
 def test_soft_newton_passes_linear_systems_that_single_precision_does_not_solve():
     """In this world the linear solver gets nowhere in the second step; a sweep leads on."""
     model = stack_products([grid.random_world(9).mdp], grid.COMPLETE)
-    model = jax.tree.map(
-        lambda x: x[0].astype(jnp.float32) if x.dtype == float else x[0], model)
+    model = jax.tree.map(lambda x: x[0].astype(jnp.float32) if x.dtype == float else x[0], model)
     found = soft_value(model, grid.expert_reward(model), 0.95, max_steps=5000)
     assert found.status == Status.CONVERGED
     assert jnp.max(found.upper - found.lower) < 0.02

@@ -31,8 +31,14 @@ def labels(place):
 
 
 WORLD = make_environment(
-    reset, step, lambda place: place, actions=make_box(-1, 1, (2,)), labels=labels,
-    propositions=["right", "up"], horizon=8)
+    reset,
+    step,
+    lambda place: place,
+    actions=make_box(-1, 1, (2,)),
+    labels=labels,
+    propositions=["right", "up"],
+    horizon=8,
+)
 TASK = task_environment(WORLD, "!up U right", ending="undecided")
 
 
@@ -51,13 +57,26 @@ def above(totals):
 
 @pytest.mark.slow
 def test_scores_are_means_over_episodes():
-    every = ("failure", "violation", "undecided", "visits", "cost", "length", "discounted_visits",
-             "discounted_reward", above)
+    every = (
+        "failure",
+        "violation",
+        "undecided",
+        "visits",
+        "cost",
+        "length",
+        "discounted_visits",
+        "discounted_reward",
+        above,
+    )
     evaluate = episode_evaluator(
-        TASK, agent, objective="success", costs=every, num_episodes=NUMBER, discount=0.9)
+        TASK, agent, objective="success", costs=every, num_episodes=NUMBER, discount=0.9
+    )
     own = episode_evaluator(WORLD, agent, num_episodes=NUMBER)
-    run = jax.jit(lambda key, goal: jax.vmap(lambda k: run_episode(
-        k, TASK, agent(goal), num_steps=8))(jax.random.split(key, NUMBER)))
+    run = jax.jit(
+        lambda key, goal: jax.vmap(lambda k: run_episode(k, TASK, agent(goal), num_steps=8))(
+            jax.random.split(key, NUMBER)
+        )
+    )
     seen = []
     for seed, goal in enumerate(np.array([[3.0, 0.5], [0.5, 3.0], [2.2, 2.2], [0.0, 0.0]])):
         key, goal = jax.random.key(seed), jnp.asarray(goal)
@@ -67,17 +86,23 @@ def test_scores_are_means_over_episodes():
         success = (verdict == Verdict.SATISFIED).mean()
         length = runs.valid.sum(1)
         expected = (
-            1 - success, (verdict == Verdict.VIOLATED).mean(),
-            (verdict == Verdict.UNDECIDED).mean(), runs.world.visits[:, -1].mean(),
-            runs.cost.sum(1).mean(), length.mean())
+            1 - success,
+            (verdict == Verdict.VIOLATED).mean(),
+            (verdict == Verdict.UNDECIDED).mean(),
+            runs.world.visits[:, -1].mean(),
+            runs.cost.sum(1).mean(),
+            length.mean(),
+        )
         np.testing.assert_allclose(objective, success, rtol=1e-6)
         np.testing.assert_allclose(costs[:6], expected, rtol=1e-6)
         np.testing.assert_allclose(costs[8], (length > 5).mean(), rtol=1e-6)
         assert costs[6] <= costs[3] and costs.shape == (9,)
         np.testing.assert_allclose(
-            costs[7], (runs.reward * 0.9 ** np.arange(8)).sum(1).mean(), rtol=1e-9)
+            costs[7], (runs.reward * 0.9 ** np.arange(8)).sum(1).mean(), rtol=1e-9
+        )
         plain = jax.vmap(lambda k, g=goal: run_episode(k, WORLD, agent(g), num_steps=8))(
-            jax.random.split(key, NUMBER))
+            jax.random.split(key, NUMBER)
+        )
         np.testing.assert_allclose(own(goal, key), plain.reward.sum(1).mean(), rtol=1e-9)
         seen.append(float(success))
     assert seen[0] > 0.6 and min(seen) == 0 and seen[2] not in (0, 1)
@@ -86,15 +111,17 @@ def test_scores_are_means_over_episodes():
     together = jax.jit(jax.vmap(evaluate))(goals, keys)
     for i in range(2):
         alone = evaluate(goals[i], keys[i])
-        jax.tree.map(lambda x, y, i=i: np.testing.assert_allclose(x[i], y, rtol=1e-9),
-                     together, alone)
+        jax.tree.map(
+            lambda x, y, i=i: np.testing.assert_allclose(x[i], y, rtol=1e-9), together, alone
+        )
 
 
 @pytest.mark.slow
 def test_a_search_keeps_a_task_and_saves_effort():
     """The least effort with which the task fails at most one time in five."""
     evaluate = episode_evaluator(
-        TASK, agent, objective=lambda totals: -totals.cost, costs="failure", num_episodes=20)
+        TASK, agent, objective=lambda totals: -totals.cost, costs="failure", num_episodes=20
+    )
     problem = cce.make_problem(evaluate, diagonal_gaussian(jnp.zeros(2), 2.0), limit=0.2)
     hparams = cce.Hparams(rate=0.5, population=60)
     key, fresh = jax.random.split(jax.random.key(0))
@@ -104,12 +131,15 @@ def test_a_search_keeps_a_task_and_saves_effort():
     assert found.violation <= 0
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"objective": "success"}, "'success' needs a task"),
-    ({"costs": ["cost", "joy"]}, "'joy' is none; choose one of reward"),
-    ({"num_episodes": 0}, "num_episodes=0"),
-    ({"num_steps": 0}, "num_steps=0"),
-])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"objective": "success"}, "'success' needs a task"),
+        ({"costs": ["cost", "joy"]}, "'joy' is none; choose one of reward"),
+        ({"num_episodes": 0}, "num_episodes=0"),
+        ({"num_steps": 0}, "num_steps=0"),
+    ],
+)
 def test_what_does_not_fit_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
         episode_evaluator(WORLD, agent, **change)

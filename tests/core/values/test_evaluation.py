@@ -36,8 +36,13 @@ def line_step(place, action, key):
     drift = jax.random.randint(noise, (), -1, 2)
     chance = jax.random.uniform(luck)
     return Timestep(
-        jnp.clip(place + action - 1 + drift, 0, 4), place + 0.5, chance < 0.05,
-        (chance < 0.1) | (chance > 0.97), action * 1.0, 0.9)
+        jnp.clip(place + action - 1 + drift, 0, 4),
+        place + 0.5,
+        chance < 0.05,
+        (chance < 0.1) | (chance > 0.97),
+        action * 1.0,
+        0.9,
+    )
 
 
 def line_observe(place):
@@ -49,8 +54,13 @@ def line_labels(place):
 
 
 LINE = make_environment(
-    line_reset, line_step, line_observe, actions=3, labels=line_labels,
-    propositions=["home", "goal"])
+    line_reset,
+    line_step,
+    line_observe,
+    actions=3,
+    labels=line_labels,
+    propositions=["home", "goal"],
+)
 
 
 def choose(observation, key):
@@ -74,7 +84,8 @@ def episodes(key, environment, agent, num_steps):
 def check_mean(estimate, x):
     np.testing.assert_allclose(estimate.mean, x.mean(), rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(
-        estimate.error, x.std(ddof=1) / np.sqrt(len(x)), rtol=1e-5, atol=1e-9)
+        estimate.error, x.std(ddof=1) / np.sqrt(len(x)), rtol=1e-5, atol=1e-9
+    )
     assert estimate.lower <= estimate.mean <= estimate.upper
 
 
@@ -83,8 +94,14 @@ def check_mean(estimate, x):
 def test_figures_are_those_of_the_episodes(name):
     environment, key = ENVIRONMENTS[name], jax.random.key(3)
     found = evaluate(
-        key, WANDERER, environment, num_episodes=NUMBER, num_steps=STEPS, discount=DISCOUNT,
-        batch=16)
+        key,
+        WANDERER,
+        environment,
+        num_episodes=NUMBER,
+        num_steps=STEPS,
+        discount=DISCOUNT,
+        batch=16,
+    )
     runs = jax.device_get(episodes(key, environment, WANDERER, STEPS))
     length = runs.valid.sum(1)
     check_mean(found.length, length)
@@ -115,7 +132,8 @@ def test_figures_are_those_of_the_episodes(name):
         check_mean(found.discounted_visits, visits @ DISCOUNT ** np.arange(STEPS + 1))
         assert found.visits.mean > 0.3
     for estimate, share in zip(
-            (found.success, found.violation, found.undecided), shares, strict=True):
+        (found.success, found.violation, found.undecided), shares, strict=True
+    ):
         assert estimate.mean == share.mean() and estimate.method == "Clopper-Pearson"
         ends = clopper_pearson(np.array([share.sum()]), np.array([NUMBER]), 0.05)
         np.testing.assert_allclose((estimate.lower, estimate.upper), np.ravel(ends), atol=1e-12)
@@ -124,8 +142,14 @@ def test_figures_are_those_of_the_episodes(name):
     # Whatever the batch, even if it is larger than what is asked for.
     for batch in (7, 1000):
         assert found == evaluate(
-            key, WANDERER, environment, num_episodes=NUMBER, num_steps=STEPS, discount=DISCOUNT,
-            batch=batch)
+            key,
+            WANDERER,
+            environment,
+            num_episodes=NUMBER,
+            num_steps=STEPS,
+            discount=DISCOUNT,
+            batch=batch,
+        )
 
 
 @pytest.mark.slow
@@ -133,17 +157,29 @@ def test_figures_are_those_of_the_episodes(name):
 def test_episodes_over_devices_are_the_episodes(number):
     """Also where the devices do not divide a batch."""
     mesh = jax.make_mesh((number,), ("episodes",), devices=jax.devices()[:number])
-    run = partial(evaluate, jax.random.key(3), WANDERER, ENVIRONMENTS["finite"],
-                  num_episodes=NUMBER, num_steps=STEPS, discount=DISCOUNT, batch=NUMBER // 2 + 1)
+    run = partial(
+        evaluate,
+        jax.random.key(3),
+        WANDERER,
+        ENVIRONMENTS["finite"],
+        num_episodes=NUMBER,
+        num_steps=STEPS,
+        discount=DISCOUNT,
+        batch=NUMBER // 2 + 1,
+    )
     split = run(sharding=NamedSharding(mesh, PartitionSpec("episodes")))
     assert split == run()
 
 
 def test_worlds_are_not_kept():
     """No array has an axis of the steps, so that memory does not grow with them."""
-    shown = str(jax.make_jaxpr(lambda key: evaluation._batch(
-        key, ENVIRONMENTS["finite"], WANDERER, 0, 1.0, num_steps=977, batch=16))(
-            jax.random.key(0)))
+    shown = str(
+        jax.make_jaxpr(
+            lambda key: evaluation._batch(
+                key, ENVIRONMENTS["finite"], WANDERER, 0, 1.0, num_steps=977, batch=16
+            )
+        )(jax.random.key(0))
+    )
     assert "[16]" in shown and "[977" not in shown and ",977" not in shown
 
 
@@ -183,7 +219,8 @@ def stay(observation, key):
 
 IDLE = agent_of(stay)
 COIN = make_environment(
-    coin_reset, Partial(coin_step, jnp.asarray(0.5)), nothing, actions=1, horizon=1)
+    coin_reset, Partial(coin_step, jnp.asarray(0.5)), nothing, actions=1, horizon=1
+)
 
 
 def coin(chance):
@@ -241,17 +278,22 @@ def test_simulated_evaluations_cover(number, chance, threshold, monkeypatch):
     All episodes of all evaluations are simulated at once, and then handed out batch by batch.
     """
     environment, batch, most = coin(chance), 64, 192
-    run = jax.jit(lambda first: jax.vmap(lambda seed: evaluation._batch(
-        jax.random.key(seed), environment, IDLE, 0, 1.0, num_steps=1, batch=most))(
-            first + jnp.arange(200)))
+    run = jax.jit(
+        lambda first: jax.vmap(
+            lambda seed: evaluation._batch(
+                jax.random.key(seed), environment, IDLE, 0, 1.0, num_steps=1, batch=most
+            )
+        )(first + jnp.arange(200))
+    )
     parts = [jax.device_get(run(first)) for first in range(0, number, 200)]
     every = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    plain = evaluate(jax.random.key(1), IDLE, environment, num_episodes=most, batch=batch,
-                     threshold=threshold)
+    plain = evaluate(
+        jax.random.key(1), IDLE, environment, num_episodes=most, batch=batch, threshold=threshold
+    )
 
     def handed(key, environment, agent, first, discount, *, num_steps, batch, sharding):
         begin = int(first)
-        return jax.tree.map(lambda x: x[seed, begin: begin + batch], every)
+        return jax.tree.map(lambda x: x[seed, begin : begin + batch], every)
 
     monkeypatch.setattr(evaluation, "_batch", handed)
     for name in ("share_estimate", "_decided"):  # of few counts, many times
@@ -259,8 +301,13 @@ def test_simulated_evaluations_cover(number, chance, threshold, monkeypatch):
     covered = wrong = decided = spent = 0
     for seed in range(number):
         found = evaluate(
-            jax.random.key(0), IDLE, environment, num_episodes=most, batch=batch,
-            threshold=threshold)
+            jax.random.key(0),
+            IDLE,
+            environment,
+            num_episodes=most,
+            batch=batch,
+            threshold=threshold,
+        )
         covered += found.success.lower <= chance <= found.success.upper
         decided += found.decision is not None
         wrong += found.decision is not None and found.decision != (chance >= 0.9)
@@ -272,36 +319,50 @@ def test_simulated_evaluations_cover(number, chance, threshold, monkeypatch):
     assert wrong <= (0.05 + slack) * number
     if threshold is not None and chance < 0.6:
         assert spent == batch * number and decided == number  # one batch tells
-    print(f"{chance=} {threshold=} covered={covered / number} decided={decided / number} "
-          f"wrong={wrong / number} episodes={spent / number}")
+    print(
+        f"{chance=} {threshold=} covered={covered / number} decided={decided / number} "
+        f"wrong={wrong / number} episodes={spent / number}"
+    )
 
 
 # --- thresholds -----------------------------------------------------------------------------------
 
 
 def test_a_threshold_ends_the_simulation_when_it_is_decided():
-    above, below, between = (evaluate(
-        jax.random.key(0), IDLE, coin(chance), threshold=0.9, num_episodes=2000, batch=100)
-        for chance in (0.99, 0.5, 0.9))
+    above, below, between = (
+        evaluate(jax.random.key(0), IDLE, coin(chance), threshold=0.9, num_episodes=2000, batch=100)
+        for chance in (0.99, 0.5, 0.9)
+    )
     assert above.decision is True and above.success.lower >= 0.9
     assert 100 <= above.num_episodes < 500
     assert below.decision is False and below.success.upper < 0.9 and below.num_episodes == 100
     assert between.decision is None and between.num_episodes == 2000
     assert [x.status for x in (above, below, between)] == [
-        Status.CONVERGED, Status.CONVERGED, Status.MAX_STEPS]
+        Status.CONVERGED,
+        Status.CONVERGED,
+        Status.MAX_STEPS,
+    ]
     for found, text in ((above, "success is at"), (below, "is not at"), (between, "open whether")):
         assert text in str(found) and "at any time" in found.success.method
         assert "at any time" in found.visits.method
 
 
 def test_a_table_tells_it_all():
-    found = evaluate(
-        jax.random.key(0), IDLE, coin(0.5), num_episodes=50, batch=50, discount=0.5)
+    found = evaluate(jax.random.key(0), IDLE, coin(0.5), num_episodes=50, batch=50, discount=0.5)
     rows = str(found).splitlines()
     assert rows[0].startswith("50 episodes of at most 1 steps")
     assert [row.split()[0] for row in rows[1:]] == [
-        "success", "violation", "undecided", "reward", "discounted", "cost", "length", "visits",
-        "discounted", "ended:"]
+        "success",
+        "violation",
+        "undecided",
+        "reward",
+        "discounted",
+        "cost",
+        "length",
+        "visits",
+        "discounted",
+        "ended:",
+    ]
     assert found.length.lower == found.length.upper == 1
     # A visit is one after the first reading.
     assert found.discounted_visits.mean == 0.5 * found.visits.mean == 0.5 * found.success.mean
@@ -320,17 +381,20 @@ def test_sums_that_are_not_finite_are_told():
 # --- refusals -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"num_steps": None}, "episodes that never end: .* with_time_limit"),
-    ({"num_steps": 0}, "num_steps=0; it must be at least 1"),
-    ({"num_episodes": 0}, "num_episodes=0"),
-    ({"batch": 0}, "batch=0"),
-    ({"confidence": 1.0}, "confidence=1.0; it must be above 0 and below 1"),
-    ({"threshold": 0.9}, "threshold=0.9, but the environment has no task"),
-    ({"discount": 1.5}, "discount=1.5"),
-    ({"agent": choose}, "agent is function; give an Agent"),
-    ({"agent": agent_of(lambda seen, key: seen)}, r"the agent's action is .*1"),
-])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"num_steps": None}, "episodes that never end: .* with_time_limit"),
+        ({"num_steps": 0}, "num_steps=0; it must be at least 1"),
+        ({"num_episodes": 0}, "num_episodes=0"),
+        ({"batch": 0}, "batch=0"),
+        ({"confidence": 1.0}, "confidence=1.0; it must be above 0 and below 1"),
+        ({"threshold": 0.9}, "threshold=0.9, but the environment has no task"),
+        ({"discount": 1.5}, "discount=1.5"),
+        ({"agent": choose}, "agent is function; give an Agent"),
+        ({"agent": agent_of(lambda seen, key: seen)}, r"the agent's action is .*1"),
+    ],
+)
 def test_what_does_not_fit_is_refused(change, message):
     given = {"agent": WANDERER, "num_steps": 3, "num_episodes": 5} | change
     with pytest.raises(ValueError, match=message):

@@ -81,7 +81,8 @@ def test_implicit_derivatives(dense):
             return implicit(operator, found)
         solved = inverse(jax.lax.stop_gradient(jnp.eye(5) - jax.jacobian(operator)(found)))
         return implicit(
-            operator, found, solve=lambda b: solved @ b, transpose_solve=lambda b: b @ solved)
+            operator, found, solve=lambda b: solved @ b, transpose_solve=lambda b: b @ solved
+        )
 
     assert_gradients(root, point, {k: rng.normal(size=v.shape) for k, v in point.items()})
 

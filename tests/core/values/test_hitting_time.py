@@ -18,7 +18,8 @@ def test_times_against_fractions(kind, seed):
     policy = reference.random_policy(rng, explicit)
     target = reference.random_target(rng, explicit.num_states)
     found = hitting_time(
-        model, policy.reshape(*model.state_shape, -1), target.reshape(model.state_shape)).ravel()
+        model, policy.reshape(*model.state_shape, -1), target.reshape(model.state_shape)
+    ).ravel()
     chain = reference.chain(explicit.transition, policy)
     # Rows of floats sum to one but for rounding.
     sure = reference.exact_reachability(chain, target).astype(float) > 1 - 1e-9

@@ -20,8 +20,9 @@ def settled(carry, given):
 
 
 def solve(carry, given, most):
-    return iterate(halve, settled, GRAPH, carry, given, max_steps=most, lanes="side by side",
-                   every=2)
+    return iterate(
+        halve, settled, GRAPH, carry, given, max_steps=most, lanes="side by side", every=2
+    )
 
 
 @pytest.mark.few(2)

@@ -104,10 +104,17 @@ def batch(cases):
 
 # Of the other methods the games below ask by the system's moves.
 @pytest.mark.few(3)
-@pytest.mark.parametrize(("method", "per"), [
-    *((method, "move") for method in METHODS), (METHODS[0], "system_move"),
-    *(pytest.param(method, "system_move", marks=pytest.mark.exhaustive)
-      for method in METHODS[1:])])
+@pytest.mark.parametrize(
+    ("method", "per"),
+    [
+        *((method, "move") for method in METHODS),
+        (METHODS[0], "system_move"),
+        *(
+            pytest.param(method, "system_move", marks=pytest.mark.exhaustive)
+            for method in METHODS[1:]
+        ),
+    ],
+)
 def test_minimax_values_are_those_of_all_strategy_pairs(batch, exact, method, per):
     games, rewards, discounts = batch
     solution = solver(method, per)(games, rewards, discounts, games.available, 1e-8)
@@ -149,8 +156,13 @@ def test_a_lane_is_as_if_alone(batch, method):
     for i in (0, 7):
         # Numbers of the kind that others ask with, for whom this is compiled too.
         alone = minimax_value(
-            lane(games, i), np.asarray(rewards[i]), float(discounts[i]), method=method,
-            max_steps=10_000, tolerance=1e-8)
+            lane(games, i),
+            np.asarray(rewards[i]),
+            float(discounts[i]),
+            method=method,
+            max_steps=10_000,
+            tolerance=1e-8,
+        )
         assert_solutions_agree(lane(together, i), alone)
         assert lane(together, i).num_steps == alone.num_steps
 
@@ -199,10 +211,13 @@ def test_discounts_near_one_do_not_keep_any_method_from_ending():
         rewards.append(reference.random_reward(rng, 8, 3))
     games, rewards = stack(games), stack(rewards)
     found = {
-        method: jax.jit(jax.vmap(
-            lambda g, r, m=method: minimax_value(
-                g, r, 0.99, per="system_move", method=m, tolerance=1e-5, max_steps=1_000_000)
-        ))(games, rewards)
+        method: jax.jit(
+            jax.vmap(
+                lambda g, r, m=method: minimax_value(
+                    g, r, 0.99, per="system_move", method=m, tolerance=1e-5, max_steps=1_000_000
+                )
+            )
+        )(games, rewards)
         for method in METHODS
     }
     for method in METHODS:
@@ -231,11 +246,12 @@ def test_evaluating_both_players_greedy_choices_in_full_goes_in_circles():
     assert tuple(policy) != seen[-1]
 
     both, sure = np.stack([successor] * 2, -1), np.broadcast_to([1.0, 0.0], (*successor.shape, 2))
-    game = as_game(
-        reference.Model(both, sure, np.ones(SHAPE[:2], bool), np.eye(4)[0]), system)
+    game = as_game(reference.Model(both, sure, np.ones(SHAPE[:2], bool), np.eye(4)[0]), system)
     full = {"tolerance": 1e-9, "max_steps": 5000}
-    found = {method: check(minimax_value(game, reward, 0.99, method=method, **full))
-             for method in METHODS}
+    found = {
+        method: check(minimax_value(game, reward, 0.99, method=method, **full))
+        for method in METHODS
+    }
     assert found["strategy_iteration"].num_steps < 20
     for method in METHODS:
         np.testing.assert_allclose(found[method].value, found[METHODS[1]].value, atol=2e-9)
@@ -253,7 +269,8 @@ def test_a_mask_restricts_and_getting_stuck_is_worth_minus_infinity(cases, batch
     num_lost = 0
     for i, (model, system, reward, discount) in enumerate(cases[:80]):
         expected = brute.minimax_value(
-            model, system, reward, discount, per, model.available & masks[i])
+            model, system, reward, discount, per, model.available & masks[i]
+        )
         lost = expected.astype(float) == -np.inf
         num_lost += lost.sum()
         for field in ("value", "lower", "upper"):
@@ -299,7 +316,9 @@ def robots(size):
     start = ((x != y) & (turn == 1)).astype(float)
     available = available.reshape(flat)
     world = make_mdp(
-        successor.reshape(*flat, 1), available[..., None] * 1.0, available=available,
+        successor.reshape(*flat, 1),
+        available[..., None] * 1.0,
+        available=available,
         initial=start / start.sum(),
     )
     game = make_game(world, turn == 1)
@@ -309,20 +328,34 @@ def robots(size):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("size", "method", "states", "counts"), [
-    *((3, method, 120, {10.0: 56, 9.0: 16}) for method in METHODS),
-    pytest.param(4, METHODS[0], 432, {10.0: 132, 9.0: 44, 8.1: 48, 7.29: 16},
-                 marks=pytest.mark.exhaustive),
-])
+@pytest.mark.parametrize(
+    ("size", "method", "states", "counts"),
+    [
+        *((3, method, 120, {10.0: 56, 9.0: 16}) for method in METHODS),
+        pytest.param(
+            4,
+            METHODS[0],
+            432,
+            {10.0: 132, 9.0: 44, 8.1: 48, 7.29: 16},
+            marks=pytest.mark.exhaustive,
+        ),
+    ],
+)
 def test_robots_on_a_grid(size, method, states, counts):
     """The dissertation's Example 1 (section 5.5, figure 13 and table 5)."""
     game, reward, allowed = robots(size)
     inside = restrict(game, allowed=allowed)
     assert inside.model.num_states == states
-    found = check(minimax_value(
-        inside.model, reward[inside.base_state], 0.9,
-        per="system_move", method=method, tolerance=1e-6,
-    ))
+    found = check(
+        minimax_value(
+            inside.model,
+            reward[inside.base_state],
+            0.9,
+            per="system_move",
+            method=method,
+            tolerance=1e-6,
+        )
+    )
     value = np.asarray(found.value)[np.asarray(inside.model.system)]
     numbers, times = np.unique(value.round(4), return_counts=True)
     assert dict(zip(numbers.tolist(), times.tolist(), strict=True)) == counts
@@ -332,19 +365,26 @@ def test_robots_on_a_grid(size, method, states, counts):
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize(("method", "per"), [
-    (METHODS[0], "system_move"), (METHODS[1], "move"), (METHODS[2], "system_move")])
+@pytest.mark.parametrize(
+    ("method", "per"),
+    [(METHODS[0], "system_move"), (METHODS[1], "move"), (METHODS[2], "system_move")],
+)
 def test_worst_cases_of_strategies(cases, method, per):
     rng = np.random.default_rng(5)
     drawn = [reference.random_policy(rng, case[0]) for case in cases[:150]]
     games, rewards, discounts = batch_of(cases[:150])
-    mixed = jax.jit(jax.vmap(
-        lambda g, p, r, d: strategy_value(g, p, r, d, per=per, method=method)
-    ))(games, stack(drawn), rewards, discounts)
-    assert_certified(mixed, np.stack([
-        brute.strategy_value(model, system, policy, reward, discount, per)
-        for (model, system, reward, discount), policy in zip(cases, drawn, strict=False)
-    ]))
+    mixed = jax.jit(
+        jax.vmap(lambda g, p, r, d: strategy_value(g, p, r, d, per=per, method=method))
+    )(games, stack(drawn), rewards, discounts)
+    assert_certified(
+        mixed,
+        np.stack(
+            [
+                brute.strategy_value(model, system, policy, reward, discount, per)
+                for (model, system, reward, discount), policy in zip(cases, drawn, strict=False)
+            ]
+        ),
+    )
     assert mixed.policy.shape == (150, *SHAPE[:2])
 
 
@@ -359,8 +399,9 @@ def test_a_strategy_of_single_actions_is_the_stochastic_one_that_is_sure(cases):
             np.testing.assert_array_equal(found.policy.argmax(-1), best.policy)
 
 
-@pytest.mark.parametrize("kinds", [("int", "int"), ("int", "float"), ("float", "int"),
-                                   ("float", "float")])
+@pytest.mark.parametrize(
+    "kinds", [("int", "int"), ("int", "float"), ("float", "int"), ("float", "float")]
+)
 def test_against_a_given_environment_it_is_the_value_of_both(cases, kinds):
     rng = np.random.default_rng(6)
     for model, system, reward, discount in cases[:4]:
@@ -369,7 +410,8 @@ def test_against_a_given_environment_it_is_the_value_of_both(cases, kinds):
         rows = [np.eye(SHAPE[1])[p] if p.ndim == 1 else p for p in given]
         joint = np.where(system[:, None], *rows)
         found = strategy_value(
-            as_game(model, system), given[0], reward, discount, environment=given[1])
+            as_game(model, system), given[0], reward, discount, environment=given[1]
+        )
         expected = policy_value(as_mdp(model), jnp.asarray(joint), reward, discount)
         np.testing.assert_allclose(found.value, expected.value, atol=1e-9)
         assert_encloses(found, reference.exact_policy_value(model, joint, reward, discount))
@@ -383,8 +425,9 @@ def test_a_loop_that_a_given_environment_leaves_by_chance_has_a_value():
     policy = jnp.array([[0.5, 0.5], [0.75, 0.25]])
     with pytest.raises(ValueError, match="state 1"):
         strategy_value(game, jnp.array([0, 0]), reward, 0.5, per="system_move")
-    found = check(strategy_value(
-        game, jnp.array([0, 0]), reward, 0.5, per="system_move", environment=policy))
+    found = check(
+        strategy_value(game, jnp.array([0, 0]), reward, 0.5, per="system_move", environment=policy)
+    )
     np.testing.assert_allclose(found.value, [5.0, 8.0], rtol=1e-12)
 
 
@@ -396,7 +439,8 @@ def test_rows_of_another_player_are_not_read_and_others_have_to_be_distributions
     found = strategy_value(game, np.array([7, 0, 0, 1]), reward, 0.5)
     np.testing.assert_allclose(found.value, [2 / 3, 4 / 3, 7 / 3, 2.0])
     kind = strategy_value(
-        game, np.array([-1, 0, 0, 1]), reward, 0.5, environment=np.array([1, -1, 5, 2]))
+        game, np.array([-1, 0, 0, 1]), reward, 0.5, environment=np.array([1, -1, 5, 2])
+    )
     np.testing.assert_allclose(kind.value, [4 / 3, 5 / 3, 8 / 3, 2.0])
     with pytest.raises(ValueError, match="takes action -1 in state 2"):
         strategy_value(game, np.array([0, 0, -1, 1]), reward, 0.5)
@@ -413,8 +457,7 @@ def test_where_nobody_can_move_is_worth_minus_infinity_and_what_leads_there_too(
     found = strategy_value(game, strategy, jnp.ones((4, 2)), 0.5)
     assert found.status == Status.CONVERGED
     np.testing.assert_allclose(found.value, [-np.inf, -np.inf, -np.inf, 2.0])
-    kind = strategy_value(
-        game, strategy, jnp.ones((4, 2)), 0.5, environment=np.zeros(4, int))
+    kind = strategy_value(game, strategy, jnp.ones((4, 2)), 0.5, environment=np.zeros(4, int))
     np.testing.assert_allclose(kind.value, [2.0, 2.0, -np.inf, 2.0])
 
 
@@ -422,10 +465,13 @@ def test_where_nobody_can_move_is_worth_minus_infinity_and_what_leads_there_too(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("label_on", "method"), [
-    pytest.param("entry", "policy_iteration", marks=pytest.mark.exhaustive),
-    ("exit", "strategy_iteration"),
-])
+@pytest.mark.parametrize(
+    ("label_on", "method"),
+    [
+        pytest.param("entry", "policy_iteration", marks=pytest.mark.exhaustive),
+        ("exit", "strategy_iteration"),
+    ],
+)
 def test_products_and_dense_games_agree_with_explicit_ones(label_on, method):
     rng = np.random.default_rng(7)
     lazy, model = random_product(rng, label_on=label_on)
@@ -441,11 +487,16 @@ def test_products_and_dense_games_agree_with_explicit_ones(label_on, method):
     one = minimax_value(game, reward, 0.9, allowed=allowed, **options)
     assert one.value.shape == lazy.state_shape
     for other in (flat, dense):
-        assert_solutions_agree(one, minimax_value(
-            other, reward.reshape(rows), 0.9, allowed=allowed.reshape(rows), **options))
+        assert_solutions_agree(
+            one,
+            minimax_value(
+                other, reward.reshape(rows), 0.9, allowed=allowed.reshape(rows), **options
+            ),
+        )
     one = strategy_value(game, strategy.reshape(reward.shape), reward, 0.9, **options)
     assert_solutions_agree(
-        one, strategy_value(flat, strategy, reward.reshape(rows), 0.9, **options))
+        one, strategy_value(flat, strategy, reward.reshape(rows), 0.9, **options)
+    )
 
 
 def test_derivatives():
@@ -455,20 +506,22 @@ def test_derivatives():
     probability /= np.where(model.available, probability.sum(-1), 1)[..., None]
     mdp = as_mdp(model)
     point = {
-        "reward": rng.normal(size=(5, 2)), "discount": 0.8, "probability": probability,
+        "reward": rng.normal(size=(5, 2)),
+        "discount": 0.8,
+        "probability": probability,
         "strategy": np.where(model.available, rng.uniform(0.2, 1, (5, 2)), 0),
     }
     point["strategy"] /= point["strategy"].sum(-1, keepdims=True)
     directions = {
-        "reward": rng.normal(size=(5, 2)), "discount": 1.0,
+        "reward": rng.normal(size=(5, 2)),
+        "discount": 1.0,
         "probability": mass_preserving(rng, probability),
         "strategy": mass_preserving(rng, point["strategy"]),
     }
 
     def answer(x):
         game = Game(mdp.replace(probability=x["probability"]), jnp.asarray(system))
-        best = minimax_value(
-            game, x["reward"], x["discount"], per="system_move", tolerance=1e-12)
+        best = minimax_value(game, x["reward"], x["discount"], per="system_move", tolerance=1e-12)
         worst = strategy_value(game, x["strategy"], x["reward"], x["discount"], tolerance=1e-12)
         return best.value, worst.value
 
@@ -516,9 +569,11 @@ def test_how_it_ends_when_it_cannot_converge(cases, method):
     vain = minimax_value(game, reward, 0.9, method=method, tolerance=1e-20, max_steps=10_000)
     assert vain.status == Status.PRECISION
     assert vain.num_steps < 1000
-    for bad in (minimax_value(game, reward, 1.0, **options),
-                minimax_value(game, reward, -0.5, **options),
-                minimax_value(game, np.full_like(reward, np.nan), 0.5, **options)):
+    for bad in (
+        minimax_value(game, reward, 1.0, **options),
+        minimax_value(game, reward, -0.5, **options),
+        minimax_value(game, np.full_like(reward, np.nan), 0.5, **options),
+    ):
         assert bad.status == Status.NONFINITE
         assert (bad.lower == -np.inf).all()
         assert (bad.upper == np.inf).all()
@@ -603,7 +658,8 @@ def test_a_large_mean_payoff_game_satisfies_its_equations():
     for mine, sign in ((system, 1), (~system, -1)):
         moves = np.where(mine[:, None], chosen, available)
         np.testing.assert_allclose(
-            sign * least_cycle_mean(successor, moves, sign * reward), found.value, atol=1e-12)
+            sign * least_cycle_mean(successor, moves, sign * reward), found.value, atol=1e-12
+        )
 
 
 def least_cycle_mean(successor, moves, weight):
@@ -617,7 +673,7 @@ def least_cycle_mean(successor, moves, weight):
             cost[n + 1, :, t] = np.minimum(cost[n + 1, :, t], cost[n, :, s] + weight[s, a])
     steps = (size - np.arange(size))[:, None, None]
     with np.errstate(invalid="ignore"):
-        mean = ((cost[size] - cost[:size]) / steps)
+        mean = (cost[size] - cost[:size]) / steps
     mean = np.where(np.isfinite(cost[:size]), mean, -np.inf).max(axis=0)
     return np.where(np.isfinite(cost[size]), mean, np.inf).min(axis=1)
 
@@ -654,24 +710,43 @@ def small_game():
     return make_game(from_dense(np.eye(2)[[[1, 1], [0, 1]]]), [True, False])
 
 
-@pytest.mark.parametrize(("words", "call"), [
-    ("method='newton'", lambda g: minimax_value(g, jnp.zeros((2, 2)), 0.5, method="newton")),
-    ("per='turn'", lambda g: minimax_value(g, jnp.zeros((2, 2)), 0.5, per="turn")),
-    ("reward has shape", lambda g: minimax_value(g, jnp.zeros(2), 0.5)),
-    ("allowed has shape", lambda g: minimax_value(g, jnp.zeros((2, 2)), 0.5, allowed=[True] * 2)),
-    ("state 1 the environment can move for ever",
-     lambda g: minimax_value(g, jnp.zeros((2, 2)), 0.5, per="system_move")),
-    ("strategy .of integers. has shape",
-     lambda g: strategy_value(g, jnp.zeros(3, int), jnp.zeros((2, 2)), 0.5)),
-    ("environment .stochastic. has shape",
-     lambda g: strategy_value(
-         g, jnp.zeros(2, int), jnp.zeros((2, 2)), 0.5, environment=jnp.ones((2, 3)))),
-    ("environment='fair'",
-     lambda g: strategy_value(g, jnp.zeros(2, int), jnp.zeros((2, 2)), 0.5, environment="fair")),
-    ("state 1, action 0 is inf",
-     lambda g: mean_payoff(g, jnp.array([[0.0, 0.0], [jnp.inf, 0.0]]))),
-    ("outside jit", lambda g: jax.jit(mean_payoff)(g, jnp.zeros((2, 2)))),
-])
+@pytest.mark.parametrize(
+    ("words", "call"),
+    [
+        ("method='newton'", lambda g: minimax_value(g, jnp.zeros((2, 2)), 0.5, method="newton")),
+        ("per='turn'", lambda g: minimax_value(g, jnp.zeros((2, 2)), 0.5, per="turn")),
+        ("reward has shape", lambda g: minimax_value(g, jnp.zeros(2), 0.5)),
+        (
+            "allowed has shape",
+            lambda g: minimax_value(g, jnp.zeros((2, 2)), 0.5, allowed=[True] * 2),
+        ),
+        (
+            "state 1 the environment can move for ever",
+            lambda g: minimax_value(g, jnp.zeros((2, 2)), 0.5, per="system_move"),
+        ),
+        (
+            "strategy .of integers. has shape",
+            lambda g: strategy_value(g, jnp.zeros(3, int), jnp.zeros((2, 2)), 0.5),
+        ),
+        (
+            "environment .stochastic. has shape",
+            lambda g: strategy_value(
+                g, jnp.zeros(2, int), jnp.zeros((2, 2)), 0.5, environment=jnp.ones((2, 3))
+            ),
+        ),
+        (
+            "environment='fair'",
+            lambda g: strategy_value(
+                g, jnp.zeros(2, int), jnp.zeros((2, 2)), 0.5, environment="fair"
+            ),
+        ),
+        (
+            "state 1, action 0 is inf",
+            lambda g: mean_payoff(g, jnp.array([[0.0, 0.0], [jnp.inf, 0.0]])),
+        ),
+        ("outside jit", lambda g: jax.jit(mean_payoff)(g, jnp.zeros((2, 2)))),
+    ],
+)
 def test_misuse_is_named(words, call):
     with pytest.raises(ValueError, match=words):
         call(small_game())

@@ -11,11 +11,11 @@ KINDS = ("cosafe", "safety", "buchi", "parity")
 
 
 def random_case(rng, kind):
-    """A product, any policy, one of the moves that lose nothing, the best, and what each attains.
-    """
+    """A product, any policy, one of the moves that lose nothing, the best, and what each attains."""
     while True:
-        model = jl.product(random_world(rng), random_automaton(rng, kind),
-                           label_on=rng.choice(["entry", "exit"]))
+        model = jl.product(
+            random_world(rng), random_automaton(rng, kind), label_on=rng.choice(["entry", "exit"])
+        )
         sure = jl.optimal_actions(model)
         policy = np.asarray(model.available) * rng.dirichlet(np.ones(A), (S, Q))
         policy /= policy.sum(-1, keepdims=True)
@@ -33,11 +33,24 @@ def reached(model, policy, over):
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize(("kind", "over"), [
-    ("cosafe", "mean"), ("safety", "worst"), ("buchi", "mean"), ("parity", "worst"),
-    *(pytest.param(*setting, marks=pytest.mark.exhaustive) for setting in (
-        ("cosafe", "worst"), ("safety", "mean"), ("buchi", "worst"), ("parity", "mean"))),
-])
+@pytest.mark.parametrize(
+    ("kind", "over"),
+    [
+        ("cosafe", "mean"),
+        ("safety", "worst"),
+        ("buchi", "mean"),
+        ("parity", "worst"),
+        *(
+            pytest.param(*setting, marks=pytest.mark.exhaustive)
+            for setting in (
+                ("cosafe", "worst"),
+                ("safety", "mean"),
+                ("buchi", "worst"),
+                ("parity", "mean"),
+            )
+        ),
+    ],
+)
 def test_the_share_is_the_least_that_reaches_what_is_asked(kind, over):
     rng = np.random.default_rng([KINDS.index(kind), over == "mean"])
     shares = []
@@ -47,7 +60,8 @@ def test_the_share_is_the_least_that_reaches_what_is_asked(kind, over):
         asked = low + (high - low) * rng.uniform(0.1, 0.95)
         found = mixture.least_mixture(model, policy, inside, asked, over=over)
         np.testing.assert_allclose(
-            found.policy, (1 - found.share) * policy + found.share * inside, rtol=0, atol=1e-15)
+            found.policy, (1 - found.share) * policy + found.share * inside, rtol=0, atol=1e-15
+        )
         value = reached(model, found.policy, over)
         assert found.attained == pytest.approx(value, abs=1e-9)
         assert value >= asked - 1e-12
@@ -67,12 +81,19 @@ def test_the_share_is_the_least_that_reaches_what_is_asked(kind, over):
 def corridor(slow):
     """To the goal, to a trap, or on the spot; `slow` is how seldom the slow policy goes on."""
     world = jl.make_mdp(
-        [[[1], [2], [0]], [[1]] * 3, [[2]] * 3], np.ones((3, 3, 1)), label=[[0], [1], [0]],
-        propositions=["g"], initial=[1, 0, 0])
+        [[[1], [2], [0]], [[1]] * 3, [[2]] * 3],
+        np.ones((3, 3, 1)),
+        label=[[0], [1], [0]],
+        propositions=["g"],
+        initial=[1, 0, 0],
+    )
     model = jl.product(world, "F g")
     shape = (*model.state_shape, 3)
-    return model, np.broadcast_to([0.2, 0.7, 0.1], shape), np.broadcast_to(
-        [slow, 0, 1 - slow], shape)
+    return (
+        model,
+        np.broadcast_to([0.2, 0.7, 0.1], shape),
+        np.broadcast_to([slow, 0, 1 - slow], shape),
+    )
 
 
 def test_where_what_loses_nothing_dawdles_the_quickest_is_mixed_in():

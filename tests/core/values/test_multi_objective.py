@@ -23,8 +23,12 @@ def leaking(model, rate=0.2):
     probability = np.insert(mdp.probability * (1 - rate), last, rate)
     start = np.append(mdp.entry_start + np.arange(model.num_rows + 1), successor.size + 1)
     return make_sparse(
-        np.append(mdp.row_start, mdp.num_rows + 1), start, np.append(successor, end),
-        np.append(probability, 1.0), initial=start_at(end + 1))
+        np.append(mdp.row_start, mdp.num_rows + 1),
+        start,
+        np.append(successor, end),
+        np.append(probability, 1.0),
+        initial=start_at(end + 1),
+    )
 
 
 def by_sweeps(model, events, rewards, weights, sweeps):
@@ -47,8 +51,9 @@ def by_sweeps(model, events, rewards, weights, sweeps):
                 after[i] = 2
         return tuple(after), earned
 
-    step = sum((w * r for w, r in zip(weights[count:], rewards, strict=True)),
-               np.zeros(model.num_rows))
+    step = sum(
+        (w * r for w, r in zip(weights[count:], rewards, strict=True)), np.zeros(model.num_rows)
+    )
     moves, todo = {}, [(0, entered(0, (0,) * count)[0])]
     while todo:
         state = todo.pop()
@@ -64,9 +69,11 @@ def by_sweeps(model, events, rewards, weights, sweeps):
                 todo.append((model.successor[e], after))
             moves[state].append((step[r], ahead))
     number = {state: i for i, state in enumerate(moves)}
-    rows = [(number[state], c + sum(p * x for p, _, x in ahead),
-             {number[t]: p for p, t, _ in ahead}) for state, rows in moves.items()
-            for c, ahead in rows]
+    rows = [
+        (number[state], c + sum(p * x for p, _, x in ahead), {number[t]: p for p, t, _ in ahead})
+        for state, rows in moves.items()
+        for c, ahead in rows
+    ]
     matrix = np.zeros((len(rows), len(number)))
     for i, (_, _, ahead) in enumerate(rows):
         for t, p in ahead.items():
@@ -93,9 +100,14 @@ def test_half_spaces_are_what_sweeps_find(seed):
     model = random_sparse(rng, 6, most=2, width=2, initial=start_at(6))
     first, second, stay = (rng.random(6) < p for p in (0.3, 0.3, 0.8))
     every = np.ones(6, bool)
-    found = pareto(model, [
-        Objective(target=first, stay=stay),
-        Objective(target=second, direction="max" if seed % 2 else "min")], tolerance=1e-3)
+    found = pareto(
+        model,
+        [
+            Objective(target=first, stay=stay),
+            Objective(target=second, direction="max" if seed % 2 else "min"),
+        ],
+        tolerance=1e-3,
+    )
     assert found.status == Status.CONVERGED and found.gap <= 1e-3
     check_front(found.front, model, [(first, stay), (second, every)], [])
     # Points of the curve do not beat one another.
@@ -110,8 +122,7 @@ def test_rewards_of_both_signs_and_probabilities(seed):
     model = leaking(random_sparse(rng, 5, most=2, width=2))
     end = np.arange(6) == 5
     target, every = rng.random(6) < 0.3, np.ones(6, bool)
-    gain, cost = (np.where(end[model.host.state], 0, rng.random(model.num_rows))
-                  for _ in range(2))
+    gain, cost = (np.where(end[model.host.state], 0, rng.random(model.num_rows)) for _ in range(2))
     objectives = [
         Objective(target=target & ~end),
         Objective(reward=Rewards(choice=gain)),
@@ -130,42 +141,60 @@ def test_rewards_of_both_signs_and_probabilities(seed):
 def test_one_objective_is_what_its_own_solver_finds(seed):
     rng = np.random.default_rng(seed)
     model = random_sparse(
-        rng, 7, most=2, width=2, initial=start_at(7), label=rng.random((7, 2)) < 0.4,
-        propositions=["a", "b"])
+        rng,
+        7,
+        most=2,
+        width=2,
+        initial=start_at(7),
+        label=rng.random((7, 2)) < 0.4,
+        propositions=["a", "b"],
+    )
     for formula in ("G F a", "F G b", "a U b", "G (a -> F b)"):
         for direction in ("max", "min"):
             alone = multi_objective(model, [Objective(formula=formula, direction=direction)])
             expected = sparse_satisfaction(model, formula, objective=direction).solution
             assert alone.lower - 1e-6 <= expected.value[0] <= alone.upper + 1e-6
             assert alone.status == Status.CONVERGED
-    both = achievable(
-        model, [Objective(formula="G F a"), Objective(formula="G F !b")], [1.0, 1.0])
+    both = achievable(model, [Objective(formula="G F a"), Objective(formula="G F !b")], [1.0, 1.0])
     most = sparse_satisfaction(model, "G F a & G F !b").solution
     assert both.holds == (most.lower[0] == 1)
     # How often both can be had is at least the sum less one, and one alone is no more.
     share = 0.5 * float(most.lower[0])
     assert achievable(
-        model, [Objective(formula="G F a"), Objective(formula="G F !b")], [share, share]).holds
+        model, [Objective(formula="G F a"), Objective(formula="G F !b")], [share, share]
+    ).holds
 
 
 def test_sets_of_recurrence_that_exclude_each_other():
     """Two circles, of which one must be left for good to enter the other."""
     model = make_sparse(
-        [0, 2, 4, 5], [0, 1, 2, 3, 4, 5], [0, 1, 1, 2, 2], np.ones(5), initial=start_at(3),
-        label=[[1, 0, 0], [0, 1, 0], [0, 0, 1]], propositions=["a", "b", "c"])
-    objectives = [Objective(formula="G F a"), Objective(formula="G F b"),
-                  Objective(formula="F G c")]
+        [0, 2, 4, 5],
+        [0, 1, 2, 3, 4, 5],
+        [0, 1, 1, 2, 2],
+        np.ones(5),
+        initial=start_at(3),
+        label=[[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        propositions=["a", "b", "c"],
+    )
+    objectives = [
+        Objective(formula="G F a"),
+        Objective(formula="G F b"),
+        Objective(formula="F G c"),
+    ]
     assert achievable(model, objectives, [0.25, 0.25, 0.5]).holds is True
     assert achievable(model, objectives, [0.25, 0.25, 0.51]).holds is False
     found = pareto(model, objectives)
     assert sorted(found.points.tolist()) == [[0, 0, 1], [0, 1, 0], [1, 0, 0]]
-    assert achievable(model, [Objective(formula="F b"), Objective(formula="G F b")],
-                      [1.0, 1.0]).holds is True
+    assert (
+        achievable(model, [Objective(formula="F b"), Objective(formula="G F b")], [1.0, 1.0]).holds
+        is True
+    )
 
 
 def test_mixtures_and_half_spaces_are_the_evidence():
-    model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], np.ones(4),
-                        initial=start_at(3))
+    model = make_sparse(
+        [0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], np.ones(4), initial=start_at(3)
+    )
     a, b = (np.arange(3) == i for i in (1, 2))
     yes = achievable(model, [Objective(target=a), Objective(target=b)], [0.3, 0.7])
     assert yes.holds and (yes.share @ yes.front.lower >= [0.3, 0.7]).all()
@@ -188,10 +217,12 @@ def test_thresholds_of_what_is_best(seed):
     most = reachability_probability(model, target).value[0]
     least = reachability_probability(model, other, objective="min").value[0]
     alone = multi_objective(
-        model, [Objective(target=target), Objective(target=other, threshold=0.0)])
+        model, [Objective(target=target), Objective(target=other, threshold=0.0)]
+    )
     assert alone.lower - 1e-6 <= most <= alone.upper + 1e-6
     spared = multi_objective(
-        model, [Objective(avoid=other), Objective(target=target, threshold=0.0)])
+        model, [Objective(avoid=other), Objective(target=target, threshold=0.0)]
+    )
     assert spared.lower - 1e-6 <= 1 - least <= spared.upper + 1e-6
 
 
@@ -201,13 +232,21 @@ def acyclic(rng, size, ends=3):
         ahead = np.arange(s + 1, size)
         count.append(1 if s >= size - ends else 3)
         for _ in range(count[-1]):
-            rows.append([s] if s >= size - ends else sorted(
-                rng.choice(ahead, min(2, ahead.size), replace=False)))
+            rows.append(
+                [s]
+                if s >= size - ends
+                else sorted(rng.choice(ahead, min(2, ahead.size), replace=False))
+            )
     start = np.concatenate([[0], np.cumsum([len(row) for row in rows])])
     probability = rng.random(start[-1]) + 0.1
     probability /= np.repeat(np.add.reduceat(probability, start[:-1]), np.diff(start))
-    return make_sparse(np.concatenate([[0], np.cumsum(count)]), start, np.concatenate(rows),
-                       probability, initial=start_at(size))
+    return make_sparse(
+        np.concatenate([[0], np.cumsum(count)]),
+        start,
+        np.concatenate(rows),
+        probability,
+        initial=start_at(size),
+    )
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -222,14 +261,18 @@ def test_storm_finds_the_same(seed):
     least = float(np.round(rng.random(), 2))
     questions = {
         f'multi(Pmax=? [ F "a" ], P>={least} [ F "b" ], P<=0.7 [ F "c" ])': [
-            Objective(target=sets["a"]), Objective(target=sets["b"], threshold=least),
-            Objective(target=sets["c"], direction="min", threshold=0.7)],
+            Objective(target=sets["a"]),
+            Objective(target=sets["b"], threshold=least),
+            Objective(target=sets["c"], direction="min", threshold=0.7),
+        ],
         f'multi(R{{"r"}}min=? [ C ], P>={least} [ G !"b" ])': [
             Objective(reward=Rewards(state=reward), direction="min"),
-            Objective(avoid=sets["b"], threshold=least)],
+            Objective(avoid=sets["b"], threshold=least),
+        ],
         f'multi(R{{"r"}}max=? [ C ], P>={least} [ G !"b" ])': [
             Objective(reward=Rewards(state=reward)),
-            Objective(avoid=sets["b"], threshold=least)],
+            Objective(avoid=sets["b"], threshold=least),
+        ],
     }
     for text, objectives in questions.items():
         (question,) = stormpy.parse_properties(text)
@@ -242,7 +285,9 @@ def test_storm_finds_the_same(seed):
     (question,) = stormpy.parse_properties('Pmax=? [ F "a" ]')
     np.testing.assert_allclose(
         multi_objective(model, [Objective(target=sets["a"])]).value,
-        storm_values(storm, 'Pmax=? [ F "a" ]')[0], atol=1e-6)
+        storm_values(storm, 'Pmax=? [ F "a" ]')[0],
+        atol=1e-6,
+    )
 
 
 def arc(corners):
@@ -250,9 +295,13 @@ def arc(corners):
     angle = np.linspace(0, np.pi / 2, corners)
     x, y = (np.append(f(angle), 0.0) for f in (np.cos, np.sin))
     model = make_sparse(
-        [0, corners, corners + 1], np.arange(corners + 2), np.ones(corners + 1, int),
-        np.ones(corners + 1), initial=[1, 0],
-        rewards={"x": Rewards(choice=x), "y": Rewards(choice=y)})
+        [0, corners, corners + 1],
+        np.arange(corners + 2),
+        np.ones(corners + 1, int),
+        np.ones(corners + 1),
+        initial=[1, 0],
+        rewards={"x": Rewards(choice=x), "y": Rewards(choice=y)},
+    )
     return model, x[:-1], y[:-1]
 
 
@@ -263,13 +312,15 @@ def test_a_border_of_many_corners(corners):
     for least in (0.28, 0.7, 0.99999):
         most = np.interp(least, y, x)  # mixtures of neighbours are the border
         best = multi_objective(
-            model, [Objective(reward="x"), Objective(reward="y", threshold=least)])
+            model, [Objective(reward="x"), Objective(reward="y", threshold=least)]
+        )
         assert best.status == Status.CONVERGED
         assert best.lower - 1e-12 <= most <= best.upper + 1e-12
         assert best.upper - best.lower <= 1e-6 * best.upper
         for beyond, holds in ((-1e-10, True), (1e-10, False)):
             found = achievable(
-                model, [Objective(reward="x"), Objective(reward="y")], [most + beyond, least])
+                model, [Objective(reward="x"), Objective(reward="y")], [most + beyond, least]
+            )
             assert found.holds is holds and found.nearest is None
             if holds:
                 assert (found.share @ found.front.lower >= [most + beyond, least]).all()
@@ -299,14 +350,21 @@ def test_all_corners_are_found():
     found = pareto(model, [Objective(reward="x"), Objective(reward="y")], tolerance=1e-6)
     assert found.status == Status.CONVERGED and found.gap <= 1e-6
     np.testing.assert_allclose(found.points, np.stack([x, y], 1)[::-1], atol=1e-9)
-    few = pareto(model, [Objective(reward="x"), Objective(reward="y")], tolerance=1e-6,
-                 max_points=12)
+    few = pareto(
+        model, [Objective(reward="x"), Objective(reward="y")], tolerance=1e-6, max_points=12
+    )
     assert few.status == Status.MAX_STEPS and 1e-6 < few.gap < 0.01
 
 
 def test_what_is_wrong_is_named():
-    model = make_sparse([0, 2, 3], [0, 1, 2, 3], [0, 1, 1], np.ones(3), initial=[1, 0],
-                        rewards={"r": Rewards(choice=[1.0, 0, 0])})
+    model = make_sparse(
+        [0, 2, 3],
+        [0, 1, 2, 3],
+        [0, 1, 1],
+        np.ones(3),
+        initial=[1, 0],
+        rewards={"r": Rewards(choice=[1.0, 0, 0])},
+    )
     end = np.array([False, True])
     with pytest.raises(ValueError, match="objective 1: give one of"):
         pareto(model, [Objective()])
@@ -317,14 +375,15 @@ def test_what_is_wrong_is_named():
     with pytest.raises(ValueError, match="objective 2 is infinite"):
         pareto(model, [Objective(target=end), Objective(reward="r")])
     with pytest.raises(ValueError, match="under every policy"):
-        pareto(model, [Objective(reward=[1.0, 1.0, 1.0], direction="min"),
-                       Objective(target=end)])
+        pareto(model, [Objective(reward=[1.0, 1.0, 1.0], direction="min"), Objective(target=end)])
     with pytest.raises(ValueError, match="rewards of at least 0"):
         pareto(model, [Objective(reward=[-1.0, 0, 0]), Objective(target=end)])
     with pytest.raises(ValueError, match="give one finite number for each"):
         achievable(model, [Objective(target=end), Objective(avoid=end)])
     with pytest.raises(ValueError, match="to all but one"):
-        multi_objective(model, [Objective(target=end), Objective(avoid=end),
-                      Objective(avoid=end, threshold=0.5)])
+        multi_objective(
+            model,
+            [Objective(target=end), Objective(avoid=end), Objective(avoid=end, threshold=0.5)],
+        )
     least = multi_objective(model, [Objective(reward="r", direction="min", target=end)])
     assert least.lower == least.upper == 0

@@ -35,8 +35,9 @@ def batch_of(cases):
 @pytest.mark.few(1)
 @pytest.mark.parametrize("tolerance", [None, 1e-6])
 def test_occupancies_are_enclosed(cases, tolerance):
-    solution = jax.jit(jax.vmap(
-        lambda m, p, d: jl.occupancy_measure(m, p, d, tolerance=tolerance)))(*batch_of(cases))
+    solution = jax.jit(
+        jax.vmap(lambda m, p, d: jl.occupancy_measure(m, p, d, tolerance=tolerance))
+    )(*batch_of(cases))
     assert (solution.status == Status.CONVERGED).all()
     assert_encloses(solution, np.stack([reference.exact_occupancy(*case) for case in cases]))
     assert (solution.upper - solution.lower).max() <= (2 * tolerance if tolerance else 1e-9)
@@ -82,7 +83,8 @@ def test_it_is_differentiable_in_the_start():
     mdp, policy = as_mdp(model), jnp.asarray(reference.random_policy(rng, model))
     assert_gradients(
         lambda x: jl.occupancy_measure(mdp, policy, 0.9, initial=x["initial"]).value,
-        {"initial": model.initial}, {"initial": rng.normal(size=5)},
+        {"initial": model.initial},
+        {"initial": rng.normal(size=5)},
     )
 
 

@@ -15,9 +15,14 @@ def solution(xp, dtype, width):
     value = VALUE.astype(dtype)
     lower, upper = np.maximum(value - width, 0), np.minimum(value + width, 1)
     return Solution(
-        value=xp.asarray(value), policy=xp.zeros(6, int), lower=xp.asarray(lower.astype(dtype)),
-        upper=xp.asarray(upper.astype(dtype)), residual=xp.asarray(0.0), num_steps=xp.asarray(1),
-        status=xp.asarray(int(Status.CONVERGED)))
+        value=xp.asarray(value),
+        policy=xp.zeros(6, int),
+        lower=xp.asarray(lower.astype(dtype)),
+        upper=xp.asarray(upper.astype(dtype)),
+        residual=xp.asarray(0.0),
+        num_steps=xp.asarray(1),
+        status=xp.asarray(int(Status.CONVERGED)),
+    )
 
 
 @pytest.mark.parametrize(("xp", "dtype"), [(np, np.float64), (np, np.float32), (jnp, np.float32)])

@@ -42,8 +42,12 @@ def random_case(rng, kind):
     probability[lazy, 1] = probability[lazy, 0] / 2 + np.array([0, 0, 1 / 2])
     available = rng.random((S, A)) < 0.9
     available[np.arange(S), rng.integers(A, size=S)] = True
-    world = {"successor": successor, "probability": probability, "available": available,
-             "label": rng.random((S, 2)) < 0.5}
+    world = {
+        "successor": successor,
+        "probability": probability,
+        "available": available,
+        "label": rng.random((S, 2)) < 0.5,
+    }
     delta = np.where(rng.random((Q, L)) < 0.4, rng.integers(0, Q, (Q, L)), np.arange(Q)[:, None])
     if kind in ("cosafe", "safety"):
         delta[-1] = Q - 1
@@ -138,7 +142,8 @@ def case_that_matters(rng, kind, label_on, objective):
 
 def check_case(rng, kind, label_on, objective):
     parts, matrix, priority, policies, values, sure = case_that_matters(
-        rng, kind, label_on, objective)
+        rng, kind, label_on, objective
+    )
     model = model_of(*parts)
     best, surely = values.max(0), sure.any(0)
     found = optimal_actions(model, objective=objective)
@@ -154,8 +159,11 @@ def check_case(rng, kind, label_on, objective):
 
     # The same from bounds that say nothing, of which only what is proven anew is left.
     inner = (found.best.value > 0) & (found.best.value < 1)
-    vague = replace(found.best, lower=jnp.where(inner, 0, found.best.lower),
-                    upper=jnp.where(inner, 1, found.best.upper))
+    vague = replace(
+        found.best,
+        lower=jnp.where(inner, 0, found.best.lower),
+        upper=jnp.where(inner, 1, found.best.upper),
+    )
     proven = optimal_actions(model, vague, objective=objective)
     np.testing.assert_array_equal(proven.allowed, found.allowed)
     assert float(proven.loss) < 1e-12
@@ -174,8 +182,7 @@ def check_case(rng, kind, label_on, objective):
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize(("kind", "label_on", "objective"), CASES)
-@pytest.mark.parametrize(
-    "count", [18, pytest.param(313, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("count", [18, pytest.param(313, marks=pytest.mark.exhaustive)])
 def test_every_policy_on_the_whole_mask_is_optimal_and_no_best_action_is_missing(
     kind, label_on, objective, count
 ):
@@ -196,7 +203,9 @@ def crossing():
     return make_mdp(
         [[[0, 0], [1, 1]], [[0, 0], [2, 3]], *ends],
         [[[1, 0], [1, 0]], [[1, 0], [0.5, 0.5]], *[[[1, 0]] * 2] * 2],
-        initial=[1, 0, 0, 0], label=[[0], [0], [1], [0]], propositions=["goal"],
+        initial=[1, 0, 0, 0],
+        label=[[0], [0], [1], [0]],
+        propositions=["goal"],
     )
 
 
@@ -210,7 +219,8 @@ def test_what_wide_bounds_let_in_is_found_out(crossing, monkeypatch):
     """Staying gives up a thousandth, which bounds of that width do not show."""
     last = crossing.replace(
         successor=crossing.successor.at[0, 0].set(np.array([0, 3], np.int32)),
-        probability=crossing.probability.at[0, 0].set(np.array([0.999, 0.001])))
+        probability=crossing.probability.at[0, 0].set(np.array([0.999, 0.001])),
+    )
     model = product(last, "F goal")
     start = int(model.initial_memory[0])
     assert optimal_actions(model).allowed[0, start].tolist() == [False, True]
@@ -237,9 +247,12 @@ def test_what_wide_bounds_let_in_is_found_out(crossing, monkeypatch):
 def test_in_an_accepting_component_no_lesser_priority_is_met_again():
     """Round the loop b (0) holds once more; G a keeps to the cell, and leaving it is final."""
     world = make_mdp(
-        [[[0], [1], [2]], [[0], [0], [0]], [[2], [2], [2]]], np.ones((3, 3, 1)),
-        initial=[1, 0, 0], label=[[True, False], [False, False], [False, True]],
-        propositions=["a", "b"])
+        [[[0], [1], [2]], [[0], [0], [0]], [[2], [2], [2]]],
+        np.ones((3, 3, 1)),
+        initial=[1, 0, 0],
+        label=[[True, False], [False, False], [False, True]],
+        propositions=["a", "b"],
+    )
     model = product(world, "F G a | F b")
     start = int(model.initial_memory[0])
     found = optimal_actions(model)

@@ -35,7 +35,8 @@ def process(seed, over):
         found = jnp.asarray(successor)[state, action]
         kind = jnp.asarray(over)[found]
         return Timestep(found, jnp.zeros(K), kind == 1, kind == 2), (
-            jnp.asarray(probability)[state, action])
+            jnp.asarray(probability)[state, action]
+        )
 
     def step(state, action, key):
         found, chance = at(state, action)
@@ -43,9 +44,15 @@ def process(seed, over):
         return Timestep(*(x[k] for x in found[:4]))
 
     world = make_environment(
-        lambda key: jax.random.choice(key, S, p=jnp.asarray(initial)), step, lambda x: x / S,
-        actions=A, labels=lambda x: (x % 3 == jnp.arange(2)), propositions=["zero", "one"],
-        starts=lambda: (jnp.arange(S), jnp.asarray(initial)), outcomes=at)
+        lambda key: jax.random.choice(key, S, p=jnp.asarray(initial)),
+        step,
+        lambda x: x / S,
+        actions=A,
+        labels=lambda x: x % 3 == jnp.arange(2),
+        propositions=["zero", "one"],
+        starts=lambda: (jnp.arange(S), jnp.asarray(initial)),
+        outcomes=at,
+    )
     return world, successor, probability, over
 
 
@@ -74,9 +81,13 @@ def reference(arrays, task, num_steps, policy):
             return float(lasts(memory, state))
         if left == 0 or kind == 2:
             return 0.0
-        each = [sum(p * value(int(t), read(memory, int(t)), left - 1, int(over[t]))
-                    for t, p in zip(successor[state, a], probability[state, a], strict=True))
-                for a in range(A)]
+        each = [
+            sum(
+                p * value(int(t), read(memory, int(t)), left - 1, int(over[t]))
+                for t, p in zip(successor[state, a], probability[state, a], strict=True)
+            )
+            for a in range(A)
+        ]
         return max(each) if policy is None else float(policy[state, memory] @ each)
 
     starts = [(s, read(int(automaton.initial), s)) for s in range(3)]
@@ -95,8 +106,9 @@ def on_table(table, policy):
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("kind", ["stochastic", "deterministic"])
 def test_bounds_enclose_the_recursion(seed, kind):
-    world, *arrays = process(seed, np.array([0, 0, 0, 0, 0, 1, 2])[np.random.default_rng(
-        seed + 9).permutation(S)])
+    world, *arrays = process(
+        seed, np.array([0, 0, 0, 0, 0, 1, 2])[np.random.default_rng(seed + 9).permutation(S)]
+    )
     table = tabulate(world)
     task = TASKS[seed]
     num_memory = len(to_automaton(task).delta)
@@ -155,6 +167,7 @@ def test_the_best_of_letters_is_a_shortest_way():
 
 def shortest(letter, place, automaton, decided):
     """Steps until the task is done, by a queue; 16 for more or never."""
+
     def read(memory, cell):
         shown = {"abc"[letter[cell]]} if letter[cell] < 3 else set()
         return int(automaton.delta[memory, letter_index(automaton, shown)])

@@ -28,8 +28,14 @@ from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_p
 from jaxltl.core.values.soft import soft_value
 from tests.core.models.test_sharded import A, S, mesh_of, world
 
-MESHES = [(4, 2), *(pytest.param(count, reach, marks=pytest.mark.exhaustive)
-                    for count in (1, 2, 4) for reach in (2, None))]
+MESHES = [
+    (4, 2),
+    *(
+        pytest.param(count, reach, marks=pytest.mark.exhaustive)
+        for count in (1, 2, 4)
+        for reach in (2, None)
+    ),
+]
 FORMULAS = ("F (a & X F b)", "G F a & F G !b", "G !a")
 
 
@@ -56,8 +62,9 @@ class Case:
     def agree(self, one, other, tolerance=1e-9):
         """Both end alike, the bounds of each enclose the value of the other."""
         assert int(one.status) == int(other.status) == Status.CONVERGED
-        value, lower, upper = (from_mesh(self.sharded, x)
-                               for x in (other.value, other.lower, other.upper))
+        value, lower, upper = (
+            from_mesh(self.sharded, x) for x in (other.value, other.lower, other.upper)
+        )
         np.testing.assert_allclose(value, one.value, atol=tolerance, rtol=tolerance)
         assert (lower <= np.asarray(one.upper) + 1e-13).all()
         assert (upper >= np.asarray(one.lower) - 1e-13).all()
@@ -87,8 +94,9 @@ def test_solvers(count, reach, solver):
     case.agree(one, other)
 
 
-@pytest.mark.parametrize("solver", [
-    "optimal", *(pytest.param(x, marks=pytest.mark.exhaustive) for x in SOLVERS)])
+@pytest.mark.parametrize(
+    "solver", ["optimal", *(pytest.param(x, marks=pytest.mark.exhaustive) for x in SOLVERS)]
+)
 def test_solvers_where_one_table_holds_all(solver):
     case = Case(4, 1, ragged=False)
     assert isinstance(table(case.sharded), SpreadSuccessors)
@@ -108,8 +116,10 @@ def test_formulas(count, reach, formula):
     if formula != FORMULAS[0]:
         return
     policy = np.repeat(case.policy[:, None], one.num_memory, 1)
-    case.agree(satisfaction_probability(one, jnp.asarray(policy)),
-               satisfaction_probability(other, case.there(policy)))
+    case.agree(
+        satisfaction_probability(one, jnp.asarray(policy)),
+        satisfaction_probability(other, case.there(policy)),
+    )
 
 
 @pytest.mark.parametrize(("count", "reach"), MESHES)
@@ -132,7 +142,8 @@ def test_graphs(count, reach):
 
 def graphs(model, region):
     return {
-        "attractor": attractor(model, region)[:2], "avoidable": [avoidable(model, region)],
+        "attractor": attractor(model, region)[:2],
+        "avoidable": [avoidable(model, region)],
         "surely": almost_surely_reaching(model, region)[:1],
         "end components": end_components(model, region),
         "bottom components": bottom_components(model, _support(model, region)),
@@ -157,15 +168,20 @@ def test_components_by_sweeps_are_those_of_the_host(count):
     for seed in range(count):
         mdp = world(seed, [1, 2, None][seed % 3])
         for formula in (None, "G F a & F G !b", "F (a & X F b)"):
-            model = mdp if formula is None else product(
-                mdp, formula, label_on=("entry", "exit")[seed % 2])
+            model = (
+                mdp
+                if formula is None
+                else product(mdp, formula, label_on=("entry", "exit")[seed % 2])
+            )
             rng = np.random.default_rng(seed)
             shape = model.state_shape
             host, core = graph_of(model), rng.random(shape) < 0.8
             some = (rng.random((*shape, A)) < 0.8) & host.available
             stays = some & host.forall(core) & host.on_choices(core)
             for which, allowed, closed in (
-                    (core, stays, False), (np.ones(shape, bool), some, True)):
+                (core, stays, False),
+                (np.ones(shape, bool), some, True),
+            ):
                 one = host.components(which, allowed, closed)
                 other = swept(TracedGraph(model), which, allowed, closed)
                 for x, y in zip(one, other, strict=True):
@@ -183,13 +199,17 @@ def test_games_and_occupancy(count, reach):
     # Operation by operation it takes a hundred small programs.
     solve = jax.jit(games_and_occupancy) if (count, reach) == (4, 2) else games_and_occupancy
     value, region, visits = solve(
-        other, buchi(other, "a"), case.there(case.reward), case.there(case.policy))
+        other, buchi(other, "a"), case.there(case.reward), case.there(case.policy)
+    )
     case.agree(minimax_value(one, jnp.asarray(case.reward), 0.9), value)
     np.testing.assert_array_equal(
-        from_mesh(case.sharded, region), winning_region(one, buchi(one, "a")).region)
+        from_mesh(case.sharded, region), winning_region(one, buchi(one, "a")).region
+    )
     np.testing.assert_allclose(
         from_mesh(case.sharded, visits),
-        occupancy_measure(case.mdp, jnp.asarray(case.policy), 0.9).value, atol=1e-9)
+        occupancy_measure(case.mdp, jnp.asarray(case.policy), 0.9).value,
+        atol=1e-9,
+    )
 
 
 wins = jax.jit(lambda game, goal: winning_region(game, goal).region)
@@ -197,8 +217,11 @@ wins = jax.jit(lambda game, goal: winning_region(game, goal).region)
 
 def games_and_occupancy(game, goal, reward, policy):
     """The values, who wins and the visits."""
-    return (minimax_value(game, reward, 0.9), wins(game, goal),
-            occupancy_measure(game.mdp, policy, 0.9).value)
+    return (
+        minimax_value(game, reward, 0.9),
+        wins(game, goal),
+        occupancy_measure(game.mdp, policy, 0.9).value,
+    )
 
 
 @pytest.mark.parametrize(("count", "reach"), MESHES)
@@ -208,15 +231,18 @@ def test_gradients(count, reach):
 
     def discounted(reward, policy, model, weight):
         return jnp.sum(weight * soft_value(model, reward, 0.9).value) + jnp.sum(
-            weight * policy_value(model, policy, reward, 0.8).value)
+            weight * policy_value(model, policy, reward, 0.8).value
+        )
 
     slope = jax.jit(jax.grad(discounted, argnums=(0, 1)))
     here = slope(jnp.asarray(case.reward), jnp.asarray(case.policy), case.mdp, weight)
-    there = slope(case.there(case.reward), case.there(case.policy), case.sharded,
-                  case.there(weight))
+    there = slope(
+        case.there(case.reward), case.there(case.policy), case.sharded, case.there(weight)
+    )
     for x, y in zip(here, there, strict=True):
         np.testing.assert_allclose(
-            from_mesh(case.sharded, y) * case.mdp.available, x * case.mdp.available, atol=1e-8)
+            from_mesh(case.sharded, y) * case.mdp.available, x * case.mdp.available, atol=1e-8
+        )
 
 
 @pytest.mark.slow
@@ -228,24 +254,41 @@ def test_derivatives_in_the_probabilities(count, reach):
     other = np.random.default_rng(4).random(mdp.probability.shape) * (mdp.probability > 0)
     total = other.sum(-1, keepdims=True)
     other = make_mdp(
-        mdp.successor, np.where(total > 0, other / np.maximum(total, 1e-9), 0),
-        available=mdp.available, label=mdp.label, propositions=mdp.propositions)
+        mdp.successor,
+        np.where(total > 0, other / np.maximum(total, 1e-9), 0),
+        available=mdp.available,
+        label=mdp.label,
+        propositions=mdp.propositions,
+    )
     there = shard(other, case.sharded.mesh)
 
     def slope(share, models, reward, target, weight):
         def value(share):
             one, two = models
             parts = ("tables",) if hasattr(one, "tables") else ("probability",)
-            mixed = one.replace(**{
-                name: jax.tree.map(
-                    lambda x, y: x if x.dtype == np.int32 else (1 - share) * x + share * y,
-                    getattr(one, name), getattr(two, name)) for name in parts})
-            return jnp.sum(weight * (reachability_probability(mixed, target).value
-                                     + optimal_value(mixed, reward, 0.8).value))
+            mixed = one.replace(
+                **{
+                    name: jax.tree.map(
+                        lambda x, y: x if x.dtype == np.int32 else (1 - share) * x + share * y,
+                        getattr(one, name),
+                        getattr(two, name),
+                    )
+                    for name in parts
+                }
+            )
+            return jnp.sum(
+                weight
+                * (
+                    reachability_probability(mixed, target).value
+                    + optimal_value(mixed, reward, 0.8).value
+                )
+            )
+
         return jax.grad(value)(share)
 
     slope = jax.jit(slope)
     one = slope(0.3, (mdp, other), case.reward, case.target, weight)
-    two = slope(0.3, (case.sharded, there), *(
-        case.there(x) for x in (case.reward, case.target, weight)))
+    two = slope(
+        0.3, (case.sharded, there), *(case.there(x) for x in (case.reward, case.target, weight))
+    )
     np.testing.assert_allclose(two, one, rtol=1e-8)

@@ -14,19 +14,25 @@ from tests.core.models.test_sharded import world
 from tests.core.values.test_over_mesh import FORMULAS, SOLVERS, quantities
 
 
-@pytest.mark.parametrize(("names", "reaches"), [
-    (("sweeps", "reach max"), (2,)),
-    pytest.param((*SOLVERS, *FORMULAS), (2, None), marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize(
+    ("names", "reaches"),
+    [
+        (("sweeps", "reach max"), (2,)),
+        pytest.param((*SOLVERS, *FORMULAS), (2, None), marks=pytest.mark.exhaustive),
+    ],
+)
 def test_solvers(names, reaches):
-    ended = several.ended(several.start(
-        2, "-m", "tests.solvers_over_processes", ";".join(names), repr(reaches)), 600)
+    ended = several.ended(
+        several.start(2, "-m", "tests.solvers_over_processes", ";".join(names), repr(reaches)), 600
+    )
     assert [x.status for x in ended] == [0, 0], ended[0].err[-2000:] + ended[1].err[-2000:]
     # Besides what the program tells, its collectives speak of themselves.
     told = [[x for x in each.out.splitlines() if x.startswith("(")] for each in ended]
     assert told[0] == told[1]
     lines = [ast.literal_eval(line) for line in told[0]]
     assert [(reach, name) for reach, name, _ in lines] == [
-        (reach, name) for reach in reaches for name in names]
+        (reach, name) for reach in reaches for name in names
+    ]
     for reach, name, (status, lower, upper) in lines:
         mdp = world(0, reach)
         if name in SOLVERS:

@@ -34,7 +34,8 @@ def cases(acceptance, label_on):
         letter = rng.permutation(4)
         delta, final = reference.random_acceptor(rng, 3, 4, acceptance)
         automaton = make_automaton(
-            delta, 0, bit_labels(np.arange(4), 2), ("a", "b"), final=final, acceptance=acceptance)
+            delta, 0, bit_labels(np.arange(4), 2), ("a", "b"), final=final, acceptance=acceptance
+        )
         mdp = as_mdp(world_model, label=bit_labels(letter, 2), propositions=("a", "b"))
         lazy = jl.product(mdp, automaton, label_on=label_on)
         model = reference.explicit_product(world_model, delta, 0, letter, label_on)
@@ -73,8 +74,12 @@ def assert_correct(found, models, exact):
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("acceptance", "label_on"),
-    [("cosafe", "exit"), ("cosafe", "entry"), ("safety", "exit"),
-     pytest.param("safety", "entry", marks=pytest.mark.exhaustive)],
+    [
+        ("cosafe", "exit"),
+        ("cosafe", "entry"),
+        ("safety", "exit"),
+        pytest.param("safety", "entry", marks=pytest.mark.exhaustive),
+    ],
 )
 def test_the_probability_is_enclosed_in_every_lane(acceptance, label_on):
     models, policies, exact = cases(acceptance, label_on)
@@ -83,9 +88,15 @@ def test_the_probability_is_enclosed_in_every_lane(acceptance, label_on):
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize(("acceptance", "label_on"), [
-    ("cosafe", "exit"), ("cosafe", "entry"), ("safety", "exit"),
-    pytest.param("safety", "entry", marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize(
+    ("acceptance", "label_on"),
+    [
+        ("cosafe", "exit"),
+        ("cosafe", "entry"),
+        ("safety", "exit"),
+        pytest.param("safety", "entry", marks=pytest.mark.exhaustive),
+    ],
+)
 def test_elimination_agrees(acceptance, label_on):
     models, policies, exact = cases(acceptance, label_on)
     for i in range(0, NUM_MODELS, 4):
@@ -93,7 +104,8 @@ def test_elimination_agrees(acceptance, label_on):
         bounds = tp._by_elimination(model, policies[i])
         found = tp._summarize(model, *map(jnp.asarray, bounds), None)
         assert_correct(
-            jax.tree.map(lambda x: x[None], found), stack_models(model), exact[i : i + 1])
+            jax.tree.map(lambda x: x[None], found), stack_models(model), exact[i : i + 1]
+        )
 
 
 @pytest.mark.exhaustive
@@ -137,8 +149,11 @@ def test_unknown_methods_are_refused():
 def reluctant(leaving, dtype):
     """Two cells that a policy hardly ever leaves, then for the goal or a trap, one time in four."""
     mdp = jl.make_mdp(
-        [[[1], [2], [3]], [[0], [2], [3]], [[2]] * 3, [[3]] * 3], np.ones((4, 3, 1)),
-        label=[[0], [0], [1], [0]], propositions=["g"], initial=[0.5, 0.5, 0, 0],
+        [[[1], [2], [3]], [[0], [2], [3]], [[2]] * 3, [[3]] * 3],
+        np.ones((4, 3, 1)),
+        label=[[0], [0], [1], [0]],
+        propositions=["g"],
+        initial=[0.5, 0.5, 0, 0],
     )
     policy = np.array([1 - 4 * leaving, leaving, 3 * leaving])
     models = stack_products([mdp, mdp], "F g")
@@ -148,8 +163,10 @@ def reluctant(leaving, dtype):
     return models, jnp.asarray(policies, dtype)
 
 
-@pytest.mark.parametrize(("leaving", "dtype"), [
-    (1e-12, "float32"), pytest.param(1e-18, "float64", marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize(
+    ("leaving", "dtype"),
+    [(1e-12, "float32"), pytest.param(1e-18, "float64", marks=pytest.mark.exhaustive)],
+)
 def test_what_is_hardly_ever_left_is_certified_all_the_same(leaving, dtype):
     models, policies = reluctant(leaving, dtype)
     inside = tp.task_performance(world(models, 0), policies[0])
@@ -192,8 +209,10 @@ def test_what_is_no_policy_is_refused_in_its_lane_alone():
     assert found.status[7] == Status.INVALID and np.isnan(found.mean[7])
     assert (found.lower[7], found.upper[7]) == (0, 1)
     assert (np.delete(np.asarray(found.status), 7) == Status.CONVERGED).all()
-    for call in (lambda: tp.task_performances(models, jnp.asarray(bad)),
-                 lambda: tp.task_performance(lane(models, 7), jnp.asarray(bad[7]))):
+    for call in (
+        lambda: tp.task_performances(models, jnp.asarray(bad)),
+        lambda: tp.task_performance(lane(models, 7), jnp.asarray(bad[7])),
+    ):
         with pytest.raises(ValueError, match=r"of state \(2, 1\) sums to 2.5"):
             call()
 
@@ -230,8 +249,9 @@ def test_starts_from_which_nothing_does_any_task_are_found(kind):
     rng = np.random.default_rng(KINDS.index(kind))
     count = []
     for _ in range(20):
-        model = jl.product(random_world(rng), random_automaton(rng, kind),
-                           label_on=rng.choice(["entry", "exit"]))
+        model = jl.product(
+            random_world(rng), random_automaton(rng, kind), label_on=rng.choice(["entry", "exit"])
+        )
         starts = np.flatnonzero(np.asarray(model.mdp.initial) > 0)
         memory = np.asarray(model.initial_memory)[starts]
         never = np.asarray(tp.infeasible_starts(model))
@@ -262,10 +282,15 @@ def test_tasks_without_end_are_enclosed_in_every_world(kind):
         automaton = random_automaton(rng, kind)
         worlds = [random_world(rng) for _ in range(4)]
         models = stack([jl.product(w, automaton, label_on="exit") for w in worlds])
-        policies = np.stack([
-            np.asarray(m.available) * rng.dirichlet(np.ones(A), m.state_shape) *
-            (rng.random((*m.state_shape, A)) < 0.6) + 1e-300 * one_hot(random_choice(rng, m))
-            for m in (lane(models, w) for w in range(4))])
+        policies = np.stack(
+            [
+                np.asarray(m.available)
+                * rng.dirichlet(np.ones(A), m.state_shape)
+                * (rng.random((*m.state_shape, A)) < 0.6)
+                + 1e-300 * one_hot(random_choice(rng, m))
+                for m in (lane(models, w) for w in range(4))
+            ]
+        )
         policies /= policies.sum(-1, keepdims=True)
         found = tp.task_performances(models, jnp.asarray(policies))
         assert (found.status == Status.CONVERGED).all()
@@ -285,12 +310,17 @@ def test_tasks_without_end_of_policies_that_hardly_ever_get_out_are_certified_to
     """As `reluctant`, for ever after."""
     leaving = 1e-18
     mdp = jl.make_mdp(
-        [[[1], [2], [3]], [[0], [2], [3]], [[2]] * 3, [[3]] * 3], np.ones((4, 3, 1)),
-        label=[[0], [0], [1], [0]], propositions=["g"], initial=[0.5, 0.5, 0, 0])
+        [[[1], [2], [3]], [[0], [2], [3]], [[2]] * 3, [[3]] * 3],
+        np.ones((4, 3, 1)),
+        label=[[0], [0], [1], [0]],
+        propositions=["g"],
+        initial=[0.5, 0.5, 0, 0],
+    )
     models = stack_products([mdp], "G F g")
     policy = np.array([1 - 4 * leaving, leaving, 3 * leaving])
     found = tp.task_performances(
-        models, jnp.asarray(np.broadcast_to(policy, (1, 4, models.num_memory, 3))))
+        models, jnp.asarray(np.broadcast_to(policy, (1, 4, models.num_memory, 3)))
+    )
     assert found.status.tolist() == [Status.CONVERGED]
     np.testing.assert_allclose(found.mean, [0.25], rtol=1e-12)
     assert found.lower[0] <= 0.25 <= found.upper[0]

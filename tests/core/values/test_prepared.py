@@ -45,8 +45,11 @@ def escaping(model, among):
         tenth = [0.1][: among[r]]
         rows.append((np.append(host.successor[a:b], last), np.append(share * p[a:b], tenth)))
     return make_sparse(
-        model.row_start, np.cumsum([0] + [x.size for x, _ in rows]),
-        np.concatenate([x for x, _ in rows]).astype(int), np.concatenate([w for _, w in rows]))
+        model.row_start,
+        np.cumsum([0] + [x.size for x, _ in rows]),
+        np.concatenate([x for x, _ in rows]).astype(int),
+        np.concatenate([w for _, w in rows]),
+    )
 
 
 def random_case(seed, question="probability"):
@@ -72,8 +75,7 @@ def by_host(model, target, stay, reward, maximize):
 def of_policy(model, policy, target, stay, reward):
     chain = chain_of(model, model, policy)
     if reward is None:
-        return optimal.reachability(
-            chain.mdp, target, maximize=True, stay=stay, depth=chain.depth)
+        return optimal.reachability(chain.mdp, target, maximize=True, stay=stay, depth=chain.depth)
     paid = chain.mean(reward, model.row_start)
     return optimal.total_reward(chain.mdp, paid, target, maximize=True, depth=chain.depth)
 
@@ -107,9 +109,15 @@ def cases(*some, seeds=24):
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize(("seed", "question", "objective"), cases(
-    (0, "probability", "max"), (0, "reward", "min"), (1, "probability", "min"),
-    (1, "reward", "max")))
+@pytest.mark.parametrize(
+    ("seed", "question", "objective"),
+    cases(
+        (0, "probability", "max"),
+        (0, "reward", "min"),
+        (1, "probability", "min"),
+        (1, "reward", "max"),
+    ),
+)
 def test_optima_are_those_of_the_host_engine(seed, question, objective):
     rng, model, target, stay, reward = random_case(seed, question)
     maximize = objective == "max"
@@ -178,8 +186,13 @@ def test_wide_rows_and_many_choices_are_split():
 
 def test_the_widest_shapes_are_split_into_trees():
     many = schedule.Nodes(
-        1, np.zeros(9, int), np.arange(9), np.repeat(np.arange(9), 23), np.full(207, schedule.ONE),
-        np.arange(207))
+        1,
+        np.zeros(9, int),
+        np.arange(9),
+        np.repeat(np.arange(9), 23),
+        np.full(207, schedule.ONE),
+        np.arange(207),
+    )
     found = schedule.schedule(many, 207, 208)
     total = np.zeros(found.size + 3)
     total[found.size] = 1
@@ -197,13 +210,13 @@ def test_the_widest_shapes_are_split_into_trees():
 
 
 def fourth_order(f, x, along, h):
-    return (8 * (f(x + h * along) - f(x - h * along))
-            - (f(x + 2 * h * along) - f(x - 2 * h * along))) / (12 * h)
+    return (
+        8 * (f(x + h * along) - f(x - h * along)) - (f(x + 2 * h * along) - f(x - 2 * h * along))
+    ) / (12 * h)
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize(
-    ("seed", "objective"), cases((1, "max"), (0, "policy"), seeds=4))
+@pytest.mark.parametrize(("seed", "objective"), cases((1, "max"), (0, "policy"), seeds=4))
 def test_slopes_are_those_of_differences(seed, objective):
     rng, model, target, _, reward = random_case(seed, "reward")
     model, reward = escaping(model, np.ones(model.num_rows, int)), reward + 0.1
@@ -219,7 +232,8 @@ def test_slopes_are_those_of_differences(seed, objective):
         a, b, c = jnp.split(x, np.cumsum([row.size, state.size]))
         given = {"policy": normal(c, state, SIZE)} if objective == "policy" else {}
         found = solve_prepared(
-            prepared, probability=normal(a, row, state.size), reward=b, tolerance=1e-11, **given)
+            prepared, probability=normal(a, row, state.size), reward=b, tolerance=1e-11, **given
+        )
         return found.value @ weigh
 
     x = np.concatenate([np.log(model.probability), reward, rng.normal(size=state.size)])
@@ -260,7 +274,10 @@ def test_other_numbers_are_judged(walk):
     lanes[1:, 1] = 0, -0.5, 0.6, np.nan, np.inf
     found = jax.vmap(lambda x: solve_prepared(prepared, probability=x))(lanes)
     assert found.status.tolist() == [
-        Status.CONVERGED, *[Status.INVALID] * 3, *[Status.NONFINITE] * 2]
+        Status.CONVERGED,
+        *[Status.INVALID] * 3,
+        *[Status.NONFINITE] * 2,
+    ]
     assert np.isnan(found.value[1:]).all() and np.isinf(found.upper[1:]).all()
     np.testing.assert_allclose(found.value[0], np.arange(5) / 4, atol=1e-6)
 
@@ -274,7 +291,10 @@ def test_other_rewards_are_judged(walk):
     lanes[2:, 1] = -1, np.nan, np.inf
     found = jax.vmap(lambda x: solve_prepared(prepared, reward=x))(lanes)
     assert found.status.tolist() == [
-        Status.CONVERGED, *[Status.INVALID] * 2, *[Status.NONFINITE] * 2]
+        Status.CONVERGED,
+        *[Status.INVALID] * 2,
+        *[Status.NONFINITE] * 2,
+    ]
     np.testing.assert_allclose(found.value[0], [0, 4.5, 5, 5.5, 0], atol=1e-5)
     endless = prepare(model, target, reward=[0, 1.0, 0, 1, 0])
     assert np.asarray(solve_prepared(endless).value).tolist() == [*[np.inf] * 4, 0]
@@ -286,8 +306,9 @@ def test_policies_are_judged():
     rows = np.array([[0, 2], [1, 2], [2, 2]])
     weights = np.array([[0.5, 0.5, 1], [0.5, 0.6, 1], [-1, 2, 1], [np.nan, 0.5, 1]])
     for policies, statuses, values in (
-            (rows, "CONVERGED CONVERGED INVALID", [0, 1, np.nan]),
-            (weights, "CONVERGED INVALID INVALID NONFINITE", [1, np.nan, np.nan, np.nan])):
+        (rows, "CONVERGED CONVERGED INVALID", [0, 1, np.nan]),
+        (weights, "CONVERGED INVALID INVALID NONFINITE", [1, np.nan, np.nan, np.nan]),
+    ):
         found = jax.vmap(lambda x: solve_prepared(prepared, policy=x))(policies)
         assert found.status.tolist() == [Status[x] for x in statuses.split()]
         np.testing.assert_equal(np.asarray(found.value[:, 0]), values)
@@ -309,17 +330,17 @@ def test_wrong_arguments_are_named(walk):
     model, target = walk
     prepared = prepare(model, target)
     for text, run in (
-            ("objective='least'", partial(prepare, model, target, objective="least")),
-            ("target has shape", partial(prepare, model, target[:3])),
-            ("stay has shape", partial(prepare, model, target, stay=target[:3])),
-            ("leave stay out", partial(prepare, model, target, stay=target, reward=np.ones(5))),
-            ("choice of state 2 is -1", partial(prepare, model, target, reward=[0, 0, -1, 0, 0])),
-            ("choice of state 1 is inf",
-             partial(prepare, model, target, reward=[0, np.inf, 0, 0, 0])),
-            ("probability has shape", partial(solve_prepared, prepared, probability=np.ones(3))),
-            ("prepare it with a reward", partial(solve_prepared, prepared, reward=np.ones(5))),
-            ("not 'max'", partial(solve_prepared, prepared, policy=np.arange(5))),
-            ("call it before jit", lambda: jax.jit(lambda x: prepare(model, x).place)(target))):
+        ("objective='least'", partial(prepare, model, target, objective="least")),
+        ("target has shape", partial(prepare, model, target[:3])),
+        ("stay has shape", partial(prepare, model, target, stay=target[:3])),
+        ("leave stay out", partial(prepare, model, target, stay=target, reward=np.ones(5))),
+        ("choice of state 2 is -1", partial(prepare, model, target, reward=[0, 0, -1, 0, 0])),
+        ("choice of state 1 is inf", partial(prepare, model, target, reward=[0, np.inf, 0, 0, 0])),
+        ("probability has shape", partial(solve_prepared, prepared, probability=np.ones(3))),
+        ("prepare it with a reward", partial(solve_prepared, prepared, reward=np.ones(5))),
+        ("not 'max'", partial(solve_prepared, prepared, policy=np.arange(5))),
+        ("call it before jit", lambda: jax.jit(lambda x: prepare(model, x).place)(target)),
+    ):
         with pytest.raises(ValueError, match=text):
             run()
     many = make_sparse([0, 2, 3], [0, 1, 2, 3], [0, 1, 1], [1, 1, 1])

@@ -48,8 +48,11 @@ def test_values_are_those_of_the_host_engine(kind, asks_reward):
         p = np.asarray(model.probability) * np.exp(rng.normal(size=model.num_transitions))
         p = p / np.add.reduceat(p, model.entry_start[:-1])[model.host.row]
         host = model.replace(probability=p).host
-        expected = (optimal.total_reward(host, reward, target, maximize=True) if asks_reward
-                    else optimal.reachability(host, target, maximize=True))
+        expected = (
+            optimal.total_reward(host, reward, target, maximize=True)
+            if asks_reward
+            else optimal.reachability(host, target, maximize=True)
+        )
         given = {"reward": jnp.asarray(reward)} if asks_reward else {}
         value, status = evaluate(prepared, probability=p, **given)
         np.testing.assert_allclose(value, expected.value, rtol=1e-6, atol=1e-9)
@@ -67,6 +70,7 @@ def test_elimination_and_passes_say_the_same(monkeypatch):
     def slopes():
         def first(p):  # a new function, which is traced anew
             return jnp.sum(evaluate_prepared(prepared, probability=p)[0])
+
         prepared_chain._evaluate.clear_cache()
         return jax.value_and_grad(first)(prepared.probability)
 

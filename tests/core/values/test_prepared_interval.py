@@ -46,8 +46,7 @@ def _ends(rng, zeros):
 
 
 def _model(successor, lower, upper):
-    return interval_rows(ROW_START, ENTRY_START, successor, lower, upper,
-                         initial=np.ones(5) / 5)
+    return interval_rows(ROW_START, ENTRY_START, successor, lower, upper, initial=np.ones(5) / 5)
 
 
 def _by_force(model, cost=None):
@@ -60,8 +59,7 @@ def _by_force(model, cost=None):
         rows[r][:, mdp.successor[part]] = list(corners)
     found = []
     for policy in itertools.product((2, 3), (4, 5), (6, 7)):
-        chains = [np.stack(x) for x in itertools.product(
-            *(rows[r] for r in (0, 1, *policy)))]
+        chains = [np.stack(x) for x in itertools.product(*(rows[r] for r in (0, 1, *policy)))]
         power = np.array(chains)
         for _ in range(50):
             power = power @ power
@@ -102,16 +100,17 @@ def test_all_ends_of_a_batch_are_enclosed_as_by_brute_force(seed, objective, nat
     successor, lower, upper, cost = _cases(seed, 12)
     model = _model(successor, lower[0], upper[0])
     for reward in (None, cost):
-        prepared = prepare_interval(
-            model, GOAL, reward=reward, objective=objective, nature=nature)
-        solve = jax.jit(jax.vmap(
-            lambda a, b, p=prepared: solve_prepared_interval(p, lower=a, upper=b)))
+        prepared = prepare_interval(model, GOAL, reward=reward, objective=objective, nature=nature)
+        solve = jax.jit(
+            jax.vmap(lambda a, b, p=prepared: solve_prepared_interval(p, lower=a, upper=b))
+        )
         found = solve(lower, upper)
         assert int(found.status[0]) == Status.CONVERGED
         assert set(np.asarray(found.status).tolist()) <= {Status.CONVERGED, Status.INVALID}
         for i in np.flatnonzero(np.asarray(found.status) == Status.CONVERGED):
-            value = _optimum(_by_force(_model(successor, lower[i], upper[i]), reward),
-                             objective, nature)
+            value = _optimum(
+                _by_force(_model(successor, lower[i], upper[i]), reward), objective, nature
+            )
             finite = np.isfinite(value)
             low, high = np.asarray(found.lower[i]), np.asarray(found.upper[i])
             np.testing.assert_array_equal(np.isfinite(high), finite)
@@ -126,8 +125,9 @@ def test_all_ends_of_a_batch_are_enclosed_as_by_brute_force(seed, objective, nat
 def test_policy_and_nature_attain_what_they_are_shown_for(objective, nature):
     successor, lower, upper, _ = _cases(3, 1)
     model = _model(successor, lower[0], upper[0])
-    found = solve_prepared_interval(prepare_interval(
-        model, GOAL, stay=STAY, objective=objective, nature=nature))
+    found = solve_prepared_interval(
+        prepare_interval(model, GOAL, stay=STAY, objective=objective, nature=nature)
+    )
     host = robust_reachability(model, GOAL, stay=STAY, objective=objective, nature=nature)
     p = np.asarray(found.nature)
     assert (p >= model.lower - 1e-15).all() and (p <= model.upper + 1e-15).all()
@@ -135,7 +135,8 @@ def test_policy_and_nature_attain_what_they_are_shown_for(objective, nature):
     fixed = _model(successor, p, np.maximum(p, 1e-300))  # what is left out has no room
     side = robust_reachability(fixed, GOAL, stay=STAY, objective=objective)
     mine = robust_reachability(
-        model, GOAL, stay=STAY, policy=np.asarray(found.policy), nature=nature)
+        model, GOAL, stay=STAY, policy=np.asarray(found.policy), nature=nature
+    )
     np.testing.assert_allclose(mine.value, host.value, atol=2e-6)
     np.testing.assert_allclose(side.value, host.value, atol=2e-6)
 
@@ -158,10 +159,14 @@ def test_given_policies_are_evaluated():
 
 # Compiling derivatives takes seconds; by default each direction and each question occurs.
 @pytest.mark.few(1)
-@pytest.mark.parametrize(("objective", "nature", "question"), [
-    pytest.param(*ways, question, marks=[] if usual else pytest.mark.exhaustive)
-    for i, ways in enumerate(DIRECTIONS) for usual, question in (
-        (i in (0, 3), "probability"), (i in (1, 2), "reward"))])
+@pytest.mark.parametrize(
+    ("objective", "nature", "question"),
+    [
+        pytest.param(*ways, question, marks=[] if usual else pytest.mark.exhaustive)
+        for i, ways in enumerate(DIRECTIONS)
+        for usual, question in ((i in (0, 3), "probability"), (i in (1, 2), "reward"))
+    ],
+)
 def test_derivatives_in_the_ends_are_differences(objective, nature, question):
     rng = np.random.default_rng(5)
     successor = np.concatenate([[0, 1], *([0, 1, s] for s in (2, 3, 4, 2, 3, 4))])
@@ -181,24 +186,32 @@ def test_derivatives_in_the_ends_are_differences(objective, nature, question):
         return robust_total_reward(model, reward, goal, tolerance=1e-12, **ask)
 
     prepared = prepare_interval(
-        model, goal, stay=STAY if reward is None else None, reward=reward, **ask)
+        model, goal, stay=STAY if reward is None else None, reward=reward, **ask
+    )
 
     def derivatives(ends):
         """The slope and the change on the way, both of one linear program."""
         _, forward = jax.linearize(
-            lambda a, b: solve_prepared_interval(prepared, lower=a, upper=b).value @ weight,
-            *ends)
+            lambda a, b: solve_prepared_interval(prepared, lower=a, upper=b).value @ weight, *ends
+        )
         return jax.linear_transpose(forward, *ends)(1.0), forward(*way)
 
     ends = np.asarray(model.lower), np.asarray(model.upper)
-    there, back = (host(model.replace(lower=ends[0] + h * way[0], upper=ends[1] + h * way[1]))
-                   for h in (1e-6, -1e-6))
+    there, back = (
+        host(model.replace(lower=ends[0] + h * way[0], upper=ends[1] + h * way[1]))
+        for h in (1e-6, -1e-6)
+    )
     change = (there.value - back.value) @ weight / 2e-6
     assert abs(change) > 1e-4
     slope, forward = jax.jit(derivatives)(ends)
     small = robust_sensitivity(
-        model, host(model), goal, nature=nature, initial=weight,
-        stay=STAY if reward is None else None)
+        model,
+        host(model),
+        goal,
+        nature=nature,
+        initial=weight,
+        stay=STAY if reward is None else None,
+    )
     np.testing.assert_allclose(slope[0] @ way[0] + slope[1] @ way[1], change, rtol=1e-5)
     np.testing.assert_allclose(forward, change, rtol=1e-5)
     np.testing.assert_allclose(small.lower @ way[0] + small.upper @ way[1], change, rtol=1e-5)
@@ -225,6 +238,7 @@ def test_other_graphs_are_refused_inside_jit():
 
 def test_nature_that_may_drop_other_successors_is_refused():
     """State 1 reaches 0 surely only as long as nature cannot put all mass on what leads back."""
+
     def model(room):
         return interval_rows(None, [0, 1, 3], [0, 0, 1], [1, 0, 0], [1, 0.75, room])
 
@@ -253,14 +267,17 @@ def test_nature_gives_mass_in_order(width):
         np.testing.assert_allclose(mine, best, atol=1e-15)
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    ({"stay": STAY, "reward": np.ones(8)}, "leave stay out"),
-    ({"nature": "up"}, "nature='up'"),
-    ({"objective": "policy"}, "objective='policy'"),
-    ({"policy": np.zeros(5, np.int32)}, "the policy takes row 0 in state 1"),
-    ({"policy": np.ones(8)}, "rows, int"),
-    ({"reward": -np.ones(8)}, "at least 0"),
-])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"stay": STAY, "reward": np.ones(8)}, "leave stay out"),
+        ({"nature": "up"}, "nature='up'"),
+        ({"objective": "policy"}, "objective='policy'"),
+        ({"policy": np.zeros(5, np.int32)}, "the policy takes row 0 in state 1"),
+        ({"policy": np.ones(8)}, "rows, int"),
+        ({"reward": -np.ones(8)}, "at least 0"),
+    ],
+)
 def test_misuse_is_told_in_words(change, words):
     successor, lower, upper, _ = _cases(0, 1)
     with pytest.raises(ValueError, match=words):

@@ -28,7 +28,8 @@ def sticky_loop():
     probability = [
         [[1 - RARE, RARE, 0]] * 2,
         [[1 - RARE, 0.3 * RARE, 0.7 * RARE], [1 - RARE, 0.6 * RARE, 0.4 * RARE]],
-        rest, rest,
+        rest,
+        rest,
     ]
     return make_mdp(successor, probability, initial=[1, 0, 0, 0])
 
@@ -36,16 +37,15 @@ def sticky_loop():
 @pytest.mark.parametrize(("objective", "exact"), [("max", 0.6), ("min", 0.3)])
 def test_a_loop_that_is_hardly_left(objective, exact):
     goal = jnp.array([False, False, True, False])
-    found = reachability_probability(
-        sticky_loop(), goal, objective=objective, tolerance=1e-8
-    )
+    found = reachability_probability(sticky_loop(), goal, objective=objective, tolerance=1e-8)
     assert int(found.status) == Status.CONVERGED
     assert (found.lower[:2] <= exact).all() and (exact <= found.upper[:2]).all()
     assert float(jnp.max(found.upper - found.lower)) <= 2e-8
     assert int(found.policy[1]) == (objective == "max")
     assert found.value[2:].tolist() == [1, 0]
-    few = jax.jit(lambda m, n: reachability_probability(
-        m, goal, objective=objective, max_steps=n))(sticky_loop(), 100)
+    few = jax.jit(lambda m, n: reachability_probability(m, goal, objective=objective, max_steps=n))(
+        sticky_loop(), 100
+    )
     assert int(few.status) == Status.MAX_STEPS
     assert int(few.num_steps) == 100
 
@@ -56,9 +56,7 @@ def random_case(rng, size):
     successor = rng.integers(0, size, shape)
     weight = rng.random(shape) ** 8 + 1e-6
     successor[-2:] = np.array([size - 2, size - 1])[:, None, None]
-    model = make_mdp(
-        successor, weight / weight.sum(-1, keepdims=True), initial=np.eye(size)[0]
-    )
+    model = make_mdp(successor, weight / weight.sum(-1, keepdims=True), initial=np.eye(size)[0])
     return model, jnp.arange(size) == size - 1
 
 
@@ -98,7 +96,8 @@ def test_end_components_choose_together():
     # 0 and 1 form a component; only 1 can leave it, to 2 (the goal) or 3.
     model = make_mdp(
         [[[1, 1], [1, 1]], [[0, 0], [2, 3]], [[2, 2]] * 2, [[3, 3]] * 2],
-        [[[1, 0]] * 2, [[1, 0], [0.25, 0.75]], [[1, 0]] * 2, [[1, 0]] * 2], initial=[1, 0, 0, 0],
+        [[[1, 0]] * 2, [[1, 0], [0.25, 0.75]], [[1, 0]] * 2, [[1, 0]] * 2],
+        initial=[1, 0, 0, 0],
     )
     found = reachability_probability(model, jnp.arange(4) == 2)
     np.testing.assert_allclose(found.value, [0.25, 0.25, 1, 0], atol=1e-13)
@@ -124,6 +123,7 @@ def test_probabilities_of_small_tasks_compile_nothing(task):
 
 def test_a_model_of_ones_own_is_solved_by_its_primitives():
     """What is no table of rows is left to the compiled engine, however small and concrete."""
+
     class Walk:
         """From 1 to 3 evenly to both sides; 0 and 4 are ends."""
 

@@ -109,13 +109,22 @@ def test_the_examples_are_not_trivial(cases, exact):
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize(("objective", "tolerance"), [
-    ("max", None), ("min", None), ("max", 1e-12),
-    pytest.param("min", 1e-12, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize(
+    ("objective", "tolerance"),
+    [
+        ("max", None),
+        ("min", None),
+        ("max", 1e-12),
+        pytest.param("min", 1e-12, marks=pytest.mark.exhaustive),
+    ],
+)
 def test_optima_are_enclosed_and_attained(cases, exact, objective, tolerance):
     mdps, targets, _ = batch_of(cases)
-    solution = jax.jit(jax.vmap(lambda m, t: jl.reachability_probability(
-        m, t, objective=objective, tolerance=tolerance)))(mdps, targets)
+    solution = jax.jit(
+        jax.vmap(
+            lambda m, t: jl.reachability_probability(m, t, objective=objective, tolerance=tolerance)
+        )
+    )(mdps, targets)
     assert_certified(solution, exact[objective], tolerance or DEFAULT)
     assert_attained(cases, solution, objective, NUM_MODELS)
     if tolerance is None:
@@ -124,8 +133,9 @@ def test_optima_are_enclosed_and_attained(cases, exact, objective, tolerance):
 
 @pytest.mark.parametrize("tolerance", [None, 1e-12])
 def test_policies_are_enclosed(cases, exact, tolerance):
-    solution = jax.jit(jax.vmap(lambda m, t, p: jl.reachability_probability(
-        m, t, policy=p, tolerance=tolerance)))(*batch_of(cases))
+    solution = jax.jit(
+        jax.vmap(lambda m, t, p: jl.reachability_probability(m, t, policy=p, tolerance=tolerance))
+    )(*batch_of(cases))
     assert_certified(solution, exact["policy"], tolerance or DEFAULT)
 
 
@@ -149,14 +159,16 @@ def test_enclosures_in_single_precision(cases, exact):
     with jax.enable_x64(False):
         mdps, targets, policies = batch_of(few)
         for objective in ("max", "min"):
-            solution = jax.jit(jax.vmap(lambda m, t, o=objective: jl.reachability_probability(
-                m, t, objective=o)))(mdps, targets)
+            solution = jax.jit(
+                jax.vmap(lambda m, t, o=objective: jl.reachability_probability(m, t, objective=o))
+            )(mdps, targets)
             assert solution.value.dtype == jnp.float32
             assert_certified(solution, exact[objective][:200], tolerance)
             assert_finest(few, exact[objective][:200], solution, rounding_unit(mdps))
             assert_attained(few, solution, objective, 200)
-        solution = jax.jit(jax.vmap(lambda m, t, p: jl.reachability_probability(
-            m, t, policy=p)))(mdps, targets, policies)
+        solution = jax.jit(jax.vmap(lambda m, t, p: jl.reachability_probability(m, t, policy=p)))(
+            mdps, targets, policies
+        )
         assert_certified(solution, exact["policy"][:200], tolerance)
 
 
@@ -193,8 +205,9 @@ def test_satisfaction_is_enclosed_and_attained(acceptance, label_on, count):
     shape = (3, 3, 2)
     batch = jnp.asarray(np.stack(policies).reshape(-1, *shape))
     solution = jax.jit(jax.vmap(jl.satisfaction_probability))(lazy, batch)
-    exact = [exact_satisfaction(*pair, p).reshape(3, 3)
-             for pair, p in zip(some, policies, strict=True)]
+    exact = [
+        exact_satisfaction(*pair, p).reshape(3, 3) for pair, p in zip(some, policies, strict=True)
+    ]
     assert_certified(solution, exact)
 
     solution = jax.jit(jax.vmap(jl.optimal_satisfaction))(lazy)
@@ -208,8 +221,10 @@ def test_satisfaction_is_enclosed_and_attained(acceptance, label_on, count):
 def test_satisfaction_by_hand():
     """A slippery corridor: reach g before r; from the middle, one step to each side."""
     world = jl.make_mdp(
-        [[[0, 0]], [[0, 2]], [[2, 2]]], [[[1.0, 0]], [[0.75, 0.25]], [[1.0, 0]]],
-        label=[[1, 0], [0, 0], [0, 1]], propositions=("r", "g"),
+        [[[0, 0]], [[0, 2]], [[2, 2]]],
+        [[[1.0, 0]], [[0.75, 0.25]], [[1.0, 0]]],
+        label=[[1, 0], [0, 0], [0, 1]],
+        propositions=("r", "g"),
     )
     for text, expected in (("F r", [1, 0.75, 0]), ("G !r", [0, 0.25, 1])):
         lazy = jl.product(world, text)
@@ -245,9 +260,7 @@ def test_loops_that_hardly_end_are_enclosed_or_refused(objective, escape, dtype)
         if objective == "policy":
             solution = jl.reachability_probability(mdp, target, policy=jnp.zeros(12, int))
         else:
-            solution = jl.reachability_probability(
-                mdp, target, objective=objective, max_steps=2000
-            )
+            solution = jl.reachability_probability(mdp, target, objective=objective, max_steps=2000)
         exact = [Fraction(1, 2 ** (10 - i)) for i in range(10)] + [Fraction(1), Fraction(0)]
         if escape != 1e-9:  # that row cannot be stored exactly, and then the truth is another
             assert_encloses(solution, np.array(exact, object))

@@ -27,16 +27,32 @@ from tests.reference_intervals import chains, parity, random_model, reach, rewar
 from tests.support import counts
 
 DIRECTIONS = [("max", "max"), ("max", "min"), ("min", "max"), ("min", "min")]
-TASKS = ["F a", "G !b", "!b U a", "G F a", "F G a", "G F a & F G !b", "G (a -> F b)",
-         "(G F a -> G F b) & F c", "X X a", "F (a & X b) | G c"]
+TASKS = [
+    "F a",
+    "G !b",
+    "!b U a",
+    "G F a",
+    "F G a",
+    "G F a & F G !b",
+    "G (a -> F b)",
+    "(G F a -> G F b) & F c",
+    "X X a",
+    "F (a & X b) | G c",
+]
 
 
 def labelled(rng, host=None):
     host = random_model(rng) if host is None else host
     mdp = host.mdp
     return interval_rows(
-        mdp.row_start, mdp.entry_start, mdp.successor, host.lower, host.upper,
-        label=rng.random((mdp.num_states, 3)) < 0.5, propositions=["a", "b", "c"])
+        mdp.row_start,
+        mdp.entry_start,
+        mdp.successor,
+        host.lower,
+        host.upper,
+        label=rng.random((mdp.num_states, 3)) < 0.5,
+        propositions=["a", "b", "c"],
+    )
 
 
 def around(model, width):
@@ -71,9 +87,10 @@ def test_wider_intervals_give_nature_more():
             low = high = exact.value
             for width in (0.05, 0.2, 1.0):
                 model = around(given, width)
-                least, most = (robust_satisfaction(
-                    model, task, objective=objective, nature=nature).solution
-                    for nature in ("min", "max"))
+                least, most = (
+                    robust_satisfaction(model, task, objective=objective, nature=nature).solution
+                    for nature in ("min", "max")
+                )
                 assert int(least.status) == int(most.status) == Status.CONVERGED
                 assert (least.lower <= low + 1e-6).all()
                 assert (most.upper >= high - 1e-6).all()
@@ -94,10 +111,10 @@ def test_products(label_on):
         for objective, nature in DIRECTIONS:
             found = optimal_satisfaction(pairs, objective=objective, nature=nature)
             alone = robust_satisfaction(
-                model, task, objective=objective, nature=nature, states=np.arange(4)).solution
+                model, task, objective=objective, nature=nature, states=np.arange(4)
+            ).solution
             assert int(found.status) == Status.CONVERGED
-            np.testing.assert_allclose(
-                found.value[np.arange(4), start], alone.value, atol=2e-6)
+            np.testing.assert_allclose(found.value[np.arange(4), start], alone.value, atol=2e-6)
 
 
 @pytest.mark.few(1)
@@ -108,15 +125,15 @@ def test_policies_of_products(label_on):
     for task in TASKS:
         model = labelled(rng)
         pairs = product(model, task, label_on=label_on)
-        points = product(make_interval(model.nominal, *[model.nominal.probability] * 2), task,
-                         label_on=label_on)
+        points = product(
+            make_interval(model.nominal, *[model.nominal.probability] * 2), task, label_on=label_on
+        )
         exact = product(model.nominal, task, label_on=label_on)
         host = model.nominal.host
         weight = rng.random((host.num_rows, pairs.num_memory))
         weight /= np.add.reduceat(weight, host.row_start[:-1])[host.state]
         alone = satisfaction_probability(exact, weight).value
-        np.testing.assert_allclose(
-            satisfaction_probability(points, weight).value, alone, atol=2e-6)
+        np.testing.assert_allclose(satisfaction_probability(points, weight).value, alone, atol=2e-6)
         for nature in ("min", "max"):
             best = optimal_satisfaction(pairs, nature=nature)
             if nature == "min":  # else nature, too, has to keep to what attains it
@@ -143,10 +160,8 @@ def test_parts_of_interval_models():
     target = model.states_where("a")
     for nature in ("min", "max"):
         whole = robust_reachability(model, target, policy=host.row_start[:-1], nature=nature)
-        found = robust_reachability(
-            part.model, target[np.asarray(part.base_state)], nature=nature)
-        np.testing.assert_allclose(
-            found.value, whole.value[np.asarray(part.base_state)], atol=1e-6)
+        found = robust_reachability(part.model, target[np.asarray(part.base_state)], nature=nature)
+        np.testing.assert_allclose(found.value, whole.value[np.asarray(part.base_state)], atol=1e-6)
 
 
 def test_policies_are_evaluated():
@@ -160,7 +175,8 @@ def test_policies_are_evaluated():
             np.testing.assert_allclose(own.value, best.value, atol=1e-6)
             np.testing.assert_array_equal(own.policy, best.policy)
             other = robust_reachability(
-                model, target, policy=model.nominal.host.row_start[:-1], nature=nature)
+                model, target, policy=model.nominal.host.row_start[:-1], nature=nature
+            )
             assert (other.lower <= best.upper + 1e-12).all()
 
 
@@ -170,11 +186,14 @@ def test_one_function_takes_both_kinds():
     for objective, nature in DIRECTIONS:
         np.testing.assert_array_equal(
             reachability_probability(model, target, objective=objective, nature=nature).value,
-            robust_reachability(model, target, objective=objective, nature=nature).value)
+            robust_reachability(model, target, objective=objective, nature=nature).value,
+        )
         np.testing.assert_array_equal(
             total_reward(model, np.ones(4), target, objective=objective, nature=nature).value,
             robust_total_reward(
-                model, np.ones(4), target, objective=objective, nature=nature).value)
+                model, np.ones(4), target, objective=objective, nature=nature
+            ).value,
+        )
     with pytest.raises(ValueError, match=r"nature='max'.*intervals"):
         reachability_probability(model.nominal, target, nature="max")
 
@@ -191,15 +210,19 @@ def test_mixed_policies():
         points = make_interval(model.nominal, *[model.nominal.probability] * 2)
         alone = reachability_probability(model.nominal, target, policy=weight)
         np.testing.assert_allclose(
-            robust_reachability(points, target, policy=weight).value, alone.value, atol=1e-6)
-        low, high = (robust_reachability(model, target, policy=weight, nature=nature)
-                     for nature in ("min", "max"))
+            robust_reachability(points, target, policy=weight).value, alone.value, atol=1e-6
+        )
+        low, high = (
+            robust_reachability(model, target, policy=weight, nature=nature)
+            for nature in ("min", "max")
+        )
         assert (low.lower <= alone.upper).all()
         assert (high.upper >= alone.lower).all()
         p = np.asarray(high.nature)
         assert ((model.lower - 1e-15 <= p) & (p <= model.upper + 1e-15)).all()
         again = reachability_probability(
-            model.nominal.replace(probability=p), target, policy=weight)
+            model.nominal.replace(probability=p), target, policy=weight
+        )
         np.testing.assert_allclose(again.value, high.value, atol=1e-6)
 
 
@@ -219,10 +242,14 @@ def test_games(count):
         for nature in ("min", "max"):
             for objective in ("max", "min"):
                 of = {"objective": objective, "nature": nature}
-                held(robust_reachability(game, goal, **of),
-                     played(host, goal, system, worth[0], **of))
-                held(robust_total_reward(game, cost, goal, **of),
-                     played(host, goal, system, worth[1], **of))
+                held(
+                    robust_reachability(game, goal, **of),
+                    played(host, goal, system, worth[0], **of),
+                )
+                held(
+                    robust_total_reward(game, cost, goal, **of),
+                    played(host, goal, system, worth[1], **of),
+                )
             yes = np.zeros(4, bool)
             sides = host_sides(host, system, "max", nature)
             found = _solved(sides, host, yes, yes, priority, False, 1e-6)
@@ -264,8 +291,14 @@ def held(found, value):
 
 def test_exact_games_have_values():
     """A game on a sparse model: the environment takes the worse of two coins."""
-    coins = make_sparse([0, 2, 3, 4], [0, 2, 4, 5, 6], [1, 2, 1, 2, 1, 2],
-                        [0.25, 0.75, 0.5, 0.5, 1, 1], label=[[0], [1], [0]], propositions=["a"])
+    coins = make_sparse(
+        [0, 2, 3, 4],
+        [0, 2, 4, 5, 6],
+        [1, 2, 1, 2, 1, 2],
+        [0.25, 0.75, 0.5, 0.5, 1, 1],
+        label=[[0], [1], [0]],
+        propositions=["a"],
+    )
     for system, best in ((True, 0.5), (False, 0.25)):
         game = Game(coins, np.array([system] * 3))
         assert robust_reachability(game, "a").value[0] == pytest.approx(best)
@@ -289,30 +322,41 @@ def test_discounted_values():
                 p = model.host.nature(ahead, maximize=nature == "max")
                 image = model.host.total(p * ahead)
                 value = getattr(np, objective + "imum").reduceat(image, host.row_start[:-1])
-            found = robust_discounted_value(
-                model, earned, 0.9, objective=objective, nature=nature)
+            found = robust_discounted_value(model, earned, 0.9, objective=objective, nature=nature)
             assert int(found.status) == Status.CONVERGED
             np.testing.assert_allclose(found.value, value, atol=1e-8)
             assert (found.lower <= value + 1e-12).all()
             assert (value <= found.upper + 1e-12).all()
             game = Game(model, np.ones(4, bool))
-            np.testing.assert_allclose(robust_discounted_value(
-                game, earned, 0.9, objective=objective, nature=nature).value, value, atol=1e-7)
+            np.testing.assert_allclose(
+                robust_discounted_value(
+                    game, earned, 0.9, objective=objective, nature=nature
+                ).value,
+                value,
+                atol=1e-7,
+            )
 
 
 COIN = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
 
 
-@pytest.mark.parametrize(("lower", "upper", "message"), [
-    ([0.6, 0.3, 1, 1], [0.5, 0.6, 1, 1], r"state 0, choice 0: the interval of successor 1 is "
-                                         r"\[0.6, 0.5\]"),
-    ([-0.1, 0.3, 1, 1], [0.5, 0.6, 1, 1], r"\[-0.1, 0.5\]"),
-    ([0.1, 0.3, 1, 1], [0.5, 1.6, 1, 1], r"\[0.3, 1.6\]"),
-    ([0.1, np.nan, 1, 1], [0.5, 0.6, 1, 1], r"\[nan, 0.6\]"),
-    ([0.6, 0.5, 1, 1], [0.7, 0.6, 1, 1], "lower ends sum to 1.1, which is above 1"),
-    ([0.1, 0.2, 1, 1], [0.3, 0.4, 1, 1], "upper ends sum to 0.7, which is below 1"),
-    ([0.1, 0.2, 1], [0.3, 0.4, 1], r"lower has shape \(3,\); expected \(4,\)"),
-])
+@pytest.mark.parametrize(
+    ("lower", "upper", "message"),
+    [
+        (
+            [0.6, 0.3, 1, 1],
+            [0.5, 0.6, 1, 1],
+            r"state 0, choice 0: the interval of successor 1 is "
+            r"\[0.6, 0.5\]",
+        ),
+        ([-0.1, 0.3, 1, 1], [0.5, 0.6, 1, 1], r"\[-0.1, 0.5\]"),
+        ([0.1, 0.3, 1, 1], [0.5, 1.6, 1, 1], r"\[0.3, 1.6\]"),
+        ([0.1, np.nan, 1, 1], [0.5, 0.6, 1, 1], r"\[nan, 0.6\]"),
+        ([0.6, 0.5, 1, 1], [0.7, 0.6, 1, 1], "lower ends sum to 1.1, which is above 1"),
+        ([0.1, 0.2, 1, 1], [0.3, 0.4, 1, 1], "upper ends sum to 0.7, which is below 1"),
+        ([0.1, 0.2, 1], [0.3, 0.4, 1], r"lower has shape \(3,\); expected \(4,\)"),
+    ],
+)
 def test_ends_without_a_distribution(lower, upper, message):
     with pytest.raises(ValueError, match=message):
         make_interval(COIN, lower, upper)
@@ -360,13 +404,20 @@ def test_bad_questions():
         robust_total_reward(model, Rewards(transition=np.array([1.0, 2, 0, 0])), target)
 
 
-@pytest.mark.parametrize(("states", "message"), [
-    ([3], r"states has 3; the states are 0 to 2"), ([0, -1], r"states has -1"),
-    ([True, False, True], r"states is bool\[3\]"), ([0.0], "states is float64"),
-    ([], "at least one")])
+@pytest.mark.parametrize(
+    ("states", "message"),
+    [
+        ([3], r"states has 3; the states are 0 to 2"),
+        ([0, -1], r"states has -1"),
+        ([True, False, True], r"states is bool\[3\]"),
+        ([0.0], "states is float64"),
+        ([], "at least one"),
+    ],
+)
 def test_states_that_are_none(states, message):
-    coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
-                       label={"a": [1]})
+    coin = make_sparse(
+        None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0], label={"a": [1]}
+    )
     model = make_interval(coin, coin.probability, coin.probability)
     for solve, of in ((robust_satisfaction, model), (sparse_satisfaction, coin)):
         with pytest.raises(ValueError, match=message):

@@ -78,8 +78,7 @@ def check_case(rng, kind, label_on, objective):
     for times, policies, matrix, open_ in found:
         least = times.min(0)
         assert np.isfinite(least).all()
-        np.testing.assert_allclose(
-            expected_times(policy, matrix, open_)[0], least, rtol=1e-9)
+        np.testing.assert_allclose(expected_times(policy, matrix, open_)[0], least, rtol=1e-9)
         agrees = (policies == policy).all(2) | ~open_
         assert agrees.all(1).any()  # it is one of them where it matters
 
@@ -101,8 +100,9 @@ def test_a_corridor_is_walked_straight():
     best = jl.optimal_satisfaction(model)
     assert (best.value == 1).all()
     (right,) = set(np.asarray(best.policy)[:3, int(model.initial_memory[0])].tolist())
-    successor, probability = (np.asarray(x)[0, right] for x in (
-        model.mdp.successor, model.mdp.probability))
+    successor, probability = (
+        np.asarray(x)[0, right] for x in (model.mdp.successor, model.mdp.probability)
+    )
     assert successor[probability.argmax()] == 1
 
 
@@ -123,12 +123,13 @@ def test_ways_out_by_sweeps_and_by_systems(dense, sweeps, monkeypatch):
         monkeypatch.setattr(way_out, "DENSE_LIMIT", 0)
         rows = [sparse.csr_array(row) for row in rows]
     open_ = np.arange(size) < size - 1
-    found = way_out.quickest(
-        list(rows), np.ones((size, 2), bool), open_, np.zeros(size, np.int32))
+    found = way_out.quickest(list(rows), np.ones((size, 2), bool), open_, np.zeros(size, np.int32))
     np.testing.assert_array_equal(found[:-1], quick[:-1])
     monkeypatch.setattr(way_out, "_MOST", 10)
-    assert way_out.quickest(
-        list(rows), np.ones((size, 2), bool), open_, np.zeros(size, np.int32)) is None
+    assert (
+        way_out.quickest(list(rows), np.ones((size, 2), bool), open_, np.zeros(size, np.int32))
+        is None
+    )
 
 
 TASKS = ("F g", "G !r", "G F g & G F y", "F G g & F y")
@@ -136,9 +137,14 @@ TASKS = ("F g", "G !r", "G F g & G F y", "F G g & F y")
 
 # By default each task and each objective occurs.
 @pytest.mark.few(2)
-@pytest.mark.parametrize(("task", "objective"), [
-    pytest.param(task, objective, marks=[] if i % 2 == j else pytest.mark.exhaustive)
-    for i, task in enumerate(TASKS) for j, objective in enumerate(("max", "min"))])
+@pytest.mark.parametrize(
+    ("task", "objective"),
+    [
+        pytest.param(task, objective, marks=[] if i % 2 == j else pytest.mark.exhaustive)
+        for i, task in enumerate(TASKS)
+        for j, objective in enumerate(("max", "min"))
+    ],
+)
 def test_the_host_is_as_good_as_the_traced_engine(task, objective):
     model = jl.product(jl.gridworld("g . r\n. s y", slip=0.2, initial="s"), task)
     host = jl.optimal_satisfaction(model, objective=objective)
@@ -148,18 +154,31 @@ def test_the_host_is_as_good_as_the_traced_engine(task, objective):
         np.testing.assert_allclose(attained, host.value, atol=1e-7)
 
 
-@pytest.mark.parametrize(("task", "objective"), [
-    ("F g", "max"), ("G !t", "max"), ("F t", "min"), ("G !g", "min"), ("G F g", "max"),
-    ("F G t", "min"),
-])
+@pytest.mark.parametrize(
+    ("task", "objective"),
+    [
+        ("F g", "max"),
+        ("G !t", "max"),
+        ("F t", "min"),
+        ("G !g", "min"),
+        ("G F g", "max"),
+        ("F G t", "min"),
+    ],
+)
 def test_among_equal_odds_the_short_way_and_never_worse_odds(task, objective):
     """Even odds by way of 1, worse ones at once, even ones after a while, even ones at once."""
     goal, trap = [2] * 3, [3] * 3
     world = jl.make_mdp(
         [[[1, 1, 1], [2, 3, 3], [0, 2, 3], [2, 3, 3]], [[2, 3, 3]] * 4, [goal] * 4, [trap] * 4],
-        [[[1, 0, 0], [0.49, 0.51, 0], [0.5, 0.25, 0.25], [0.5, 0.5, 0]], [[0.5, 0.5, 0]] * 4,
-         [[1, 0, 0]] * 4, [[1, 0, 0]] * 4],
-        initial=[1, 0, 0, 0], label=[[0, 0], [0, 0], [1, 0], [0, 1]], propositions=["g", "t"],
+        [
+            [[1, 0, 0], [0.49, 0.51, 0], [0.5, 0.25, 0.25], [0.5, 0.5, 0]],
+            [[0.5, 0.5, 0]] * 4,
+            [[1, 0, 0]] * 4,
+            [[1, 0, 0]] * 4,
+        ],
+        initial=[1, 0, 0, 0],
+        label=[[0, 0], [0, 0], [1, 0], [0, 1]],
+        propositions=["g", "t"],
     )
     model = jl.product(world, task)
     best = jl.optimal_satisfaction(model, objective=objective)
@@ -178,12 +197,16 @@ def test_a_rare_danger_is_never_called_impossible(wide):
         world = jl.make_mdp(
             [[[0, 1, 2]], [[1] * 3], [[2] * 3]],
             np.array([[[0.5, 0.5, rare]], [[1, 0, 0]], [[1, 0, 0]]]),
-            initial=[1, 0, 0], label=[[0], [0], [1]], propositions=["danger"],
+            initial=[1, 0, 0],
+            label=[[0], [0], [1]],
+            propositions=["danger"],
         )
         model = jl.product(world, "G !danger")
         start = 0, int(model.initial_memory[0])
-        for found in (jl.optimal_satisfaction(model), jl.satisfaction_probability(
-                model, np.ones((*model.state_shape, 1)))):
+        for found in (
+            jl.optimal_satisfaction(model),
+            jl.satisfaction_probability(model, np.ones((*model.state_shape, 1))),
+        ):
             assert int(found.status) == jl.Status.CONVERGED
             assert 1 - 1e-6 < float(np.asarray(found.lower)[start]) < 1
             assert float(np.asarray(found.upper)[start]) == 1

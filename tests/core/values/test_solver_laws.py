@@ -70,7 +70,8 @@ DISCOUNTED = {
     **{
         f"optimal_value-{method}": Solver(
             lambda m, x, method=method, **o: jl.optimal_value(
-                m, x["reward"], x["discount"], method=method, **o),
+                m, x["reward"], x["discount"], method=method, **o
+            ),
             ("reward", "discount"),
         )
         for method in ("policy_iteration", "modified_policy_iteration", "value_iteration")
@@ -78,31 +79,39 @@ DISCOUNTED = {
     **{
         f"soft_value-{method}": Solver(
             lambda m, x, method=method, **o: jl.soft_value(
-                m, x["reward"], x["discount"], method=method, **o),
-            ("reward", "discount"), stochastic=True,
+                m, x["reward"], x["discount"], method=method, **o
+            ),
+            ("reward", "discount"),
+            stochastic=True,
         )
         for method in ("newton", "value_iteration")
     },
     "boltzmann_value": Solver(
         lambda m, x, **o: jl.boltzmann_value(m, x["reward"], x["discount"], **o),
-        ("reward", "discount"), stochastic=True,
+        ("reward", "discount"),
+        stochastic=True,
     ),
     **{
         f"minimax_value-{method}": Solver(
             lambda m, x, method=method, **o: jl.minimax_value(
-                game_of(m), x["reward"], x["discount"], method=method, **o),
-            ("reward", "discount"), differentiated=False,
+                game_of(m), x["reward"], x["discount"], method=method, **o
+            ),
+            ("reward", "discount"),
+            differentiated=False,
         )
         for method in ("policy_iteration", "value_iteration", "strategy_iteration")
     },
     "strategy_value": Solver(
         lambda m, x, **o: jl.strategy_value(
-            game_of(m), x["policy"], x["reward"], x["discount"], **o),
-        ("reward", "discount", "policy"), differentiated=False,
+            game_of(m), x["policy"], x["reward"], x["discount"], **o
+        ),
+        ("reward", "discount", "policy"),
+        differentiated=False,
     ),
     "occupancy_measure": Solver(
         lambda m, x, **o: jl.occupancy_measure(m, x["policy"], x["discount"], **o),
-        ("discount", "policy"), steps=False,
+        ("discount", "policy"),
+        steps=False,
     ),
 }
 UNDISCOUNTED = {
@@ -111,7 +120,9 @@ UNDISCOUNTED = {
     "reachability-policy": Solver(reach, ("policy",), steps=False),
     "satisfaction_probability": Solver(
         lambda m, x, **o: jl.satisfaction_probability(m, x["policy"], **o),
-        ("policy",), steps=False, kinds=("product",),
+        ("policy",),
+        steps=False,
+        kinds=("product",),
     ),
     "optimal_satisfaction": Solver(
         lambda m, x, **o: jl.optimal_satisfaction(m, **o), (), kinds=("product",)
@@ -164,8 +175,11 @@ def example(kind: str, seed: int = 0) -> tuple[Any, reference.Model, dict]:
 
 def flat_inputs(inputs: dict, explicit: reference.Model) -> dict:
     shape = explicit.available.shape
-    return {**inputs, **{name: inputs[name].reshape(shape) for name in ("reward", "policy")},
-            "target": inputs["target"].ravel()}
+    return {
+        **inputs,
+        **{name: inputs[name].reshape(shape) for name in ("reward", "policy")},
+        "target": inputs["target"].ravel(),
+    }
 
 
 def limits_of(
@@ -193,8 +207,11 @@ def test_representations_agree(name, kind):
     loose = 1e-6 if name in UNDISCOUNTED else 1e-10  # within the default tolerance
     for field in ("value", "lower", "upper", "policy"):
         np.testing.assert_allclose(
-            np.ravel(getattr(one, field)), np.ravel(getattr(other, field)),
-            rtol=loose, atol=loose, err_msg=field,
+            np.ravel(getattr(one, field)),
+            np.ravel(getattr(other, field)),
+            rtol=loose,
+            atol=loose,
+            err_msg=field,
         )
 
 
@@ -202,8 +219,11 @@ def test_representations_agree(name, kind):
 # Of each solver one program is compiled, whose lanes are a case each.
 
 HARDER = {  # discount, tolerance and the steps allowed
-    "one step": (0.999, 1e-9, 1), "few steps": (0.5, 1e-9, 3), "easy": (0.1, 1e-6, 10_000),
-    "harder": (0.9, 1e-6, 10_000), "hard": (0.999, 1e-6, 100_000),
+    "one step": (0.999, 1e-9, 1),
+    "few steps": (0.5, 1e-9, 3),
+    "easy": (0.1, 1e-6, 10_000),
+    "harder": (0.9, 1e-6, 10_000),
+    "hard": (0.999, 1e-6, 100_000),
 }
 INVALID = {
     "too much": lambda row: 2.5 * row,
@@ -267,7 +287,8 @@ def solved(name: str) -> tuple[dict, dict[str, jl.Solution]]:
     cases = cases_of(solver)
     models, inputs, limits = zip(*cases.values(), strict=True)
     batch = jax.jit(jax.vmap(lambda m, x, o: solver.solve(m, x, **o)))(
-        stack(models), stack(inputs), stack(limits))
+        stack(models), stack(inputs), stack(limits)
+    )
     batch = jax.tree.map(np.asarray, batch)
     return cases, {case: lane(batch, i) for i, case in enumerate(cases)}
 
@@ -351,7 +372,8 @@ def test_compiled_within_another_function_is_the_same(name):
     limits = limits_of(solver, tolerance=1e-8)
     # Outside it is the host that answers, as near as the tolerance asks.
     assert_solutions_agree(
-        compiled(name)(model, inputs, limits), solver.solve(model, inputs, **limits), 1e-7)
+        compiled(name)(model, inputs, limits), solver.solve(model, inputs, **limits), 1e-7
+    )
 
 
 @pytest.mark.parametrize("name", SOLVERS)
@@ -377,7 +399,8 @@ def test_new_numbers_do_not_retrace(name):
 
 
 @pytest.mark.parametrize(
-    "name", [n for n, s in DISCOUNTED.items() if s.steps and n != "policy_value"])
+    "name", [n for n, s in DISCOUNTED.items() if s.steps and n != "policy_value"]
+)
 def test_an_impossible_tolerance_does_not_use_up_all_steps(name):
     solver = SOLVERS[name]
     model, _, inputs = example("product" if solver.kinds == ("product",) else "sparse")
@@ -433,7 +456,8 @@ def test_discounts_outside_the_promise_never_converge(name, discount):
 USUAL = {"policy_value", "boltzmann_value", "reachability-policy"}
 DERIVATIVES = [
     pytest.param(
-        name, kind,
+        name,
+        kind,
         marks=[] if kind == SOLVERS[name].kinds[0] or name in USUAL else pytest.mark.exhaustive,
     )
     for name, kind in PAIRS

@@ -72,14 +72,22 @@ def test_until_is_the_formula():
         for objective in ("max", "min"):
             until = reachability_probability(sparse, goal, stay=stay, objective=objective)
             formula = sparse_satisfaction(
-                sparse, "a U b", objective=objective, states=np.arange(sparse.num_states))
+                sparse, "a U b", objective=objective, states=np.arange(sparse.num_states)
+            )
             overlap(until, formula.solution, 1e-12)
             again = reachability_probability(padded, goal, stay=stay, objective=objective)
             overlap(until, again)
 
 
-FORMULAS = ("G F a & G F b", "F G a | G F b", "F (a & X F b)", "G (a -> X b)", "F a & G !b",
-            "G F a -> G F b", "a U (b & X a)")
+FORMULAS = (
+    "G F a & G F b",
+    "F G a | G F b",
+    "F (a & X F b)",
+    "G (a -> X b)",
+    "F a & G !b",
+    "G F a -> G F b",
+    "a U (b & X a)",
+)
 
 
 @pytest.mark.few(3)
@@ -93,8 +101,12 @@ def test_formulas(formula):
             theirs = optimal_satisfaction(lazy, objective=objective)
             automaton, letter = lazy.automaton, np.asarray(lazy.letter)
             memory = np.asarray(automaton.delta)[int(automaton.initial), letter]
-            start = theirs.replace(**{name: np.asarray(getattr(theirs, name))[states, memory]
-                                      for name in ("lower", "upper", "value")})
+            start = theirs.replace(
+                **{
+                    name: np.asarray(getattr(theirs, name))[states, memory]
+                    for name in ("lower", "upper", "value")
+                }
+            )
             overlap(ours.solution, start)
 
 
@@ -134,8 +146,9 @@ def test_lazy_products_of_sparse_worlds(formula, label_on):
         weight /= np.add.reduceat(weight, sparse.row_start[:-1])[sparse.host.state]
         table = np.zeros((*ours.state_shape, padded.num_actions))
         table[sparse.host.state, :, sparse.action] = weight
-        overlap(satisfaction_probability(ours, weight), satisfaction_probability(theirs, table),
-                1e-9)
+        overlap(
+            satisfaction_probability(ours, weight), satisfaction_probability(theirs, table), 1e-9
+        )
 
 
 @counts(6, 60)  # of each size the padded model's program is another one
@@ -164,8 +177,9 @@ def test_policies_of_many_choices_are_enclosed():
     weight = np.full(count + 2, 2.5e-17)
     weight[0], weight[-1] = 0.5, 0.5
     successor = np.concatenate([np.ones(count + 1, int), [2], [1, 2]])
-    model = make_sparse([0, count + 2, count + 3, count + 4], np.arange(count + 5), successor,
-                        np.ones(count + 4))
+    model = make_sparse(
+        [0, count + 2, count + 3, count + 4], np.arange(count + 5), successor, np.ones(count + 4)
+    )
     policy = np.concatenate([weight, [1, 1]])
     exact = [Fraction(float(w)) for w in weight]
     share = sum(exact[:-1]) / sum(exact)
@@ -199,8 +213,11 @@ def test_restricted_models():
         rows[sparse.host.row_start[:-1]] = True
         first = with_allowed(sparse, rows)
         assert first.is_chain
-        overlap(reachability_probability(first, goal),
-                reachability_probability(sparse, goal, policy=sparse.row_start[:-1]), 1e-12)
+        overlap(
+            reachability_probability(first, goal),
+            reachability_probability(sparse, goal, policy=sparse.row_start[:-1]),
+            1e-12,
+        )
 
 
 def test_rewards_for_ever():
@@ -228,7 +245,8 @@ def test_what_is_wrong_is_named():
         total_reward(sparse, -np.ones(sparse.num_rows), goal)
     with pytest.raises(ValueError, match="state 0, whose rows are 0"):
         reachability_probability(
-            sparse, goal, policy=np.full(sparse.num_states, sparse.num_rows - 1, np.int32))
+            sparse, goal, policy=np.full(sparse.num_states, sparse.num_rows - 1, np.int32)
+        )
     with pytest.raises(ValueError, match="policy has shape"):
         reachability_probability(sparse, goal, policy=np.ones(3 + sparse.num_rows))
     with pytest.raises(ValueError, match="sums to"):

@@ -48,40 +48,55 @@ def game(model):
 SOLVERS = {
     "policy_value": Solver(
         lambda m, x: jl.policy_value(m, x["policy"], x["reward"], x["discount"]),
-        ("reward", "discount", "policy")),
+        ("reward", "discount", "policy"),
+    ),
     **{
         f"optimal_value-{method}": Solver(
             lambda m, x, method=method: jl.optimal_value(
-                m, x["reward"], x["discount"], method=method), ("reward", "discount"), False)
+                m, x["reward"], x["discount"], method=method
+            ),
+            ("reward", "discount"),
+            False,
+        )
         for method in ("policy_iteration", "modified_policy_iteration", "value_iteration")
     },
     **{
         f"soft_value-{method}": Solver(
-            lambda m, x, method=method: jl.soft_value(
-                m, x["reward"], x["discount"], method=method), ("reward", "discount"))
+            lambda m, x, method=method: jl.soft_value(m, x["reward"], x["discount"], method=method),
+            ("reward", "discount"),
+        )
         for method in ("newton", "value_iteration")
     },
     "boltzmann_value": Solver(
-        lambda m, x: jl.boltzmann_value(m, x["reward"], x["discount"]), ("reward", "discount")),
+        lambda m, x: jl.boltzmann_value(m, x["reward"], x["discount"]), ("reward", "discount")
+    ),
     "boltzmann_value-newton": Solver(
         lambda m, x: jl.boltzmann_value(m, x["reward"], x["discount"] / 3, method="newton"),
-        ("reward", "discount")),
+        ("reward", "discount"),
+    ),
     "occupancy_measure": Solver(
-        lambda m, x: jl.occupancy_measure(m, x["policy"], x["discount"]), ("discount", "policy")),
+        lambda m, x: jl.occupancy_measure(m, x["policy"], x["discount"]), ("discount", "policy")
+    ),
     **{
         f"minimax_value-{method}": Solver(
             lambda m, x, method=method: jl.minimax_value(
-                game(m), x["reward"], x["discount"], method=method, allowed=x["allowed"]),
-            ("reward", "discount"), False)
+                game(m), x["reward"], x["discount"], method=method, allowed=x["allowed"]
+            ),
+            ("reward", "discount"),
+            False,
+        )
         for method in ("policy_iteration", "value_iteration", "strategy_iteration")
     },
     "strategy_value": Solver(
         lambda m, x: jl.strategy_value(game(m), x["policy"], x["reward"], x["discount"]),
-        ("reward", "discount", "policy")),
+        ("reward", "discount", "policy"),
+    ),
     "strategy_value-environment": Solver(
         lambda m, x: jl.strategy_value(
-            game(m), x["policy"], x["reward"], x["discount"], environment=x["policy"]),
-        ("reward", "discount", "policy")),
+            game(m), x["policy"], x["reward"], x["discount"], environment=x["policy"]
+        ),
+        ("reward", "discount", "policy"),
+    ),
 }
 
 
@@ -117,12 +132,19 @@ def example(seed: int = 0) -> Example:
     probability /= np.repeat(np.add.reduceat(probability, start[:-1]), count)
     reward = jl.Rewards(*(rng.normal(size=n) for n in (COUNT, row_start[-1], start[-1])))
     model = jl.make_sparse(
-        row_start, start, successor, probability, rewards={"gain": reward},
-        label={"a": [1, 4], "b": [2]}, valuation={"name": np.array(list("abcdefghi"))})
+        row_start,
+        start,
+        successor,
+        probability,
+        rewards={"gain": reward},
+        label={"a": [1, 4], "b": [2]},
+        valuation={"name": np.array(list("abcdefghi"))},
+    )
     state, num_rows = model.host.state, model.num_rows
     weight = rng.random(num_rows) + 0.2
     inputs = {
-        "reward": rng.normal(size=num_rows), "discount": np.asarray(0.9),
+        "reward": rng.normal(size=num_rows),
+        "discount": np.asarray(0.9),
         "policy": weight / np.bincount(state, weight)[state],
         "allowed": (rng.random(num_rows) < 0.7) | (np.diff(row_start)[state] == 1),
     }
@@ -150,8 +172,9 @@ def assert_as_padded(found: jl.Solution, name: str, inputs: dict[str, Any]) -> N
     wide = {n: case.wide(x) if np.shape(x) == case.action.shape else x for n, x in inputs.items()}
     expected = jax.tree.map(np.asarray, SOLVERS[name].solve(case.padded, wide))
     parts = {f: getattr(expected, f) for f in ("value", "lower", "upper", "policy")}
-    expected = replace(expected, **{
-        f: case.narrow(x) if x.ndim == 2 else x for f, x in parts.items()})
+    expected = replace(
+        expected, **{f: case.narrow(x) if x.ndim == 2 else x for f, x in parts.items()}
+    )
     assert_solutions_agree(found, expected, 1e-10)
     if "value_iteration" in name:  # what else is done depends on rounding
         np.testing.assert_array_equal(found.num_steps, expected.num_steps)
@@ -164,19 +187,18 @@ def assert_as_padded(found: jl.Solution, name: str, inputs: dict[str, Any]) -> N
 @pytest.mark.parametrize("name", SOLVERS)
 def test_the_answer_is_that_of_the_padded_model(name):
     found = solved(name)
-    assert found.status == (
-        Status.UNCERTIFIED if name == "boltzmann_value" else Status.CONVERGED)
+    assert found.status == (Status.UNCERTIFIED if name == "boltzmann_value" else Status.CONVERGED)
     assert_as_padded(found, name, example().inputs)
 
 
 # Compiling derivatives takes seconds; by default each way to reduce choices occurs.
-USUAL = ("policy_value", "optimal_value-policy_iteration", "soft_value-newton",
-         "occupancy_measure")
+USUAL = ("policy_value", "optimal_value-policy_iteration", "soft_value-newton", "occupancy_measure")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [
-    pytest.param(n, marks=[] if n in USUAL else pytest.mark.exhaustive) for n in SOLVERS])
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[] if n in USUAL else pytest.mark.exhaustive) for n in SOLVERS]
+)
 def test_derivatives(name):
     """Forward, reverse and central differences, in all inputs and the probabilities."""
     model, _, inputs, _ = example()
@@ -187,8 +209,11 @@ def test_derivatives(name):
         return noise - (np.bincount(owner, noise) / np.bincount(owner))[owner]
 
     directions = {
-        "reward": rng.normal(size=host.num_rows), "discount": np.ones(()),
-        "policy": balanced(host.state), "probability": balanced(host.row)}
+        "reward": rng.normal(size=host.num_rows),
+        "discount": np.ones(()),
+        "policy": balanced(host.state),
+        "probability": balanced(host.row),
+    }
     point = {n: inputs[n] for n in solver.needs} | {"probability": model.probability}
 
     def answer(x):
@@ -220,18 +245,28 @@ def cases() -> dict[str, tuple[Any, dict[str, Any]]]:
         "slow": (model, {**inputs, "discount": np.asarray(0.99)}),
     }
     for name, number in (("nan", np.nan), ("infinite", np.inf)):
-        found[f"{name} reward"] = model, {
-            **inputs, "reward": with_row(inputs["reward"], row, number)}
+        found[f"{name} reward"] = (
+            model,
+            {**inputs, "reward": with_row(inputs["reward"], row, number)},
+        )
     for name, number in (("too much", 2.0), ("negative", -0.1), ("nan", np.nan)):
-        found[f"{name} policy"] = model, {
-            **inputs, "policy": with_row(inputs["policy"], row, number)}
+        found[f"{name} policy"] = (
+            model,
+            {**inputs, "policy": with_row(inputs["policy"], row, number)},
+        )
     for name, discount in (("one", 1.0), ("nan", np.nan)):
         found[f"{name} discount"] = model, {**inputs, "discount": np.asarray(discount)}
     return found
 
 
-LANES = ("policy_value", "optimal_value-modified_policy_iteration", "soft_value-newton",
-         "occupancy_measure", "minimax_value-policy_iteration", "strategy_value")
+LANES = (
+    "policy_value",
+    "optimal_value-modified_policy_iteration",
+    "soft_value-newton",
+    "occupancy_measure",
+    "minimax_value-policy_iteration",
+    "strategy_value",
+)
 
 
 @cache
@@ -285,8 +320,9 @@ def test_rows_and_weights_are_one_policy():
     weight = np.zeros(model.num_rows)
     weight[rows] = 1
     for name in ("policy_value", "occupancy_measure", "strategy_value"):
-        one, other = (compiled(name)(numbers(model), {**inputs, "policy": p})
-                      for p in (rows, weight))
+        one, other = (
+            compiled(name)(numbers(model), {**inputs, "policy": p}) for p in (rows, weight)
+        )
         assert_solutions_agree(one, other)
     wrong = with_row(rows, 0, rows[1]).astype(int)
     found = compiled("policy_value")(numbers(model), {**inputs, "policy": wrong})
@@ -338,7 +374,8 @@ def test_the_adjoint_of_soft_policies():
     cotangent = np.random.default_rng(3).normal(size=policy.size)
     found = soft_policy_adjoint(numbers(case.model), policy, 0.9, cotangent)
     expected = soft_policy_adjoint(
-        case.padded, case.wide(policy), 0.9, jnp.asarray(case.wide(cotangent)))
+        case.padded, case.wide(policy), 0.9, jnp.asarray(case.wide(cotangent))
+    )
     np.testing.assert_allclose(found, case.narrow(expected), atol=1e-10)
 
 
@@ -346,7 +383,8 @@ def test_where_the_boltzmann_operator_contracts_is_known_inside_jit():
     for count in (1, 2, 7, 1000):
         expected = boltzmann_expansion(count)
         np.testing.assert_allclose(
-            jax.jit(boltzmann_expansion)(jnp.int32(count)), expected, rtol=1e-12)
+            jax.jit(boltzmann_expansion)(jnp.int32(count)), expected, rtol=1e-12
+        )
 
 
 @pytest.mark.slow
@@ -362,8 +400,7 @@ def test_products_are_solved_without_padding(label_on):
         best = jl.optimal_value(lazy, "gain", 0.9)
         again = jl.policy_value(lazy, best.policy, "gain", 0.9)
         soft = jl.soft_value(lazy, reward, 0.9)
-        against = jl.minimax_value(
-            jl.Game(lazy, jnp.ones(lazy.state_shape, bool)), reward, 0.9)
+        against = jl.minimax_value(jl.Game(lazy, jnp.ones(lazy.state_shape, bool)), reward, 0.9)
         visits = jl.occupancy_measure(lazy, best.policy, 0.9)
         return best, again, soft, against, visits
 
@@ -374,11 +411,12 @@ def test_products_are_solved_without_padding(label_on):
     for found in (best, again, jl.policy_value(lazy, host.policy, "gain", 0.9)):
         np.testing.assert_allclose(found.value, host.value, atol=1e-6)
     assert_solutions_agree(soft, jl.soft_value(flat, reward, 0.9), 1e-10)
+    np.testing.assert_allclose(against.value, jl.optimal_value(lazy, reward, 0.9).value, atol=1e-6)
     np.testing.assert_allclose(
-        against.value, jl.optimal_value(lazy, reward, 0.9).value, atol=1e-6)
-    np.testing.assert_allclose(
-        visits.value @ jl.row_reward(flat, "gain"), np.sum(flat.initial * host.value.ravel()),
-        atol=1e-6)
+        visits.value @ jl.row_reward(flat, "gain"),
+        np.sum(flat.initial * host.value.ravel()),
+        atol=1e-6,
+    )
 
 
 def test_the_environment_may_move_for_nothing():
@@ -412,12 +450,17 @@ def test_rewards_that_cancel_leave_their_rounding(kind):
     reward = rng.normal(size=matrix.shape) * 1e8
     reward -= (matrix * reward).sum(-1, keepdims=True)
     exact = [[Fraction(float(x)) for x in row] for row in np.asarray(padded.probability)[:, 0]]
-    earned = [sum(p * Fraction(float(x)) for p, x in zip(row, reward[s, 0], strict=True))
-              for s, row in enumerate(exact)]
-    system = [[Fraction(int(s == t)) - Fraction(1, 2) * p for t, p in enumerate(row)]
-              for s, row in enumerate(exact)]
+    earned = [
+        sum(p * Fraction(float(x)) for p, x in zip(row, reward[s, 0], strict=True))
+        for s, row in enumerate(exact)
+    ]
+    system = [
+        [Fraction(int(s == t)) - Fraction(1, 2) * p for t, p in enumerate(row)]
+        for s, row in enumerate(exact)
+    ]
     solve = jax.jit(lambda m, r: jl.optimal_value(m, r, 0.5))
-    found = solve(padded, reward) if kind == "padded" else solve(
-        jl.to_sparse(padded), reward.ravel())
+    found = (
+        solve(padded, reward) if kind == "padded" else solve(jl.to_sparse(padded), reward.ravel())
+    )
     assert found.status == Status.CONVERGED
     assert_encloses(found, exact_solve(system, earned))

@@ -13,10 +13,24 @@ from jaxltl.core.values.sparse_satisfaction import (
 )
 
 FORMULAS = (
-    "F (a & X F b)", "!a U (b & F c)", "X X a", "a & F b", "true", "a",  # a prefix proves
-    "G (a -> X b)", "G !(a & b) & X !c", "a W (b & X a)",  # a prefix refutes
-    "G F a", "G F a & G F b", "G (a -> F b)", "G F a & G !c",  # Buchi
-    "F G a", "F G !a | G F b", "G F a -> G F b", "F G a & G F b & !c U b", "G F a & F G (b | c)",
+    "F (a & X F b)",
+    "!a U (b & F c)",
+    "X X a",
+    "a & F b",
+    "true",
+    "a",  # a prefix proves
+    "G (a -> X b)",
+    "G !(a & b) & X !c",
+    "a W (b & X a)",  # a prefix refutes
+    "G F a",
+    "G F a & G F b",
+    "G (a -> F b)",
+    "G F a & G !c",  # Buchi
+    "F G a",
+    "F G !a | G F b",
+    "G F a -> G F b",
+    "F G a & G F b & !c U b",
+    "G F a & F G (b | c)",
 )
 
 
@@ -31,8 +45,14 @@ def random_sparse(seed: int, num_states: int = 6, most_rows: int = 3) -> SparseM
     initial = np.zeros(num_states)
     initial[:3] = 1 / 3
     return make_sparse(
-        np.append(0, rows.cumsum()), start, successor, weight, initial=initial,
-        label=rng.random((num_states, 3)) < 0.4, propositions=["a", "b", "c"])
+        np.append(0, rows.cumsum()),
+        start,
+        successor,
+        weight,
+        initial=initial,
+        label=rng.random((num_states, 3)) < 0.4,
+        propositions=["a", "b", "c"],
+    )
 
 
 def chain_of(model: SparseMDP, found: Satisfaction) -> SparseMDP:
@@ -46,8 +66,14 @@ def chain_of(model: SparseMDP, found: Satisfaction) -> SparseMDP:
     entry = np.concatenate(entry)
     initial = np.bincount(found.product.start, minlength=n) / found.product.start.size
     return make_sparse(
-        None, start, mdp.successor[entry], mdp.probability[entry], initial=initial,
-        label=np.asarray(model.label)[found.product.base_state], propositions=model.propositions)
+        None,
+        start,
+        mdp.successor[entry],
+        mdp.probability[entry],
+        initial=initial,
+        label=np.asarray(model.label)[found.product.base_state],
+        propositions=model.propositions,
+    )
 
 
 @pytest.mark.few(9)
@@ -62,7 +88,8 @@ def test_values_are_those_of_the_padded_product(formula):
             at = states, np.asarray(lazy.initial_memory)
             for label_on in ("entry", "exit"):
                 found = sparse_satisfaction(
-                    model, formula, objective=objective, states=states, label_on=label_on)
+                    model, formula, objective=objective, states=states, label_on=label_on
+                )
                 solution = found.solution
                 assert (solution.lower <= solution.value).all()
                 assert (solution.value <= solution.upper).all()
@@ -78,8 +105,7 @@ def test_strategies_attain_what_they_are_said_to(formula):
         for objective in ("max", "min"):
             found = sparse_satisfaction(model, formula, objective=objective)
             chain = chain_of(model, found)
-            attained = sparse_satisfaction(
-                chain, formula, states=found.product.start).solution
+            attained = sparse_satisfaction(chain, formula, states=found.product.start).solution
             np.testing.assert_allclose(attained.value, found.solution.value, atol=1e-6)
 
 

@@ -53,8 +53,11 @@ def random_world(rng: np.random.Generator):
     successor[-3:] = np.arange(STATES - 3, STATES)[:, None, None]
     probability = weight / weight.sum(-1, keepdims=True)
     return make_mdp(
-        successor, probability, initial=np.full(STATES, 1 / STATES),
-        label=rng.random((STATES, len(NAMES))) < 0.5, propositions=list(NAMES),
+        successor,
+        probability,
+        initial=np.full(STATES, 1 / STATES),
+        label=rng.random((STATES, len(NAMES))) < 0.5,
+        propositions=list(NAMES),
     )
 
 
@@ -74,8 +77,11 @@ def storm_values(model, objective: str, formula: Formula) -> np.ndarray | None:
 
 def padded(formula: Formula):
     """The parity automaton with idle states added, so that all products share one compilation."""
-    automaton = to_automaton(formula, [{n for i, n in enumerate(NAMES) if k >> i & 1}
-                                       for k in range(4)], acceptance="parity")
+    automaton = to_automaton(
+        formula,
+        [{n for i, n in enumerate(NAMES) if k >> i & 1} for k in range(4)],
+        acceptance="parity",
+    )
     extra = MEMORY - len(automaton.delta)
     if extra < 0 or automaton.letters.shape[1] < 2:
         return None

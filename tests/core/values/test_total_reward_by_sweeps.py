@@ -48,8 +48,7 @@ def some_problem(seed, num_states=S):
 
 def made(parts):
     successor, probability, available = parts
-    return jl.make_mdp(
-        np.where(probability > 0, successor, 0), probability, available=available)
+    return jl.make_mdp(np.where(probability > 0, successor, 0), probability, available=available)
 
 
 def agree(found, host, tolerance=1e-6, taken=np.asarray, status=Status.CONVERGED):
@@ -92,8 +91,9 @@ def host_agrees(seed):
         found = inside(model, reward, target, objective=objective)
         agree(found, host)
         attains(model, reward, target, found, objective)
-    agree(inside(model, reward, target, policy), jl.total_reward(
-        model, reward, target, policy=policy))
+    agree(
+        inside(model, reward, target, policy), jl.total_reward(model, reward, target, policy=policy)
+    )
 
 
 def test_inside_jit_it_is_that_of_the_host():
@@ -143,8 +143,11 @@ def exact_least(model, reward, target):
     best = np.full(model.num_states, None)
     transition = reference.FRACTION(model.transition)
     for policy in reference.memoryless_policies(model.available):
-        value = exact_value(transition[np.arange(S_TINY), list(policy)],
-                            reference.FRACTION(reward[np.arange(S_TINY), list(policy)]), target)
+        value = exact_value(
+            transition[np.arange(S_TINY), list(policy)],
+            reference.FRACTION(reward[np.arange(S_TINY), list(policy)]),
+            target,
+        )
         for s, v in enumerate(value):
             if v is not None and (best[s] is None or v < best[s]):
                 best[s] = v
@@ -245,7 +248,8 @@ def test_single_precision():
                 # Roundings of some hundred steps are a thousandth.
                 finite = host.value[np.isfinite(host.value)]
                 assert found.status == Status.CONVERGED or (
-                    found.status == Status.PRECISION and finite.max() > 100)
+                    found.status == Status.PRECISION and finite.max() > 100
+                )
 
 
 # --- what else is asked of it --------------------------------------------------------------------
@@ -261,14 +265,16 @@ def slopes_agree(run, at, changes, step=1e-5):
     found = jax.jit(jax.grad(lambda x: run(*x)))(at)
     run = jax.jit(run)
     for i, change in enumerate(changes):
-        up, down = (run(*at[:i], at[i] + s * change, *at[i + 1:]) for s in (step, -step))
+        up, down = (run(*at[:i], at[i] + s * change, *at[i + 1 :]) for s in (step, -step))
         np.testing.assert_allclose(
-            (found[i] * change).sum(), (up - down) / (2 * step), rtol=1e-4, atol=1e-4)
+            (found[i] * change).sum(), (up - down) / (2 * step), rtol=1e-4, atol=1e-4
+        )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("objective", [
-    "min", pytest.param("max", marks=pytest.mark.exhaustive), "policy"])
+@pytest.mark.parametrize(
+    "objective", ["min", pytest.param("max", marks=pytest.mark.exhaustive), "policy"]
+)
 def test_derivatives_are_those_of_differences(objective):
     parts, reward, target, policy = some_problem(1)
     model, rng = made(parts), np.random.default_rng(0)
@@ -298,7 +304,8 @@ def test_derivatives_over_a_mesh():
     given = world.number >= 0
     goal = put(target) | ~given
     slopes_agree(
-        lambda r: sum_of_finite(world, r, goal, objective="min"), [put(reward)], [put(change)])
+        lambda r: sum_of_finite(world, r, goal, objective="min"), [put(reward)], [put(change)]
+    )
 
 
 @pytest.mark.slow
@@ -325,15 +332,15 @@ def test_products_over_a_mesh():
         wide = np.broadcast_to(reward[:, None], (S, memory, A))
         for objective in ("max", "min"):
             host = jl.total_reward(alone, wide, target, objective=objective)
-            found = jl.total_reward(
-                spread, to_mesh(world, wide), spread.final, objective=objective)
+            found = jl.total_reward(spread, to_mesh(world, wide), spread.final, objective=objective)
             agree(found, host, taken=partial(from_mesh, world))
 
 
 def test_rewards_by_name_and_of_states():
     """On a mesh of one device: a sparse model's names, and what a state earns."""
     sparse = jl.make_sparse(
-        None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0], rewards={"steps": jl.Rewards(state=[1, 1])})
+        None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0], rewards={"steps": jl.Rewards(state=[1, 1])}
+    )
     world = shard(sparse, mesh_of(1))
     target = to_mesh(world, np.array([False, True]))
     for reward in ("steps", to_mesh(world, np.ones(2))):
@@ -358,4 +365,3 @@ def test_what_is_refused():
     assert bad.status == Status.NONFINITE and np.isnan(bad.value).all()
     none = inside(model, reward, target, policy * 2)
     assert none.status == Status.INVALID and np.isnan(none.value).all()
-

@@ -42,7 +42,8 @@ def test_the_error_holds_what_it_says(shape, enough):
     game, allowed, probability, gain, guess = models(0, 4, shape)
     for i in range(4):
         value, error, quantity = span_iteration(
-            game, allowed, gain[i], probability[i], guess[i], 0.8, enough=enough)
+            game, allowed, gain[i], probability[i], guess[i], 0.8, enough=enough
+        )
         expected = exact(game, allowed, probability[i], gain[i], 0.8)
         assert error <= enough
         assert np.abs(value[:-1] - expected).max() <= error + 1e-9
@@ -50,8 +51,7 @@ def test_the_error_holds_what_it_says(shape, enough):
         model = game.mdp.replace(probability=probability[i])
         reached = expectation(model, value)
         moves = np.asarray(game.available)
-        np.testing.assert_allclose(
-            quantity[moves], (gain[i] + 0.8 * reached)[moves], atol=1e-12)
+        np.testing.assert_allclose(quantity[moves], (gain[i] + 0.8 * reached)[moves], atol=1e-12)
 
 
 @pytest.mark.exhaustive
@@ -63,8 +63,10 @@ def test_lanes_are_as_if_alone_however_they_are_nested():
     def solve(game, allowed, p, g, v, d, e, a):
         return span_iteration(game, allowed, g, p, v, d, enough=e, active=a)
 
-    alone = [solve(game, allowed, *x) for x in zip(
-        probability, gain, guess, discount, enough, active, strict=True)]
+    alone = [
+        solve(game, allowed, *x)
+        for x in zip(probability, gain, guess, discount, enough, active, strict=True)
+    ]
     lanes = (probability, gain, guess, discount, enough, active)
     shared = (None, None, 0, 0, 0, 0, 0, 0)
     flat = jax.jit(jax.vmap(solve, shared))(game, allowed, *lanes)
@@ -92,8 +94,10 @@ def test_the_last_of_many_lanes_end_as_they_do_among_few():
     few = jax.jit(jax.vmap(solve))
 
     def by_eights(value, active):
-        groups = [few(*(x[i : i + 8] for x in (probability, gain, value, enough, active)))
-                  for i in range(0, 64, 8)]
+        groups = [
+            few(*(x[i : i + 8] for x in (probability, gain, value, enough, active)))
+            for i in range(0, 64, 8)
+        ]
         return jax.tree.map(lambda *x: jnp.concatenate(x), *groups)
 
     near = by_eights(guess, jnp.ones(64, bool))[0]

@@ -37,8 +37,14 @@ def walk(env, key, num_steps):
         choose, step = jax.random.split(key)
         action = random_action(choose, env.actions, allowed_in(env, world))
         after, found = step_or_reset(env, world, action, step)
-        return after, (env.observe(world), action, found.reward, found.terminated, found.truncated,
-                       env.observe(found.world))
+        return after, (
+            env.observe(world),
+            action,
+            found.reward,
+            found.terminated,
+            found.truncated,
+            env.observe(found.world),
+        )
 
     first, rest = keys_of(key, num_steps)
     return lax.scan(go, env.reset(first), rest)[1]

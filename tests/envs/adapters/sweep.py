@@ -28,6 +28,7 @@ def of_gymnax():
     noise = np.random.default_rng(0).random((50, 28, 28), np.float32), np.arange(50) % 10
     mnist.load_mnist.load_mnist = lambda: (noise, noise)
     for name in gymnax.registered_envs:
+
         def make(name=name):
             own, params = gymnax.make(name)
             if hasattr(params, "max_steps_in_episode"):
@@ -38,6 +39,7 @@ def of_gymnax():
                 return after, seen, reward, terminated | own.is_truncated(after, params)
 
             return (jl.from_gymnax(own, params), lambda key: own.reset_env(key, params)[::-1], step)
+
         yield name, make
 
 
@@ -45,6 +47,7 @@ def of_navix():
     import navix
 
     for name in navix.registry():
+
         def make(name=name):
             own = navix.make(name, max_steps=LIMIT)
 
@@ -57,6 +60,7 @@ def of_navix():
                 return after, after.observation, after.reward, after.is_done()
 
             return jl.from_navix(own), reset, step
+
         yield name, make
 
 
@@ -64,6 +68,7 @@ def of_xminigrid():
     import xminigrid
 
     for name in xminigrid.registered_environments():
+
         def make(name=name):
             own, params = xminigrid.make(name, max_steps=LIMIT)
 
@@ -76,6 +81,7 @@ def of_xminigrid():
                 return after, after.observation, after.reward, after.last()
 
             return jl.from_xminigrid(own, params), reset, step
+
         yield name, make
 
 
@@ -88,12 +94,15 @@ def of_jumanji():
 
     special = {  # fewer agents, and no files from the network
         "Connector-v3": lambda: jumanji.environments.Connector(
-            pairs.UniformRandomGenerator(grid_size=5, num_agents=3)),
-        "JobShop-v0": lambda: jumanji.environments.JobShop(shop.RandomGenerator(
-            num_jobs=4, num_machines=3, max_num_ops=3, max_op_duration=3)),
+            pairs.UniformRandomGenerator(grid_size=5, num_agents=3)
+        ),
+        "JobShop-v0": lambda: jumanji.environments.JobShop(
+            shop.RandomGenerator(num_jobs=4, num_machines=3, max_num_ops=3, max_op_duration=3)
+        ),
         "Sokoban-v0": lambda: jumanji.environments.Sokoban(boxes.ToyGenerator()),
     }
     for name in sorted(jumanji.registered_environments()):
+
         def make(name=name):
             own = special[name]() if name in special else jumanji.make(name)
             if own.reward_spec.shape:
@@ -122,6 +131,7 @@ def of_jumanji():
                 return after, found.observation, found.reward, found.last()
 
             return env, reset, step
+
         yield name, make
 
 
@@ -129,6 +139,7 @@ def of_brax():
     import brax.envs
 
     for name in brax.envs._envs:
+
         def make(name=name):
             own = brax.envs.training.EpisodeWrapper(brax.envs.get_environment(name), LIMIT, 1)
 
@@ -141,14 +152,20 @@ def of_brax():
                 return after, after.obs, after.reward, after.done > 0
 
             return jl.from_brax(own), reset, step
+
         yield name, make
 
 
 def of_craftax():
     from craftax.craftax_env import make_craftax_env_from_name
 
-    for name in ("Craftax-Classic-Symbolic-v1", "Craftax-Classic-Pixels-v1",
-                 "Craftax-Symbolic-v1", "Craftax-Pixels-v1"):
+    for name in (
+        "Craftax-Classic-Symbolic-v1",
+        "Craftax-Classic-Pixels-v1",
+        "Craftax-Symbolic-v1",
+        "Craftax-Pixels-v1",
+    ):
+
         def make(name=name):
             own = make_craftax_env_from_name(name, auto_reset=False)
             params = own.default_params.replace(max_timesteps=LIMIT)
@@ -158,6 +175,7 @@ def of_craftax():
                 return after, seen, reward, done
 
             return jl.from_craftax(own, params), lambda key: own.reset_env(key, params)[::-1], step
+
         yield name, make
 
 
@@ -169,6 +187,7 @@ def of_pgx():
         return jax.random.categorical(key, jnp.log(state.legal_action_mask)).astype(jnp.int32)
 
     for name in pgx.available_envs():
+
         def make(name=name):
             own = pgx.make(name)
             others = None if own.num_players == 1 else anyone
@@ -184,7 +203,9 @@ def of_pgx():
                     return state, earned
                 return jax.lax.while_loop(
                     lambda x: ~(x[0].terminated | x[0].truncated) & (x[0].current_player != 0),
-                    move, (state, earned, key))[:2]
+                    move,
+                    (state, earned, key),
+                )[:2]
 
             def reset(key):
                 start, wait = jax.random.split(key)
@@ -196,16 +217,26 @@ def of_pgx():
                 go, wait = jax.random.split(key)
                 state = own.step(state, action, go)
                 state, earned = await_turn(state, owed + state.rewards[0], wait)
-                return ((state, jnp.float32(0)), own.observe(state, 0), earned,
-                        state.terminated | state.truncated)
+                return (
+                    (state, jnp.float32(0)),
+                    own.observe(state, 0),
+                    earned,
+                    state.terminated | state.truncated,
+                )
 
             return jl.from_pgx(own, others), reset, step
+
         yield name, make
 
 
 PACKAGES = {
-    "gymnax": of_gymnax, "navix": of_navix, "xminigrid": of_xminigrid, "jumanji": of_jumanji,
-    "brax": of_brax, "craftax": of_craftax, "pgx": of_pgx,
+    "gymnax": of_gymnax,
+    "navix": of_navix,
+    "xminigrid": of_xminigrid,
+    "jumanji": of_jumanji,
+    "brax": of_brax,
+    "craftax": of_craftax,
+    "pgx": of_pgx,
 }
 
 
@@ -227,20 +258,31 @@ def of_contacts(env, reset, step, steps=STEPS, walks=WALKS):
         return jax.lax.scan(go, env.reset(first), rest)[1]
 
     world, action, found = jax.tree.map(
-        lambda x: x.reshape(-1, *x.shape[2:]), jax.jit(jax.vmap(walked))(keys))
+        lambda x: x.reshape(-1, *x.shape[2:]), jax.jit(jax.vmap(walked))(keys)
+    )
     told = jax.jit(jax.vmap(lambda *pair: step(*pair, None)[1:]))(world, action)
-    pairs = {"last observations": (found.world, told[0]), "rewards": (found.reward, told[1]),
-             "ends": (found.terminated | found.truncated, told[2])}
+    pairs = {
+        "last observations": (found.world, told[0]),
+        "rewards": (found.reward, told[1]),
+        "ends": (found.terminated | found.truncated, told[2]),
+    }
     pairs["first observations"] = (
         jax.tree.map(lambda x: x[::steps], env.observe(world)),
-        jax.jit(jax.vmap(lambda key: reset(keys_of(key, steps)[0])[1]))(keys))
-    wrong = [f"{name}: {text}" for name, pair in pairs.items()
-             if (text := unlike(*pair, 1e-3, scaled=True))]
+        jax.jit(jax.vmap(lambda key: reset(keys_of(key, steps)[0])[1]))(keys),
+    )
+    wrong = [
+        f"{name}: {text}"
+        for name, pair in pairs.items()
+        if (text := unlike(*pair, 1e-3, scaled=True))
+    ]
     for row in np.asarray(found.terminated | found.truncated).reshape(walks, -1):
         if (lengths(row) > env.horizon).any():
             wrong.append(f"an episode goes on after {env.horizon} steps")
-    return ("; ".join(wrong), int((found.terminated | found.truncated).sum()),
-            int((found.truncated & ~found.terminated).sum()))
+    return (
+        "; ".join(wrong),
+        int((found.terminated | found.truncated).sum()),
+        int((found.truncated & ~found.terminated).sum()),
+    )
 
 
 def differences(env, reset, step, steps=STEPS, walks=WALKS):
@@ -261,12 +303,20 @@ def differences(env, reset, step, steps=STEPS, walks=WALKS):
     wrong, least = [], env.horizon or steps + 1
     for row, key in enumerate(keys):
         seen, action, reward, terminated, truncated, last = jax.tree.map(
-            lambda x, row=row: np.asarray(x[row]), found)
+            lambda x, row=row: np.asarray(x[row]), found
+        )
         told = own(key, action)
-        pairs = {"observations": (seen, told[0]), "rewards": (reward, told[2]),
-                 "ends": (terminated | truncated, told[3]), "last observations": (last, told[5])}
-        wrong += [f"{name} of walk {row}: {text}"
-                  for name, pair in pairs.items() if (text := unlike(*pair))]
+        pairs = {
+            "observations": (seen, told[0]),
+            "rewards": (reward, told[2]),
+            "ends": (terminated | truncated, told[3]),
+            "last observations": (last, told[5]),
+        }
+        wrong += [
+            f"{name} of walk {row}: {text}"
+            for name, pair in pairs.items()
+            if (text := unlike(*pair))
+        ]
         ages = lengths(terminated | truncated)
         if (ages[truncated] != least).any() and env.horizon:
             wrong.append(f"walk {row} is cut off after {ages[truncated]} steps")
@@ -296,8 +346,11 @@ def unlike(mine, theirs, most=1e-4, scaled=False):
         if x.shape != y.shape:
             return f"{x.shape} for {y.shape}"
         size = np.abs(y).max(-1, keepdims=True, initial=0.1) if scaled and y.ndim > 1 else 0.1
-        close = np.isclose(x, y, rtol=most, atol=most * size, equal_nan=True) if (
-            y.dtype.kind == "f") else x == y
+        close = (
+            np.isclose(x, y, rtol=most, atol=most * size, equal_nan=True)
+            if (y.dtype.kind == "f")
+            else x == y
+        )
         if not close.all():
             return f"{(~close).sum()} of {close.size} numbers, first at {np.argwhere(~close)[0]}"
     return ""
@@ -328,8 +381,10 @@ def main(words):
     names = [x for x in words if x not in PACKAGES]
     for package in packages:
         for name, wrong, said in sweep(package, names):
-            print(f"{package:10} {name:34} {'WRONG ' + wrong if wrong else 'same'}  {said}",
-                  flush=True)
+            print(
+                f"{package:10} {name:34} {'WRONG ' + wrong if wrong else 'same'}  {said}",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

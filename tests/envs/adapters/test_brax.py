@@ -16,7 +16,8 @@ from tests.envs.adapters.harness import (  # noqa: F401
 )
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:Brax System:UserWarning", "ignore:Accessing .* directly from `Data`:DeprecationWarning")
+    "ignore:Brax System:UserWarning", "ignore:Accessing .* directly from `Data`:DeprecationWarning"
+)
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +56,11 @@ def test_a_thousand_steps_are_braxs_own(envs):
 
 def test_a_limit_of_ours_and_labels(envs):
     env = with_time_limit(
-        from_brax(envs.get_environment("fast"), labels=fast, propositions=["fast"]), 10)
+        from_brax(envs.get_environment("fast"), labels=fast, propositions=["fast"]), 10
+    )
     episode = run_episode(
-        jax.random.key(0), env, agent_of(lambda seen, key: jnp.ones(1)), num_steps=12)
+        jax.random.key(0), env, agent_of(lambda seen, key: jnp.ones(1)), num_steps=12
+    )
     assert episode.valid.sum() == 10 and episode.truncated and not episode.terminated
     speed = 0.02 * np.arange(13).clip(max=10)
     np.testing.assert_allclose(episode.world[0].obs[:, 1], speed, rtol=1e-5)
@@ -70,6 +73,7 @@ def test_what_is_not_braxs_is_named(envs):
         wrapped = envs.training.EpisodeWrapper(kind(own), 10, 1)
         with pytest.raises(ValueError, match=f"wrapped in {kind.__name__}; give brax.envs.get_env"):
             from_brax(wrapped)
+
     class Old(type(own)):
         """One that this JAX does not have a function for."""
 

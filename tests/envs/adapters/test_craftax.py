@@ -30,7 +30,8 @@ def test_a_thousand_steps_are_craftaxs_own(craftax):
     assert env.actions == Finite(17) and env.horizon == 40
     keys = jax.random.split(jax.random.key(2), 4)
     seen, action, reward, terminated, truncated, last = jax.jit(
-        jax.vmap(lambda key: walk(env, key, 250)))(keys)
+        jax.vmap(lambda key: walk(env, key, 250))
+    )(keys)
 
     def theirs(key, actions):
         first, rest = jax.random.split(key)
@@ -39,7 +40,8 @@ def test_a_thousand_steps_are_craftaxs_own(craftax):
             observation, state = carry
             key, action = given
             after, state, reward, done, _ = own.step(
-                jax.random.split(key)[1], state, action, params)
+                jax.random.split(key)[1], state, action, params
+            )
             return (after, state), (observation, reward, done)
 
         return jax.lax.scan(go, own.reset(first, params), (jax.random.split(rest, 250), actions))[1]
@@ -52,7 +54,8 @@ def test_a_thousand_steps_are_craftaxs_own(craftax):
         np.testing.assert_array_equal(terminated[row] | truncated[row], done)
         goes_on = ~np.asarray(done)[:-1]
         np.testing.assert_allclose(
-            last[row][:-1][goes_on], observation[1:][goes_on], rtol=2e-5, atol=2e-6)
+            last[row][:-1][goes_on], observation[1:][goes_on], rtol=2e-5, atol=2e-6
+        )
     assert truncated.sum() >= 20
     # One that dies, in the middle and at the limit.
     world = jax.jit(env.reset)(keys[0])

@@ -38,8 +38,7 @@ def test_a_thousand_steps_are_gymnaxs_own(gymnax):
         seen = info["final_observation"]
         return after, seen, jnp.asarray(reward, float), terminated, truncated
 
-    found = same_as_own(
-        env, lambda key: cartpole.reset(key, params)[::-1], step)
+    found = same_as_own(env, lambda key: cartpole.reset(key, params)[::-1], step)
     both_ends(found)
     assert (np.abs(found[5][found[3]][:, [0, 2]]) > [2.4, 12 * np.pi / 180]).any(1).all()
 
@@ -65,8 +64,12 @@ def test_boxes_labels_and_params(gymnax):
     always = agent_of(lambda seen, key: jnp.int32(1))
 
     def fall(gravity):
-        env = from_gymnax(cartpole, params.replace(gravity=gravity), labels=upright,
-                          propositions=["upright", "right"])
+        env = from_gymnax(
+            cartpole,
+            params.replace(gravity=gravity),
+            labels=upright,
+            propositions=["upright", "right"],
+        )
         return run_episode(jax.random.key(0), env, always, num_steps=10)
 
     episode = jax.jit(jax.vmap(fall))(gravity.gravity)

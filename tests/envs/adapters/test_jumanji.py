@@ -67,8 +67,8 @@ def test_actions_of_several_parts_are_numbered(jumanji, name, apart):
     found = jax.jit(env.step)(world, jnp.int32(number), jax.random.key(1))
     _, theirs = jax.jit(own.step)(world.state, jnp.array(actions[number]))
     for x, y in zip(
-            jax.tree.leaves(found.world.observation), jax.tree.leaves(theirs.observation),
-            strict=True):
+        jax.tree.leaves(found.world.observation), jax.tree.leaves(theirs.observation), strict=True
+    ):
         np.testing.assert_array_equal(x, y)
 
 
@@ -90,8 +90,11 @@ def test_parts_in_turn_are_one_step(jumanji, name):
         for part in range(parts):
             seen, may = observe(now), np.asarray(allowed(now))
             assert seen.turn.argmax() == part and seen.parts.sum() == part
-            left = mask[part] if len(mask) == parts and name != "Minesweeper-v0" else (
-                mask[tuple(chosen)] if part else mask.any(1))
+            left = (
+                mask[part]
+                if len(mask) == parts and name != "Minesweeper-v0"
+                else (mask[tuple(chosen)] if part else mask.any(1))
+            )
             np.testing.assert_array_equal(np.flatnonzero(may), np.flatnonzero(left))
             chosen.append(int(rng.choice(np.flatnonzero(may))))
             found = step(now, jnp.int32(chosen[-1]), jax.random.key(1))
@@ -102,16 +105,18 @@ def test_parts_in_turn_are_one_step(jumanji, name):
         np.testing.assert_allclose(found.reward, told.reward, rtol=1e-6)
         assert (found.terminated | found.truncated) == told.last() and now.turn == 0
         for x, y in zip(
-                jax.tree.leaves(now.world.observation), jax.tree.leaves(told.observation),
-                strict=True):
+            jax.tree.leaves(now.world.observation), jax.tree.leaves(told.observation), strict=True
+        ):
             np.testing.assert_allclose(x, y, rtol=1e-6)
         if told.last():
             now = reset(jax.random.key(2))
 
 
 def test_a_task_file_chooses_parts_in_turn(jumanji, tmp_path):
-    task = SimpleNamespace(path=tmp_path / "task.toml", world={
-        "environment": "jumanji:JobShop-v0", "arguments": {"in_turn": True}})
+    task = SimpleNamespace(
+        path=tmp_path / "task.toml",
+        world={"environment": "jumanji:JobShop-v0", "arguments": {"in_turn": True}},
+    )
     assert load_environment(task).actions == Finite(21)
     del task.world["arguments"]
     with pytest.raises(ValueError, match=r"'jumanji:JobShop-v0': from_jumanji: parts of .*in_turn"):

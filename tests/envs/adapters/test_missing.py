@@ -8,7 +8,8 @@ import jaxltl
 
 
 @pytest.mark.parametrize(
-    "name", ["brax", "craftax", "gymnax", "jumanji", "navix", "pgx", "xminigrid"])
+    "name", ["brax", "craftax", "gymnax", "jumanji", "navix", "pgx", "xminigrid"]
+)
 def test_a_missing_package_is_named(name, monkeypatch):
     for module in [name, *sys.modules]:
         if module == name or module.startswith(f"{name}."):

@@ -100,11 +100,14 @@ def test_a_game_of_one_player(pgx):
 def test_what_is_not_pgxs_is_named(pgx):
     game = pgx.make("tic_tac_toe")
     for call, text in (
-            (lambda: from_pgx(game), "for 2 players; give an opponent"),
-            (lambda: from_pgx(game, somebody, 2), "player=2; tic_tac_toe has the players 0 to 1"),
-            (lambda: from_pgx(game.step, somebody), "is a builtins.method, no environment of pgx"),
-            (lambda: from_pgx(game, lambda state, key: state.legal_action_mask),
-             r"opponent returns bool\[9\]; it must return the number"),
-            (lambda: from_pgx(pgx.make("2048"), somebody), "for 1 players.*None where there is")):
+        (lambda: from_pgx(game), "for 2 players; give an opponent"),
+        (lambda: from_pgx(game, somebody, 2), "player=2; tic_tac_toe has the players 0 to 1"),
+        (lambda: from_pgx(game.step, somebody), "is a builtins.method, no environment of pgx"),
+        (
+            lambda: from_pgx(game, lambda state, key: state.legal_action_mask),
+            r"opponent returns bool\[9\]; it must return the number",
+        ),
+        (lambda: from_pgx(pgx.make("2048"), somebody), "for 1 players.*None where there is"),
+    ):
         with pytest.raises(ValueError, match=text):
             call()
