@@ -15,9 +15,6 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxltl.algos import learner, mlirl
-from jaxltl.app._learn_pictures import live as live
-from jaxltl.app._learn_pictures import pictures as pictures
-from jaxltl.app._learn_pictures import task_pictures as task_pictures
 from jaxltl.app.files.tables import errors_in
 from jaxltl.app.files.task import (
     Task,
@@ -51,6 +48,9 @@ from jaxltl.app.job import (
 )
 from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.app.job import postfix as postfix
+from jaxltl.app.reports.learn_pictures import live as live
+from jaxltl.app.reports.learn_pictures import pictures as pictures
+from jaxltl.app.reports.learn_pictures import task_pictures as task_pictures
 from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.lifting import lift_policy
 from jaxltl.core.models.product import Product, product

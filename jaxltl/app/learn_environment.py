@@ -18,10 +18,8 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxltl.algos.checkpoint import atomic_write, read_arrays
-from jaxltl.app._environment_learners import Method, make_method
-from jaxltl.app.drawing import Picture, drawing
+from jaxltl.app.environment_learners import Method, make_method
 from jaxltl.app.environment_source import load_environment
-from jaxltl.app.explorer import Curves, curves
 from jaxltl.app.files.tables import errors_in, read_bytes
 from jaxltl.app.files.task import many
 from jaxltl.app.files.task_environment import EnvironmentTask, named_files
@@ -38,6 +36,8 @@ from jaxltl.app.job import (
     took,
 )
 from jaxltl.app.job import fingerprint as fingerprint
+from jaxltl.app.reports.drawing import Picture, drawing
+from jaxltl.app.reports.explorer import Curves, curves
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.labels import require_known

@@ -20,20 +20,6 @@ from jax import lax
 from jax.sharding import Mesh
 
 from jaxltl.algos import learner, todirl
-from jaxltl.app._todirl_guarantee import check_attainable, hold, is_weighable, likeliest
-from jaxltl.app._todirl_parts import (
-    LENGTH,
-    Judged,
-    Learned,
-    Outcome,
-    Setup,
-    Worlds,
-    counted_worlds,
-    part_of,
-)
-from jaxltl.app._todirl_pictures import live as live
-from jaxltl.app._todirl_pictures import pictures as pictures
-from jaxltl.app._todirl_pictures import task_pictures as task_pictures
 from jaxltl.app.files.tables import errors_in
 from jaxltl.app.files.task import require_end, synthetic_demonstrations
 from jaxltl.app.files.task_todirl import (
@@ -61,6 +47,20 @@ from jaxltl.app.job import (
 )
 from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.app.job import postfix as postfix
+from jaxltl.app.reports.todirl_pictures import live as live
+from jaxltl.app.reports.todirl_pictures import pictures as pictures
+from jaxltl.app.reports.todirl_pictures import task_pictures as task_pictures
+from jaxltl.app.todirl_guarantee import check_attainable, hold, is_weighable, likeliest
+from jaxltl.app.todirl_results import (
+    LENGTH,
+    Judged,
+    Learned,
+    Outcome,
+    Setup,
+    Worlds,
+    counted_worlds,
+    part_of,
+)
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.models.batch import lift_memory, narrow, stack_products

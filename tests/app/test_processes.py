@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxltl.algos import checkpoint
-from jaxltl.app._teller import told
+from jaxltl.app.exit_message import told
 from jaxltl.app.processes import Asked, Launch, Place, launched
 from jaxltl.core.values.answer import solve_property
 from jaxltl.core.values.discounted import optimal_value

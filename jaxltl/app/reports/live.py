@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxltl.app.drawing import Picture
-from jaxltl.app.explorer import START, Curves, Explorer, TooLarge
 from jaxltl.app.files.task import place, where
+from jaxltl.app.reports.drawing import Picture
+from jaxltl.app.reports.explorer import START, Curves, Explorer, TooLarge
 from jaxltl.app.reports.page import Remark, number, probability, rows
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import edge_guards

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxltl.app.drawing import Drawing, drawing
+from jaxltl.app.reports.drawing import Drawing, drawing
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.product import Product

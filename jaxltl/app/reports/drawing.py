@@ -13,7 +13,7 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.util import Finalize
 from typing import Any, NamedTuple
 
-from jaxltl.app.programs import few_collections
+from jaxltl.app.compilation import few_collections
 
 _PROCESSES = 2
 

@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.app.drawing import Picture, drawing
-from jaxltl.app.explorer import (
+from jaxltl.app.guarantee import left_out
+from jaxltl.app.job import automaton_picture, over_seeds, short_name
+from jaxltl.app.reports.drawing import Picture, drawing
+from jaxltl.app.reports.explorer import (
     START,
     Curves,
     Explorer,
@@ -21,8 +23,6 @@ from jaxltl.app.explorer import (
     explorer,
     learned_runs,
 )
-from jaxltl.app.guarantee import left_out
-from jaxltl.app.job import automaton_picture, over_seeds, short_name
 from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.restrict import restrict

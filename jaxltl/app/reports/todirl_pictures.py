@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.app._todirl_parts import Judged, Outcome, Setup, Worlds, counted_worlds, part_of
-from jaxltl.app.drawing import Picture, drawing
-from jaxltl.app.explorer import (
+from jaxltl.app.job import automaton_picture, over_seeds, short_name
+from jaxltl.app.reports.drawing import Picture, drawing
+from jaxltl.app.reports.explorer import (
     LONGEST_RUN,
     START,
     Curves,
@@ -23,7 +23,7 @@ from jaxltl.app.explorer import (
     explorer,
     learned_runs,
 )
-from jaxltl.app.job import automaton_picture, over_seeds, short_name
+from jaxltl.app.todirl_results import Judged, Outcome, Setup, Worlds, counted_worlds, part_of
 from jaxltl.core.models.batch import lift_memory
 from jaxltl.core.models.monitor import Verdict, verdicts
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories

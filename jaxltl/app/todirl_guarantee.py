@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxltl.app._todirl_parts import Learned, Setup, part_of
 from jaxltl.app.files.task import place as name_of
 from jaxltl.app.files.task_todirl import Scene
 from jaxltl.app.guarantee import bracket
+from jaxltl.app.todirl_results import Learned, Setup, part_of
 from jaxltl.core.values.mixture import attained, reaching, require_attainable
 
 _HALVINGS = 5  # between two weights, since what is still too much is mixed away
